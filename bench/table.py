@@ -1,0 +1,59 @@
+"""What every benchmark shares: rows, a table on the screen, `--json FILE`, `--quick`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured figure. `goal` is text such as "<= 1.5"; `met` is None where there is no goal."""
+
+    name: str
+    value: float | str | None
+    unit: str = ""
+    goal: str = ""
+    met: bool | None = None
+
+
+def at_most(name: str, value: float, unit: str, limit: float) -> Row:
+    return Row(name, value, unit, f"<= {limit:g}", bool(value <= limit))
+
+
+def at_least(name: str, value: float, unit: str, limit: float) -> Row:
+    return Row(name, value, unit, f">= {limit:g}", bool(value >= limit))
+
+
+def show(rows: list[Row], title: str) -> None:
+    table = Table(title=title)
+    for column in ("name", "value", "unit", "goal", "met"):
+        table.add_column(column, justify="right" if column == "value" else "left")
+    for row in rows:
+        value = f"{row.value:.4g}" if isinstance(row.value, float) else str(row.value)
+        table.add_row(row.name, value, row.unit, row.goal, {True: "yes", False: "NO", None: ""}[row.met])
+    Console(width=140).print(table)
+
+
+def main(
+    measure: Callable[[argparse.Namespace], list[Row]],
+    title: str,
+    arguments: Callable[[argparse.ArgumentParser], None] | None = None,
+) -> None:
+    """Command line of a benchmark: measures, prints the table, writes the JSON rows."""
+    parser = argparse.ArgumentParser(description=title)
+    parser.add_argument("--quick", action="store_true", help="a smaller run that ends within a minute")
+    parser.add_argument("--json", type=Path, help="write the rows as JSON")
+    if arguments:
+        arguments(parser)
+    options = parser.parse_args()
+    rows = measure(options)
+    show(rows, title)
+    if options.json:
+        options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))

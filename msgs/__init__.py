@@ -1,0 +1,172 @@
+"""The messages that nodes exchange: frozen dataclasses of scalars and numpy arrays. No logic, no torch, no zmq.
+
+An array's annotation says dtype and shape: `Annotated[np.ndarray, "float32 h w"]`. A number is a fixed size, a name
+is a size that must be the same wherever that name stands in one message. The codec checks both.
+
+Conventions (ARCHITECTURE.md): camera axes x right, y down, z forward; depth is z; pixel (0, 0) is the center of the
+first pixel; `world_from_cam` maps camera to world coordinates; images are RGB; intrinsics are (fx, fy, cx, cy) in
+pixels of the image they come with. Maps smaller than the image (`h w` against `H W`) cover the same field of view:
+scale the intrinsics with `mvsgs_core.camera.scale_intrinsics`. 0 in a depth or inverse-depth map means "unknown".
+
+`index` is the index of the frame in its stream; a keyframe keeps its frame's index as its id everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Annotated, Any
+
+import numpy as np
+
+
+class TrackingState(IntEnum):
+    """What the tracker knows of a frame's pose."""
+
+    TRACKED = 0
+    LOST = 1  # no pose: the frame could not be matched with the map
+    NOT_STARTED = 2  # no pose: before the start-up succeeded
+    DEGENERATE = 3  # a pose, but the motion gives no depth (pure rotation) or the image no texture
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of the stream, undistorted."""
+
+    index: int
+    timestamp: float  # seconds
+    image: Annotated[np.ndarray, "uint8 H W 3"]
+    intrinsics: Annotated[np.ndarray, "float64 4"]
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """What only the evaluator may see: the frame to score renders against, and the true pose and depth if known."""
+
+    index: int
+    timestamp: float  # seconds
+    image: Annotated[np.ndarray, "uint8 H W 3"]
+    intrinsics: Annotated[np.ndarray, "float64 4"]
+    world_from_cam: Annotated[np.ndarray, "float64 4 4"] | None
+    depth: Annotated[np.ndarray, "float32 H W"] | None  # in the unit of the true poses
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A frame that the tracker keeps, with its pose and coarse inverse depth on the tracker's grid."""
+
+    index: int
+    timestamp: float  # seconds
+    image: Annotated[np.ndarray, "uint8 H W 3"]
+    intrinsics: Annotated[np.ndarray, "float64 4"]
+    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
+    scale: float  # the map's scale that pose and depths are in, see Poses; 1 when first sent
+    inverse_depth: Annotated[np.ndarray, "float32 h w"]
+    inverse_depth_weight: Annotated[np.ndarray, "float32 h w"]  # confidence, 0 to 1
+    segment: int  # part of the map; poses of two segments share no frame of reference
+
+
+@dataclass(frozen=True)
+class Depth:
+    """A keyframe with its multi-view stereo depth."""
+
+    index: int
+    timestamp: float  # seconds
+    image: Annotated[np.ndarray, "uint8 H W 3"]
+    intrinsics: Annotated[np.ndarray, "float64 4"]
+    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
+    scale: float
+    depth: Annotated[np.ndarray, "float32 h w"]
+    confidence: Annotated[np.ndarray, "float32 h w"]  # 0 to 1
+    segment: int
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe with its refined and filtered depth: what the mapper adds to the map."""
+
+    index: int
+    timestamp: float  # seconds
+    image: Annotated[np.ndarray, "uint8 H W 3"]
+    intrinsics: Annotated[np.ndarray, "float64 4"]
+    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
+    scale: float
+    depth: Annotated[np.ndarray, "float32 h w"]  # 0 where filtered out
+    confidence: Annotated[np.ndarray, "float32 h w"]  # 0 to 1
+    normals: Annotated[np.ndarray, "float32 h w 3"]  # camera frame, toward the camera; 0 where depth is 0
+    segment: int
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Corrected keyframe poses after bundle adjustment or loop closure, merged by keyframe index.
+
+    Absolute, not differences: what was computed at `Keyframe.scale` s has its depths multiplied by scale / s.
+    """
+
+    revision: int
+    index: Annotated[np.ndarray, "int64 K"]
+    world_from_cam: Annotated[np.ndarray, "float64 K 4 4"]
+    scale: Annotated[np.ndarray, "float64 K"]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Every frame that the tracker saw, sent once at the end; poses agree with the last Poses."""
+
+    index: Annotated[np.ndarray, "int64 N"]
+    timestamp: Annotated[np.ndarray, "float64 N"]
+    world_from_cam: Annotated[np.ndarray, "float64 N 4 4"]  # NaN where there is no pose
+    keyframe: Annotated[np.ndarray, "bool N"]
+    state: Annotated[np.ndarray, "uint8 N"]  # TrackingState
+    segment: Annotated[np.ndarray, "int32 N"]
+
+
+@dataclass(frozen=True)
+class SplatMap:
+    """The whole map: sent before the final refinement (`refined` False) and after it."""
+
+    refined: bool
+    iterations: int
+    density: str  # "gaussian", "exact" or "ges_scale": what `betas` means
+    means: Annotated[np.ndarray, "float32 N 3"]
+    log_scales: Annotated[np.ndarray, "float32 N 3"]
+    quaternions: Annotated[np.ndarray, "float32 N 4"]  # w first
+    opacity_logits: Annotated[np.ndarray, "float32 N"]
+    sh: Annotated[np.ndarray, "float32 N B 3"]  # spherical harmonics, B = (degree + 1)²
+    betas: Annotated[np.ndarray, "float32 N"]
+    anchors: Annotated[np.ndarray, "int64 N"]  # keyframe that the splat came from and moves with
+    keyframes: Annotated[np.ndarray, "int64 K"]
+    world_from_cam: Annotated[np.ndarray, "float64 K 4 4"]  # of those keyframes, as the mapper used them
+    scale: Annotated[np.ndarray, "float64 K"]
+    exposures: Annotated[np.ndarray, "float32 K 3 4"]  # color affine [A | b] of each keyframe
+
+
+@dataclass(frozen=True)
+class Preview:
+    """The map as it grows, for a viewer: never slows the mapper, newest only."""
+
+    index: int  # newest keyframe
+    iterations: int
+    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
+    intrinsics: Annotated[np.ndarray, "float64 4"]
+    image: Annotated[np.ndarray, "uint8 H W 3"]
+    render: Annotated[np.ndarray, "uint8 H W 3"]
+    means: Annotated[np.ndarray, "float32 N 3"]
+    covariances: Annotated[np.ndarray, "float32 N 3 3"]
+    colors: Annotated[np.ndarray, "uint8 N 3"]
+    opacities: Annotated[np.ndarray, "float32 N"]
+
+
+@dataclass(frozen=True)
+class End:
+    """The last message of every topic. `stats` holds what each node upstream counted and timed, by node name."""
+
+    stats: Mapping[str, Any] = field(default_factory=dict)
+
+
+Message = Frame | GroundTruth | Keyframe | Depth | View | Poses | Trajectory | SplatMap | Preview | End
+TYPES: dict[str, type] = {
+    t.__name__: t for t in (Frame, GroundTruth, Keyframe, Depth, View, Poses, Trajectory, SplatMap, Preview, End)
+}

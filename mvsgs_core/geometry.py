@@ -1,0 +1,142 @@
+"""Rigid and similarity transforms, float64. A pose is a 4x4 matrix; names say the frames: `world_from_cam`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    rotation_t = np.swapaxes(pose[..., :3, :3], -1, -2)
+    result = np.zeros_like(pose, dtype=np.float64)
+    result[..., :3, :3] = rotation_t
+    result[..., :3, 3] = -(rotation_t @ pose[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def skew(v: np.ndarray) -> np.ndarray:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    o = np.zeros_like(x)
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*v.shape[:-1], 3, 3)
+
+
+def so3_exp(omega: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
+    theta2 = np.sum(omega * omega, axis=-1)[..., None, None]
+    theta = np.sqrt(theta2)
+    small = theta < 1e-4
+    safe = np.where(small, 1.0, theta)
+    a = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    k = skew(omega)
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def so3_log(rotation: np.ndarray) -> np.ndarray:
+    """Rotation vectors (..., 3) of rotation matrices (..., 3, 3), stable up to and at pi (by quaternion)."""
+    q = quaternion_from_rotation(rotation)
+    q = np.where(q[..., :1] < 0, -q, q)
+    w, v = q[..., 0], q[..., 1:]
+    n = np.linalg.norm(v, axis=-1)
+    angle = 2.0 * np.arctan2(n, w)
+    factor = np.where(n < 1e-9, 2.0, angle / np.where(n < 1e-9, 1.0, n))
+    return v * factor[..., None]
+
+
+def se3_exp(xi: np.ndarray) -> np.ndarray:
+    """Poses (..., 4, 4) of twists (..., 6) = (translation, rotation)."""
+    rho, omega = xi[..., :3], xi[..., 3:]
+    theta2 = np.sum(omega * omega, axis=-1)[..., None, None]
+    theta = np.sqrt(theta2)
+    small = theta < 1e-4
+    safe = np.where(small, 1.0, theta)
+    b = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    c = np.where(small, 1.0 / 6.0 - theta2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    k = skew(omega)
+    v = np.eye(3) + b * k + c * (k @ k)
+    pose = np.zeros((*xi.shape[:-1], 4, 4))
+    pose[..., :3, :3] = so3_exp(omega)
+    pose[..., :3, 3] = (v @ rho[..., None])[..., 0]
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def se3_log(pose: np.ndarray) -> np.ndarray:
+    """Twists (..., 6) = (translation, rotation) of poses (..., 4, 4)."""
+    omega = so3_log(pose[..., :3, :3])
+    theta2 = np.sum(omega * omega, axis=-1)[..., None, None]
+    theta = np.sqrt(theta2)
+    small = theta < 1e-4
+    safe = np.where(small, 1.0, theta)
+    half = 0.5 * safe
+    c = np.where(small, 1.0 / 12.0, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2)
+    k = skew(omega)
+    v_inv = np.eye(3) - 0.5 * k + c * (k @ k)
+    rho = (v_inv @ pose[..., :3, 3:])[..., 0]
+    return np.concatenate([rho, omega], axis=-1)
+
+
+def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4), w first, of rotation matrices (..., 3, 3): the largest component is solved first."""
+    m = rotation
+    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    four_squares = np.stack(
+        [1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], axis=-1
+    )
+    a = m[..., 2, 1] - m[..., 1, 2]
+    b = m[..., 0, 2] - m[..., 2, 0]
+    c = m[..., 1, 0] - m[..., 0, 1]
+    d = m[..., 0, 1] + m[..., 1, 0]
+    e = m[..., 0, 2] + m[..., 2, 0]
+    f = m[..., 1, 2] + m[..., 2, 1]
+    rows = np.stack(
+        [
+            np.stack([four_squares[..., 0], a, b, c], axis=-1),
+            np.stack([a, four_squares[..., 1], d, e], axis=-1),
+            np.stack([b, d, four_squares[..., 2], f], axis=-1),
+            np.stack([c, e, f, four_squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(four_squares, axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def rotation_from_quaternion(q: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), w first; normalised here."""
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    return np.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        axis=-1,
+    ).reshape(*q.shape[:-1], 3, 3)  # fmt: skip
+
+
+def interpolate(pose_a: np.ndarray, pose_b: np.ndarray, t: float) -> np.ndarray:
+    """Pose (4, 4) on the screw motion from `pose_a` (t = 0) to `pose_b` (t = 1)."""
+    return pose_a @ se3_exp(t * se3_log(inverse(pose_a) @ pose_b))
+
+
+def umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> tuple[float, np.ndarray, np.ndarray]:
+    """Least-squares similarity: target = s R source + t (Umeyama 1991, eq. 40-42).
+
+    source, target: (N, 3). Returns (s, R (3, 3), t (3,)). Raises ValueError with fewer than 3 points or without extent.
+    """
+    if len(source) < 3:
+        raise ValueError(f"an alignment needs at least 3 positions, got {len(source)}")
+    mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
+    ds, dt = source - mean_s, target - mean_t
+    variance = float(np.mean(np.sum(ds * ds, axis=1)))
+    if variance <= 0 or not np.isfinite(variance):
+        raise ValueError("all positions coincide: no alignment")
+    u, d, vt = np.linalg.svd(dt.T @ ds / len(source))
+    s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0])
+    rotation = u @ np.diag(s) @ vt
+    scale = float(np.sum(d * s) / variance) if with_scale else 1.0
+    return scale, rotation, mean_t - scale * rotation @ mean_s

@@ -1,0 +1,144 @@
+"""The contract of a node: a function from messages to messages.
+
+    class Strided(Node):
+        @dataclass
+        class Config:
+            stride: int = 10  # frames
+
+        def on_frame(self, frame: Frame) -> Iterator[Keyframe]:
+            ...
+            yield Keyframe(...)
+
+The parameter's type declares the input, the yielded type the output. Hooks:
+
+- `on_<anything>(self, message: T) -> Iterator[U | V]`: one per input type.
+- `run(self) -> Iterator[U]`: a source instead has this.
+- `on_idle(self) -> list[U] | None`: one slice (well under 100 ms) of background work while no message waits;
+  None when there is nothing to do until the next message.
+- `on_end(self) -> Iterator[U]`: every input has ended.
+
+A node imports no socket and knows no topic: it is tested as `list(Tracker(config).on_frame(frame))`.
+"""
+
+from __future__ import annotations
+
+import time
+import types
+import typing
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, is_dataclass
+from typing import Any
+
+import msgs
+
+
+@dataclass
+class Stats:
+    """What a node counts and times; it travels downstream in `End` and ends in the report."""
+
+    counts: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    skipped: dict[str, float] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)  # latest value: for the live display and the report
+    warnings: list[str] = field(default_factory=list)  # what a user should know: fallbacks, lost tracking
+
+    def count(self, name: str, n: float = 1) -> None:
+        self.counts[name] = self.counts.get(name, 0) + n
+
+    def skip(self, what: str, n: float = 1) -> None:
+        """Work that was not done because the scene did not need it."""
+        self.skipped[what] = self.skipped.get(what, 0) + n
+
+    def warn(self, text: str) -> None:
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    @contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+class Node:
+    """Base of all nodes. `Config` is the node's parameters with their defaults; a launch file sets them."""
+
+    @dataclass
+    class Config:
+        pass
+
+    config: Any
+
+    def __init__(self, config: Any = None) -> None:
+        self.config = self.Config() if config is None else config
+        self.stats = Stats()
+
+    def run(self) -> Iterator[Any]:
+        """Sources only: yields messages until the stream ends."""
+        raise TypeError(f"{type(self).__name__} is no source: it has no run()")
+
+    def on_idle(self) -> list[Any] | None:
+        return None
+
+    def on_end(self) -> Iterator[Any]:
+        yield from ()
+
+
+_OUTPUT_HOOKS: tuple[str, ...] = ("run", "on_idle", "on_end")
+
+
+def is_source(node: type[Node]) -> bool:
+    return node.run is not Node.run
+
+
+def handlers(node: type[Node]) -> dict[type, str]:
+    """Input message type -> name of the method that takes it. Raises TypeError where an annotation is missing."""
+    found: dict[type, str] = {}
+    for name in dir(node):
+        if not name.startswith("on_") or name in _OUTPUT_HOOKS or not callable(getattr(node, name)):
+            continue
+        hints = _hints(node, name)
+        parameters = [t for key, t in hints.items() if key != "return"]
+        if len(parameters) != 1 or parameters[0] not in msgs.TYPES.values():
+            raise TypeError(f"{node.__qualname__}.{name} must take one message, annotated with its type from msgs")
+        if parameters[0] in found:
+            raise TypeError(f"{node.__qualname__}: {found[parameters[0]]} and {name} take the same type")
+        found[parameters[0]] = name
+    return found
+
+
+def outputs(node: type[Node]) -> tuple[type, ...]:
+    """Message types that a node yields, from the return annotations of its hooks."""
+    found: dict[type, None] = {}
+    for name in (*handlers(node).values(), *_OUTPUT_HOOKS):
+        if getattr(node, name) is getattr(Node, name, None):
+            continue
+        returned = _hints(node, name).get("return")
+        if returned is None:
+            raise TypeError(f"{node.__qualname__}.{name} must say what it yields: -> Iterator[Keyframe]")
+        for t in _message_types(returned):
+            found[t] = None
+    return tuple(found)
+
+
+def _hints(node: type[Node], name: str) -> dict[str, Any]:
+    try:
+        return typing.get_type_hints(getattr(node, name))
+    except NameError as error:
+        raise TypeError(f"{node.__qualname__}.{name}: {error}; import message types at module level") from error
+
+
+def _message_types(annotation: Any) -> Iterator[type]:
+    if isinstance(annotation, type) and is_dataclass(annotation):
+        if annotation in msgs.TYPES.values():
+            yield annotation
+        return
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType) or typing.get_args(annotation):
+        for part in typing.get_args(annotation):
+            yield from _message_types(part)
+
+
+__all__ = ["Node", "Stats", "handlers", "is_source", "outputs"]
