@@ -75,6 +75,7 @@ class Node:
     def __init__(self, config: Any = None) -> None:
         self.config = self.Config() if config is None else config
         self.stats = Stats()
+        self.upstream: dict[str, Any] = {}  # what each node upstream counted, by name: complete when on_end runs
 
     def run(self) -> Iterator[Any]:
         """Sources only: yields messages until the stream ends."""
