@@ -130,6 +130,7 @@ class SplatMap:
     refined: bool
     iterations: int
     density: str  # "gaussian", "exact" or "ges_scale": what `betas` means
+    origin: Annotated[np.ndarray, "float64 3"]  # world position that means are relative to: float32 needs it near
     means: Annotated[np.ndarray, "float32 N 3"]
     log_scales: Annotated[np.ndarray, "float32 N 3"]
     quaternions: Annotated[np.ndarray, "float32 N 4"]  # w first
@@ -145,7 +146,7 @@ class SplatMap:
 
 @dataclass(frozen=True)
 class Preview:
-    """The map as it grows, for a viewer: never slows the mapper, newest only."""
+    """The map as it grows, for a viewer: never slows the mapper, newest only. All relative to SplatMap.origin."""
 
     index: int  # newest keyframe
     iterations: int

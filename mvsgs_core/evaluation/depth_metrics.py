@@ -1,0 +1,51 @@
+"""How good depth maps are: absolute relative error, share of inliers, completeness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+INLIER = 0.05  # relative error below which a depth counts as right
+
+
+@dataclass(frozen=True)
+class DepthScore:
+    """Sums over pixels, so that scores of several maps add up."""
+
+    relative_error: float
+    inliers: int
+    estimated: int  # pixels with both an estimate and a true depth
+    known: int  # pixels with a true depth
+
+    def __add__(self, other: DepthScore) -> DepthScore:
+        return DepthScore(
+            self.relative_error + other.relative_error,
+            self.inliers + other.inliers,
+            self.estimated + other.estimated,
+            self.known + other.known,
+        )
+
+    def summary(self) -> dict[str, float | None]:
+        return {
+            "abs_rel": self.relative_error / self.estimated if self.estimated else None,
+            "inlier_ratio": self.inliers / self.estimated if self.estimated else None,
+            "completeness": self.estimated / self.known if self.known else None,
+        }
+
+
+NO_DEPTH = DepthScore(0.0, 0, 0, 0)
+
+
+def score_depth(depth: np.ndarray, truth: np.ndarray, scale: float, inlier: float = INLIER) -> DepthScore:
+    """Scores depth (h, w), times `scale`, against true depth (H, W); 0 is unknown in both.
+
+    The truth is read at the centers of the estimate's pixels (nearest): averaging would invent depths at edges.
+    """
+    height, width = depth.shape
+    truth = cv2.resize(truth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    known = np.isfinite(truth) & (truth > 0)
+    both = known & np.isfinite(depth) & (depth > 0)
+    error = np.abs(depth[both].astype(np.float64) * scale - truth[both]) / truth[both]
+    return DepthScore(float(error.sum()), int((error < inlier).sum()), int(both.sum()), int(known.sum()))

@@ -1,0 +1,119 @@
+"""The report as one self-contained HTML file: figures, pictures, plots. No request leaves it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mvsgs_core.evaluation import svg
+
+_STYLE = """
+:root { color-scheme: light dark; --line: #8884; --soft: #8882; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.5rem; margin-bottom: 0; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+table { border-collapse: collapse; } td, th { padding: .25rem .8rem; border-bottom: 1px solid var(--line); }
+th { text-align: left; } td { text-align: right; font-variant-numeric: tabular-nums; }
+td:first-child { text-align: left; }
+.pictures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px; margin: 2px 0 14px; }
+.pictures img { width: 100%; display: block; } figure { margin: 0; }
+figcaption { font-size: .8rem; opacity: .75; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(420px, 1fr)); gap: 16px; }
+.plot { width: 100%; font-size: 11px; fill: currentColor; background: var(--soft); border-radius: 6px; }
+.plot .grid { stroke: var(--line); stroke-width: .6; }
+.warning { border-left: 4px solid #dd6b20; padding: .1rem .8rem; background: var(--soft); margin: .3rem 0; }
+code { background: var(--soft); padding: .1rem .3rem; }
+"""
+
+
+def image_tag(picture: np.ndarray, caption: str) -> str:
+    """<figure> with an RGB uint8 picture embedded as JPEG."""
+    done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    if not done:
+        raise RuntimeError(f"could not encode the picture {caption!r}")
+    encoded = base64.b64encode(data.tobytes()).decode()
+    text = escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/jpeg;base64,{encoded}"><figcaption>{text}</figcaption></figure>'
+
+
+def rendering_table(report: Mapping[str, Any]) -> str:
+    rows = ["<tr><th>frames</th><th>refinement</th><th>PSNR dB</th><th>SSIM</th><th>LPIPS</th><th>count</th></tr>"]
+    for kind in ("keyframes", "held_out", "all"):
+        for when, key in (("before", "rendering_before_refinement"), ("after", "rendering")):
+            s = report[key][kind]
+            cells = (kind.replace("_", "-"), when, number(s["psnr"], 2), number(s["ssim"], 4), number(s["lpips"], 4))
+            rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in (*cells, s["count"])) + "</tr>")
+    return f"<table>{''.join(rows)}</table>"
+
+
+def figures_table(figures: Mapping[str, Any]) -> str:
+    rows = [f"<tr><td>{escape(str(k))}</td><td>{escape(str(v))}</td></tr>" for k, v in figures.items()]
+    return f"<table>{''.join(rows)}</table>"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def page(
+    title: str,
+    report: Mapping[str, Any],
+    comparisons: Sequence[tuple[str, Mapping[str, np.ndarray]]],
+    depth_maps: Sequence[tuple[str, Mapping[str, np.ndarray]]],
+    plots: Mapping[str, str],
+) -> str:
+    """The whole document. comparisons and depth_maps: (caption, pictures by name) a row."""
+    trajectory, depth, splats, times = report["trajectory"], report["depth"], report["map"], report["time"]
+    figures = {
+        "ATE RMSE of keyframes (after Sim(3), unit of the true poses)": number(trajectory["ate_rmse"], 4),
+        "… in % of the path": number(trajectory["ate_percent"], 2),
+        "frames tracked": f"{trajectory['frames_tracked']} of {trajectory['frames']}",
+        "keyframes": trajectory["keyframes"],
+        "filtered depth: absolute relative error": number(depth["abs_rel"], 4),
+        "filtered depth: inliers within 5 %": number(depth["inlier_ratio"]),
+        "filtered depth: completeness": number(depth["completeness"]),
+        "splats": f"{splats['splats']:,}",
+        "map size": f"{splats['bytes'] / 1e6:.1f} MB",
+        "optimization steps": f"{splats['iterations']:,}",
+        "wall time, first frame to finished map": f"{number(times['wall'], 1)} s",
+        "keyframes per second": number(times["keyframes_per_second"], 2),
+    }
+    memory = {node: f"{size / 1e6:.0f} MB" for node, size in report.get("memory", {}).get("peak_bytes", {}).items()}
+    skipped = {f"{node}: {what}": f"{n:g}" for node, s in report.get("skipped", {}).items() for what, n in s.items()}
+    warnings = [f"{node}: {text}" for node, texts in report.get("warnings", {}).items() for text in texts]
+    warnings += report.get("notes", [])
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        f"<p>{escape(report.get('protocol', ''))}</p>",
+        "".join(f'<p class="warning">{escape(w)}</p>' for w in warnings),
+        "<h2>Rendering</h2>",
+        rendering_table(report),
+        *(_row(caption, pictures) for caption, pictures in comparisons),
+        "<h2>Figures</h2>",
+        figures_table(figures),
+        '<h2>Plots</h2><div class="plots">',
+        *(f"<div><b>{escape(name)}</b>{plot}</div>" for name, plot in plots.items()),
+        "</div>",
+        "<h2>Depth maps of keyframes, filtered</h2>",
+        *(_row(caption, pictures) for caption, pictures in depth_maps),
+        "<h2>Skipped work</h2>",
+        figures_table(skipped) if skipped else "<p>nothing</p>",
+        "<h2>Peak memory</h2>",
+        figures_table(memory),
+    ]
+    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{_STYLE}</style>'
+    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
+
+
+def _row(caption: str, pictures: Mapping[str, np.ndarray]) -> str:
+    figures = "".join(image_tag(picture, name) for name, picture in pictures.items())
+    return f'<b>{escape(caption)}</b><div class="pictures">{figures}</div>'
+
+
+def timing_bars(stages: Mapping[str, Mapping[str, float]]) -> str:
+    values = {f"{node}: {name}": s for node, parts in stages.items() for name, s in parts.items() if s >= 0.005}
+    return svg.bars(dict(sorted(values.items(), key=lambda item: -item[1])[:24]), "s")

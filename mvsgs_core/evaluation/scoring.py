@@ -1,0 +1,134 @@
+"""Renders the map at the poses of the run and scores the renders against the photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from mvsgs_core.camera import resize_image
+from mvsgs_core.evaluation import image_metrics
+from mvsgs_core.evaluation.lpips import Lpips
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.rasterizer import rasterize
+
+HELD_OUT_EVERY = 5  # frames: every 5th that is no keyframe is "held out"
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame to score, at its native resolution."""
+
+    index: int
+    keyframe: bool
+    world_from_cam: np.ndarray  # (4, 4) in the map's frame
+    intrinsics: np.ndarray  # (4,)
+    photograph: Callable[[], np.ndarray]  # (H, W, 3) uint8, read when needed
+
+
+@dataclass(frozen=True)
+class Score:
+    index: int
+    keyframe: bool
+    psnr: float
+    ssim: float
+    lpips: float | None
+
+
+def render_view(splats: Splats, density: str, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Color (H, W, 3) float32 in 0..1 and depth (H, W) float32 of the map seen from a view."""
+    with torch.inference_mode():
+        render = rasterize(splats, view.world_from_cam, view.intrinsics, size, density=density)
+    return render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
+
+
+def score_view(splats: Splats, density: str, view: View, lpips: Lpips | None) -> Score:
+    """Scores one view without any exposure correction at test time."""
+    photograph = view.photograph().astype(np.float32) / 255.0
+    color, _ = render_view(splats, density, view, photograph.shape[:2])
+    distance = None
+    if lpips is not None:
+        images = [torch.from_numpy(i).permute(2, 0, 1)[None].contiguous() for i in (color, photograph)]
+        distance = float(lpips(*images))
+    return Score(
+        view.index,
+        view.keyframe,
+        image_metrics.psnr(color, photograph),
+        image_metrics.ssim(color, photograph),
+        distance,
+    )
+
+
+def choose(views: list[View], limit: int) -> list[View]:
+    """All views, or where there are more than `limit` as many of each kind, spread evenly over the run."""
+    if len(views) <= limit:
+        return views
+    groups = [
+        [v for v in views if v.keyframe],
+        [v for v in views if not v.keyframe and v.index % HELD_OUT_EVERY == 0],
+        [v for v in views if not v.keyframe and v.index % HELD_OUT_EVERY != 0],
+    ]
+    chosen: list[View] = []
+    for k, group in enumerate(groups):
+        share = (limit - len(chosen)) // (len(groups) - k)
+        picks = np.unique(np.linspace(0, len(group) - 1, min(share, len(group))).round().astype(int)) if group else []
+        chosen += [group[i] for i in picks]
+    return sorted(chosen, key=lambda v: v.index)
+
+
+def summarize(scores: Iterable[Score]) -> dict[str, dict[str, float | int | None]]:
+    """Means over keyframes (training views), held-out frames (never mapped), and all frames scored."""
+    scores = list(scores)
+    return {
+        "keyframes": _mean([s for s in scores if s.keyframe]),
+        "held_out": _mean([s for s in scores if not s.keyframe and s.index % HELD_OUT_EVERY == 0]),
+        "all": _mean(scores),
+    }
+
+
+def _mean(scores: list[Score]) -> dict[str, float | int | None]:
+    def mean(values: list[float]) -> float | None:
+        return float(np.mean(values)) if values else None
+
+    return {
+        "psnr": mean([s.psnr for s in scores]),
+        "ssim": mean([s.ssim for s in scores]),
+        "lpips": mean([s.lpips for s in scores if s.lpips is not None]),
+        "count": len(scores),
+    }
+
+
+def comparison(splats: Splats, density: str, view: View, width: int = 400) -> dict[str, np.ndarray]:
+    """Pictures (h, w, 3) uint8 of a view for the report: photograph, render, error, rendered depth."""
+    photograph = view.photograph()
+    color, depth = render_view(splats, density, view, photograph.shape[:2])
+    size = (max(1, round(photograph.shape[0] * width / photograph.shape[1])), width)
+    error = np.abs(color - photograph.astype(np.float32) / 255.0).mean(axis=2)
+    pictures = {
+        "photograph": photograph,
+        "render": (color * 255).round().astype(np.uint8),
+        "error (x4)": colorize(np.clip(error * 4, 0, 1)),
+        "rendered depth": colorize_depth(depth),
+    }
+    return {name: resize_image(picture, size) for name, picture in pictures.items()}
+
+
+def colorize(values: np.ndarray) -> np.ndarray:
+    """(H, W) in 0..1 to (H, W, 3) uint8 RGB: black, red, yellow, white."""
+    v = np.clip(np.nan_to_num(values), 0, 1)[..., None] * 3
+    return (np.clip(v - np.array([0.0, 1.0, 2.0]), 0, 1) * 255).astype(np.uint8)
+
+
+def colorize_depth(depth: np.ndarray) -> np.ndarray:
+    """(H, W) depth, 0 unknown, to (H, W, 3) uint8: near bright, far dark (by inverse depth), unknown blue."""
+    known = np.isfinite(depth) & (depth > 0)
+    picture = np.zeros((*depth.shape, 3), dtype=np.uint8)
+    picture[...] = (30, 30, 90)
+    if known.any():
+        inverse = 1.0 / depth[known]
+        low, high = np.percentile(inverse, [1, 99])
+        shade = np.clip((inverse - low) / max(high - low, 1e-12), 0, 1)
+        picture[known] = (colorize(shade[None] * 0.9 + 0.05)[0]).astype(np.uint8)
+    return picture
