@@ -1,0 +1,45 @@
+"""Calibration as a user gives it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from PIL import Image, ImageOps
+
+from mvsgs_core.datasets.lens import Lens, guess_lens
+
+
+def lens_from_option(
+    intrinsics: Sequence[float] | str, distortion: Sequence[float], size: tuple[int, int]
+) -> tuple[Lens, list[str]]:
+    """The lens of the option `intrinsics`: [fx, fy, cx, cy] in pixels of the original image (height, width), or "auto".
+
+    Returns the lens and warnings: "auto" is a guess and says so. Raises ValueError for anything else.
+    """
+    if isinstance(intrinsics, str):
+        if intrinsics != "auto":
+            raise ValueError(f"intrinsics is null, [fx, fy, cx, cy] or auto, got {intrinsics!r}")
+        lens = guess_lens(size)
+        return lens, [
+            f"intrinsics are a guess: {lens.intrinsics[0]:.0f} pixels focal length for {size[1]}x{size[0]} (65 degrees "
+            "across the longer side), no distortion; calibrate the camera and set intrinsics=[fx,fy,cx,cy] for accuracy"
+        ]
+    values = [float(v) for v in intrinsics]
+    if len(values) != 4:
+        raise ValueError(f"intrinsics is [fx, fy, cx, cy] in pixels of the original image, got {list(intrinsics)}")
+    return Lens((values[0], values[1], values[2], values[3]), size, tuple(float(v) for v in distortion)), []
+
+
+def lens_for_images(
+    intrinsics: Sequence[float] | str, distortion: Sequence[float], images: Iterable[Path]
+) -> tuple[Lens, list[str]]:
+    """`lens_from_option` for the size of the first of `images` whose header can be read."""
+    for path in images:
+        try:
+            with Image.open(path) as opened:
+                width, height = ImageOps.exif_transpose(opened).size
+        except (OSError, SyntaxError, ValueError):
+            continue  # reading the sequence reports it
+        return lens_from_option(intrinsics, distortion, (height, width))
+    raise ValueError("intrinsics are for the size of the images, but none of them can be opened")

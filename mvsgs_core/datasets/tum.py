@@ -1,0 +1,181 @@
+"""TUM RGB-D (Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", 2012) and sets in its layout."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mvsgs_core.datasets.calibration import lens_for_images
+from mvsgs_core.datasets.files import Layout
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record, Size
+from mvsgs_core.geometry import rotation_from_quaternion
+
+LAYOUT = Layout(
+    "TUM RGB-D",
+    "a folder with rgb.txt and rgb/ (lines `timestamp file`) and, if known, depth.txt, depth/ (16-bit PNG, 5000 = 1 m) "
+    "and groundtruth.txt (lines `timestamp tx ty tz qx qy qz qw`, camera to world)",
+    "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/download, for example rgbd_dataset_freiburg1_xyz.tgz, unpacked",
+)
+
+# Published calibrations of the color cameras, 640x480 (facts of the data set's file formats page).
+CAMERAS = {
+    "freiburg1": Lens((517.3, 516.5, 318.6, 255.3), (480, 640), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": Lens((520.9, 521.0, 325.1, 249.7), (480, 640), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": Lens((535.4, 539.2, 320.1, 247.6), (480, 640)),
+}
+CALIBRATION_FILE = "camera.txt"  # our own addition: `fx fy cx cy [distortion]` in one line, in pixels of the images
+_DEPTH = DepthFormat(per_unit=5000.0)
+
+
+class Tum(ImageSequence):
+    """A folder in TUM RGB-D layout, undistorted.
+
+    camera: freiburg1, freiburg2, freiburg3; null reads it off `camera.txt`, the folder's name or the header of
+    groundtruth.txt. intrinsics, distortion: of any other camera, instead.
+    max_difference: seconds between an image and the pose or depth map that goes with it. The nearest one counts, as in
+    the data set's own tools; a depth map goes to one image only.
+    crop: null zooms in on the undistorted image until no pixel is empty; a number keeps the published focal length,
+    resizes to `size` plus that border and cuts it off (size=[384, 512], crop=8: the usual protocol).
+    Raises FileNotFoundError and ValueError, which say what was expected.
+    """
+
+    def __init__(
+        self,
+        path: str | Path | None = None,
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Size = None,
+        intrinsics: Sequence[float] | str | None = None,
+        distortion: Sequence[float] = (),
+        camera: str | None = None,
+        crop: int | None = None,
+        max_difference: float = 0.02,
+    ) -> None:
+        folder = LAYOUT.folder(path)
+        images = _read_list(LAYOUT.file(folder / "rgb.txt"))
+        if not images:
+            raise LAYOUT.missing(f"{folder / 'rgb.txt'} lists no image")
+        times = np.array([t for t, _ in images])
+        found, notes = _find_lens(folder, [folder / name for _, name in images], camera, intrinsics, distortion)
+        depth_of = _depth_maps(folder, times, max_difference)
+        poses, pose_notes = _poses(folder, times, max_difference)
+        records = [
+            Record(time, folder / name, found, poses.get(i), depth_of.get(i)) for i, (time, name) in enumerate(images)
+        ]
+        super().__init__(
+            records, start=start, stop=stop, stride=stride, size=size, crop=crop,
+            depth_format=_DEPTH if depth_of else None,
+        )  # fmt: skip
+        self.warnings += notes + pose_notes
+
+
+def nearest(wanted: np.ndarray, available: np.ndarray, max_difference: float) -> dict[int, int]:
+    """Index into `wanted` (N,) -> index into `available` (M, sorted) of the nearest time, where it is near enough."""
+    if len(available) == 0:
+        return {}
+    right = np.clip(np.searchsorted(available, wanted), 1, max(len(available) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(available) - 1)
+    best = np.where(np.abs(available[left] - wanted) <= np.abs(available[right] - wanted), left, right)
+    near = np.abs(available[best] - wanted) <= max_difference
+    return {int(i): int(best[i]) for i in np.flatnonzero(near)}
+
+
+def _read_list(path: Path) -> list[tuple[float, str]]:
+    entries = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        parts = line.split()
+        if len(parts) >= 2 and not line.startswith("#"):
+            try:
+                entries.append((float(parts[0]), parts[1]))
+            except ValueError as error:
+                raise ValueError(f"{path}: a line must be `timestamp file`, this one is {line!r}") from error
+    return sorted(entries)
+
+
+def _find_lens(
+    folder: Path,
+    images: list[Path],
+    camera: str | None,
+    intrinsics: Sequence[float] | str | None,
+    distortion: Sequence[float],
+) -> tuple[Lens, list[str]]:
+    if intrinsics is not None:
+        return lens_for_images(intrinsics, distortion, images)
+    if camera is not None:
+        if camera not in CAMERAS:
+            raise ValueError(f"camera is one of {', '.join(CAMERAS)}, got {camera!r}")
+        return CAMERAS[camera], []
+    calibration = folder / CALIBRATION_FILE
+    if calibration.is_file():
+        values = [float(v) for v in calibration.read_text().split("#")[0].split()]
+        return lens_for_images(values[:4], values[4:], images)
+    header = folder / "groundtruth.txt"
+    head = header.read_text(errors="replace")[:400] if header.is_file() else ""
+    for text in (folder.name, folder.resolve().name, head):
+        match = re.search(r"(?:freiburg|fr)([123])(?!\d)", text)
+        if match:
+            return CAMERAS[f"freiburg{match[1]}"], []
+    raise ValueError(
+        f"the name of {folder} does not tell which camera took it: set options.camera to one of {', '.join(CAMERAS)}, "
+        f"or intrinsics=[fx,fy,cx,cy] (and options.distortion), or write them into {calibration}"
+    )
+
+
+def _depth_maps(folder: Path, times: np.ndarray, max_difference: float) -> dict[int, Path]:
+    listing = folder / "depth.txt"
+    if not listing.is_file():
+        return {}
+    entries = _read_list(listing)
+    depth_times = np.array([t for t, _ in entries])
+    image_of = nearest(depth_times, times, np.inf)  # a depth map belongs to the image nearest to it, and to no other
+    return {
+        i: folder / entries[j][1] for i, j in nearest(times, depth_times, max_difference).items() if image_of[j] == i
+    }
+
+
+def _poses(folder: Path, times: np.ndarray, max_difference: float) -> tuple[dict[int, np.ndarray], list[str]]:
+    path = folder / "groundtruth.txt"
+    if not path.is_file():
+        return {}, [f"{path.name} is missing: the trajectory is not scored"]
+    table = read_trajectory(path)
+    if len(table) == 0:
+        return {}, [f"{path.name} is empty: the trajectory is not scored"]
+    matched = nearest(times, table[:, 0], max_difference)
+    notes = []
+    if len(matched) < len(times):
+        notes.append(f"{len(times) - len(matched)} of {len(times)} images have no true pose within {max_difference} s")
+    return {i: pose_from_row(table[j]) for i, j in matched.items()}, notes
+
+
+def read_trajectory(path: Path) -> np.ndarray:
+    """(N, 8) float64 rows `timestamp tx ty tz qx qy qz qw`, sorted by time. Raises ValueError for a malformed line."""
+    rows = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        text = line.split("#")[0].replace(",", " ").split()
+        if not text:
+            continue
+        try:
+            row = [float(v) for v in text]
+        except ValueError as error:
+            raise ValueError(f"{path}: not a line of numbers: {line!r}") from error
+        if len(row) != 8:
+            raise ValueError(f"{path}: a line must be `timestamp tx ty tz qx qy qz qw`, this one is {line!r}")
+        if np.all(np.isfinite(row)) and np.linalg.norm(row[4:]) > 0.5:  # motion capture writes zeros where it lost it
+            rows.append(row)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    return table[np.argsort(table[:, 0], kind="stable")]
+
+
+def pose_from_row(row: np.ndarray) -> np.ndarray:
+    """world_from_cam (4, 4) float64 of `timestamp tx ty tz qx qy qz qw`."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_quaternion(row[[7, 4, 5, 6]])
+    pose[:3, 3] = row[1:4]
+    return pose

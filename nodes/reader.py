@@ -1,0 +1,71 @@
+"""Source: a recorded or generated sequence; its ground truth has a topic of its own, so that no estimator can peek."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from msgs import Frame, GroundTruth
+from mvsgs_core.datasets import Item, Sequence, open_dataset
+from nodes import Node
+
+
+class Reader(Node):
+    """Any sequence that `mvsgs_core.datasets.open_dataset` opens -> Frame and GroundTruth of each of its frames."""
+
+    @dataclass
+    class Config:
+        name: str = "tum"  # format, one of mvsgs_core.datasets.READERS
+        path: str | None = None  # folder or file
+        start: int = 0  # first frame of the original sequence
+        stop: int | None = None  # frame to stop before; null: the end
+        stride: int = 1  # every which frame
+        size: Any = None  # [height, width], or a number of pixels at the same aspect; null: as it is
+        realtime: bool = False  # play at the recorded rate instead of as fast as it is read
+        options: dict[str, Any] = field(default_factory=dict)  # of that format: see its class in mvsgs_core.datasets
+
+    config: Config
+
+    def run(self) -> Iterator[Frame | GroundTruth]:
+        sequence = self._open()
+        self.stats.values["frames_expected"] = len(sequence)
+        pace = _Pace()
+        frames = iter(sequence)
+        while True:
+            with self.stats.time("read"):
+                item = next(frames, None)
+            for warning in sequence.warnings if item is None else ():
+                self.stats.warn(warning)
+            if item is None:
+                return
+            if self.config.realtime:
+                pace.wait(item.timestamp)
+            self.stats.count("frames")
+            yield Frame(item.index, item.timestamp, item.image, item.intrinsics)
+            yield _ground_truth(item)
+
+    def _open(self) -> Sequence:
+        c = self.config
+        size = tuple(c.size) if isinstance(c.size, list | tuple) else c.size
+        return open_dataset(
+            c.name, path=c.path, start=c.start, stop=c.stop, stride=c.stride, size=size, **dict(c.options)
+        )
+
+
+def _ground_truth(item: Item) -> GroundTruth:
+    return GroundTruth(item.index, item.timestamp, item.image, item.intrinsics, item.world_from_cam, item.depth)
+
+
+class _Pace:
+    """Holds frames back until the time at which they were recorded."""
+
+    def __init__(self) -> None:
+        self._offset: float | None = None  # clock minus timestamp, seconds
+
+    def wait(self, timestamp: float) -> None:
+        now = time.monotonic()
+        if self._offset is None:
+            self._offset = now - timestamp
+        time.sleep(max(0.0, timestamp + self._offset - now))
