@@ -1,0 +1,192 @@
+"""One rasterizer interface over three back ends: "reference" (PyTorch), "cpu" (C++) and "triton" (GPU).
+
+The mathematics, the same in each: EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et al. 2023).
+
+- A splat's covariance goes to the image by the projection's Jacobian at its mean, there x/z and y/z clamped to the
+  image widened by 0.3 tan(fov) on every side; + 0.3 px^2 on the diagonal (`antialiased` scales the opacity by
+  sqrt(det / det_blurred), so that a splat smaller than a pixel does not grow brighter by it).
+- alpha = min(0.99, opacity * density(m)); below 1/255 it is skipped. Splats are blended front to back in the order of
+  float32 depth, equal depths in the order of their index; a pixel ends once its transmittance is below 1e-4 (the splat
+  that brings it below is blended still).
+- Color = sum w c + T background, with c = max(0, 1/2 + SH(direction from the camera)); depth = sum w z / sum w, 0 where
+  nothing is seen; opacity = sum w = 1 - T.
+
+A splat with a parameter that is not finite, a quaternion of length 0 or an extent beyond 1e8 px is left out and counted
+in `Render.refused`; its gradients are 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvsgs_core.splats import densities, spherical_harmonics
+from mvsgs_core.splats.model import Splats
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+BLUR = 0.3  # px^2, low-pass on the diagonal of the image covariance
+MAX_ALPHA = 0.99
+MIN_TRANSMITTANCE = 1e-4
+CLAMP_MARGIN = 0.3  # of tan(fov): how far beyond the image the Jacobian follows x/z and y/z
+MIN_COMPENSATION = 0.005  # floor of the antialiased opacity factor
+MAX_VARIANCE = 1e16  # px^2
+MIN_QUATERNION = 1e-8
+TILE = 16  # pixels
+
+BACKENDS = ("auto", "reference", "cpu", "triton")
+
+
+@dataclass(frozen=True)
+class View:
+    """What the back ends get besides the splats: a checked camera and the switches."""
+
+    pose: Tensor  # (4, 4) float64 world_from_cam, may carry a gradient
+    intrinsics: tuple[float, ...]  # fx, fy, cx, cy, px at `size`
+    size: tuple[int, int]  # height, width, px
+    density: str  # "gaussian" or "exact"
+    background: tuple[float, ...]  # red, green, blue
+    tile_mask: Tensor | None  # (ceil(H / 16), ceil(W / 16)) bool, False = leave the tile out
+    near: float  # map units
+    antialiased: bool
+    degree: int  # of the spherical harmonics
+    threads: int  # 0 = as many as OpenMP would take
+
+
+@dataclass
+class Render:
+    """A rendered view and what density control reads from it; H, W pixels, N splats."""
+
+    color: Tensor  # (H, W, 3), nominally 0 to 1, not clamped
+    depth: Tensor  # (H, W), expected z in map units, 0 where opacity is 0
+    opacity: Tensor  # (H, W), 0 to 1
+    visible: Tensor  # (N,) bool: in front, on the image, opacity at least 1/255
+    radii: Tensor  # (N,), half of the longer side of the splat's box on the image, px; 0 if not visible
+    screen: (
+        Tensor  # (N, 2) zeros; after backward its .grad is dL/d(mean on the image), in units of half the image (3DGS)
+    )
+    weight_sum: Tensor  # (N,), blending weight alpha * T summed over the pixels
+    weight_max: Tensor  # (N,), the largest blending weight at any pixel
+    refused: int  # splats left out because a parameter is not finite or degenerate
+
+
+def tile_grid(size: tuple[int, int]) -> tuple[int, int]:
+    """(rows, columns) of 16x16 tiles that cover an image of (height, width)."""
+    return -(-size[0] // TILE), -(-size[1] // TILE)
+
+
+def se3_exp(twist: Tensor) -> Tensor:
+    """(4, 4) rigid transform of a twist (6,) = (translation, rotation), differentiable at 0 as well."""
+    rho, omega = twist[:3], twist[3:]
+    zero = torch.zeros_like(omega[0])
+    k = torch.stack(
+        [zero, -omega[2], omega[1], omega[2], zero, -omega[0], -omega[1], omega[0], zero]
+    ).reshape(3, 3)  # fmt: skip
+    generator = torch.cat([torch.cat([k, rho[:, None]], dim=1), torch.zeros_like(twist[:4])[None]], dim=0)
+    return torch.linalg.matrix_exp(generator)
+
+
+def rasterize(
+    splats: Splats,
+    world_from_cam: Tensor | np.ndarray,
+    intrinsics: Tensor | np.ndarray,
+    size: tuple[int, int],
+    *,
+    density: str = "gaussian",
+    background: Tensor | np.ndarray | None = None,
+    backend: str = "auto",
+    exposure: Tensor | None = None,
+    pose_delta: Tensor | None = None,
+    tile_mask: Tensor | np.ndarray | None = None,
+    near: float = 1e-3,
+    antialiased: bool = False,
+    degree: int | None = None,
+    threads: int | None = None,
+) -> Render:
+    """Renders `splats` from a camera; differentiable in every tensor of `splats`, in the pose and in the exposure.
+
+    world_from_cam: (4, 4) float64. Positions are taken relative to the camera in float64 before anything else.
+    intrinsics: (fx, fy, cx, cy) in pixels at `size` = (height, width); pixel (0, 0) is the center of the first pixel.
+    background: (3,) color behind the splats, black if None; carries no gradient.
+    exposure: (3, 4) affine [A | b]; the color returned is A color + b.
+    pose_delta: (6,) twist (translation, rotation) in the camera's frame: renders from world_from_cam @ exp(pose_delta).
+    tile_mask: (rows, columns) of `tile_grid`, False leaves a tile out: background there, and no gradient from it.
+    near: splats with z <= near are left out, map units: relate it to the scene's depth, for the map's scale is arbitrary.
+    degree: highest degree of the spherical harmonics used; None = all that `splats.sh` has.
+    threads: of the "cpu" back end; None = all. The result is the same for every number.
+    backend: "auto" takes "triton" on a GPU and "cpu" otherwise.
+
+    Raises ValueError for shapes, dtypes, sizes or names that do not fit, ImportError if the back end is not there.
+    """
+    splats.check()
+    densities.check_density(density)
+    most = spherical_harmonics.degree_of(splats.sh.shape[1])
+    if degree is not None and not 0 <= degree <= most:
+        raise ValueError(f"degree {degree}: the splats have spherical harmonics up to {most}")
+    if size[0] < 1 or size[1] < 1:
+        raise ValueError(f"an image of {size[0]}x{size[1]} pixels cannot be rendered")
+    if density == "ges_scale":
+        shift = densities.log_scale_shift(splats.betas)
+        splats = Splats(
+            splats.means, splats.log_scales + shift[:, None], splats.quaternions, splats.opacity_logits, splats.sh,
+            splats.betas.detach(),
+        )  # fmt: skip
+    view = View(
+        pose=_pose(world_from_cam, pose_delta),
+        intrinsics=_floats(intrinsics, 4, "intrinsics"),
+        size=(int(size[0]), int(size[1])),
+        density="exact" if density == "exact" else "gaussian",
+        background=(0.0, 0.0, 0.0) if background is None else _floats(background, 3, "background"),
+        tile_mask=_mask(tile_mask, size),
+        near=float(near),
+        antialiased=antialiased,
+        degree=most if degree is None else degree,
+        threads=threads or 0,
+    )
+    render = _backend(backend, splats.means.device)(splats, view)
+    if exposure is not None:
+        if tuple(exposure.shape) != (3, 4):
+            raise ValueError(f"exposure is {tuple(exposure.shape)}: expected (3, 4)")
+        affine = exposure.to(render.color.dtype)
+        render.color = render.color @ affine[:, :3].T + affine[:, 3]
+    return render
+
+
+def _backend(name: str, device: torch.device) -> Callable[[Splats, View], Render]:
+    if name == "auto":
+        name = "reference"
+    if name == "reference":
+        from mvsgs_core.splats import reference
+
+        return reference.render
+    raise ValueError(f"backend {name!r}: choose one of {', '.join(BACKENDS)}")
+
+
+def _pose(world_from_cam: Tensor | np.ndarray, delta: Tensor | None) -> Tensor:
+    pose = torch.as_tensor(world_from_cam).to(device="cpu", dtype=torch.float64)
+    if tuple(pose.shape) != (4, 4):
+        raise ValueError(f"world_from_cam is {tuple(pose.shape)}: expected (4, 4)")
+    if not bool(torch.isfinite(pose).all()):
+        raise ValueError("world_from_cam is not finite")
+    return pose if delta is None else pose @ se3_exp(delta.to(device="cpu", dtype=torch.float64))
+
+
+def _floats(values: Tensor | np.ndarray, count: int, name: str) -> tuple[float, ...]:
+    array = torch.as_tensor(values).detach().double().cpu().reshape(-1)
+    if len(array) != count or not bool(torch.isfinite(array).all()):
+        raise ValueError(f"{name}: expected {count} finite numbers, got {array.tolist()}")
+    return tuple(array.tolist())
+
+
+def _mask(mask: Tensor | np.ndarray | None, size: tuple[int, int]) -> Tensor | None:
+    if mask is None:
+        return None
+    tensor = torch.as_tensor(mask)
+    if tuple(tensor.shape) != tile_grid(size) or tensor.dtype != torch.bool:
+        raise ValueError(f"tile_mask is {tensor.dtype} {tuple(tensor.shape)}: expected bool {tile_grid(size)}")
+    return tensor.contiguous()
