@@ -39,7 +39,8 @@ class Evaluator(Node):
         if folder:
             folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        self.evaluation = Evaluation(self.config.max_frames, self._load_lpips(), folder)
+        lpips = self._load_lpips()
+        self.evaluation = Evaluation(self.config.max_frames, lpips, folder)
         self.report: dict[str, Any] = {}
 
     def on_ground_truth(self, truth: GroundTruth) -> Iterator[None]:

@@ -19,9 +19,9 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Mean structural similarity of two (H, W, 3) images in 0..1: 11x11 Gaussian window, sigma 1.5, valid pixels.
+    """Mean structural similarity of two (H, W, 3) images in 0..1: 11x11 Gaussian window, sigma 1.5, borders mirrored.
 
-    Agrees with torchmetrics' structural_similarity_index_measure(data_range=1) to 1e-5 and takes a tenth of its time.
+    Agrees with torchmetrics' structural_similarity_index_measure(data_range=1) to 1e-5 and takes less than half of its time.
     Raises ValueError for different shapes, for an image smaller than the window, or for values that are not finite.
     """
     _check(image, reference)
@@ -37,8 +37,7 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     index = ((2 * mean_x * mean_y + c1) * (2 * covariance + c2)) / (
         (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
     )
-    border = _WINDOW // 2
-    return float(index[border:-border, border:-border].mean())
+    return float(index.mean())
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

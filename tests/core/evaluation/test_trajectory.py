@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.core import metrics
+from evo.core.trajectory import PoseTrajectory3D
+from evo.tools import file_interface
+
+from mvsgs_core import geometry
+from mvsgs_core.evaluation import trajectory
+
+
+def _trajectories(n: int = 60, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth true trajectory, and an estimate in another frame, at another scale, with noise."""
+    rng = np.random.default_rng(0)
+    truth = np.tile(np.eye(4), (n, 1, 1))
+    for k in range(1, n):
+        twist = np.concatenate([[0.05, 0.01 * np.sin(k / 5), 0.02], 0.03 * rng.standard_normal(3)])
+        truth[k] = truth[k - 1] @ geometry.se3_exp(twist)
+    move = geometry.se3_exp(np.array([1.0, -2.0, 0.5, 0.3, -0.7, 1.1]))
+    estimate = move @ truth
+    estimate[:, :3, 3] = 0.37 * estimate[:, :3, 3] + 0.002 * rng.standard_normal((n, 3))
+    estimate[:, :3, :3] = estimate[:, :3, :3] @ geometry.so3_exp(0.01 * rng.standard_normal((n, 3)))
+    truth[:, :3, 3] += offset
+    return estimate, truth
+
+
+def _evo(poses: np.ndarray) -> PoseTrajectory3D:
+    return PoseTrajectory3D(poses_se3=list(poses), timestamps=np.arange(len(poses), dtype=float))
+
+
+def test_agrees_with_evo() -> None:
+    estimate, truth = _trajectories()
+    alignment = trajectory.align(estimate, truth)
+    ours = trajectory.rmse(trajectory.absolute_errors(estimate, truth, alignment))
+    reference, aligned = _evo(truth), _evo(estimate)
+    _, _, scale = aligned.align(reference, correct_scale=True)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((reference, aligned))
+    assert ours == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), rel=1e-9)
+    assert alignment.scale == pytest.approx(scale, rel=1e-9)
+    move, turn = trajectory.relative_errors(estimate, truth, alignment.scale)
+    for relation, value in (
+        (metrics.PoseRelation.translation_part, move),
+        (metrics.PoseRelation.rotation_angle_deg, turn),
+    ):
+        rpe = metrics.RPE(relation, delta=1, all_pairs=True)
+        rpe.process_data((reference, aligned))
+        assert value == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
+
+
+def test_far_origin_changes_nothing() -> None:
+    errors = []
+    for offset in (0.0, 1e6):
+        estimate, truth = _trajectories(offset=offset)
+        errors.append(trajectory.rmse(trajectory.absolute_errors(estimate, truth, trajectory.align(estimate, truth))))
+    assert errors[1] == pytest.approx(errors[0], rel=1e-4)
+
+
+def test_a_mirrored_estimate_is_not_aligned_by_a_reflection() -> None:
+    estimate, truth = _trajectories()
+    mirrored = estimate.copy()
+    mirrored[:, 0, 3] *= -1
+    alignment = trajectory.align(mirrored, truth)
+    assert np.linalg.det(alignment.rotation) == pytest.approx(1.0)
+
+
+def test_no_alignment_is_an_error() -> None:
+    estimate, truth = _trajectories()
+    with pytest.raises(ValueError, match="at least 3"):
+        trajectory.align(estimate[:2], truth[:2])
+    estimate[:, :3, 3] = 1.0
+    with pytest.raises(ValueError, match="coincide"):
+        trajectory.align(estimate, truth)
+
+
+def test_tum_files_round_trip_and_evo_reads_them(tmp_path: Path) -> None:
+    estimate, _ = _trajectories()
+    times = np.arange(len(estimate)) / 30 + 1305031102.0
+    trajectory.write_tum(tmp_path / "t.txt", times, estimate)
+    read_times, read = trajectory.read_tum(tmp_path / "t.txt")
+    np.testing.assert_allclose(read_times, times, atol=1e-6)
+    np.testing.assert_allclose(read, estimate, atol=1e-7)
+    theirs = file_interface.read_tum_trajectory_file(str(tmp_path / "t.txt"))
+    np.testing.assert_allclose(np.array(theirs.poses_se3), estimate, atol=1e-7)
+    (tmp_path / "bad.txt").write_text("1 2 3\n")
+    with pytest.raises(ValueError, match=r"bad\.txt:1: expected"):
+        trajectory.read_tum(tmp_path / "bad.txt")
