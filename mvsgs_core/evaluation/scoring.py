@@ -73,8 +73,8 @@ def choose(views: list[View], limit: int) -> list[View]:
     chosen: list[View] = []
     for k, group in enumerate(groups):
         share = (limit - len(chosen)) // (len(groups) - k)
-        picks = np.unique(np.linspace(0, len(group) - 1, min(share, len(group))).round().astype(int)) if group else []
-        chosen += [group[i] for i in picks]
+        places = np.linspace(0, max(len(group) - 1, 0), min(share, len(group)))
+        chosen += [group[i] for i in np.unique(places.round().astype(int))]
     return sorted(chosen, key=lambda v: v.index)
 
 
