@@ -1,0 +1,161 @@
+// Python bindings of the tracking kernels. Array shapes are checked by the Python callers.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <optional>
+
+#include "bundle_adjustment.hpp"
+#include "lucas_kanade.hpp"
+#include "nearest.hpp"
+#include "optimize.hpp"
+
+namespace nb = nanobind;
+using namespace mvsgs;
+
+template <class T>
+using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Out = nb::ndarray<nb::numpy, T>;
+
+template <class T>
+static Out<T> to_numpy(std::vector<T>&& values, std::initializer_list<size_t> shape) {
+    auto* owned = new std::vector<T>(std::move(values));
+    nb::capsule owner(owned, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+    return Out<T>(owned->data(), shape, owner);
+}
+
+static nb::dict bundle_adjust(In<double> poses, In<double> inverse_depth, In<double> pixels, In<double> intrinsics,
+                              In<int32_t> from, In<int32_t> to, In<double> target, In<double> information,
+                              In<uint8_t> free_pose, In<uint8_t> free_depth, In<double> damping,
+                              std::optional<In<double>> prior, std::optional<In<double>> prior_weight,
+                              bool free_focal, int robust, double robust_scale, double min_z,
+                              double min_inverse_depth, int steps, bool adaptive, double lm, double ep,
+                              double tolerance, int threads) {
+    Problem p;
+    p.keyframes = static_cast<int>(inverse_depth.shape(0));
+    p.cells = static_cast<int>(inverse_depth.shape(1));
+    p.edges = static_cast<int>(from.shape(0));
+    p.channels = p.edges ? static_cast<int>(information.shape(1)) : 2;
+    p.pixels = pixels.data();
+    std::copy_n(intrinsics.data(), 4, p.intrinsics);
+    p.from = from.data();
+    p.to = to.data();
+    p.target = target.data();
+    p.information = information.data();
+    p.free_pose = free_pose.data();
+    p.free_depth = free_depth.data();
+    p.damping = damping.data();
+    p.prior = prior ? prior->data() : nullptr;
+    p.prior_weight = prior_weight ? prior_weight->data() : nullptr;
+    p.free_focal = free_focal;
+    p.robust = static_cast<Robust>(robust);
+    p.robust_scale = robust_scale;
+    p.min_z = min_z;
+    p.threads = std::max(1, threads);
+    State state;
+    for (int k = 0; k < p.keyframes; ++k) {
+        const double* t = poses.data() + 16 * k;
+        for (int r = 0; r < 3; ++r) {
+            state.rotation.insert(state.rotation.end(), {t[4 * r], t[4 * r + 1], t[4 * r + 2]});
+            state.translation.push_back(t[4 * r + 3]);
+        }
+    }
+    state.inverse_depth.assign(inverse_depth.data(), inverse_depth.data() + inverse_depth.size());
+    Report report;
+    std::vector<double> diagonal;
+    {
+        nb::gil_scoped_release release;
+        report = optimize(p, {steps, adaptive, lm, ep, tolerance, min_inverse_depth}, state, diagonal);
+    }
+    std::vector<double> matrices(static_cast<size_t>(16) * p.keyframes, 0.0);
+    for (int k = 0; k < p.keyframes; ++k) {
+        double* t = &matrices[16 * k];
+        for (int r = 0; r < 3; ++r) {
+            std::copy_n(&state.rotation[9 * k + 3 * r], 3, t + 4 * r);
+            t[4 * r + 3] = state.translation[3 * k + r];
+        }
+        t[15] = 1.0;
+    }
+    const size_t keyframes = p.keyframes, cells = p.cells;
+    nb::dict result;
+    result["poses"] = to_numpy(std::move(matrices), {keyframes, 4, 4});
+    result["inverse_depth"] = to_numpy(std::move(state.inverse_depth), {keyframes, cells});
+    result["information"] = to_numpy(std::move(diagonal), {keyframes, cells});
+    result["focal_factor"] = state.focal_factor;
+    result["initial_cost"] = report.initial_cost;
+    result["cost"] = report.cost;
+    result["steps"] = report.steps;
+    result["smallest_pivot"] = report.smallest_pivot;
+    result["failure"] = report.failure;
+    return result;
+}
+
+static Pyramid pyramid(const std::vector<In<float>>& levels, int border) {
+    Pyramid p{{}, border};
+    for (const auto& level : levels) {
+        const int h = static_cast<int>(level.shape(0)), w = static_cast<int>(level.shape(1));
+        p.levels.push_back({level.data(), h - 2 * border, w - 2 * border, w});
+    }
+    return p;
+}
+
+// (N, 4) float32: u, v, forward-backward distance (infinite where lost), correlation.
+static Out<float> lucas_kanade(const std::vector<In<float>>& a, const std::vector<In<float>>& b, In<float> points,
+                               In<float> guess, int border, int start_level, int iterations, float window_sigma,
+                               float min_eigenvalue, int threads) {
+    const Pyramid pa = pyramid(a, border), pb = pyramid(b, border);
+    const int levels = static_cast<int>(std::min(pa.levels.size(), pb.levels.size()));
+    const TrackOptions options{std::min(start_level, levels - 1), iterations, window_sigma, min_eigenvalue};
+    const int n = static_cast<int>(points.shape(0));
+    std::vector<float> out(static_cast<size_t>(4) * n);
+    {
+        nb::gil_scoped_release release;
+#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
+        for (int k = 0; k < n; ++k) {
+            const float u = points.data()[2 * k], v = points.data()[2 * k + 1];
+            const float gu = guess.data()[2 * k], gv = guess.data()[2 * k + 1];
+            const Tracked there = track_point(pa, pb, u, v, gu, gv, options);
+            float distance = INFINITY;
+            if (there.found) {
+                // Back from as wrong a guess as the way out had: starting at the answer would prove nothing.
+                const Tracked back =
+                    track_point(pb, pa, there.u, there.v, there.u + (u - gu), there.v + (v - gv), options);
+                if (back.found) distance = std::hypot(back.u - u, back.v - v);
+            }
+            const float row[4] = {there.u, there.v, distance, there.correlation};
+            std::copy_n(row, 4, &out[static_cast<size_t>(4) * k]);
+        }
+    }
+    return to_numpy(std::move(out), {static_cast<size_t>(n), 4});
+}
+
+static Out<double> median_of_nearest(In<double> points, In<double> values, In<double> queries, int count,
+                                     double radius) {
+    const int n = static_cast<int>(points.shape(0)), m = static_cast<int>(queries.shape(0));
+    std::vector<double> out;
+    {
+        nb::gil_scoped_release release;
+        out = nearest_medians(points.data(), values.data(), n, queries.data(), m, count, radius);
+    }
+    return to_numpy(std::move(out), {static_cast<size_t>(m)});
+}
+
+NB_MODULE(MVSGS_MODULE, m) {
+    m.def("bundle_adjust", &bundle_adjust, nb::arg("poses"), nb::arg("inverse_depth"), nb::arg("pixels"),
+          nb::arg("intrinsics"), nb::arg("source"), nb::arg("to"), nb::arg("target"), nb::arg("information"),
+          nb::arg("free_pose"), nb::arg("free_depth"), nb::arg("damping"), nb::arg("prior").none(),
+          nb::arg("prior_weight").none(), nb::arg("free_focal"), nb::arg("robust"), nb::arg("robust_scale"),
+          nb::arg("min_z"), nb::arg("min_inverse_depth"), nb::arg("steps"), nb::arg("adaptive"), nb::arg("lm"),
+          nb::arg("ep"), nb::arg("tolerance"), nb::arg("threads"));
+    m.def("lucas_kanade", &lucas_kanade, nb::arg("a"), nb::arg("b"), nb::arg("points"), nb::arg("guess"),
+          nb::arg("border"), nb::arg("start_level"), nb::arg("iterations"), nb::arg("window_sigma"),
+          nb::arg("min_eigenvalue"), nb::arg("threads"));
+    m.def("median_of_nearest", &median_of_nearest, nb::arg("points"), nb::arg("values"), nb::arg("queries"),
+          nb::arg("count"), nb::arg("radius"));
+}
