@@ -177,6 +177,10 @@ class ImageSequence:
         resized = resize_image(undistortion.image(image), padded)[inside]
         return Item(index, record.timestamp, np.ascontiguousarray(resized), intrinsics, record.world_from_cam, depth)
 
+    def registered(self, depth: np.ndarray) -> np.ndarray:
+        """The depth map (h, w) as the color camera would see it: of most sets it is already."""
+        return depth
+
     def _size_of(self, native: tuple[int, int]) -> tuple[int, int]:
         if self._size is None and self._crop:  # nothing to resize to, so cropping makes the image smaller
             return native[0] - 2 * self._crop, native[1] - 2 * self._crop
@@ -199,6 +203,7 @@ class ImageSequence:
         except UnreadableImageError as error:
             self._notices.tally("depth maps could not be read: depth is not scored there", str(error))
             return None
+        depth = self.registered(depth)
         if not same_shape((depth.shape[0], depth.shape[1]), native):
             self._notices.tally("depth maps have another shape than their image and were left out", record.image.name)
             return None
