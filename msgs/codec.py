@@ -1,0 +1,345 @@
+"""Message <-> one frame of bytes: `prefix | type name | msgpack header | 64-byte-aligned arrays`. See WIRE.md.
+
+Nothing in a frame is trusted: version, type, field names, dtypes, shapes, sizes, offsets and nesting are checked
+against the dataclasses of `msgs` before an array is made, so that a bad frame is a `CodecError` that says what is
+wrong with it, and never a crash or a large allocation. Decoded arrays are read-only views on the frame.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+
+import msgs
+
+VERSION = 1
+RELIABLE = b"R"  # first byte of a frame, which readers subscribe to: every message ...
+NEWEST = b"N"  # ... or only the newest
+ALIGNMENT = 64  # bytes, of each array from the frame's start
+MAX_MESSAGE_BYTES = 256 * 2**20
+MAX_HEADER_BYTES = 64 * 2**10
+MAX_END_HEADER_BYTES = 2**20  # End carries the statistics of the whole graph
+MAX_ITEMS = 4096  # entries of one list or map in End.stats
+MAX_DEPTH = 8  # of the maps and lists in End.stats
+MAX_TEXT = 64 * 2**10  # bytes of one string
+
+_PREFIX = struct.Struct("<c3sBBHI")  # delivery, magic, version, length of the name, zero, length of the header
+_MAGIC = b"MVS"
+_IMAGE_SIZES = frozenset("HWhw")  # named sizes that may not be 0
+
+
+class CodecError(ValueError):
+    """A message that cannot be sent, or a frame that is not a message."""
+
+
+class Decoded(NamedTuple):
+    message: msgs.Message
+    sequence: int  # position of the message in its topic, from 0
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """What an annotation such as `Annotated[np.ndarray, "float32 h w 3"] | None` asks for."""
+
+    dtype: np.dtype  # little-endian
+    dims: tuple[int | str, ...]  # a size, or the name of one
+    optional: bool
+
+
+FieldSpec = ArraySpec | type  # `type`: int, float, str, bool or Mapping
+
+
+def encode(
+    message: msgs.Message, sequence: int = 0, *, delivery: bytes = RELIABLE, max_bytes: int = MAX_MESSAGE_BYTES
+) -> memoryview:
+    """The message as one frame.
+
+    Raises CodecError where a field differs from its annotation or the frame would be larger than `max_bytes`.
+    """
+    name = type(message).__name__
+    specs = _SPECS.get(name)
+    if specs is None or msgs.TYPES[name] is not type(message):
+        raise CodecError(f"{type(message).__qualname__} is no message; the types are {', '.join(_SPECS)}")
+    scalars: dict[str, Any] = {}
+    arrays: dict[str, list[Any]] = {}
+    sizes: dict[str, int] = {}
+    values: list[tuple[np.ndarray, list[Any]]] = []
+    for field, spec in specs.items():
+        value = getattr(message, field)
+        where = f"{name}.{field}"
+        if not isinstance(spec, ArraySpec):
+            scalars[field] = _checked_scalar(value, spec, where)
+        elif value is None and spec.optional:
+            scalars[field] = None
+        else:
+            if not isinstance(value, np.ndarray):
+                raise CodecError(f"{where} is a {type(value).__name__}, not an array")
+            _check_array(spec, str(value.dtype), value.shape, sizes, where)
+            arrays[field] = [spec.dtype.name, list(value.shape), 0]
+            values.append((value, arrays[field]))
+    header, total = _lay_out(name, sequence, scalars, arrays, values)
+    if total > max_bytes:
+        raise CodecError(f"{name} takes {total} bytes, more than the {max_bytes} that a message may have")
+    buffer = np.empty(total, np.uint8)
+    frame = memoryview(buffer)  # type: ignore[arg-type]
+    start = _PREFIX.size + len(name)
+    _PREFIX.pack_into(frame, 0, delivery, _MAGIC, VERSION, len(name), 0, len(header))
+    buffer[_PREFIX.size : start] = np.frombuffer(name.encode(), np.uint8)
+    buffer[start : start + len(header)] = np.frombuffer(header, np.uint8)
+    end = start + len(header)
+    for value, entry in values:
+        offset = entry[2]
+        buffer[end:offset] = 0  # no stray memory on the wire
+        end = offset + value.nbytes
+        target = np.frombuffer(buffer, value.dtype.newbyteorder("<"), value.size, offset) if value.size else None
+        if target is not None:
+            np.copyto(target.reshape(value.shape), value)
+    return frame
+
+
+def decode(
+    frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int = MAX_MESSAGE_BYTES, copy: bool = False
+) -> Decoded:
+    """The message of a frame (any bytes-like object). Its arrays are read-only views that keep the frame alive.
+
+    `expect` restricts the types that are accepted. Raises CodecError for everything that `encode` would not write.
+    """
+    view = memoryview(frame)
+    if view.nbytes > max_bytes:
+        raise CodecError(f"a frame of {view.nbytes} bytes, more than the {max_bytes} that a message may have")
+    if not view.contiguous:
+        raise CodecError("the frame's bytes are not contiguous")
+    view = view.cast("B") if view.nbytes else view
+    name, header = _split(view)
+    allowed = tuple(msgs.TYPES.values()) if expect is None else expect
+    if name not in _SPECS or msgs.TYPES[name] not in allowed:
+        raise CodecError(f"a frame of type {name!r} where {' or '.join(t.__name__ for t in allowed)} is expected")
+    sequence, scalars, arrays = _unpack_header(header, name)
+    specs = _SPECS[name]
+    given = [*scalars, *arrays]
+    if len(set(given)) != len(given) or set(given) != set(specs):
+        raise CodecError(f"{name} has the fields {', '.join(specs)}; this frame has {', '.join(given) or 'none'}")
+    built: dict[str, Any] = {}
+    sizes: dict[str, int] = {}
+    end = _aligned(_PREFIX.size + len(name) + len(header)) if arrays else _PREFIX.size + len(name) + len(header)
+    first = end
+    for field, spec in specs.items():
+        where = f"{name}.{field}"
+        if not isinstance(spec, ArraySpec):
+            if field not in scalars:
+                raise CodecError(f"{where} is no array")
+            built[field] = _checked_scalar(scalars[field], spec, where)
+        elif field in scalars:
+            if scalars[field] is not None or not spec.optional:
+                raise CodecError(f"{where} must be an array" + (" or nil" if spec.optional else ""))
+            built[field] = None
+        else:
+            built[field], stop = _array(view, arrays[field], spec, sizes, first, where, copy)
+            end = max(end, stop)
+    if view.nbytes != end:
+        raise CodecError(f"the frame of a {name} has {view.nbytes} bytes, its content ends at {end}")
+    return Decoded(msgs.TYPES[name](**built), sequence)
+
+
+def type_name(frame: Any) -> str:
+    """The message type that a frame says it is, without decoding the rest. Raises CodecError."""
+    return _split(memoryview(frame).cast("B"))[0]
+
+
+def array_specs(message_type: type) -> dict[str, FieldSpec]:
+    """Field name -> what the annotation asks for."""
+    return dict(_SPECS[message_type.__name__])
+
+
+def _aligned(offset: int) -> int:
+    return -(-offset // ALIGNMENT) * ALIGNMENT
+
+
+def _lay_out(
+    name: str,
+    sequence: int,
+    scalars: dict[str, Any],
+    arrays: dict[str, list[Any]],
+    values: list[tuple[np.ndarray, list[Any]]],
+) -> tuple[bytes, int]:
+    """Header and length of the frame; enters the offsets into `arrays`.
+
+    The header's length depends on the offsets that it holds: they are laid out behind a header of the largest size
+    that it can have, 8 bytes more for each offset than with the zeros.
+    """
+    start = _PREFIX.size + len(name)
+    content = {"sequence": sequence, "scalars": scalars, "arrays": arrays}
+    try:
+        longest = len(msgpack.packb(content)) + 8 * len(arrays)
+        end = _aligned(start + longest) if arrays else start + longest
+        for value, entry in values:
+            entry[2] = _aligned(end)
+            end = entry[2] + value.nbytes
+        header = msgpack.packb(content)
+    except (ValueError, OverflowError, TypeError) as error:
+        raise CodecError(f"{name}: {error}") from error
+    limit = MAX_END_HEADER_BYTES if name == "End" else MAX_HEADER_BYTES
+    if len(header) > limit:
+        raise CodecError(f"{name}: a header of {len(header)} bytes, more than {limit}")
+    return header, (end if arrays else start + len(header))
+
+
+def _split(view: memoryview) -> tuple[str, memoryview]:
+    """Type name and header of a frame."""
+    if view.nbytes < _PREFIX.size:
+        raise CodecError(f"a frame of {view.nbytes} bytes is too short")
+    delivery, magic, version, name_length, zero, header_length = _PREFIX.unpack_from(view)
+    if magic != _MAGIC or delivery not in (RELIABLE, NEWEST):
+        raise CodecError(f"no message: it starts with {bytes(view[:4])!r}, not b'RMVS' or b'NMVS'")
+    if version != VERSION or zero:
+        raise CodecError(f"a frame of version {version}, flags {zero}; this program reads version {VERSION}, flags 0")
+    start = _PREFIX.size + name_length
+    try:
+        name = bytes(view[_PREFIX.size : start]).decode("ascii")
+    except UnicodeDecodeError:
+        raise CodecError("the type name is not ASCII") from None
+    limit = MAX_END_HEADER_BYTES if name == "End" else MAX_HEADER_BYTES
+    if header_length > limit:
+        raise CodecError(f"a header of {header_length} bytes, more than {limit}")
+    if start + header_length > view.nbytes:
+        raise CodecError(
+            f"a frame of {view.nbytes} bytes is cut off in its header, which ends at {start + header_length}"
+        )
+    return name, view[start : start + header_length]
+
+
+def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], dict[str, Any]]:
+    try:
+        # msgpack allocates a list's declared length at once: the limits keep a false one small
+        content = msgpack.unpackb(
+            header,
+            strict_map_key=True,
+            max_array_len=MAX_ITEMS,
+            max_map_len=MAX_ITEMS,
+            max_str_len=MAX_TEXT,
+            max_bin_len=0,
+            max_ext_len=0,
+        )
+    except (ValueError, TypeError, msgpack.UnpackException) as error:
+        raise CodecError(f"{name}: the header is no valid msgpack: {error or type(error).__name__}") from error
+    if not isinstance(content, dict) or set(content) != {"sequence", "scalars", "arrays"}:
+        raise CodecError(f"{name}: the header must be a map of sequence, scalars and arrays")
+    sequence, scalars, arrays = content["sequence"], content["scalars"], content["arrays"]
+    if type(sequence) is not int or not 0 <= sequence < 2**63:
+        raise CodecError(f"{name}: the sequence number must be an integer from 0")
+    if not isinstance(scalars, dict) or not isinstance(arrays, dict):
+        raise CodecError(f"{name}: scalars and arrays must be maps")
+    return sequence, scalars, arrays
+
+
+def _array(
+    view: memoryview, entry: Any, spec: ArraySpec, sizes: dict[str, int], first: int, where: str, copy: bool
+) -> tuple[np.ndarray, int]:
+    """The array and where its bytes end."""
+    if not isinstance(entry, list) or len(entry) != 3 or not isinstance(entry[1], list):
+        raise CodecError(f"{where} must be given as [dtype, shape, offset]")
+    dtype, shape, offset = entry
+    if any(type(n) is not int or n < 0 for n in (*shape, offset)):
+        raise CodecError(f"{where}: shape {shape} and offset {offset} must be integers from 0")
+    _check_array(spec, dtype, tuple(shape), sizes, where)
+    stop = offset + math.prod(shape) * spec.dtype.itemsize
+    if offset % ALIGNMENT or offset < first or stop > view.nbytes:
+        raise CodecError(
+            f"{where}: bytes {offset} to {stop} are not inside the frame's {first} to {view.nbytes}, "
+            f"at a multiple of {ALIGNMENT}"
+        )
+    array = np.frombuffer(view[offset:stop], spec.dtype).reshape(shape)
+    if spec.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
+        raise CodecError(f"{where}: a bool is 0 or 1")
+    if copy or not array.flags.aligned:  # a small frame may lie anywhere in memory
+        array = array.copy()
+    if where.endswith(".timestamp") and not np.isfinite(array).all():
+        raise CodecError(f"{where} is not finite")
+    array.flags.writeable = False
+    return array, stop
+
+
+def _check_array(spec: ArraySpec, dtype: Any, shape: tuple[int, ...], sizes: dict[str, int], where: str) -> None:
+    if dtype != spec.dtype.name:
+        raise CodecError(f"{where} must be {spec.dtype.name}, not {dtype}")
+    if len(shape) != len(spec.dims):
+        raise CodecError(f"{where} must have the shape ({' '.join(map(str, spec.dims))}), not {shape}")
+    for size, dim in zip(shape, spec.dims, strict=True):
+        expected = dim if isinstance(dim, int) else sizes.setdefault(dim, size)
+        if size != expected:
+            raise CodecError(f"{where} has the shape {shape}, but {dim} is {expected}")
+        if dim in _IMAGE_SIZES and size == 0:
+            raise CodecError(f"{where} is an empty image: shape {shape}")
+
+
+def _checked_scalar(value: Any, kind: Any, where: str) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if kind is float and type(value) is int:
+        value = float(value)
+    if kind is Mapping:
+        return _checked_stats(value, where, MAX_DEPTH, top=True)
+    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+        raise CodecError(f"{where} must be {kind.__name__}, not {type(value).__name__}")
+    if kind is float and not math.isfinite(value):
+        raise CodecError(f"{where} is {value}")
+    if kind is int:
+        value = int(value)
+        if not -(2**63) <= value < 2**63:
+            raise CodecError(f"{where} does not fit 64 bits")
+    if kind is str and len(value.encode(errors="replace")) > MAX_TEXT:
+        raise CodecError(f"{where} is longer than {MAX_TEXT} bytes")
+    return value
+
+
+def _checked_stats(value: Any, where: str, depth: int, *, top: bool = False) -> Any:
+    """Maps, lists, strings, numbers, booleans and nil, nested at most MAX_DEPTH deep."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Mapping | list | tuple):
+        if depth == 0:
+            raise CodecError(f"{where} is nested more than {MAX_DEPTH} deep")
+        if len(value) > MAX_ITEMS:
+            raise CodecError(f"{where} has {len(value)} entries, more than {MAX_ITEMS}")
+    if isinstance(value, Mapping):
+        if not all(isinstance(key, str) for key in value):
+            raise CodecError(f"{where}: keys must be strings")
+        return {key: _checked_stats(item, f"{where}.{key}", depth - 1) for key, item in value.items()}
+    if top:
+        raise CodecError(f"{where} must be a map, not {type(value).__name__}")
+    if isinstance(value, list | tuple):
+        return [_checked_stats(item, where, depth - 1) for item in value]
+    if value is None or isinstance(value, bool | float):
+        return value
+    for kind in (str, int):
+        if isinstance(value, kind):
+            return _checked_scalar(value, kind, where)
+    raise CodecError(f"{where}: a {type(value).__name__} cannot be sent; use numbers, strings, lists and maps")
+
+
+def _specs_of(message_type: type) -> dict[str, FieldSpec]:
+    hints = typing.get_type_hints(message_type, include_extras=True)
+    return {f.name: _field_spec(hints[f.name]) for f in fields(message_type)}
+
+
+def _field_spec(hint: Any) -> FieldSpec:
+    optional = False
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        (hint,) = (part for part in typing.get_args(hint) if part is not type(None))
+        optional = True
+    if typing.get_origin(hint) is typing.Annotated:
+        dtype, *dims = hint.__metadata__[0].split()
+        sizes = tuple(int(dim) if dim.isdigit() else dim for dim in dims)
+        return ArraySpec(np.dtype(dtype).newbyteorder("<"), sizes, optional)
+    return typing.get_origin(hint) or hint
+
+
+_SPECS: dict[str, dict[str, FieldSpec]] = {name: _specs_of(t) for name, t in msgs.TYPES.items()}

@@ -1,0 +1,73 @@
+"""Addresses of topics and the keys of a graph: what is allowed, and why not. No socket."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+IPC_PATH_BYTES = 107  # the kernel's limit of a socket's path
+KEY_FILE = "graph.key"
+
+
+class TransportError(RuntimeError):
+    """A topic cannot be opened, or a message was lost."""
+
+
+class Keys(NamedTuple):
+    """CURVE key pair of a graph, in Z85: every process has it, and nobody without it is let in."""
+
+    public: bytes
+    secret: bytes
+
+
+def load_keys(folder: Path) -> Keys:
+    """The keys that `nodes.transport.create_keys` wrote.
+
+    Raises TransportError if there are none, if other users can read them, or if the file holds no key pair.
+    """
+    path = folder / KEY_FILE
+    if not path.is_file():
+        raise TransportError(
+            f"no keys at {path}: make them with "
+            f'python -c "from nodes.transport import create_keys; create_keys({str(folder)!r})"'
+        )
+    if path.stat().st_mode & 0o077:
+        raise TransportError(f"{path} can be read by other users: chmod 600 {path}")
+    lines = path.read_bytes().split()
+    if len(lines) != 2 or any(len(line) != 40 for line in lines):
+        raise TransportError(f"{path} holds no key pair: two lines of 40 characters, public and secret")
+    return Keys(*lines)
+
+
+def save_keys(folder: Path, keys: Keys) -> None:
+    """To a file that only its owner can read. Raises FileExistsError rather than replace keys."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    descriptor = os.open(folder / KEY_FILE, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(keys.public + b"\n" + keys.secret + b"\n")
+
+
+def check_address(address: str, *, bind: bool = False, keys: Keys | None = None) -> None:
+    """Raises TransportError for what cannot be opened, and for a bind beyond loopback without keys."""
+    kind, _, rest = address.partition("://")
+    if kind == "ipc" and rest:
+        if len(os.fsencode(rest)) > IPC_PATH_BYTES:
+            raise TransportError(f"the socket path {rest} is longer than {IPC_PATH_BYTES} bytes: use a shorter folder")
+        return
+    host, _, port = rest.rpartition(":")
+    if kind != "tcp" or not host or not (port.isdigit() and int(port) < 65536):
+        raise TransportError(f"{address} is no address; use ipc:///path or tcp://host:port")
+    if bind and keys is None and not _is_loopback(host):
+        raise TransportError(
+            f"{address} can be reached from other machines and would accept anybody: give CURVE keys, "
+            "or bind to 127.0.0.1 or an ipc:// path"
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
