@@ -1,0 +1,93 @@
+"""One node's process as the launcher sees it: started, listened to, stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from launch.status import NodeStatus
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def python_path() -> str:
+    """PYTHONPATH of a node: the repository, the user's directory (for a node of theirs), then what was set."""
+    return os.pathsep.join(dict.fromkeys(p for p in (str(ROOT), str(Path.cwd()), os.environ.get("PYTHONPATH")) if p))
+
+
+class Child:
+    """A running node."""
+
+    def __init__(
+        self, status: NodeStatus, spec: Path, pipe: tuple[int, int], log: Path, environment: dict[str, str]
+    ) -> None:
+        """Starts `python -m nodes spec`; `pipe` is (read end, write end) of its status, whose number the spec names."""
+        self.status = status
+        self.log = log
+        self.pipe = pipe[0]
+        self._text = b""
+        with log.open("wb") as output:
+            # Its own session: the terminal's Ctrl-C reaches only the launcher, which decides whom to stop.
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "nodes", str(spec)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                pass_fds=[pipe[1]],
+                start_new_session=True,
+                env={**os.environ, "PYTHONPATH": python_path(), "PYTHONUNBUFFERED": "1", **environment},
+            )
+        os.close(pipe[1])
+        os.set_blocking(self.pipe, False)
+
+    @property
+    def name(self) -> str:
+        return self.status.name
+
+    def read_status(self) -> bool:
+        """Folds in what the node wrote. False once it has closed its end, as it does when it is gone."""
+        while True:
+            try:
+                news = os.read(self.pipe, 1 << 16)
+            except BlockingIOError:
+                return True
+            if not news:
+                return False
+            *lines, self._text = (self._text + news).split(b"\n")
+            for line in filter(None, lines):
+                self.status.update(line)
+
+    def failure(self) -> str | None:
+        """What went wrong, or None as long as nothing did."""
+        code = self.process.poll()
+        if self.status.state == "failed":
+            return self.status.error or "failed"
+        if code is None or code == 0:
+            return None
+        if code < 0:
+            hint = "; out of memory?" if code == -signal.SIGKILL else ""
+            return f"killed by signal {-code} ({signal.strsignal(-code)}{hint})"
+        return f"exit code {code}"
+
+    def last_words(self, lines: int = 30) -> str:
+        """The traceback that the node reported, else the end of its log."""
+        if self.status.traceback:
+            return self.status.traceback.rstrip()
+        return "\n".join(self.log.read_text(errors="replace").splitlines()[-lines:])
+
+    def send(self, number: signal.Signals) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+
+    def kill_group(self) -> None:
+        """SIGKILL for the node and whatever it started itself."""
+        try:
+            os.killpg(self.process.pid, signal.SIGKILL)
+        except (ProcessLookupError, PermissionError):
+            self.process.kill()
+
+    def close(self) -> None:
+        os.close(self.pipe)

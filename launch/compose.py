@@ -1,0 +1,122 @@
+"""Command-line overrides -> configuration (Hydra) -> checked graph.
+
+Hydra refuses a parameter that the choice's file does not have; here the node's `Config` decides that (another
+`_target_` has other parameters), so overrides of a slot's parameters are handed to Hydra as `++slot.parameter=value`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from launch.graph import Graph, Replaced, build
+from launch.parameters import GraphError, did_you_mean
+
+CONF = Path(__file__).resolve().parent / "conf"
+
+
+def compose(overrides: Sequence[str] = (), conf: Path = CONF) -> Graph:
+    """The graph of the configuration in `conf` with overrides such as "dataset=tum" or "mapper.iterations=9".
+
+    Raises GraphError, before anything runs, with what would be valid.
+    """
+    prepared = prepare(overrides, conf)
+    try:
+        with initialize_config_dir(version_base="1.3", config_dir=str(conf)):
+            config = hydra_compose("config", prepared, return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise GraphError(str(error)) from error
+    return graph_of(config, prepared, config.hydra.runtime.choices)
+
+
+def graph_of(config: DictConfig, overrides: Sequence[str], choices: Mapping[str, Any]) -> Graph:
+    """The graph of a composed configuration. `overrides` are those it was composed with."""
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    if own.get("output") is None:
+        own.output = f"runs/{time.strftime('%Y-%m-%d_%H-%M-%S')}-{choices.get('dataset', 'run')}"
+    own.output = str(Path(own.output).expanduser().absolute())
+    replaced = _replaced(own, overrides)
+    try:
+        resolved = OmegaConf.to_container(own, resolve=True)
+    except OmegaConfBaseException as error:
+        raise GraphError(str(error)) from error
+    assert isinstance(resolved, dict)
+    return build({str(key): value for key, value in resolved.items()}, replaced)
+
+
+def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: bool = True) -> list[str]:
+    """Overrides as Hydra takes them. Raises GraphError for an unknown slot, choice or key, with those there are.
+
+    `all_choices_known` is False where choices can come from other directories: Hydra refuses them then.
+    """
+    slots, settings = vocabulary(conf)
+    choices = {slot: sorted(path.stem for path in (conf / slot).glob("*.yaml")) for slot in slots}
+    return [_prepare(text, choices, settings, all_choices_known) for text in overrides]
+
+
+def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str], all_choices_known: bool) -> str:
+    override = _parse(text)
+    key = override.key_or_group
+    root, _, rest = key.partition(".")
+    if root == "hydra" or root.startswith("hydra/") or override.type is not OverrideType.CHANGE:
+        return text
+    if root in settings:
+        return text
+    if root not in slots:
+        raise GraphError(
+            f"{text}: no slot or key {root!r}{did_you_mean(root, [*slots, *settings])}; slots: {', '.join(slots)}; "
+            f"other keys: {', '.join(settings)}"
+        )
+    if rest:
+        # a key inside a parameter that is itself a mapping (dataset.options.camera) is the choice file's: Hydra checks
+        return text if "." in rest and not rest.startswith("reads.") else f"++{text}"
+    chosen, choices = override.value(), slots[root]
+    if chosen == "external" and chosen not in choices:
+        return f"++{root}.external=true"
+    if all_choices_known and not override.is_sweep_override() and chosen not in choices:
+        raise GraphError(
+            f"{text}: {root} has no choice {chosen!r}{did_you_mean(str(chosen), choices)}; "
+            f"there are: {', '.join([*choices, 'external'])}"
+        )
+    return text
+
+
+def vocabulary(conf: Path) -> tuple[list[str], list[str]]:
+    """Slots and global keys, from config.yaml."""
+    config = OmegaConf.load(conf / "config.yaml")
+    assert isinstance(config, DictConfig)
+    groups = [str(next(iter(entry))) for entry in config.defaults if isinstance(entry, DictConfig)]
+    slots = [group for group in groups if not group.startswith("override ")]
+    return slots, [str(key) for key in config if key not in ("defaults", "hydra")]
+
+
+def _replaced(config: DictConfig, overrides: Sequence[str]) -> dict[str, Replaced]:
+    """The slots whose `_target_` the overrides give, with the parameters that are not left from the old choice."""
+    given: dict[str, set[str]] = {}
+    for override in map(_parse, overrides):
+        root, _, rest = override.key_or_group.partition(".")
+        if rest:
+            given.setdefault(root, set()).add(rest.split(".")[0])
+    replaced = {}
+    for slot, keys in given.items():
+        if "_target_" in keys and slot in config:
+            interpolated = [str(key) for key in config[slot] if OmegaConf.is_interpolation(config[slot], str(key))]
+            replaced[slot] = Replaced(sorted(keys), interpolated)
+    return replaced
+
+
+def _parse(text: str) -> Override:
+    try:
+        return OverridesParser.create().parse_override(text)
+    except HydraException as error:
+        raise GraphError(f"{text}: must look like slot=choice or slot.parameter=value ({error})") from error

@@ -1,0 +1,268 @@
+"""The graph: which node stands in which slot, with which parameters, and who reads what from whom.
+
+Built from the configuration and checked as a whole before any process starts. Knows no wiring of its own: slots,
+choices and edges all come from `conf/`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgs
+import nodes
+from launch.parameters import GraphError, check_parameters, did_you_mean
+
+# A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have.
+OPTIONAL_MESSAGES = (msgs.Poses, msgs.Trajectory)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The keys of config.yaml that belong to no slot; see the comments there."""
+
+    output: str
+    device: str = "auto"
+    seed: int = 0
+    inline: bool = False
+    buffer: int = 4
+    transport: Literal["ipc", "tcp"] = "ipc"
+    host: str = "127.0.0.1"
+    port: int | None = None
+    keys: str | None = None
+    screen: Literal["auto", "live", "plain", "off"] = "auto"
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where and how a node runs: keys that every slot takes beside the node's own parameters."""
+
+    cpu: list[int] | None = None  # cores to pin to
+    threads: int | None = None  # None: a share of the cores, see launch/placement.py
+    external: bool = False  # started by hand
+    host: str | None = None  # tcp: where this slot's publishers are reached, if not at the global `host`
+    best_effort: list[str] = field(
+        default_factory=list
+    )  # types that this slot sends newest-only, as a live camera does
+
+
+@dataclass(frozen=True)
+class Edge:
+    message: type
+    sender: str
+    reader: str
+    best_effort: bool
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A node with its parameters, ready to run."""
+
+    name: str
+    node: type[nodes.Node]
+    config: dict[str, Any]  # all of the node's parameters, plain JSON values
+    reads: dict[type, str]  # message type -> sending slot, "?" after it for best effort
+    placement: Placement
+
+    @property
+    def target(self) -> str:
+        return f"{self.node.__module__}.{self.node.__qualname__}"
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Slots in an order in which every sender comes before its readers."""
+
+    slots: dict[str, Slot]
+    edges: list[Edge]
+    settings: Settings
+    resolved: dict[str, Any]  # the whole configuration as it runs, for config.yaml in the output directory
+    warnings: list[str] = field(default_factory=list)
+
+    def into(self, slot: str) -> list[Edge]:
+        return [edge for edge in self.edges if edge.reader == slot]
+
+    def out_of(self, slot: str) -> list[Edge]:
+        return [edge for edge in self.edges if edge.sender == slot]
+
+    @property
+    def sources(self) -> list[str]:
+        return [name for name, slot in self.slots.items() if nodes.is_source(slot.node)]
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """A slot whose `_target_` was given on the command line: what of the old choice's parameters still holds."""
+
+    given: Collection[str]  # on the command line too: these hold
+    interpolated: Collection[str]  # from a global key, such as ${output}: these hold where the new node has them
+
+
+def build(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | None = None) -> Graph:
+    """The checked graph of a resolved configuration. Raises GraphError, with what would be valid."""
+    replaced = replaced or {}
+    sections = {key: value for key, value in config.items() if isinstance(value, Mapping)}
+    settings = Settings(
+        **check_parameters("", "config.yaml", Settings, {k: v for k, v in config.items() if k not in sections})
+    )
+    device = _resolve_device(settings.device)
+    slots: dict[str, Slot] = {}
+    for name, section in sections.items():
+        if section.get("_target_") is not None:
+            slots[name] = _build_slot(name, section, replaced.get(name), device)
+    edges, warnings = connect(slots, list(sections))
+    resolved = {key: value for key, value in config.items() if key not in sections}
+    resolved |= {name: _section(slots[name]) if name in slots else {"_target_": None} for name in sections}
+    return Graph({name: slots[name] for name in order(slots, edges)}, edges, settings, resolved, warnings)
+
+
+def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None, device: str) -> Slot:
+    node = load_node(name, str(section["_target_"]))
+    inputs, accepted = _handlers(name, node), set(inspect.signature(node.Config).parameters)
+    reads = dict(section.get("reads") or {})
+    given = {key: value for key, value in section.items() if key not in ("_target_", "reads")}
+    placement = {key: given.pop(key) for key in Placement.__dataclass_fields__ if key in given and key not in accepted}
+    if replaced is not None:
+        # The old choice's parameters are not this node's, even where names agree: its own defaults hold.
+        kept = {*replaced.given, *(key for key in replaced.interpolated if key in accepted)}
+        given = {key: value for key, value in given.items() if key in kept}
+        reads = {key: value for key, value in reads.items() if key in {t.__name__ for t in inputs}}
+    parameters = check_parameters(name, f"{node.__module__}.{node.__qualname__}", node.Config, given)
+    if parameters.get("device") == "auto":
+        parameters["device"] = device
+    typed: dict[type, str] = {}
+    for message, sender in reads.items():
+        if message not in msgs.TYPES:
+            raise GraphError(f"{name}.reads.{message}: no such message; there are: {', '.join(msgs.TYPES)}")
+        if not isinstance(sender, str):
+            raise GraphError(f"{name}.reads.{message}={sender}: must be the name of the slot that sends it")
+        typed[msgs.TYPES[message]] = sender
+    where = Placement(**check_parameters(name, "placement", Placement, placement))
+    return Slot(name, node, parameters, typed, where)
+
+
+def load_node(slot: str, target: str) -> type[nodes.Node]:
+    """The node class `module.Class`. Raises GraphError where there is none."""
+    module_name, _, class_name = target.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ValueError:
+        raise GraphError(f"{slot}._target_={target}: must be module.Class, as in nodes.tracker.Tracker") from None
+    except ModuleNotFoundError as error:
+        if error.name is not None and (module_name == error.name or module_name.startswith(error.name + ".")):
+            raise GraphError(
+                f"{slot}._target_={target}: no module {module_name!r} in the repository, the current directory "
+                "or PYTHONPATH"
+            ) from None
+        raise GraphError(f"{slot}._target_={target}: importing {module_name} failed: {error}") from error
+    except Exception as error:
+        raise GraphError(f"{slot}._target_={target}: importing {module_name} failed: {error!r}") from error
+    found = getattr(module, class_name, None)
+    if isinstance(found, type) and issubclass(found, nodes.Node):
+        return found
+    there = [n for n, c in vars(module).items() if isinstance(c, type) and issubclass(c, nodes.Node)]
+    there = [n for n in there if n != "Node"]
+    what = "is no node (a subclass of nodes.Node)" if found is not None else "does not exist"
+    raise GraphError(
+        f"{slot}._target_={target}: {class_name} {what}; {module_name} has: {', '.join(there) or 'none'}"
+        f"{did_you_mean(class_name, there)}"
+    )
+
+
+def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edge], list[str]]:
+    """All edges, and warnings for optional ones that nobody feeds. Raises GraphError for a bad one."""
+    sends = {name: _outputs(name, slot.node) for name, slot in slots.items()}
+    edges: list[Edge] = []
+    warnings: list[str] = []
+    for name, slot in slots.items():
+        inputs = _handlers(name, slot.node)
+        if nodes.is_source(slot.node) and (inputs or slot.reads):
+            raise GraphError(f"{name}: {slot.target} is a source (it has run()), so it can read nothing")
+        if not nodes.is_source(slot.node) and not inputs:
+            raise GraphError(f"{name}: {slot.target} has neither run() nor an on_<message>(self, message: T)")
+        for message in slot.reads:
+            if message not in inputs:
+                raise GraphError(
+                    f"{name}.reads.{message.__name__}: {slot.target} does not take a {message.__name__}; "
+                    f"it takes: {_names(inputs)}"
+                )
+        for message in inputs:
+            senders = ", ".join(other for other, types in sends.items() if message in types)
+            hint = f"set {name}.reads.{message.__name__} to one that does: {senders}" if senders else "no slot does"
+            refusal = f"{name}: nobody sends {slot.target} a {message.__name__}"
+            if message not in slot.reads:
+                raise GraphError(f"{refusal}: reads does not name the slot ({hint})")
+            sender = slot.reads[message].removesuffix("?")
+            if sender not in known:
+                raise GraphError(
+                    f"{name}.reads.{message.__name__}={sender}: no such slot{did_you_mean(sender, known)}; "
+                    f"there are: {', '.join(known)}"
+                )
+            if message not in sends.get(sender, ()):
+                why = (
+                    f"{slots[sender].target} yields {_names(sends[sender])}" if sender in slots else "that slot is off"
+                )
+                if message not in OPTIONAL_MESSAGES:
+                    raise GraphError(f"{refusal}: it reads it from {sender}, but {why} ({hint})")
+                warnings.append(f"{name} gets no {message.__name__}: {sender}: {why}")
+                continue
+            best_effort = slot.reads[message].endswith("?")
+            best_effort |= message.__name__ in slots[sender].placement.best_effort
+            edges.append(Edge(message, sender, name, best_effort))
+    return edges, warnings
+
+
+def order(slots: Collection[str], edges: Collection[Edge]) -> list[str]:
+    """Slot names, every sender before its readers. Raises GraphError for a cycle."""
+    done: list[str] = []
+    while len(done) < len(slots):
+        ready = [n for n in slots if n not in done and all(e.sender in done for e in edges if e.reader == n)]
+        if not ready:
+            path = [next(n for n in slots if n not in done)]
+            while path[-1] not in path[:-1]:
+                path.append(next(e.sender for e in edges if e.reader == path[-1] and e.sender not in done))
+            loop = path[path.index(path[-1]) :][::-1]
+            raise GraphError(f"a cycle: {' -> '.join(loop)}; a node cannot wait for what it causes itself")
+        done += ready
+    return done
+
+
+def _handlers(name: str, node: type[nodes.Node]) -> dict[type, str]:
+    try:
+        return nodes.handlers(node)
+    except TypeError as error:
+        raise GraphError(f"{name}: {error}") from error
+
+
+def _outputs(name: str, node: type[nodes.Node]) -> tuple[type, ...]:
+    try:
+        return nodes.outputs(node)
+    except TypeError as error:
+        raise GraphError(f"{name}: {error}") from error
+
+
+def _names(messages: Collection[type]) -> str:
+    return ", ".join(message.__name__ for message in messages) or "nothing"
+
+
+def _section(slot: Slot) -> dict[str, Any]:
+    """A slot as its part of config.yaml."""
+    placement = {key: value for key, value in vars(slot.placement).items() if value != getattr(Placement(), key)}
+    reads = {message.__name__: sender for message, sender in slot.reads.items()}
+    return {"_target_": slot.target, **({"reads": reads} if reads else {}), **placement, **slot.config}
+
+
+def _resolve_device(device: str) -> str:
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    kind, _, number = device.partition(":")
+    if kind not in ("cpu", "cuda") or (number and not number.isdigit()):
+        raise GraphError(f"device={device}: must be auto, cpu, cuda or cuda:<number>")
+    if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
+        raise GraphError(f"device={device}: this machine has {torch.cuda.device_count()} CUDA devices; use device=cpu")
+    return device

@@ -1,0 +1,54 @@
+"""Which core and how many threads each node gets, so that the processes do not fight over the cores."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from launch.graph import Graph
+
+# Share of the cores by work per frame, measured on whole runs; a slot that is not named counts as 1.
+SHARES: Mapping[str, float] = {"mapper": 4, "mvs": 3, "tracker": 2, "depth_fusion": 1, "dataset": 0.5}
+# Works only when the others have finished: all cores are its own by then.
+LAST = ("evaluator",)
+
+
+def available_cores() -> int:
+    """Cores that this process may use: its affinity, limited by a container's quota."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota = Path("/sys/fs/cgroup/cpu.max")
+    if quota.exists():
+        limit, _, period = quota.read_text().partition(" ")
+        if limit != "max":
+            cores = min(cores, max(1, math.ceil(int(limit) / int(period))))
+    return cores
+
+
+def thread_plan(graph: Graph, cores: int | None = None) -> dict[str, int]:
+    """Threads of each slot: its own `threads`, the number of cores in `cpu`, or its share of all cores.
+
+    The heaviest slot gets at least two threads where there are two cores: it also works when the others wait.
+    """
+    cores = available_cores() if cores is None else cores
+    total = sum(SHARES.get(name, 1) for name in graph.slots if name not in LAST)
+    heaviest = max(graph.slots, key=lambda name: SHARES.get(name, 1))
+    plan = {}
+    for name, slot in graph.slots.items():
+        share = cores if name in LAST else max(1, round(cores * SHARES.get(name, 1) / total))
+        if name == heaviest:
+            share = max(share, min(2, cores))
+        pinned = len(slot.placement.cpu) if slot.placement.cpu else share
+        plan[name] = slot.placement.threads or min(share, pinned)
+    return plan
+
+
+def thread_environment(threads: int) -> dict[str, str]:
+    """Environment that holds OpenMP, BLAS and OpenCV to that many threads, which sleep instead of spinning."""
+    libraries = ("OMP", "MKL", "OPENBLAS", "NUMEXPR", "VECLIB_MAXIMUM", "BLIS")
+    return {f"{library}_NUM_THREADS": str(threads) for library in libraries} | {
+        "OPENCV_FOR_THREADS_NUM": str(threads),
+        "OMP_WAIT_POLICY": "PASSIVE",
+        "GOMP_SPINCOUNT": "0",
+    }

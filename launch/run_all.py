@@ -1,0 +1,68 @@
+"""Starts the whole graph: `python launch/run_all.py dataset=tum dataset.path=... mapper.iterations=300 viewer=off`.
+
+From any directory. `--help` lists slots, choices and parameters; `-m` sweeps; `--inline` runs all in this process.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+# The workspace first (`launch`, `nodes` and `msgs` are generic names), then the user's directory with their own nodes.
+_FIRST = [str(ROOT), str(Path.cwd())]
+sys.path[:] = _FIRST + [path for path in sys.path if path not in (*_FIRST, str(ROOT / "launch"))]
+
+import hydra  # noqa: E402
+from hydra.core.hydra_config import HydraConfig  # noqa: E402
+from omegaconf import DictConfig  # noqa: E402
+
+from launch.children import python_path  # noqa: E402
+from launch.compose import CONF, prepare  # noqa: E402
+from launch.jobs import Job, run  # noqa: E402
+from launch.parameters import GraphError  # noqa: E402
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command line; returns the exit code: 0, 1 a node failed, 2 refused, 130 stopped by Ctrl-C."""
+    try:
+        sys.argv[1:] = hydra_arguments(arguments)
+    except GraphError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    os.environ["PYTHONPATH"] = python_path()  # Hydra's launchers start workers that need the workspace too
+    codes: list[int] = []
+
+    @hydra.main(version_base="1.3", config_path="conf", config_name="config")
+    def job(config: DictConfig) -> None:
+        codes.append(run(Job.of(config, HydraConfig.get())))
+
+    job()
+    return codes[-1] if codes else 0
+
+
+def hydra_arguments(arguments: Sequence[str]) -> list[str]:
+    """The command line as Hydra takes it. Raises GraphError for overrides that name nothing there is."""
+    words = ["inline=true" if word == "--inline" else word for word in arguments]
+    conf = Path(_option(words, "--config-path", "-cp") or CONF).absolute()
+    overrides = [word for word in words if "=" in word and not word.startswith("-")]
+    elsewhere = _option(words, "--config-dir", "-cd") or any(word.startswith("hydra.searchpath") for word in overrides)
+    prepared = prepare(overrides, conf, all_choices_known=not elsewhere)
+    if {"-m", "--multirun"} & set(words):
+        # each job's output is a numbered directory in the one that was asked for
+        prepared += [f"hydra.sweep.dir={text.partition('=')[2]}" for text in overrides if text.startswith("output=")]
+    return [word for word in words if word not in overrides] + prepared
+
+
+def _option(words: Sequence[str], *names: str) -> str | None:
+    for i, word in enumerate(words):
+        name, _, value = word.partition("=")
+        if name in names:
+            return value or (words[i + 1] if i + 1 < len(words) else None)
+    return None
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

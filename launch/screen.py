@@ -1,0 +1,172 @@
+"""What a run shows: a live table of all nodes on a terminal, now and then a line elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+
+import psutil
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from launch.graph import Graph
+from launch.status import NodeStatus, total
+
+PLAIN_SECONDS = 5.0  # between two lines
+
+
+class Screen:
+    """Shows nothing but notes and warnings: the base of the others."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or Console(highlight=False)
+        self._warned: set[str] = set()
+        self._nodes: dict[str, NodeStatus] = {}
+
+    def start(self, graph: Graph, nodes: dict[str, NodeStatus], processes: dict[str, psutil.Process]) -> None:
+        """`nodes` and `processes` are kept and looked at again at every refresh."""
+        self._graph = graph
+        self._nodes = nodes
+        self._processes = processes
+        self._began = time.monotonic()
+        self.note(f"output: {graph.settings.output}")
+        for warning in graph.warnings:
+            self.note(f"note: {warning}")
+
+    def refresh(self) -> None:
+        for status in self._nodes.values():
+            for text in status.warnings:
+                if f"{status.name}: {text}" not in self._warned:
+                    self._warned.add(f"{status.name}: {text}")
+                    self.note(f"warning: {status.name}: {text}")
+
+    def note(self, text: str) -> None:
+        self.console.print(text, markup=False, soft_wrap=True)
+
+    def stop(self) -> None:
+        pass
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._began
+
+
+class PlainScreen(Screen):
+    """A line every few seconds, for logs and pipes."""
+
+    def start(self, graph: Graph, nodes: dict[str, NodeStatus], processes: dict[str, psutil.Process]) -> None:
+        super().start(graph, nodes, processes)
+        self._next = PLAIN_SECONDS
+        self._last = ""
+
+    def refresh(self) -> None:
+        super().refresh()
+        if self._nodes and self.seconds >= self._next:
+            self._next = self.seconds + PLAIN_SECONDS
+            line = "; ".join(filter(None, (brief(status) for status in self._nodes.values())))
+            if line != self._last:
+                self._last = line
+                self.note(f"{self.seconds:6.1f} s  {line}")
+
+
+class LiveScreen(Screen):
+    """One table, redrawn in place."""
+
+    _live: Live | None = None
+
+    def start(self, graph: Graph, nodes: dict[str, NodeStatus], processes: dict[str, psutil.Process]) -> None:
+        super().start(graph, nodes, processes)
+        self._live = Live(self._table(), console=self.console, auto_refresh=False)
+        self._live.start()
+
+    def refresh(self) -> None:
+        super().refresh()
+        if self._live:
+            self._live.update(self._table(), refresh=True)
+
+    def stop(self) -> None:
+        if self._live:
+            self._live.stop()
+            self._live = None
+
+    def _table(self) -> Table:
+        table = Table(title=f"{self.seconds:.0f} s", title_justify="left", expand=False)
+        for column in ("node", "state", "in", "queue", "out"):
+            table.add_column(column, justify="left" if column in ("node", "state") else "right")
+        table.add_column("progress", min_width=24)
+        table.add_column("skipped")
+        table.add_column("cpu", justify="right")
+        table.add_column("memory", justify="right")
+        for name, status in self._nodes.items():
+            cpu, memory = self._load(name)
+            table.add_row(
+                name,
+                status.state,
+                str(total(status.received) or ""),
+                str(total(status.queue) or ""),
+                str(total(status.sent) or ""),
+                progress(status),
+                figures(status.skipped),
+                cpu,
+                memory,
+            )
+        return table
+
+    def _load(self, name: str) -> tuple[str, str]:
+        """CPU since the last look and resident memory, as the system knows them; empty once the process is gone."""
+        process = self._processes.get(name)
+        if process is not None:
+            with suppress(psutil.Error):
+                memory = process.memory_info().rss
+                return f"{process.cpu_percent():.0f} %", f"{memory / 2**20:.0f} MB"
+        return "", ""
+
+
+def make_screen(kind: str, console: Console | None = None) -> Screen:
+    """The screen of `screen=auto|live|plain|off`: auto is live on a terminal, plain elsewhere."""
+    console = console or Console(highlight=False)
+    if kind == "auto":
+        kind = "live" if console.is_terminal else "plain"
+    return {"live": LiveScreen, "plain": PlainScreen, "off": Screen}[kind](console)
+
+
+def progress(status: NodeStatus) -> str:
+    """What the node counts and its latest values, `frames_expected` shown as frames 12/160."""
+    shown = dict(status.counts)
+    values = dict(status.values)
+    expected = values.pop("frames_expected", None)
+    parts = []
+    for name, value in shown.items():
+        whole = f"/{number(expected)}" if name == "frames" and expected is not None else ""
+        parts.append(f"{number(value)}{whole} {label(name)}")
+    parts += [f"{label(name)} {number(value)}" for name, value in values.items() if isinstance(value, int | float)]
+    return ", ".join(parts)
+
+
+def brief(status: NodeStatus) -> str:
+    """One node in a plain line; nothing for one that has nothing to say."""
+    text = progress(status)
+    waiting = total(status.queue)
+    if waiting:
+        text += f" ({waiting} waiting)"
+    return f"{status.name} {text}" if text else ""
+
+
+def figures(counts: Mapping[str, float]) -> str:
+    return ", ".join(f"{number(value)} {label(name)}" for name, value in counts.items())
+
+
+def label(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def number(value: float) -> str:
+    """Short: 950, 12.3k, 4.56M; three digits for a fraction."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    for size, unit in ((1e6, "M"), (1e4, "k")):
+        if abs(value) >= size:
+            return f"{value / (1e3 if unit == 'k' else size):.3g}{unit}"
+    return str(int(value)) if float(value).is_integer() else f"{value:.3g}"

@@ -1,0 +1,113 @@
+"""What a node's process is told: a JSON file with its class, parameters, addresses and placement."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from launch.graph import Edge, Graph
+from launch.parameters import GraphError
+
+LONGEST_SOCKET_PATH = 107  # bytes that a Unix socket's address holds
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """A short-named directory for sockets and specs, gone when the run is."""
+
+    path: Path
+
+    @staticmethod
+    def create(graph: Graph) -> RunDirectory:
+        """Raises GraphError where no directory has a name short enough for a socket's address."""
+        longest = max((len(_topic(edge)) for edge in graph.edges), default=0)
+        for base in dict.fromkeys((tempfile.gettempdir(), "/tmp")):
+            if (
+                len(os.fsencode(base)) + len("/mvsgs-12345678/") + longest <= LONGEST_SOCKET_PATH
+                and Path(base).is_dir()
+            ):
+                return RunDirectory(Path(tempfile.mkdtemp(prefix="mvsgs-", dir=base)))
+        raise GraphError(
+            f"the path of a socket in {tempfile.gettempdir()} would be longer than {LONGEST_SOCKET_PATH} bytes: "
+            "set TMPDIR to a shorter one, or transport=tcp"
+        )
+
+    def remove(self) -> None:
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+def addresses(graph: Graph, directory: Path) -> dict[str, str]:
+    """Topic (`slot.MessageType`) -> address. Raises GraphError for a host that may not be listened on."""
+    topics = list(dict.fromkeys(_topic(edge) for edge in graph.edges))
+    if graph.settings.transport == "ipc":
+        return {topic: f"ipc://{directory}/{topic}" for topic in topics}
+    found = {}
+    first = graph.settings.port
+    ports = [first + i for i in range(len(topics))] if first is not None else _free_ports(len(topics))
+    for topic, port in zip(topics, ports, strict=True):
+        host = graph.slots[topic.partition(".")[0]].placement.host or graph.settings.host
+        if host not in LOOPBACK and graph.settings.keys is None:
+            raise GraphError(f"{topic} at {host}: beyond loopback only with keys=DIR (CURVE keys); see the README")
+        found[topic] = f"tcp://{host}:{port}"
+    return found
+
+
+def _free_ports(count: int) -> list[int]:
+    """Ports free at this moment: all held open at once, so that they differ, then released."""
+    sockets = [socket.socket() for _ in range(count)]
+    try:
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in sockets]
+    finally:
+        for each in sockets:
+            each.close()
+
+
+def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_fd: int | None) -> dict[str, Any]:
+    """The JSON that `python -m nodes` runs a node from."""
+    slot = graph.slots[name]
+    settings = graph.settings
+    outputs: dict[str, dict[str, Any]] = {}
+    for edge in graph.out_of(name):
+        output = outputs.setdefault(
+            edge.message.__name__, {"type": edge.message.__name__, "address": address[_topic(edge)], "readers": 0}
+        )
+        output["readers"] += 1
+    return {
+        "name": name,
+        "target": slot.target,
+        "config": slot.config,
+        "inputs": [
+            {
+                "type": edge.message.__name__,
+                "slot": edge.sender,
+                "address": address[_topic(edge)],
+                "best_effort": edge.best_effort,
+            }
+            for edge in graph.into(name)
+        ],
+        "outputs": list(outputs.values()),
+        "buffer": settings.buffer,
+        "seed": settings.seed,
+        "threads": threads,
+        "cpu": slot.placement.cpu,
+        "keys": settings.keys,
+        "status_fd": status_fd,
+    }
+
+
+def write_spec(content: dict[str, Any], path: Path) -> Path:
+    path.write_text(json.dumps(content, indent=1))
+    return path
+
+
+def _topic(edge: Edge) -> str:
+    return f"{edge.sender}.{edge.message.__name__}"

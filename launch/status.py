@@ -1,0 +1,44 @@
+"""What the launcher knows of a running node: it writes one JSON line at a time to a pipe, which is folded in here."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass
+class NodeStatus:
+    """The newest figures of one node."""
+
+    name: str
+    state: str = "starting"  # as the node says it: starting, running, ending, done, failed; or external
+    received: Any = field(default_factory=dict)  # messages, by type
+    queue: Any = field(default_factory=dict)  # messages that wait, by type
+    sent: Any = field(default_factory=dict)
+    counts: dict[str, float] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)
+    skipped: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    cpu_seconds: float = 0.0
+    bytes: float = 0.0  # resident memory
+    error: str | None = None
+    traceback: str | None = None
+
+    def update(self, line: bytes | str) -> None:
+        """Folds one JSON line in. Raises ValueError for anything else."""
+        news = json.loads(line)
+        if not isinstance(news, dict):
+            raise ValueError(f"{self.name}: a status must be a JSON object, not {line!r}")
+        for key, value in news.items():
+            name = {"in": "received", "out": "sent"}.get(key, key)
+            if name in self.__dataclass_fields__ and name != "name" and value is not None:
+                setattr(self, name, value)
+
+
+def total(figure: Any) -> int:
+    """Sum of a figure that is a number, or numbers by message type."""
+    if isinstance(figure, Mapping):
+        return sum(total(item) for item in figure.values())
+    return int(figure) if isinstance(figure, int | float) else 0

@@ -1,0 +1,177 @@
+"""Source -> Relay -> Sink, with ways to misbehave."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from msgs import Frame, GroundTruth, Keyframe, Poses
+from nodes import Node
+
+
+class Source(Node):
+    """Frames 0, 1, 2, ... and their GroundTruth."""
+
+    @dataclass
+    class Config:
+        count: int = 5  # frames; 0: until it is told to end
+        period: float = 0.0  # seconds between two
+        size: tuple[int, int] = (4, 6)  # pixels, height and width
+        mode: Literal["gray", "color"] = "gray"
+        path: str | None = None
+        device: str = "auto"
+
+    config: Config
+
+    def run(self) -> Iterator[Frame | GroundTruth]:
+        index = 0
+        while self.config.count == 0 or index < self.config.count:
+            image = np.full((*self.config.size, 3), index % 256, np.uint8)
+            intrinsics = np.ones(4)
+            self.stats.count("frames")
+            yield Frame(index, index / 30, image, intrinsics)
+            yield GroundTruth(index, index / 30, image, intrinsics, None, None)
+            time.sleep(self.config.period)
+            index += 1
+
+
+class Relay(Node):
+    """Every `stride`-th Frame -> Keyframe, and three slices of idle work after each."""
+
+    @dataclass
+    class Config:
+        stride: int = 1  # frames
+        gain: float = 1.0
+        fail_at: int | None = None  # frame at which it raises
+        kill_at: int | None = None  # frame at which it is killed, as by the system
+        hang_at: int | None = None  # frame at which it stops answering, SIGTERM included
+        seconds: float = 0.0  # work per frame
+
+    config: Config
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        self._idle = 0
+
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
+        self._misbehave(frame.index)
+        time.sleep(self.config.seconds)
+        if frame.index % self.config.stride == 0:
+            self._idle = 3
+            self.stats.count("keyframes")
+            unknown = np.zeros((1, 1), np.float32)
+            yield Keyframe(
+                frame.index, frame.timestamp, frame.image, frame.intrinsics, np.eye(4), 1.0, unknown, unknown, 0
+            )
+
+    def on_idle(self) -> list[Keyframe | Poses] | None:
+        if self._idle == 0:
+            return None
+        self._idle -= 1
+        self.stats.count("idle")
+        return []
+
+    def on_end(self) -> Iterator[Poses]:
+        yield Poses(1, np.zeros(1, np.int64), np.eye(4)[None], np.ones(1))
+
+    def _misbehave(self, index: int) -> None:
+        if index == self.config.fail_at:
+            raise ArithmeticError(f"frame {index} cannot be relayed")
+        if index == self.config.kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if index == self.config.hang_at:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            while True:
+                time.sleep(1)
+
+
+class Sink(Node):
+    """Writes what arrived to `output`/sink.json."""
+
+    @dataclass
+    class Config:
+        output: str
+        labels: dict[str, Any] = field(default_factory=dict)
+
+    config: Config
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        self.keyframes: list[int] = []
+        self.truths: list[int] = []
+        self.poses = 0
+        self.seen_upstream: dict[str, Any] = {}
+
+    def on_keyframe(self, keyframe: Keyframe) -> Iterator[None]:
+        self.keyframes.append(keyframe.index)
+        self.stats.count("keyframes")
+        yield from ()
+
+    def on_ground_truth(self, truth: GroundTruth) -> Iterator[None]:
+        self.truths.append(truth.index)
+        yield from ()
+
+    def on_poses(self, poses: Poses) -> Iterator[None]:
+        self.poses += 1
+        yield from ()
+
+    def on_end(self) -> Iterator[None]:
+        threads = os.environ.get("OMP_NUM_THREADS")
+        self.seen_upstream = dict(self.upstream)
+        upstream = {name: stats.get("counts", {}) for name, stats in self.upstream.items()}
+        Path(self.config.output, "sink.json").write_text(
+            json.dumps(
+                {
+                    "keyframes": self.keyframes,
+                    "truths": self.truths,
+                    "poses": self.poses,
+                    "upstream": upstream,
+                    "threads": threads,
+                }
+            )
+        )
+        yield from ()
+
+
+class Bare(Node):
+    """Neither source nor handler."""
+
+
+class Untyped(Node):
+    """Does not say what it takes."""
+
+    def on_frame(self, frame):
+        yield frame
+
+
+class Loop(Node):
+    """Keyframe -> Frame: closes a cycle with Relay."""
+
+    def on_keyframe(self, keyframe: Keyframe) -> Iterator[Frame]:
+        yield Frame(keyframe.index, keyframe.timestamp, keyframe.image, keyframe.intrinsics)
+
+
+class Uncorrected(Node):
+    """A Relay that never sends Poses."""
+
+    @dataclass
+    class Config:
+        device: str = "auto"
+        every: int = 2
+
+    config: Config
+
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe]:
+        if frame.index % self.config.every == 0:
+            unknown = np.zeros((1, 1), np.float32)
+            yield Keyframe(
+                frame.index, frame.timestamp, frame.image, frame.intrinsics, np.eye(4), 1.0, unknown, unknown, 0
+            )
