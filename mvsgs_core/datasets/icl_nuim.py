@@ -1,0 +1,78 @@
+"""ICL-NUIM (Handa et al., "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mvsgs_core.datasets.calibration import lens_for_images
+from mvsgs_core.datasets.files import Layout, images_in
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record, Size
+from mvsgs_core.datasets.tum import pose_from_row, read_trajectory
+
+LAYOUT = Layout(
+    "ICL-NUIM (TUM RGB-D compatible PNGs)",
+    "a folder with rgb/0.png, 1.png, ..., depth/0.png, ... (16-bit, 5000 = 1 m) and groundtruth.txt (or the "
+    "livingRoom0.gt.freiburg it comes as; lines `index tx ty tz qx qy qz qw`)",
+    "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html, for example traj0_frei_png.tar.gz with its .gt.freiburg",
+)
+# Published as fy = -480: the renderer's y axis points up. Turning it down mirrors camera AND world, see `_mirror`.
+_PUBLISHED = Lens((481.2, 480.0, 319.5, 239.5), (480, 640))
+_DEPTH = DepthFormat(per_unit=5000.0)
+_FRAME_RATE = 30.0
+_Y_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+class IclNuim(ImageSequence):
+    """A trajectory of ICL-NUIM, with the y axes of camera and world turned down, so that the system is right-handed.
+
+    Raises FileNotFoundError and ValueError, which say what was expected.
+    """
+
+    def __init__(
+        self,
+        path: str | Path | None = None,
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Size = None,
+        intrinsics: Sequence[float] | str | None = None,
+        distortion: Sequence[float] = (),
+    ) -> None:
+        folder = LAYOUT.folder(path)
+        rgb = folder / "rgb"
+        images = [p for p in images_in(rgb) if p.stem.isdigit()] if rgb.is_dir() else []
+        if not images:
+            raise LAYOUT.missing(f"{rgb} has no 0.png, 1.png, ...")
+        lens, notes = _PUBLISHED, list[str]()
+        if intrinsics is not None:
+            lens, notes = lens_for_images(intrinsics, distortion, images)
+        poses, pose_notes = _poses(folder)
+        records = [
+            Record(int(p.stem) / _FRAME_RATE, p, lens, poses.get(int(p.stem)), folder / "depth" / f"{p.stem}.png")
+            for p in images
+        ]
+        missing = sum(record.world_from_cam is None for record in records)
+        if missing and poses:
+            pose_notes.append(f"{missing} of {len(records)} images have no true pose")
+        super().__init__(records, start=start, stop=stop, stride=stride, size=size, depth_format=_DEPTH)
+        self.warnings += notes + pose_notes
+
+
+def _mirror(pose: np.ndarray) -> np.ndarray:
+    """A pose between left-handed frames (y up) as one between right-handed frames (y down)."""
+    return np.asarray(_Y_DOWN @ pose @ _Y_DOWN)
+
+
+def _poses(folder: Path) -> tuple[dict[int, np.ndarray], list[str]]:
+    files = [p for p in (folder / "groundtruth.txt", *sorted(folder.glob("*.gt.freiburg"))) if p.is_file()]
+    if not files:
+        return {}, ["groundtruth.txt is missing: the trajectory is not scored"]
+    table = read_trajectory(files[0])
+    if len(table) == 0:
+        return {}, [f"{files[0].name} is empty: the trajectory is not scored"]
+    return {int(row[0]): _mirror(pose_from_row(row)) for row in table}, []

@@ -1,0 +1,88 @@
+"""Replica (Straub et al. 2019) as NICE-SLAM rendered it, and other sets in that layout."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mvsgs_core.datasets.calibration import lens_for_images
+from mvsgs_core.datasets.files import Layout, natural_order
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record, Size
+
+LAYOUT = Layout(
+    "Replica (NICE-SLAM layout)",
+    "a folder such as room0 with results/frame000000.jpg, results/depth000000.png, traj.txt (a 4x4 camera to world a "
+    "line) and, in it or beside it, cam_params.json",
+    "the Replica.zip that https://github.com/cvg/nice-slam names in scripts/download_replica.sh",
+)
+_PUBLISHED = Lens((600.0, 600.0, 599.5, 339.5), (680, 1200))
+_DEPTH_PER_METER = 6553.5
+_FRAME_RATE = 30.0  # the set has no timestamps
+
+
+class Replica(ImageSequence):
+    """A room of Replica. Raises FileNotFoundError and ValueError, which say what was expected."""
+
+    def __init__(
+        self,
+        path: str | Path | None = None,
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Size = None,
+        intrinsics: Sequence[float] | str | None = None,
+        distortion: Sequence[float] = (),
+    ) -> None:
+        folder = LAYOUT.folder(path)
+        images = sorted((folder / "results").glob("frame*.*"), key=lambda p: natural_order(p.name))
+        if not images:
+            raise LAYOUT.missing(f"{folder / 'results'} has no frame000000.jpg")
+        lens, per_meter = _camera(folder)
+        notes: list[str] = []
+        if intrinsics is not None:
+            lens, notes = lens_for_images(intrinsics, distortion, images)
+        poses, pose_notes = _poses(folder / "traj.txt")
+        records = []
+        for image in images:
+            digits = re.sub(r"\D", "", image.stem)
+            number = int(digits)
+            pose = poses[number] if number < len(poses) else None
+            records.append(Record(number / _FRAME_RATE, image, lens, pose, image.with_name(f"depth{digits}.png")))
+        missing = sum(record.world_from_cam is None for record in records)
+        if missing and len(poses):
+            pose_notes.append(f"traj.txt has no pose for {missing} of {len(records)} frames")
+        super().__init__(
+            records, start=start, stop=stop, stride=stride, size=size, depth_format=DepthFormat(per_meter)
+        )
+        self.warnings += notes + pose_notes
+
+
+def _camera(folder: Path) -> tuple[Lens, float]:
+    """The lens and how many counts of a depth map are a meter."""
+    for path in (folder / "cam_params.json", folder.parent / "cam_params.json"):
+        if path.is_file():
+            try:
+                c = json.loads(path.read_text())["camera"]
+                lens = Lens((float(c["fx"]), float(c["fy"]), float(c["cx"]), float(c["cy"])), (int(c["h"]), int(c["w"])))
+                return lens, float(c["scale"])
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(f"{path} must hold camera: w, h, fx, fy, cx, cy, scale ({error!r})") from error
+    return _PUBLISHED, _DEPTH_PER_METER
+
+
+def _poses(path: Path) -> tuple[list[np.ndarray | None], list[str]]:
+    """world_from_cam by frame number, None where a line is not finite."""
+    if not path.is_file():
+        return [], [f"{path.name} is missing: the trajectory is not scored"]
+    values = np.array([float(v) for v in path.read_text().split()])
+    if values.size == 0:
+        return [], [f"{path.name} is empty: the trajectory is not scored"]
+    if values.size % 16:
+        raise ValueError(f"{path}: a line must be 16 numbers, a 4x4 camera to world; there are {values.size} in all")
+    return [pose if np.all(np.isfinite(pose)) else None for pose in values.reshape(-1, 4, 4)], []
