@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import importlib
 import random
-from collections.abc import Callable, Iterator
+import resource
+import time
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
 import nodes
 from launch.graph import Graph
-from nodes.parameters import make_config
-
+from msgs import End, Message
+from nodes.runner import Runner, own_stats
 
 Observer = Callable[[str, nodes.Node, Any], None]
 
@@ -21,7 +23,7 @@ def run_inline(graph: Graph, observe: Observer | None = None) -> dict[str, nodes
     """Runs the graph to its end and returns its nodes by slot, so that a test can look into them.
 
     Every message goes all the way down before the next one starts, and a node's idle work is done to its end after
-    each message. `observe(slot, node, message)` sees every message that a slot sends. An exception in a node passes through.
+    each message. `observe(slot, node, message)` sees every message sent. An exception in a node passes through.
     """
     _seed(graph.settings.seed)
     return _Inline(graph, observe or (lambda slot, node, message: None)).run()
@@ -31,44 +33,42 @@ class _Inline:
     def __init__(self, graph: Graph, observe: Observer) -> None:
         self._graph = graph
         self._observe = observe
-        self._nodes = {name: slot.node(make_config(slot.node, slot.config)) for name, slot in graph.slots.items()}
-        self._handlers = {name: nodes.handlers(slot.node) for name, slot in graph.slots.items()}
+        self._runners = {
+            name: Runner(name, slot.node(make_config(slot.node, slot.config))) for name, slot in graph.slots.items()
+        }
 
     def run(self) -> dict[str, nodes.Node]:
-        sources = {name: self._nodes[name].run() for name in self._graph.sources}
+        sources: dict[str, Iterator[Message]] = {name: self._runners[name].source() for name in self._graph.sources}
         while sources:  # two sources take turns, as two processes would
             for name, messages in list(sources.items()):
                 message = next(messages, None)
                 if message is None:
                     del sources[name]
                 else:
-                    self._send(name, message)
-        for name in self._graph.slots:  # senders come before their readers
-            self._end(name)
-        return self._nodes
+                    self._send(name, [message])
+        for name, runner in self._runners.items():  # senders come before their readers
+            self._send(name, runner.end())
+            end = End(runner.node.upstream | {name: self._stats(runner)})
+            for reader in dict.fromkeys(edge.reader for edge in self._graph.out_of(name)):
+                list(self._runners[reader].handle(end))
+        return {name: runner.node for name, runner in self._runners.items()}
 
-    def _send(self, sender: str, message: Any) -> None:
-        self._observe(sender, self._nodes[sender], message)
-        for edge in self._graph.out_of(sender):
-            if edge.message is type(message):
-                self._receive(edge.reader, message)
+    def _send(self, sender: str, messages: Iterable[Message]) -> None:
+        for message in messages:
+            self._observe(sender, self._runners[sender].node, message)
+            for edge in self._graph.out_of(sender):
+                if edge.message is type(message):
+                    self._receive(edge.reader, message)
 
-    def _receive(self, name: str, message: Any) -> None:
-        node = self._nodes[name]
-        self._send_all(name, getattr(node, self._handlers[name][type(message)])(message))
-        while (produced := node.on_idle()) is not None:
-            self._send_all(name, produced)
+    def _receive(self, name: str, message: Message) -> None:
+        runner = self._runners[name]
+        self._send(name, runner.handle(message))
+        while (produced := runner.idle()) is not None:
+            self._send(name, produced)
 
-    def _send_all(self, name: str, produced: Iterator[Any] | list[Any] | None) -> None:
-        for message in produced or ():
-            self._send(name, message)
-
-    def _end(self, name: str) -> None:
-        node = self._nodes[name]
-        for edge in self._graph.into(name):
-            sender = self._nodes[edge.sender]
-            node.upstream |= sender.upstream | {edge.sender: vars(sender.stats).copy()}
-        self._send_all(name, node.on_end())
+    def _stats(self, runner: Runner) -> dict[str, Any]:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # of all nodes together, here
+        return own_stats(runner.node, peak_bytes=peak, busy_seconds=runner.busy_seconds)
 
 
 def _seed(seed: int) -> None:

@@ -1,0 +1,67 @@
+# make demo · make test · make bench · make lint: each sets up what it needs. make setup only installs.
+# Everything lands in .venv and build/; once installed, nothing here needs the network.
+
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
+	command -v $$p >/dev/null 2>&1 && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
+	&& { echo $$p; break; }; done)
+CXX_FOUND := $(shell command -v $${CXX:-c++} || command -v g++ || command -v clang++)
+JOBS ?= $(shell nproc 2>/dev/null || echo 2)
+DEMO_OUTPUT ?= runs/demo
+BIN := .venv/bin
+PACKAGES := .venv/.packages
+STAMP := .venv/.installed
+KERNELS := $(shell find mvsgs_core/csrc -type f 2>/dev/null)
+
+export CMAKE_BUILD_PARALLEL_LEVEL ?= $(JOBS)
+
+.PHONY: setup demo test lint bench bench-quick clean check-system
+
+setup: $(STAMP)
+
+# What the system lacks, in one line with the command that mends it.
+check-system:
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is missing: sudo apt install python3.11 python3.11-venv python3.11-dev"; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "Python's venv is missing: sudo apt install $$(basename $(PYTHON))-venv"; exit 1; }
+	@$(PYTHON) -c 'import os, sysconfig; open(os.path.join(sysconfig.get_paths()["include"], "Python.h"))' 2>/dev/null \
+		|| { echo "Python's headers are missing: sudo apt install $$(basename $(PYTHON))-dev"; exit 1; }
+	@test -n "$(CXX_FOUND)" || { echo "a C++ compiler is missing: sudo apt install g++"; exit 1; }
+
+# Exact versions, all of them: constraints.txt is the complete list. PIP_FLAGS: for example, on Linux without a GPU,
+# PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" spares gigabytes of CUDA packages.
+$(PACKAGES): constraints.txt | check-system
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -r constraints.txt
+	@touch $@
+
+# The package itself, with its C++ kernels: in place, so that an edit of Python needs no reinstallation.
+$(STAMP): $(PACKAGES) pyproject.toml CMakeLists.txt $(KERNELS)
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--no-build-isolation --no-deps -e .
+	@$(BIN)/python -m pip check --quiet || { echo "constraints.txt lacks what pyproject.toml asks for"; exit 1; }
+	@touch $@
+
+demo: setup
+	$(BIN)/python launch/run_all.py dataset=synthetic output=$(DEMO_OUTPUT)
+	@echo "report: file://$(abspath $(DEMO_OUTPUT))/report.html"
+
+test: lint
+	$(BIN)/python -m pytest -n 2
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# Every file in bench/ with a main is a benchmark; rows go to runs/bench/NAME.json.
+BENCHMARKS := $(filter-out __init__ table,$(basename $(notdir $(wildcard bench/*.py))))
+
+bench bench-quick: setup
+	@mkdir -p runs/bench
+	@for name in $(BENCHMARKS); do \
+		$(BIN)/python -m bench.$$name --json runs/bench/$$name.json $(if $(filter bench-quick,$@),--quick) || failed="$$failed $$name"; \
+	done; test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
+
+clean:
+	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find mvsgs_core -name '*.so' -delete
+	find . -name __pycache__ -prune -exec rm -rf {} +
