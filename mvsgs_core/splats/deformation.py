@@ -1,0 +1,96 @@
+"""Splats move with their anchor keyframe when its pose or scale is corrected, and their Adam moments with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvsgs_core import geometry
+from mvsgs_core.splats.map_state import MapState, replace_values
+from mvsgs_core.splats.sh_rotation import sh_rotation
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """X' = scale * rotation @ X + translation, float64, in the mapper's frame."""
+
+    scale: float
+    rotation: np.ndarray  # (3, 3)
+    translation: np.ndarray  # (3,)
+
+    @classmethod
+    def between(cls, old: np.ndarray, new: np.ndarray, scale: float) -> Similarity:
+        """What was seen from pose `old` (4, 4), its depths multiplied by `scale`, and put at pose `new`."""
+        rotation = new[:3, :3] @ old[:3, :3].T
+        return cls(scale, rotation, new[:3, 3] - scale * rotation @ old[:3, 3])
+
+    def moves(self, length: float, tolerance: float = 1e-6) -> bool:
+        """Whether a point within `length` moves by more than `tolerance` of it."""
+        change = abs(self.scale - 1.0) + float(np.abs(self.rotation - np.eye(3)).max())
+        return change + float(np.abs(self.translation).max()) / length > tolerance
+
+
+@torch.no_grad()
+def move_with_anchors(state: MapState, similarities: dict[int, Similarity]) -> int:
+    """Moves all splats whose anchor is a key; returns their number.
+
+    Positions, standard deviations, orientations and spherical harmonics follow. The moments follow the change of
+    variables instead of being zeroed, so that the next step goes on in the direction it was going, in the new frame: a
+    gradient transforms by R / s, the mean with it; the mean of squares by the squares of those coefficients, exact for
+    gradients with uncorrelated components (a rotated diagonal covariance, of which the diagonal is kept).
+    """
+    if not similarities or len(state) == 0:
+        return 0
+    keys = sorted(similarities)
+    lookup = torch.tensor(keys, dtype=torch.int64, device=state.device)
+    position = torch.searchsorted(lookup, state.anchors).clamp(max=len(keys) - 1)
+    chosen = torch.nonzero(lookup[position] == state.anchors)[:, 0]
+    which = position[chosen]
+    ordered = [similarities[key] for key in keys]
+    rotations = np.stack([s.rotation for s in ordered])
+    scale = _rows([s.scale for s in ordered], which)
+    rotation = _rows(rotations, which)
+    translation = _rows([s.translation for s in ordered], which)
+    turn = _rows(left_multiplication(geometry.quaternion_from_rotation(rotations)), which)
+
+    values = {name: value.clone() for name, value in vars(state.detached()).items()}
+    means = values["means"][chosen].to(torch.float64)
+    values["means"][chosen] = (scale[:, None] * _apply(rotation, means) + translation).to(torch.float32)
+    values["log_scales"][chosen] += scale.log().to(torch.float32)[:, None]
+    values["quaternions"][chosen] = _apply(turn, values["quaternions"][chosen].to(torch.float64)).to(torch.float32)
+
+    jacobian = rotation / scale[:, None, None]
+    _move_moments(state, "means", chosen, jacobian)
+    _move_moments(state, "quaternions", chosen, turn)
+    if values["sh"].shape[1] > 1:
+        harmonics = _rows([sh_rotation(r, values["sh"].shape[1]) for r in rotations], which)
+        values["sh"][chosen] = (harmonics @ values["sh"][chosen].to(torch.float64)).to(torch.float32)
+        first, second = state.first["sh"], state.second["sh"]
+        first[chosen] = (harmonics @ first[chosen].to(torch.float64)).to(torch.float32)
+        second[chosen] = (harmonics.square() @ second[chosen].to(torch.float64)).to(torch.float32)
+    replace_values(state, values)
+    return len(chosen)
+
+
+def left_multiplication(q: np.ndarray) -> np.ndarray:
+    """Matrices (K, 4, 4) with L(q) p = q p for quaternions (K, 4), w first."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _move_moments(state: MapState, name: str, chosen: Tensor, jacobian: Tensor) -> None:
+    first, second = state.first[name], state.second[name]
+    first[chosen] = _apply(jacobian, first[chosen].to(torch.float64)).to(torch.float32)
+    second[chosen] = _apply(jacobian.square(), second[chosen].to(torch.float64)).to(torch.float32)
+
+
+def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def _rows(values: object, which: Tensor) -> Tensor:
+    return torch.as_tensor(np.asarray(values, dtype=np.float64), device=which.device)[which]

@@ -1,0 +1,161 @@
+"""Adaptive density control for a map that never stops growing: clone, split, prune; or relocation of dead splats.
+
+3DGS (Kerbl et al. 2023), section 5, resets all opacities every 3,000 iterations and prunes after; an online map has no
+such rhythm, so that opacities decay by a small factor at each round instead, and what no view holds up fades out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mvsgs_core.splats.map_state import PARAMETERS, MapState, replace_values
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.reference import rotation_matrices
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """When and how splats are added and removed during optimization."""
+
+    mode: str = "adaptive"  # "adaptive": clone, split, prune; "relocate": as 3DGS-MCMC; "none"
+    every: int = 100  # iterations between two rounds
+    gradient: float = 3.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
+    split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
+    prune_opacity: float = 0.02  # 0 to 1; below: removed
+    prune_scale: float = 0.5  # largest standard deviation in median depths; above: removed
+    opacity_decay: float = 1.0  # factor on all opacities at each round; 1: none
+    max_splats: int = 1_000_000  # no growth beyond
+
+
+@dataclass(frozen=True)
+class DensityChange:
+    """What one round did."""
+
+    cloned: int = 0
+    split: int = 0
+    pruned: int = 0
+    relocated: int = 0
+
+
+@torch.no_grad()
+def control(state: MapState, config: DensityConfig, median_depth: float, generator: torch.Generator) -> DensityChange:
+    """One round on the gradients accumulated since the last; resets them. Raises ValueError for an unknown mode."""
+    if config.mode not in ("adaptive", "relocate", "none"):
+        raise ValueError(f"no density control {config.mode!r}; there are: adaptive, relocate, none")
+    if len(state) == 0 or config.mode == "none":
+        change = DensityChange()
+    elif config.mode == "relocate":
+        change = _relocate(state, config, median_depth, generator)
+    else:
+        change = _adapt(state, config, median_depth, generator)
+    if config.opacity_decay < 1.0 and config.mode != "none":
+        decay_opacities(state, config.opacity_decay)
+    state.reset_screen()
+    return change
+
+
+def removable(state: MapState, config: DensityConfig, median_depth: float) -> Tensor:
+    """(N,) bool: transparent, or too large for the scene."""
+    transparent = state.splats.opacity_logits < math.log(config.prune_opacity / (1.0 - config.prune_opacity))
+    largest = state.splats.log_scales.max(dim=1).values
+    return transparent | (largest > math.log(config.prune_scale * median_depth))
+
+
+def _adapt(state: MapState, config: DensityConfig, median_depth: float, generator: torch.Generator) -> DensityChange:
+    mean_gradient = state.screen_gradient / state.screen_views.clamp(min=1.0)
+    prune = removable(state, config, median_depth)
+    dense = (mean_gradient > config.gradient) & ~prune
+    room = max(0, config.max_splats - len(state))
+    if int(dense.sum()) > room:  # the worst first
+        order = torch.argsort(torch.where(dense, mean_gradient, -1.0), descending=True, stable=True)
+        dense = torch.zeros_like(dense)
+        dense[order[:room]] = True
+    large = state.splats.log_scales.max(dim=1).values > math.log(config.split_scale * median_depth)
+    clone, split = dense & ~large, dense & large
+    old = state.detached()
+    clones, clone_anchors = _select(old, clone), state.anchors[clone]
+    clone_steps = state.steps[clone]
+    halves = _halves(_select(old, split), generator)
+    half_anchors = state.anchors[split].repeat(2)
+    keep = ~(prune | split)
+    state.keep(keep)
+    state.append(clones, clone_anchors, clone_steps)
+    state.append(halves, half_anchors)
+    return DensityChange(cloned=int(clone.sum()), split=int(split.sum()), pruned=int(prune.sum()))
+
+
+def _halves(splats: Splats, generator: torch.Generator) -> Splats:
+    """Two splats for each, drawn from its density, with standard deviations over 1.6 (3DGS, section 5.2)."""
+    deviations = splats.log_scales.exp()
+    rotation = rotation_matrices(splats.quaternions)
+    drawn = torch.randn((2, len(deviations), 3), generator=generator).to(deviations.device) * deviations
+    offsets = (rotation @ drawn[..., None])[..., 0]
+    doubled = {name: getattr(splats, name).repeat(2, *[1] * (getattr(splats, name).dim() - 1)) for name in PARAMETERS}
+    doubled["means"] = (splats.means + offsets).reshape(-1, 3)
+    doubled["log_scales"] = doubled["log_scales"] - math.log(1.6)
+    return Splats(**doubled)
+
+
+def _relocate(state: MapState, config: DensityConfig, median_depth: float, generator: torch.Generator) -> DensityChange:
+    """Dead splats move onto live ones, drawn by opacity, such that the render changes least.
+
+    Kheradmand et al. 2024 (3DGS as Markov chain Monte Carlo), equation 9: N splats at one place, each of opacity
+    1 - (1 - o)^(1/N), with standard deviations scaled to keep the integral of the rendered splat.
+    """
+    dead = removable(state, config, median_depth)
+    alive = torch.nonzero(~dead)[:, 0]
+    moved = torch.nonzero(dead)[:, 0]
+    if len(moved) == 0 or len(alive) == 0:
+        return DensityChange()
+    values = {name: getattr(state.splats, name).detach().clone() for name in PARAMETERS}
+    opacity = torch.sigmoid(values["opacity_logits"][alive]).cpu().to(torch.float64)
+    drawn = torch.multinomial(opacity, len(moved), replacement=True, generator=generator).to(state.device)
+    copies = torch.bincount(drawn, minlength=len(alive)) + 1
+    sources = torch.nonzero(copies > 1)[:, 0]
+    o = opacity.to(state.device)[sources].clamp(1e-4, 1.0 - 1e-4)
+    shared, shrink = relocation(o, copies[sources])
+    rows = alive[sources]
+    values["opacity_logits"][rows] = torch.logit(shared.clamp(1e-4, 1.0 - 1e-4)).to(torch.float32)
+    values["log_scales"][rows] += shrink.log().to(torch.float32)[:, None]
+    origin = alive[drawn]
+    for name in PARAMETERS:
+        values[name][moved] = values[name][origin]
+    for moments in (state.first, state.second):
+        for value in moments.values():
+            value[moved] = 0.0
+            value[rows] = 0.0
+    state.anchors[moved] = state.anchors[origin]
+    state.steps[moved] = 0
+    replace_values(state, values)
+    return DensityChange(relocated=len(moved))
+
+
+def relocation(opacity: Tensor, copies: Tensor, largest: int = 51) -> tuple[Tensor, Tensor]:
+    """Opacity of each of N copies, and the factor of their standard deviations: (M,), (M,) float64.
+
+    opacity: (M,) in (0, 1); copies: (M,) int64 >= 1, of which at most `largest` count.
+    """
+    n = copies.clamp(max=largest)
+    shared = 1.0 - (1.0 - opacity) ** (1.0 / n)
+    denominator = torch.zeros_like(opacity)
+    for i in range(1, int(n.max()) + 1):
+        term = torch.zeros_like(opacity)
+        for k in range(i):
+            term += math.comb(i - 1, k) * (-1.0) ** k / math.sqrt(k + 1) * shared ** (k + 1)
+        denominator += torch.where(n >= i, term, 0.0)
+    return shared, opacity / denominator.clamp(min=1e-12)
+
+
+@torch.no_grad()
+def decay_opacities(state: MapState, factor: float) -> None:
+    """Multiplies every opacity by `factor` in (0, 1]."""
+    logits = state.splats.opacity_logits
+    logits.copy_(torch.logit((torch.sigmoid(logits) * factor).clamp(1e-5, 1.0 - 1e-5)))
+
+
+def _select(splats: Splats, mask: Tensor) -> Splats:
+    return Splats(**{name: getattr(splats, name)[mask] for name in PARAMETERS})

@@ -1,0 +1,145 @@
+"""map.ply: the layout of 3D Gaussian Splatting that viewers and trainers read, with the shape as an extra property."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mvsgs_core.splats.densities import DENSITIES, gaussian_std_ratio, log_scale_shift, neutral_beta
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.snapshot import Snapshot
+from mvsgs_core.splats.spherical_harmonics import degree_of
+
+FAR = 1e3  # origins farther than this many scene extents stay a comment: float32 positions would lose the detail
+
+
+def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
+    """Writes the map, binary little endian: x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*, and beta.
+
+    Positions are world coordinates, the origin added in float64 before the cast; only where the origin is so far away
+    that float32 would not hold them are they relative to it. A comment `origin x y z` tells what must be added.
+    fold: for viewers that know only Gaussians; the scales are those of the closest Gaussian, and there is no beta. The
+    scale is a logarithm: what multiplies the standard deviation is added to it.
+    """
+    splats = folded(final.splats, final.density) if fold else final.splats
+    extent = float(splats.means.abs().max()) if len(splats) else 0.0
+    far = float(np.abs(final.origin).max()) > FAR * max(extent, 1e-30)
+    origin = final.origin if far else np.zeros(3)
+    means = splats.means.numpy().astype(np.float64) + (final.origin - origin)
+    harmonics = splats.sh.numpy()
+    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)  # all of red, then green, then blue
+    columns = {"x": means[:, 0], "y": means[:, 1], "z": means[:, 2]}
+    columns |= {name: np.zeros(len(splats)) for name in ("nx", "ny", "nz")}
+    columns |= {f"f_dc_{k}": harmonics[:, 0, k] for k in range(3)}
+    columns |= {f"f_rest_{k}": rest[:, k] for k in range(rest.shape[1])}
+    columns["opacity"] = splats.opacity_logits.numpy()
+    columns |= {f"scale_{k}": splats.log_scales[:, k].numpy() for k in range(3)}
+    unit = torch.nn.functional.normalize(splats.quaternions, dim=1).numpy()
+    columns |= {f"rot_{k}": unit[:, k] for k in range(4)}
+    density = "gaussian" if fold else final.density
+    if density != "gaussian":
+        columns["beta"] = splats.betas.numpy()
+    rows = np.empty(len(splats), dtype=[(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        rows[name] = values
+    header = [
+        "ply", "format binary_little_endian 1.0", f"comment density {density}",
+        "comment origin " + " ".join(repr(float(value)) for value in origin), f"element vertex {len(splats)}",
+        *(f"property float {name}" for name in columns), "end_header\n",
+    ]  # fmt: skip
+    with path.open("wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        file.write(rows.tobytes())
+
+
+def folded(splats: Splats, density: str) -> Splats:
+    """The closest plain Gaussians: the shape goes into the scales."""
+    if density == "gaussian":
+        return splats
+    shift = log_scale_shift(splats.betas) if density == "ges_scale" else gaussian_std_ratio(splats.betas).log()
+    return Splats(
+        splats.means, splats.log_scales + shift[:, None], splats.quaternions, splats.opacity_logits, splats.sh,
+        torch.full_like(splats.betas, 2.0),
+    )  # fmt: skip
+
+
+def read_ply(path: Path) -> Snapshot:
+    """A map that any 3DGS program wrote, binary little endian; without keyframes, anchors -1.
+
+    Raises ValueError, saying what is wrong with the file.
+    """
+    data = path.read_bytes()
+    end = data.find(b"end_header\n")
+    if not data.startswith(b"ply") or end < 0:
+        raise ValueError(f"{path} is no PLY file")
+    header = data[:end].decode("ascii", errors="replace").splitlines()
+    if "format binary_little_endian 1.0" not in header:
+        raise ValueError(f"{path}: only binary_little_endian PLY files are read")
+    count, names, origin, density = _parse_header(header, path)
+    body = data[end + len(b"end_header\n") :]
+    dtype = np.dtype([(name, kind) for name, kind in names])
+    if len(body) < count * dtype.itemsize:
+        raise ValueError(f"{path} is cut short: {len(body)} bytes of {count * dtype.itemsize}")
+    rows = np.frombuffer(body, dtype=dtype, count=count)
+    available = {name for name, _ in names}
+    needed = ["x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_2", "rot_0", "rot_3"]
+    missing = [name for name in needed if name not in available]
+    if missing:
+        raise ValueError(f"{path} holds no splats: it lacks {', '.join(missing)}")
+    rest = sorted((name for name in available if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
+    bases = 1 + len(rest) // 3
+    degree_of(bases)
+    sh = np.zeros((count, bases, 3), dtype=np.float32)
+    sh[:, 0] = _columns(rows, ["f_dc_0", "f_dc_1", "f_dc_2"])
+    if rest:
+        sh[:, 1:] = _columns(rows, rest).reshape(count, 3, bases - 1).transpose(0, 2, 1)
+    if density is None:
+        density = "exact" if "beta" in available else "gaussian"
+    betas = rows["beta"] if "beta" in available else np.full(count, neutral_beta(density))
+    splats = Splats(
+        means=_tensor(_columns(rows, ["x", "y", "z"])),
+        log_scales=_tensor(_columns(rows, ["scale_0", "scale_1", "scale_2"])),
+        quaternions=_tensor(_columns(rows, ["rot_0", "rot_1", "rot_2", "rot_3"])),
+        opacity_logits=_tensor(rows["opacity"]),
+        sh=_tensor(sh),
+        betas=_tensor(betas),
+    )
+    return Snapshot(
+        splats=splats, anchors=np.full(count, -1, dtype=np.int64), origin=origin, density=density, iterations=0,
+        keyframes=np.zeros(0, dtype=np.int64), world_from_cam=np.zeros((0, 4, 4)), scale=np.zeros(0),
+        exposures=np.zeros((0, 3, 4), dtype=np.float32),
+    )  # fmt: skip
+
+
+def _parse_header(header: list[str], path: Path) -> tuple[int, list[tuple[str, str]], np.ndarray, str | None]:
+    kinds = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1",
+             "int": "<i4", "int32": "<i4"}  # fmt: skip
+    count, names, origin, density = -1, [], np.zeros(3), None
+    for line in header:
+        words = line.split()
+        match words:
+            case ["element", "vertex", number]:
+                count = int(number)
+            case ["element", other, _]:
+                raise ValueError(f"{path} has an element {other!r}: expected vertices only")
+            case ["property", kind, name] if kind in kinds:
+                names.append((name, kinds[kind]))
+            case ["property", *_]:
+                raise ValueError(f"{path}: cannot read {line!r}")
+            case ["comment", "origin", x, y, z]:
+                origin = np.array([float(x), float(y), float(z)])
+            case ["comment", "density", name] if name in DENSITIES:
+                density = name
+    if count < 0:
+        raise ValueError(f"{path} has no vertices")
+    return count, names, origin, density
+
+
+def _columns(rows: np.ndarray, names: list[str]) -> np.ndarray:
+    return np.stack([rows[name] for name in names], axis=-1)
+
+
+def _tensor(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))

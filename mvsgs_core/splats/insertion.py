@@ -1,0 +1,150 @@
+"""New splats from the depth of a keyframe: where the map does not explain the image yet, thinned by a voxel filter.
+
+MVS-GS, section III.C, "Online Densification". The paper's threshold (40 dB, an RMS error of 0.01) calls nearly every
+textured pixel unexplored, and its voxel of 0.005 m has no meaning at a monocular scale: here both are relative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from mvsgs_core import camera
+from mvsgs_core.splats.densities import neutral_beta
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.spherical_harmonics import C0
+
+
+@dataclass(frozen=True)
+class InsertionConfig:
+    """Where splats are added and what they look like at first."""
+
+    unexplored: bool = True  # False: every pixel with depth makes a point
+    unexplored_psnr: float = 20.0  # dB of one pixel over RGB; below: unexplored (the paper: 40)
+    unexplored_opacity: float = 0.5  # rendered opacity below: unexplored, whatever the color
+    voxel: float = 0.01  # edge of the voxel filter in median depths; 0: no filter
+    initial_scale: float = 0.6  # standard deviation in spacings of the points
+    flatten: float = 0.3  # thickness along the normal over the width; 1: isotropic
+    initial_opacity: float = 0.5  # 0 to 1 (Stereo-GS: 0.1)
+    min_confidence: float = 0.0  # of the depth, 0 to 1; views come filtered already
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points to become splats, camera or world frame, float64 unless said otherwise."""
+
+    positions: np.ndarray  # (N, 3)
+    normals: np.ndarray  # (N, 3), 0 where unknown
+    colors: np.ndarray  # (N, 3) 0 to 1
+    spacing: np.ndarray  # (N,) side of the square of surface that a point stands for, in the positions' unit
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def first(self, count: int) -> Points:
+        """The first `count` of them."""
+        return Points(self.positions[:count], self.normals[:count], self.colors[:count], self.spacing[:count])
+
+
+def unexplored_mask(
+    rendered: np.ndarray, opacity: np.ndarray, observed: np.ndarray, config: InsertionConfig
+) -> np.ndarray:
+    """Pixels (H, W) bool that the map does not explain: PSNR of the pixel below the threshold, or low opacity.
+
+    rendered, observed: (H, W, 3) in [0, 1]; opacity: (H, W). A pixel has PSNR 10 log10(1 / mean over RGB of (r - o)^2).
+    """
+    squared = np.mean((rendered - observed) ** 2, axis=-1)
+    return (squared > 10.0 ** (-config.unexplored_psnr / 10.0)) | (opacity < config.unexplored_opacity)
+
+
+def points_from_depth(
+    depth: np.ndarray, intrinsics: np.ndarray, image: np.ndarray, normals: np.ndarray | None, mask: np.ndarray
+) -> Points:
+    """Camera-frame points of the masked pixels.
+
+    depth: (h, w), intrinsics (4,) at that size, image (h, w, 3) in [0, 1], normals (h, w, 3) or None, mask (h, w) bool.
+    A pixel stands for a surface of side z / f, more where the surface is known to be slanted.
+    """
+    positions = camera.unproject(depth, intrinsics)[mask]
+    spacing = positions[:, 2] / float(np.sqrt(intrinsics[0] * intrinsics[1]))
+    chosen = np.zeros_like(positions) if normals is None else normals[mask].astype(np.float64)
+    cosine = np.abs(np.sum(chosen * positions, axis=1)) / np.linalg.norm(positions, axis=1)
+    known = np.linalg.norm(chosen, axis=1) > 0.5
+    spacing = np.where(known, spacing / np.sqrt(np.maximum(cosine, 0.25)), spacing)
+    return Points(positions, chosen, image[mask].astype(np.float64), spacing)
+
+
+def voxel_filter(points: Points, edge: float) -> Points:
+    """One point a voxel: the mean position, normal and color, and the side of the surface of all together.
+
+    edge: > 0, in the points' unit. Raises ValueError where the points span more than 2^21 voxels along an axis.
+    """
+    if len(points) == 0:
+        return points
+    cells = np.floor((points.positions - points.positions.min(axis=0)) / edge).astype(np.int64)
+    if cells.max() >= 1 << 21:
+        raise ValueError(f"voxels of {edge:g} are too small for points that span {cells.max() * edge:g}: enlarge voxel")
+    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        sums = np.stack([np.bincount(inverse, column, minlength=len(counts)) for column in values.T], axis=-1)
+        return sums / counts[:, None]
+
+    normals = mean(points.normals)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    area = np.bincount(inverse, points.spacing**2, minlength=len(counts))
+    return Points(
+        mean(points.positions),
+        np.where(length > 0.5, normals / np.maximum(length, 1e-12), 0.0),
+        mean(points.colors),
+        np.sqrt(area),
+    )
+
+
+def splats_from_points(
+    points: Points, world_from_cam: np.ndarray, sh_bases: int, density: str, config: InsertionConfig
+) -> Splats:
+    """Splats in the world frame of `world_from_cam` (4, 4), float32 tensors on the CPU.
+
+    Standard deviations are `initial_scale` spacings, `flatten` of that along a known normal. The shape starts as a
+    Gaussian: beta = 2, or b = 0 for density "ges_scale".
+    """
+    count = len(points)
+    rotation, translation = world_from_cam[:3, :3], world_from_cam[:3, 3]
+    means = points.positions @ rotation.T + translation
+    normals = points.normals @ rotation.T
+    known = np.linalg.norm(normals, axis=1) > 0.5
+    log_scales = np.repeat(np.log(np.maximum(points.spacing * config.initial_scale, 1e-30))[:, None], 3, axis=1)
+    log_scales[known, 2] += np.log(config.flatten)
+    opacity = min(max(config.initial_opacity, 1e-4), 1.0 - 1e-4)
+    sh = np.zeros((count, sh_bases, 3))
+    sh[:, 0] = (points.colors - 0.5) / C0
+    return Splats(
+        means=_tensor(means),
+        log_scales=_tensor(log_scales),
+        quaternions=_tensor(np.where(known[:, None], rotation_to(normals), [1.0, 0.0, 0.0, 0.0])),
+        opacity_logits=_tensor(np.full(count, np.log(opacity / (1.0 - opacity)))),
+        sh=_tensor(sh),
+        betas=_tensor(np.full(count, neutral_beta(density))),
+    )
+
+
+def rotation_to(normals: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4), w first, that turn the z axis onto unit normals (N, 3); any turn for a normal of -z."""
+    x, y, z = normals.T
+    w = 1.0 + z
+    q = np.stack([w, -y, x, np.zeros_like(w)], axis=-1)
+    q = np.where((w > 1e-6)[:, None], q, [0.0, 1.0, 0.0, 0.0])
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def depth_colors(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Colors (h, w, 3) float64 in [0, 1] of an image (H, W, 3) uint8 at the depth map's size."""
+    return camera.resize_image(image, size).astype(np.float64) / 255.0
+
+
+def _tensor(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))

@@ -1,0 +1,281 @@
+"""The online mapper: keyframes with depth in, a map of splats that is optimized between them and refined at the end.
+
+MVS-GS, section III.C. All state is in the mapper's own frame: world coordinates relative to the first keyframe's
+position, in units of its median depth, so that float32 holds wherever the world's origin and scale are.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from mvsgs_core import camera
+from mvsgs_core.splats import density_control, optimizer
+from mvsgs_core.splats.deformation import Similarity, move_with_anchors
+from mvsgs_core.splats.density_control import DensityConfig
+from mvsgs_core.splats.insertion import (
+    InsertionConfig,
+    depth_colors,
+    points_from_depth,
+    splats_from_points,
+    unexplored_mask,
+    voxel_filter,
+)  # fmt: skip
+from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
+from mvsgs_core.splats.map_state import MapState
+from mvsgs_core.splats.optimizer import LearningRates
+from mvsgs_core.splats.rasterizer import Render, rasterize
+from mvsgs_core.splats.schedule import Schedule
+from mvsgs_core.splats.snapshot import Snapshot, snapshot
+from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """The mapper's parameters; lengths are relative to the scene's median depth."""
+
+    iterations: int = 60  # owed for each keyframe, half on the local window, half on all (the paper: 1,000)
+    refinement: int = 500  # iterations over all keyframes after the last
+    window: int = 6  # newest keyframes that the local half trains on
+    realtime: bool = False  # a new keyframe cancels what older ones are owed
+    max_pixels: int | None = None  # area of the training images; None: as they come
+    sh_degree: int = 0  # 0 to 3
+    seed: int = 0
+    device: str = "cpu"
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    skipping: SkipConfig = field(default_factory=SkipConfig)
+    rates: LearningRates = field(default_factory=LearningRates)
+    insertion: InsertionConfig = field(default_factory=InsertionConfig)
+    density_control: DensityConfig = field(default_factory=DensityConfig)
+
+
+@dataclass
+class MapperLog:
+    """What was counted, timed and refused, for the report."""
+
+    counts: dict[str, float] = field(default_factory=dict)
+    skipped: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def count(self, name: str, n: float = 1) -> None:
+        self.counts[name] = self.counts.get(name, 0) + n
+
+    def skip(self, what: str, n: float = 1) -> None:
+        self.skipped[what] = self.skipped.get(what, 0) + n
+
+    def refuse(self, name: str, n: float, text: str) -> None:
+        """Counts bad input or a bad step that did not reach the map, and warns once."""
+        self.count(f"refused_{name}", n)
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    @contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+class OnlineMapper:
+    """Builds the map: `add_view`, then `step` while there is something owed, `correct` at any time, `refine` last."""
+
+    def __init__(self, config: MapperConfig | None = None) -> None:
+        self.config = config or MapperConfig()
+        self.state = MapState((self.config.sh_degree + 1) ** 2, torch.device(self.config.device))
+        self.views: list[TrainingView] = []
+        self.schedule = Schedule(self.config.window, self.config.seed)
+        self.log = MapperLog()
+        self.iterations = 0
+        self.origin: np.ndarray | None = None  # (3,) float64 world position of the first keyframe
+        self.unit: float | None = None  # median depth of the first keyframe that has depth, world units
+        self.global_rate = 1.0  # factor on all learning rates: falls during refinement
+        self._latest: dict[int, tuple[np.ndarray, float]] = {}  # corrected poses and scales by keyframe
+        self._generator = torch.Generator().manual_seed(self.config.seed)
+
+    @property
+    def median_depth(self) -> float:
+        """Of the scene, in the mapper's unit: what lengths are related to."""
+        known = [view.median_depth for view in self.views if view.median_depth > 0]
+        return float(np.median(known)) if known else 1.0
+
+    def add_view(self, view: PosedView) -> int:
+        """Takes in a keyframe and adds splats where the map does not explain it; returns their number.
+
+        Without `realtime`, what earlier keyframes are owed is done first, so that the result does not depend on how
+        fast keyframes come. A view with a non-finite pose or intrinsics is refused and counted.
+        """
+        if self.config.realtime:
+            self.log.skip("iterations_realtime", self.schedule.drop())
+        else:
+            while self.step():
+                pass
+        if not (np.isfinite(view.world_from_cam).all() and np.isfinite(view.intrinsics).all() and view.scale > 0):
+            self.log.refuse("views", 1, "a keyframe with a pose or intrinsics that are not finite was refused")
+            return 0
+        depth = self._checked_depth(view)
+        pose, scale = np.asarray(view.world_from_cam, dtype=np.float64), view.scale
+        if view.index in self._latest:
+            pose, scale = self._latest[view.index]
+            depth = depth * np.float32(scale / view.scale)
+        if self.origin is None:
+            self.origin = pose[:3, 3].copy()
+        median = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
+        if self.unit is None and median > 0:
+            self.unit = median
+            for earlier in self.views:
+                earlier.local_from_cam = self._local(earlier.world_from_cam)
+        added = training_view(
+            view, self._local(pose), self.config.max_pixels, self.config.skipping.levels, self.state.device
+        )
+        added.world_from_cam, added.scale, added.median_depth = pose, scale, median / (self.unit or 1.0)
+        self.views.append(added)
+        if added.valid is not None:
+            self.log.refuse(
+                "pixels", int((~added.valid[0]).sum()), "pixels that are not finite were left out of the training"
+            )
+        with self.log.time("insertion"):
+            inserted = self._insert(view, added, depth) if median > 0 else 0
+        self.schedule.owe(self.config.iterations)
+        self.log.count("inserted", inserted)
+        self.log.count("views")
+        return inserted
+
+    def step(self) -> bool:
+        """One owed iteration; False when nothing is owed."""
+        if self.schedule.owed == 0 or not self.views or len(self.state) == 0:
+            self.schedule.drop()
+            return False
+        with self.log.time("optimization"):
+            view = self.views[self.schedule.next(len(self.views))]
+            skip = self.config.skipping
+            done = skip.converged and view.converged(skip.converged_visits, skip.converged_improvement)
+            if done and not self.schedule.chance(skip.converged_keep):
+                self.log.skip("iterations_converged")
+                return True
+            self._train(view)
+        return True
+
+    def refine(self, done: int, total: int) -> None:
+        """Iteration `done` of `total` of the final refinement: any keyframe, full resolution, falling rates."""
+        if not self.views or len(self.state) == 0:
+            return
+        with self.log.time("refinement"):
+            self.global_rate = 0.1 ** (done / max(total, 1))
+            self._train(self.views[self.schedule.next_of_all(len(self.views))], refining=True)
+
+    def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> int:
+        """Takes corrected absolute poses (K, 4, 4) and cumulative scales (K,) of the keyframes `index` (K,).
+
+        Splats move with their anchor keyframe; returns how many did. Poses that are not finite are refused and counted.
+        """
+        moved: dict[int, Similarity] = {}
+        by_index = {view.index: view for view in self.views}
+        for key, pose, s in zip(index.tolist(), np.asarray(world_from_cam, dtype=np.float64), scale.tolist()):
+            if not (np.isfinite(pose).all() and np.isfinite(s) and s > 0):
+                self.log.refuse("poses", 1, "a corrected pose that is not finite was refused")
+                continue
+            self._latest[key] = (pose, s)
+            view = by_index.get(key)
+            if view is None:
+                continue
+            similarity = Similarity.between(view.local_from_cam, self._local(pose), s / view.scale)
+            view.world_from_cam, view.local_from_cam = pose, self._local(pose)
+            view.median_depth *= s / view.scale
+            view.scale = s
+            if similarity.moves(max(view.median_depth, 1e-6)):
+                moved[key] = similarity
+                view.loss_fast = view.loss_slow = float("nan")
+                view.visits_full = 0
+        with self.log.time("correction"):
+            count = move_with_anchors(self.state, moved)
+        self.log.count("corrected_keyframes", len(moved))
+        return count
+
+    def render(self, view: TrainingView, level: int = 0) -> Render:
+        """The map from a keyframe's pose, without gradients."""
+        with torch.no_grad():
+            return rasterize(
+                self.state.detached(), view.local_from_cam, view.intrinsics[level], view.size(level),
+                density=self.config.training.density, near=self.config.training.near * self.median_depth,
+                backend=self.config.training.backend, exposure=view.exposure if self.config.training.exposure else None,
+                antialiased=self.config.training.antialiased, threads=self.config.training.threads,
+            )  # fmt: skip
+
+    def snapshot(self) -> Snapshot:
+        """The map in world units, relative to its origin."""
+        return snapshot(self.state, self.views, self.origin, self.unit, self.config.training.density, self.iterations)
+
+    def _train(self, view: TrainingView, refining: bool = False) -> None:
+        config = self.config
+        factors = optimizer.groups(
+            config.rates, self.median_depth, self.global_rate, config.training.betas, config.training.density
+        )
+        train_once(
+            self.state, view, config.training, config.skipping, factors, config.rates.decay_steps,
+            self.median_depth, refining, self.log,
+        )  # fmt: skip
+        self.iterations += 1
+        self.log.count("iterations")
+        if not refining and self.iterations % config.density_control.every == 0:
+            with self.log.time("density_control"):
+                change = density_control.control(self.state, config.density_control, self.median_depth, self._generator)
+            for name, count in vars(change).items():
+                self.log.count(name, count)
+
+    def _insert(self, view: PosedView, added: TrainingView, depth: np.ndarray) -> int:
+        config = self.config.insertion
+        size = (depth.shape[0], depth.shape[1])
+        valid = depth > 0
+        if view.confidence is not None and config.min_confidence > 0:
+            valid &= view.confidence >= config.min_confidence
+        mask = valid
+        if config.unexplored and len(self.state):
+            level = self._level_of(added, size)
+            render = self.render(added, level)
+            observed = added.target(level).cpu().numpy()
+            unexplored = unexplored_mask(
+                render.color.cpu().numpy(), render.opacity.cpu().numpy(), observed, config
+            ).astype(np.float32)
+            mask = valid & (camera.resize_image(unexplored, size) > 0.5)
+            self.log.skip("points_explored", int(valid.sum() - mask.sum()))
+        intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
+        colors = depth_colors(added.levels[0].cpu().numpy(), size)
+        assert self.unit is not None
+        points = points_from_depth(depth / self.unit, intrinsics, colors, view.normals, mask)
+        if config.voxel > 0 and len(points):
+            before = len(points)
+            points = voxel_filter(points, config.voxel * self.median_depth)
+            self.log.skip("points_voxel_filter", before - len(points))
+        room = self.config.density_control.max_splats - len(self.state)
+        if len(points) > room:
+            self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
+            points = points.first(max(0, room))
+        new = splats_from_points(
+            points, added.local_from_cam, self.state.splats.sh.shape[1], self.config.training.density, config
+        )
+        self.state.append(new, torch.full((len(points),), added.index, dtype=torch.int64))
+        return len(points)
+
+    def _level_of(self, view: TrainingView, size: tuple[int, int]) -> int:
+        """The coarsest pyramid level that still has the depth map's resolution."""
+        fine = [level for level in range(len(view.levels)) if view.size(level)[0] >= size[0]]
+        return fine[-1] if fine else 0
+
+    def _local(self, world_from_cam: np.ndarray) -> np.ndarray:
+        local = world_from_cam.copy()
+        local[:3, 3] = (local[:3, 3] - self.origin) / (self.unit or 1.0)
+        return local
+
+    def _checked_depth(self, view: PosedView) -> np.ndarray:
+        bad = ~np.isfinite(view.depth) | (view.depth < 0)
+        if bad.any():
+            self.log.refuse("depths", int(bad.sum()), "depths that are not finite or negative were left out")
+        return np.where(bad, 0.0, view.depth).astype(np.float32)

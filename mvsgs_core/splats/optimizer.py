@@ -1,0 +1,139 @@
+"""Selective Adam for an online map: only what was seen is stepped, each splat by its own age, never to NaN or Inf."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mvsgs_core import native
+from mvsgs_core.splats.map_state import PARAMETERS, MapState
+
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Rates of a splat's parameters. Lengths are in units of the scene's median depth."""
+
+    means: float = 1.0e-3  # median depths a step, for a new splat
+    means_final: float = 0.05  # share of `means` that an old splat keeps
+    decay_steps: int = 600  # steps of a splat until then, log-linear
+    log_scales: float = 0.01  # natural logarithm a step
+    quaternions: float = 0.003  # a step, of a unit quaternion
+    opacity_logits: float = 0.05  # logit a step
+    sh: float = 0.01  # color a step, degree 0; higher degrees a twentieth
+    betas: float = 1.0e-3  # shape exponent a step
+
+
+@dataclass(frozen=True)
+class Group:
+    """One parameter's step: `low` and `high` bound its values, which is what keeps wild rates finite."""
+
+    name: str
+    rate: float
+    final_rate: float
+    low: float
+    high: float
+    lead: int = 48  # columns of the flattened parameter that take the full rate,
+    tail: float = 1.0  # the others this share of it
+
+
+def groups(rates: LearningRates, median_depth: float, factor: float, train_betas: bool, density: str) -> list[Group]:
+    """The steps of all parameters for a scene of this median depth; `factor` scales all rates (the global decay)."""
+    log_depth = math.log(median_depth)
+    means = rates.means * median_depth * factor
+    beta_range = (-60.0, 60.0) if density == "ges_scale" else (0.1, 20.0)
+    result = [
+        Group("means", means, means * rates.means_final, -1e6 * median_depth, 1e6 * median_depth),
+        Group("log_scales", rates.log_scales * factor, rates.log_scales * factor, log_depth - 14.0, log_depth + 3.0),
+        Group("quaternions", rates.quaternions * factor, rates.quaternions * factor, -1e3, 1e3),
+        Group("opacity_logits", rates.opacity_logits * factor, rates.opacity_logits * factor, -12.0, 12.0),
+        Group("sh", rates.sh * factor, rates.sh * factor, -100.0, 100.0, lead=3, tail=0.05),
+    ]
+    if train_betas:
+        result.append(Group("betas", rates.betas * factor, rates.betas * factor, *beta_range))
+    return result
+
+
+def step(state: MapState, visible: Tensor, steps: list[Group], decay_steps: int, threads: int = 0) -> int:
+    """One Adam step of the `visible` (N,) bool splats from the gradients on `state.splats`; clears the gradients.
+
+    Returns the number of splats refused: a non-finite gradient, or a step that would give a non-finite value, leaves
+    the whole splat (or that parameter and its moments) as it was. The kernel runs on the CPU, its PyTorch twin,
+    `step_reference`, elsewhere. Kingma and Ba 2015, algorithm 1, with one step count a splat.
+    """
+    if len(state) == 0:
+        return 0
+    if state.device.type != "cpu":
+        return step_reference(state, visible, steps, decay_steps)
+    rows: list[list[Tensor]] = [[], [], [], []]
+    settings: list[list[float]] = []
+    for group in steps:
+        parameter: Tensor = getattr(state.splats, group.name)
+        if parameter.grad is None:
+            continue
+        moments = (state.first[group.name], state.second[group.name])
+        for destination, value in zip(rows, (parameter.detach(), parameter.grad, *moments), strict=True):
+            destination.append(value.reshape(len(state), -1))
+        settings.append([group.rate, group.final_rate, group.low, group.high, float(group.lead), group.tail])
+    values, gradients, firsts, seconds = ([tensor.numpy() for tensor in group] for group in rows)
+    if not settings:
+        return 0
+    refused: int = native.load("mapper").adam(
+        values, gradients, firsts, seconds, settings, visible.numpy(), state.steps.numpy(),
+        BETA_1, BETA_2, EPSILON, decay_steps, threads or torch.get_num_threads(),
+    )  # fmt: skip
+    clear_gradients(state)
+    return refused
+
+
+@torch.no_grad()
+def step_reference(state: MapState, visible: Tensor, steps: list[Group], decay_steps: int) -> int:
+    """The same in PyTorch: what runs on a GPU, and what the kernel's test compares with."""
+    active = [group for group in steps if getattr(state.splats, group.name).grad is not None]
+    taken = visible.clone()
+    for group in active:
+        gradient = getattr(state.splats, group.name).grad.reshape(len(state), -1)
+        taken &= torch.isfinite(gradient.abs().sum(dim=1))
+    refused = visible & ~taken
+    state.steps += taken.to(torch.int32)
+    age = state.steps.to(torch.float32).clamp(min=1)[:, None]
+    progress = (age / max(decay_steps, 1)).clamp(max=1.0)
+    for group in active:
+        parameter: Tensor = getattr(state.splats, group.name)
+        value = parameter.detach().reshape(len(state), -1)
+        gradient = parameter.grad.reshape(len(state), -1)  # type: ignore[union-attr]  # active groups have one
+        first = state.first[group.name].reshape(len(state), -1)
+        second = state.second[group.name].reshape(len(state), -1)
+        m = BETA_1 * first + (1 - BETA_1) * gradient
+        v = BETA_2 * second + (1 - BETA_2) * gradient * gradient
+        rate = group.rate * (group.final_rate / group.rate) ** progress if group.rate > 0 else 0.0
+        column = torch.arange(value.shape[1], device=value.device)
+        rate = rate * torch.where(column < group.lead, 1.0, group.tail)
+        update = rate * (m / (1 - BETA_1**age)) / ((v / (1 - BETA_2**age)).sqrt() + EPSILON)
+        stepped = (value - update).clamp(group.low, group.high)
+        finite = torch.isfinite(stepped.abs().sum(dim=1) + m.abs().sum(dim=1) + v.sum(dim=1))
+        refused |= taken & ~finite
+        rows = (taken & finite)[:, None]
+        value.copy_(torch.where(rows, stepped, value))
+        first.copy_(torch.where(rows, m, first))
+        second.copy_(torch.where(rows, v, second))
+    clear_gradients(state)
+    return int(refused.sum())
+
+
+def clear_gradients(state: MapState) -> None:
+    for name in PARAMETERS:
+        getattr(state.splats, name).grad = None
+
+
+@torch.no_grad()
+def normalize_quaternions(state: MapState) -> None:
+    """Unit quaternions again; the rotation does not change, but Adam's step is a fixed angle only at unit length."""
+    q = state.splats.quaternions
+    norm = q.norm(dim=1, keepdim=True)
+    unit = torch.tensor([1.0, 0.0, 0.0, 0.0], device=q.device)
+    q.copy_(torch.where(norm > 1e-6, q / norm.clamp(min=1e-6), unit))

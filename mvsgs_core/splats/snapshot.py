@@ -1,0 +1,58 @@
+"""The map as it leaves the mapper: world units, positions relative to an origin in float64."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from mvsgs_core.splats.keyframes import TrainingView
+from mvsgs_core.splats.map_state import MapState
+from mvsgs_core.splats.model import Splats
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Splats relative to `origin`, in world units, with the keyframes they were made from."""
+
+    splats: Splats  # detached copies, on the CPU
+    anchors: np.ndarray  # (N,) int64 keyframe of each splat
+    origin: np.ndarray  # (3,) float64, world position that `splats.means` are relative to
+    density: str
+    iterations: int
+    keyframes: np.ndarray  # (K,) int64
+    world_from_cam: np.ndarray  # (K, 4, 4) float64, world frame (not relative to the origin)
+    scale: np.ndarray  # (K,) float64
+    exposures: np.ndarray  # (K, 3, 4) float32
+
+
+def snapshot(
+    state: MapState,
+    views: list[TrainingView],
+    origin: np.ndarray | None,
+    unit: float | None,
+    density: str,
+    iterations: int,
+) -> Snapshot:
+    """The state in world units; `unit` is the length of the mapper's unit in the world."""
+    local = state.detached()
+    length = unit or 1.0
+    splats = Splats(**{name: value.cpu().clone() for name, value in local.tensors().items()})
+    splats.means = (splats.means.to(torch.float64) * length).to(torch.float32)
+    splats.log_scales = splats.log_scales + math.log(length)
+    count = len(views)
+    return Snapshot(
+        splats=splats,
+        anchors=state.anchors.cpu().numpy().copy(),
+        origin=np.zeros(3) if origin is None else origin.copy(),
+        density=density,
+        iterations=iterations,
+        keyframes=np.array([view.index for view in views], dtype=np.int64),
+        world_from_cam=np.stack([v.world_from_cam for v in views]) if count else np.zeros((0, 4, 4)),
+        scale=np.array([view.scale for view in views], dtype=np.float64),
+        exposures=np.stack([v.exposure.detach().cpu().numpy() for v in views]).astype(np.float32)
+        if count
+        else np.zeros((0, 3, 4), dtype=np.float32),
+    )

@@ -1,0 +1,153 @@
+"""One training iteration: render a keyframe, compare, step what was seen; and what an iteration leaves out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from mvsgs_core.splats import optimizer
+from mvsgs_core.splats.keyframes import TrainingView
+from mvsgs_core.splats.losses import LossConfig, training_loss
+from mvsgs_core.splats.map_state import MapState
+from mvsgs_core.splats.rasterizer import TILE, rasterize
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """What is rendered and trained."""
+
+    density: str = "gaussian"  # "gaussian", "exact" or "ges_scale"
+    betas: bool = False  # train the shape; without effect for density "gaussian"
+    exposure: bool = False  # train a color affine for each keyframe
+    exposure_rate: float = 1e-3  # learning rate of it
+    antialiased: bool = False
+    near: float = 0.02  # splats nearer than this many median depths are left out
+    backend: str = "auto"
+    threads: int | None = None  # None: all
+    ssim: float = 0.2  # weight of 1 - SSIM; L1 has the rest
+
+
+@dataclass(frozen=True)
+class SkipConfig:
+    """What the optimization leaves out, each with its switch."""
+
+    converged: bool = True  # keyframes whose loss no longer falls are mostly passed over
+    converged_visits: int = 12  # full-resolution visits before a keyframe can count as converged
+    converged_improvement: float = 0.03  # share by which the loss must still fall
+    converged_keep: float = 0.3  # share of the visits that a converged keyframe still gets
+    tiles: bool = True  # tiles of low error are left out
+    tiles_error: float = 0.5  # low: below this share of the view's mean error
+    tiles_every: int = 4  # every so many visits all tiles are rendered, and their errors measured
+    coarse_to_fine: bool = True  # the first visits of a keyframe are at lower resolution
+    coarse_visits: int = 8  # of these, for each level
+    levels: int = 2  # of the image pyramid, full resolution included
+    selective: bool = True  # only splats that were seen are stepped
+
+
+class Log(Protocol):
+    """What an iteration counts into."""
+
+    def count(self, name: str, n: float = 1) -> None: ...
+
+    def skip(self, what: str, n: float = 1) -> None: ...
+
+    def refuse(self, name: str, n: float, text: str) -> None: ...
+
+
+def level_of_visit(view: TrainingView, skipping: SkipConfig) -> int:
+    """Pyramid level of a view's next visit: coarse first."""
+    if not skipping.coarse_to_fine:
+        return 0
+    return max(0, len(view.levels) - 1 - view.visits // skipping.coarse_visits)
+
+
+def busy_tiles(view: TrainingView, skipping: SkipConfig) -> Tensor | None:
+    """Tiles (rows, columns) bool worth training on; None: all, because their errors are unknown or due again."""
+    if view.tile_error is None or view.visits % skipping.tiles_every == 0:
+        return None
+    return view.tile_error > skipping.tiles_error * view.tile_error.mean()
+
+
+def train_once(
+    state: MapState,
+    view: TrainingView,
+    training: TrainingConfig,
+    skipping: SkipConfig,
+    groups: list[optimizer.Group],
+    decay_steps: int,
+    median_depth: float,
+    refining: bool,
+    log: Log,
+) -> None:
+    """One iteration on `view`. What is not finite is refused, counted in `log`, and never reaches the map."""
+    level = 0 if refining else level_of_visit(view, skipping)
+    tiles = busy_tiles(view, skipping) if skipping.tiles and level == 0 and not refining else None
+    exposure = view.exposure.requires_grad_(True) if training.exposure else None
+    render = rasterize(
+        state.splats, view.local_from_cam, view.intrinsics[level], view.size(level),
+        density=training.density, backend=training.backend, exposure=exposure, tile_mask=tiles,
+        near=training.near * median_depth, antialiased=training.antialiased, threads=training.threads,
+    )  # fmt: skip
+    target = view.target(level)
+    masked = target
+    if view.valid is not None:
+        masked = torch.where(view.valid[level][..., None], target, render.color.detach())
+    if tiles is not None:  # equal to the render where nothing was rendered: no loss, no gradient
+        masked = torch.where(pixels_of_tiles(tiles, view.size(level))[..., None], masked, render.color.detach())
+        log.skip("tiles_low_error", int((~tiles).sum()))
+    loss = training_loss(render.color, masked, LossConfig(ssim=training.ssim))
+    view.visits += 1
+    value = float(loss.detach())
+    if not value < float("inf"):
+        optimizer.clear_gradients(state)
+        log.refuse("iterations", 1, "an iteration whose loss was not finite was refused")
+        return
+    loss.backward()  # type: ignore[no-untyped-call]
+    if render.screen.grad is not None:
+        gradient = render.screen.grad.norm(dim=1)
+        state.accumulate_screen(torch.where(torch.isfinite(gradient), gradient, 0.0), render.visible)
+    visible = render.visible if skipping.selective else torch.ones_like(render.visible)
+    refused = optimizer.step(state, visible, groups, decay_steps, training.threads or 0)
+    if refused:
+        log.refuse("steps", refused, "steps of splats with gradients that are not finite were refused")
+    if skipping.selective:
+        log.skip("splats_unseen", len(state) - int(visible.sum()))
+    if exposure is not None:
+        step_exposure(view, training.exposure_rate)
+    if level == 0 and tiles is None:
+        view.record(value)
+        if skipping.tiles:
+            view.tile_error = tile_means((render.color.detach() - target).abs().mean(dim=-1))
+
+
+def tile_means(values: Tensor) -> Tensor:
+    """Mean of an image (H, W) over each tile (rows, columns); tiles at the border are smaller."""
+    pooled = torch.nn.functional.avg_pool2d(values[None, None], TILE, ceil_mode=True, count_include_pad=False)
+    return pooled[0, 0]
+
+
+def pixels_of_tiles(tiles: Tensor, size: tuple[int, int]) -> Tensor:
+    """(H, W) bool: each pixel has its tile's value."""
+    rows = tiles.repeat_interleave(TILE, dim=0)[: size[0]]
+    return rows.repeat_interleave(TILE, dim=1)[:, : size[1]]
+
+
+@torch.no_grad()
+def step_exposure(view: TrainingView, rate: float) -> None:
+    """Adam on the color affine, drawn toward the identity, so that the map and not the exposure explains the color."""
+    gradient = view.exposure.grad
+    view.exposure.grad = None
+    view.exposure.requires_grad_(False)
+    if gradient is None or not bool(torch.isfinite(gradient).all()):
+        return
+    gradient = gradient + 1e-3 * (view.exposure - torch.eye(3, 4, device=view.exposure.device))
+    first, second = view.exposure_moments
+    steps = view.visits
+    first.mul_(optimizer.BETA_1).add_(gradient, alpha=1 - optimizer.BETA_1)
+    second.mul_(optimizer.BETA_2).addcmul_(gradient, gradient, value=1 - optimizer.BETA_2)
+    mean, square = first / (1 - optimizer.BETA_1**steps), second / (1 - optimizer.BETA_2**steps)
+    view.exposure -= rate * mean / (square.sqrt() + 1e-8)
+    view.exposure.clamp_(-4.0, 4.0)

@@ -1,0 +1,165 @@
+"""View, Poses -> SplatMap, Preview: builds the map, optimizes it between keyframes, refines it at the end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from msgs import Poses, Preview, SplatMap, View
+from mvsgs_core.splats.density_control import DensityConfig
+from mvsgs_core.splats.export_ply import write_ply
+from mvsgs_core.splats.insertion import InsertionConfig
+from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.splats.optimizer import LearningRates
+from mvsgs_core.splats.preview import preview_arrays
+from mvsgs_core.splats.training import SkipConfig, TrainingConfig
+from nodes import Node
+
+_SLICE = 0.05  # seconds of optimization in one on_idle
+
+
+class Mapper(Node):
+    """The online mapper as a node.
+
+    Without `realtime` every keyframe gets all its iterations before the next is added, whatever the timing: a slow
+    mapper holds the senders back, and the result is the same in one process as in many.
+    """
+
+    @dataclass
+    class Config:
+        iterations: int = 60  # owed for each keyframe, half on the newest, half on all (the paper: 1000)
+        refinement: int = 500  # iterations over all keyframes at the end
+        window: int = 6  # keyframes of the local half
+        realtime: bool = False  # a new keyframe cancels what older ones are owed
+        max_pixels: int | None = None  # area of the training images; null: as they come
+        density: str = "gaussian"  # gaussian, exact or ges_scale
+        betas: bool = False  # train the shape (exact, ges_scale)
+        sh_degree: int = 0  # of the view-dependent color, 0 to 3
+        exposure: bool = False  # train a color affine for each keyframe
+        unexplored: bool = True  # add splats only where the map does not explain the image
+        unexplored_psnr: float = 20.0  # dB of a pixel; below: unexplored (the paper: 40)
+        voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
+        density_control: str = "adaptive"  # adaptive, relocate or none
+        max_splats: int = 1000000  # no growth beyond
+        skip_converged: bool = True  # pass over keyframes whose loss no longer falls
+        skip_tiles: bool = True  # leave out tiles of low error
+        coarse_to_fine: bool = True  # a keyframe's first visits at half resolution
+        selective: bool = True  # step only the splats that were seen
+        preview_period: float = 1.0  # seconds between previews; 0: none
+        preview_splats: int = 100000  # at most so many in a preview
+        output: str | None = None  # folder for map.ply; null: none is written
+        seed: int = 0
+        threads: int | None = None  # of the rasterizer; null: all
+        device: str = "auto"  # auto, cpu or cuda:0
+
+    config: Config
+
+    def __init__(self, config: Config | None = None) -> None:
+        super().__init__(config)
+        self.mapper = OnlineMapper(mapper_config(self.config))
+        log = self.mapper.log  # one set of counters: what the core counts is what the node reports
+        self.stats.counts, self.stats.skipped = log.counts, log.skipped
+        self.stats.seconds, self.stats.warnings = log.seconds, log.warnings
+        self._last_preview = 0.0
+
+    def on_view(self, view: View) -> Iterator[Preview]:
+        self.mapper.add_view(
+            PosedView(
+                index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
+                depth=view.depth, scale=view.scale, confidence=view.confidence, normals=view.normals,
+            )
+        )  # fmt: skip
+        self._report()
+        yield from self._preview()
+
+    def on_poses(self, poses: Poses) -> Iterator[Preview]:
+        self.mapper.correct(poses.index, poses.world_from_cam, poses.scale)
+        yield from ()
+
+    def on_idle(self) -> list[Preview] | None:
+        deadline = time.perf_counter() + _SLICE
+        if not self.mapper.step():
+            return None
+        while time.perf_counter() < deadline and self.mapper.step():
+            pass
+        self._report()
+        return list(self._preview())
+
+    def on_end(self) -> Iterator[SplatMap]:
+        while self.mapper.step():
+            pass
+        yield self._map(refined=False)
+        for done in range(self.config.refinement):
+            self.mapper.refine(done, self.config.refinement)
+        self._report()
+        if self.config.output is not None:
+            path = Path(self.config.output) / "map.ply"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_ply(path, self.mapper.snapshot())
+            self.stats.values["map_bytes"] = path.stat().st_size
+        yield self._map(refined=True)
+
+    def _report(self) -> None:
+        self.stats.values["splats"] = len(self.mapper.state)
+        self.stats.values["iterations"] = self.mapper.iterations
+        self.stats.values["iterations_owed"] = self.mapper.schedule.owed
+
+    def _map(self, refined: bool) -> SplatMap:
+        final = self.mapper.snapshot()
+        arrays = {name: value.numpy() for name, value in final.splats.tensors().items()}
+        return SplatMap(
+            refined=refined, iterations=final.iterations, density=final.density, origin=final.origin, **arrays,
+            anchors=final.anchors, keyframes=final.keyframes, world_from_cam=final.world_from_cam, scale=final.scale,
+            exposures=final.exposures,
+        )  # fmt: skip
+
+    def _preview(self) -> Iterator[Preview]:
+        now = time.monotonic()
+        period = self.config.preview_period
+        if period <= 0 or now - self._last_preview < period or not self.mapper.views or not len(self.mapper.state):
+            return
+        self._last_preview = now
+        view = self.mapper.views[-1]
+        arrays = preview_arrays(self.mapper, self.config.preview_splats)
+        pose = view.world_from_cam.copy()
+        pose[:3, 3] -= np.zeros(3) if self.mapper.origin is None else self.mapper.origin
+        yield Preview(
+            index=view.index, iterations=self.mapper.iterations, world_from_cam=pose, intrinsics=view.intrinsics[0],
+            image=view.levels[0].cpu().numpy(), **arrays,
+        )  # fmt: skip
+
+
+def mapper_config(config: Mapper.Config) -> MapperConfig:
+    """The core's configuration of the node's parameters; the rest has the core's defaults."""
+    device = config.device
+    if device == "auto":
+        import torch
+
+        device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    return MapperConfig(
+        iterations=config.iterations,
+        refinement=config.refinement,
+        window=config.window,
+        realtime=config.realtime,
+        max_pixels=config.max_pixels,
+        sh_degree=config.sh_degree,
+        seed=config.seed,
+        device=device,
+        training=TrainingConfig(
+            density=config.density, betas=config.betas, exposure=config.exposure, threads=config.threads
+        ),
+        skipping=SkipConfig(
+            converged=config.skip_converged, tiles=config.skip_tiles, coarse_to_fine=config.coarse_to_fine,
+            selective=config.selective,
+        ),
+        rates=LearningRates(),
+        insertion=InsertionConfig(
+            unexplored=config.unexplored, unexplored_psnr=config.unexplored_psnr, voxel=config.voxel
+        ),
+        density_control=DensityConfig(mode=config.density_control, max_splats=config.max_splats),
+    )  # fmt: skip
