@@ -17,9 +17,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
@@ -31,7 +30,6 @@ from nodes.addresses import Keys, TransportError, check_address, save_keys
 
 PEER_GRACE = 1.0  # s between a disconnection and its report: whoever failed first should be heard first
 NEWEST_GOODBYE = 5.0  # s that a best-effort reader has to take its End
-END_INTERVAL = 0.2  # s between the Ends for best-effort readers, which may miss one
 
 
 class PeerLost(TransportError):
@@ -386,39 +384,14 @@ class NewestReader(_Reader):
         self._wake.close()
 
 
-Reader = ReliableReader | NewestReader
+def shut_down() -> None:
+    """Closes what is left and waits until ZeroMQ's threads have sent the last goodbyes and removed the socket files."""
+    zmq.Context.instance().destroy()
 
 
-class Inbox:
-    """All inputs of a node, taken in turn so that none starves another, and its publishers' readers watched."""
-
-    def __init__(self, readers: Sequence[Reader], publishers: Sequence[Publisher]) -> None:
-        self._readers = list(readers)
-        self._publishers = list(publishers)
-        self._poller = zmq.Poller()
-        for reader in readers:
-            self._poller.register(reader.pollable, zmq.POLLIN)
-            self._poller.register(reader.monitor, zmq.POLLIN)
-        for publisher in publishers:
-            self._poller.register(publisher.socket, zmq.POLLIN)
-
-    def wait(self, timeout_s: float) -> None:
-        """Until something arrives on any socket. Raises TransportError for a lost peer or refused keys."""
-        self._poller.poll(round(timeout_s * 1000))
-        for reader in self._readers:
-            reader.watch()
-        for publisher in self._publishers:
-            publisher.watch()
-
-    def receive(self, timeout_s: float) -> tuple[Reader, Any] | None:
-        """The next message with its reader, End included; None when none comes in time."""
-        for attempt_s in (0.0, timeout_s):
-            self.wait(attempt_s)
-            for reader in self._readers:
-                message = reader.take()
-                if message is not None:
-                    self._readers.remove(reader)
-                    self._readers.append(reader)  # its turn comes last now
-                    return reader, message
-                reader.check_peer()
-        return None
+def wait(sockets: Iterable[zmq.Socket[bytes]], timeout_s: float) -> None:
+    """Until something arrives on one of the sockets (`pollable`, `monitor`, `Publisher.socket`) or the time is up."""
+    poller = zmq.Poller()
+    for socket in sockets:
+        poller.register(socket, zmq.POLLIN)
+    poller.poll(round(timeout_s * 1000))

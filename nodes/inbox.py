@@ -1,0 +1,46 @@
+"""All inputs of a node, taken in turn.
+
+A node never waits for one chosen input: in a diamond, where two paths join again, that is a deadlock as soon as the
+other path is full.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from nodes.transport import NewestReader, Publisher, ReliableReader, wait
+
+Reader = ReliableReader | NewestReader
+
+
+class Inbox:
+    """Gives the messages of several readers; watches their publishers, and the readers of this node's publishers."""
+
+    def __init__(self, readers: Sequence[Reader], publishers: Sequence[Publisher]) -> None:
+        self._readers = list(readers)  # in the order of their turns
+        self._publishers = list(publishers)
+        self._sockets = [socket for reader in readers for socket in (reader.pollable, reader.monitor)]
+        self._sockets += [publisher.socket for publisher in publishers]
+
+    def watch(self, timeout_s: float = 0.0) -> None:
+        """Waits until something arrives on any socket. Raises TransportError for a lost peer or refused keys."""
+        wait(self._sockets, timeout_s)
+        for peer in (*self._readers, *self._publishers):
+            peer.watch()
+
+    def receive(self, timeout_s: float) -> tuple[Reader, Any] | None:
+        """The next message with its reader, End included; None when none comes in time.
+
+        Raises TransportError for a lost message or peer, CodecError for a frame that is no message.
+        """
+        for seconds in (0.0, timeout_s) if timeout_s > 0 else (0.0,):
+            self.watch(seconds)
+            for reader in self._readers:
+                message = reader.take()
+                if message is not None:
+                    self._readers.remove(reader)
+                    self._readers.append(reader)  # its turn comes last now
+                    return reader, message
+                reader.check_peer()
+        return None

@@ -1,0 +1,223 @@
+"""One node in this process: its topics opened, its hooks called as messages come, and everything closed at the end.
+
+Life: start, wait for the readers of its topics, run, `on_end` once every input has ended (a source: once `run` is
+exhausted, or SIGINT has come), End on each topic, wait for the goodbyes, done. A failure at any point is reported
+with its traceback and ends the process with exit code 1; the neighbors notice and fail as well.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import queue
+import random
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import msgs
+from msgs import End, Message
+from nodes import Node, is_source
+from nodes.addresses import load_keys
+from nodes.inbox import Inbox, Reader
+from nodes.parameters import make_config
+from nodes.runner import Runner, merge_stats, own_stats, stats_of
+from nodes.spec import Spec
+from nodes.status import Status, peak_bytes
+from nodes.transport import NewestReader, PeerLost, Publisher, ReliableReader, shut_down
+
+POLL = 0.25  # s between looks at signals and lost peers while nothing arrives
+STOP_GRACE = 2.0  # s that a source's current item may take after SIGINT
+
+
+def run(spec: Spec, interrupted: Callable[[], bool]) -> int:
+    """Runs the node to its end; exit code. `interrupted` says whether SIGINT has come: it ends a source."""
+    process = _Process(spec, interrupted)
+    try:
+        process.run()
+    except Exception as error:
+        logging.exception("failed")
+        line = next(iter(str(error).splitlines()), "")
+        process.status.set(
+            "failed",
+            error=f"{type(error).__name__}: {line}",
+            traceback=traceback.format_exc(),
+            peer=isinstance(error, PeerLost),  # the consequence of another node's failure
+        )
+        return 1
+    finally:
+        process.close()
+    return 0
+
+
+def load_node(target: str) -> type[Node]:
+    """The class `module.Class`. Raises TypeError if it is no node, ImportError if it does not exist."""
+    module, _, name = target.rpartition(".")
+    found = getattr(importlib.import_module(module), name, None) if module else None
+    if not (isinstance(found, type) and issubclass(found, Node)):
+        raise TypeError(f"{target} is no node (a subclass of nodes.Node); give module.Class")
+    return found
+
+
+class _Process:
+    def __init__(self, spec: Spec, interrupted: Callable[[], bool]) -> None:
+        self._spec = spec
+        self._interrupted = interrupted
+        self._began = time.monotonic()
+        self._runner: Runner | None = None
+        self._readers: list[Reader] = []
+        self._publishers: dict[str, Publisher] = {}  # by message type
+        self.status = Status(spec.status_fd, self._snapshot)
+
+    def run(self) -> None:
+        self.status.set("starting")
+        node_type = load_node(self._spec.target)
+        self._seed()
+        runner = self._runner = Runner(self._spec.name, node_type(make_config(node_type, self._spec.config)))
+        inbox = self._open()
+        self.status.set("waiting")
+        while not all(self._publishers[o.type].ready(o.readers) for o in self._spec.outputs):
+            inbox.watch(POLL)
+        for publisher in self._publishers.values():
+            publisher.start()
+        self.status.set("running")
+        messages = self._source(runner, inbox) if is_source(node_type) else self._answers(runner, inbox)
+        for message in messages:
+            self._send(message)
+        self.status.set("ending")
+        for message in runner.end():
+            self._send(message)
+        self._finish(runner, inbox)
+        self.status.set("done")
+
+    def close(self) -> None:
+        for end in (*self._publishers.values(), *self._readers):
+            end.close()
+        shut_down()
+        self.status.close()
+
+    def _open(self) -> Inbox:
+        """Readers first: the nodes upstream wait for them, whoever waits here for others."""
+        spec = self._spec
+        keys = None if spec.keys is None else load_keys(Path(spec.keys))
+        for i in spec.inputs:
+            kind = msgs.TYPES[i.type]
+            if i.best_effort:
+                self._readers.append(NewestReader(i.address, kind, topic=i.topic, late=False, keys=keys))
+            else:
+                self._readers.append(ReliableReader(i.address, kind, topic=i.topic, buffer=spec.buffer, keys=keys))
+        for o in spec.outputs:
+            topic = f"{spec.name}.{o.type}"
+            self._publishers[o.type] = Publisher(o.address, topic=topic, buffer=spec.buffer, keys=keys)
+        return Inbox(self._readers, list(self._publishers.values()))
+
+    def _answers(self, runner: Runner, inbox: Inbox) -> Iterator[Message]:
+        """What a node makes of its inputs, and of the time when none waits."""
+        idle = False  # background work is left
+        while not all(reader.ended for reader in self._readers):
+            received = inbox.receive(0.0 if idle else POLL)
+            if received is not None:
+                idle = True
+                yield from runner.handle(received[1])
+            elif idle:
+                produced = runner.idle()
+                idle = produced is not None
+                yield from produced or ()
+
+    def _source(self, runner: Runner, inbox: Inbox) -> Iterator[Message]:
+        """A source runs in a thread: it may hang in a camera's read, and must still be stopped and watched."""
+        source = _Source(runner)
+        deadline = None
+        while deadline is None or time.monotonic() < deadline:
+            if deadline is None and self._interrupted():
+                source.stop()
+                deadline = time.monotonic() + STOP_GRACE
+            try:
+                message = source.take(POLL)
+            except queue.Empty:
+                inbox.watch()
+                continue
+            if message is None:
+                return
+            yield message
+        runner.node.stats.warn(f"{self._spec.name}: its last read did not return within {STOP_GRACE:g} s of Ctrl-C")
+
+    def _send(self, message: Message) -> None:
+        publisher = self._publishers.get(type(message).__name__)
+        if publisher is not None:  # else nobody reads it
+            publisher.send(message)
+
+    def _finish(self, runner: Runner, inbox: Inbox) -> None:
+        node = runner.node
+        own = own_stats(
+            node,
+            wall_seconds=time.monotonic() - self._began,
+            busy_seconds=runner.busy_seconds,
+            cpu_seconds=time.process_time(),
+            peak_bytes=peak_bytes(),
+            received={reader.topic: reader.received for reader in self._readers},
+            best_effort_skipped={r.topic: r.skipped for r in self._readers if isinstance(r, NewestReader)},
+            sent=dict(runner.sent),
+        )
+        end = End(merge_stats(dict(node.upstream), {self._spec.name: own}))
+        for publisher in self._publishers.values():
+            publisher.end(end)
+        open_topics = list(self._publishers.values())
+        while open_topics := [publisher for publisher in open_topics if not publisher.gone()]:
+            inbox.watch(POLL)
+
+    def _seed(self) -> None:
+        random.seed(self._spec.seed)
+        np.random.seed(self._spec.seed)
+        if "torch" in sys.modules:
+            sys.modules["torch"].manual_seed(self._spec.seed)
+
+    def _snapshot(self) -> dict[str, Any]:
+        stats = stats_of(self._runner.node.stats) if self._runner else {}
+        stats.pop("seconds", None)
+        return stats | {
+            "in": {reader.topic: reader.received for reader in self._readers},
+            "queue": {reader.topic: reader.waiting for reader in self._readers},
+            "out": dict(self._runner.sent) if self._runner else {},
+        }
+
+
+class _Source:
+    """A source's `run` in a thread, one message ahead of its taker."""
+
+    def __init__(self, runner: Runner) -> None:
+        self._messages: queue.Queue[Message | None] = queue.Queue(maxsize=1)
+        self._runner = runner
+        self._stopping = False
+        self._error: BaseException | None = None
+        threading.Thread(target=self._run, name="source", daemon=True).start()
+
+    def stop(self) -> None:
+        """The current item is still to be taken; then the stream ends."""
+        self._stopping = True
+
+    def take(self, timeout_s: float) -> Message | None:
+        """The next message, None at the end. Raises queue.Empty when none comes in time, and what `run` raised."""
+        message = self._messages.get(timeout=timeout_s)
+        if self._error is not None:
+            raise self._error
+        return message
+
+    def _run(self) -> None:
+        try:
+            for message in self._runner.source():
+                self._messages.put(message)
+                if self._stopping:
+                    break
+        except BaseException as error:
+            self._error = error
+        self._messages.put(None)
+
+
+__all__ = ["load_node", "merge_stats", "own_stats", "run"]

@@ -1,0 +1,81 @@
+"""What a node's process is told: a JSON file with its class, parameters, topics and placement.
+
+    {"name": "mvs", "target": "nodes.mvs.Mvs", "config": {...},
+     "inputs": [{"type": "Keyframe", "slot": "tracker", "address": "ipc:///tmp/x/tracker.Keyframe",
+                 "best_effort": false}],
+     "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1}],
+     "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "keys": null, "status_fd": null}
+
+`readers` counts those of both kinds; `buffer` is in messages; `keys` is a folder, see `nodes.addresses.load_keys`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import msgs
+
+
+@dataclass(frozen=True)
+class Input:
+    type: str
+    slot: str  # that sends it
+    address: str
+    best_effort: bool = False
+
+    @property
+    def topic(self) -> str:
+        return f"{self.slot}.{self.type}"
+
+
+@dataclass(frozen=True)
+class Output:
+    type: str
+    address: str
+    readers: int
+
+
+@dataclass(frozen=True)
+class Spec:
+    name: str
+    target: str  # module.Class
+    config: Mapping[str, Any]
+    inputs: tuple[Input, ...]
+    outputs: tuple[Output, ...]
+    buffer: int = 4  # messages
+    seed: int = 0
+    threads: int | None = None
+    cpu: tuple[int, ...] | None = None  # cores; None: all
+    keys: str | None = None
+    status_fd: int | None = None
+
+    @staticmethod
+    def read(path: Path) -> Spec:
+        """Raises ValueError, OSError for a file that is no specification."""
+        content = json.loads(path.read_text())
+        spec = _build(Spec, content, str(path))
+        inputs = tuple(_build(Input, item, f"{path}: inputs") for item in spec.inputs)
+        outputs = tuple(_build(Output, item, f"{path}: outputs") for item in spec.outputs)
+        for item in (*inputs, *outputs):
+            if item.type not in msgs.TYPES:
+                raise ValueError(f"{path}: {item.type} is no message; the types are {', '.join(msgs.TYPES)}")
+        cpu = None if spec.cpu is None else tuple(spec.cpu)
+        return Spec(**(vars(spec) | {"inputs": inputs, "outputs": outputs, "cpu": cpu}))
+
+
+def _build(kind: Any, content: Any, where: str) -> Any:
+    names = [field.name for field in fields(kind)]
+    missing = [
+        f.name
+        for f in fields(kind)
+        if f.default is MISSING and (not isinstance(content, dict) or f.name not in content)
+    ]
+    if not isinstance(content, dict) or missing or not set(content) <= set(names):
+        raise ValueError(
+            f"{where}: must be a JSON object of {', '.join(names)}; missing: {', '.join(missing) or 'none'}"
+        )
+    return kind(**content)
