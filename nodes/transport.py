@@ -112,6 +112,7 @@ class Publisher:
         self._max_bytes = max_bytes
         self._started = self._ended = False
         self._keys = keys
+        self._file = Path(address.removeprefix("ipc://")) if address.startswith("ipc") else None
         if keys is not None:
             _guard.enter(keys)
         self.socket = _open(zmq.XPUB, address, keys, max_bytes)
@@ -180,6 +181,8 @@ class Publisher:
             while not self.gone() and time.monotonic() < until:
                 self.socket.poll(20)
         self.socket.close(linger=0)
+        if self._file is not None:
+            self._file.unlink(missing_ok=True)
         if self._keys is not None:
             _guard.leave(self._keys)
 
