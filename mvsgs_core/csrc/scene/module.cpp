@@ -1,0 +1,146 @@
+// Python binding of the scene renderer: see mvsgs_core/scene/renderer.py for what the arrays mean.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/unique_ptr.h>
+#include <nanobind/stl/vector.h>
+#include <omp.h>
+
+#include <stdexcept>
+
+#include "scene.hpp"
+
+namespace nb = nanobind;
+using nb::literals::operator""_a;
+
+namespace {
+
+using scene::Scene;
+using Floats = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Points = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Corners = nb::ndarray<const float, nb::shape<-1, 3, 3>, nb::c_contig, nb::device::cpu>;
+using Coordinates = nb::ndarray<const float, nb::shape<-1, 3, 2>, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Texture = nb::ndarray<const uint8_t, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using Sizes = nb::ndarray<const int32_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Matrix = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
+using Rects = nb::ndarray<const float, nb::shape<-1, 4, 3>, nb::c_contig, nb::device::cpu>;
+
+int thread_count(int threads) { return threads > 0 ? threads : omp_get_max_threads(); }
+
+scene::Vec3 vector_at(const float* p) { return {p[0], p[1], p[2]}; }
+scene::Color color_at(const float* p) { return scene::Color{p[0], p[1], p[2], 0}; }
+
+nb::ndarray<nb::numpy, float> array(std::vector<size_t> shape, float*& data) {
+    size_t n = 1;
+    for (const size_t s : shape) n *= s;
+    data = new float[n];
+    nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<float*>(p); });
+    return nb::ndarray<nb::numpy, float>(data, shape.size(), shape.data(), owner);
+}
+
+scene::Pose pose_of(const Matrix& m) {
+    scene::Pose pose;
+    const double* p = m.data();
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) pose.r[3 * i + j] = static_cast<float>(p[4 * i + j]);
+    pose.t = {static_cast<float>(p[3]), static_cast<float>(p[7]), static_cast<float>(p[11])};
+    return pose;
+}
+
+std::unique_ptr<Scene> make(const Corners& corners, const Coordinates& coordinates, const Indices& patch_of,
+                            const std::vector<Texture>& textures, const Sizes& light_sizes, const Floats& gloss,
+                            const Floats& sky) {
+    const size_t n = corners.shape(0), patches = textures.size();
+    if (coordinates.shape(0) != n || patch_of.shape(0) != n) throw std::invalid_argument("one triangle, one entry");
+    if (light_sizes.shape(0) != patches || gloss.shape(0) != patches) throw std::invalid_argument("one patch, one entry");
+    if (sky.shape(0) != 16) throw std::invalid_argument("sky: horizon, zenith, below, to_sun, sun (3 each), sun_radius");
+    scene::Surfaces surfaces;
+    for (size_t i = 0; i < patches; ++i) {
+        const Texture& t = textures[i];
+        const int32_t* size = light_sizes.data() + 2 * i;
+        if (t.size() == 0 || size[0] < 1 || size[1] < 1) throw std::invalid_argument("empty texture or light map");
+        surfaces.add_patch(t.data(), static_cast<int>(t.shape(0)), static_cast<int>(t.shape(1)), size[0], size[1],
+                           gloss.data()[i]);
+    }
+    std::vector<scene::Corners> triangles;
+    for (size_t i = 0; i < n; ++i) {
+        const float *p = corners.data() + 9 * i, *uv = coordinates.data() + 6 * i;
+        const int32_t patch = patch_of.data()[i];
+        if (patch < 0 || static_cast<size_t>(patch) >= patches) throw std::invalid_argument("patch out of range");
+        const scene::Vec3 a = vector_at(p), ab = vector_at(p + 3) - a, ac = vector_at(p + 6) - a;
+        const scene::Vec3 normal = cross(ab, ac);
+        const float area = length(normal);
+        const float uv_area = std::fabs((uv[2] - uv[0]) * (uv[5] - uv[1]) - (uv[4] - uv[0]) * (uv[3] - uv[1]));
+        const auto& t = textures[patch];
+        const float texels = uv_area * static_cast<float>(t.shape(0)) * static_cast<float>(t.shape(1));
+        triangles.push_back({a, ab, ac});
+        surfaces.triangles.push_back({scene::normalized(normal), {uv[0], uv[2], uv[4]}, {uv[1], uv[3], uv[5]},
+                                      std::sqrt(texels / std::max(area, 1e-20f)), patch});
+    }
+    const float* s = sky.data();
+    const scene::Sky outside{color_at(s), color_at(s + 3), color_at(s + 6), normalized(vector_at(s + 9)), s[15],
+                             color_at(s + 12)};
+    return std::make_unique<Scene>(std::move(surfaces), triangles, outside);
+}
+
+nb::tuple render(const Scene& self, const Matrix& world_from_cam, double fx, double fy, double cx, double cy,
+                 int height, int width, float gloss, const Floats& gloss_light, const Scene* mover,
+                 const Matrix& mover_from_world, int threads) {
+    if (height < 1 || width < 1 || !(fx > 0) || !(fy > 0)) throw std::invalid_argument("size and focal length must be positive");
+    if (gloss_light.shape(0) != 3) throw std::invalid_argument("gloss_light: (3,)");
+    const scene::Camera camera{pose_of(world_from_cam), static_cast<float>(fx), static_cast<float>(fy),
+                               static_cast<float>(cx), static_cast<float>(cy), height, width};
+    const scene::Pose mover_pose = pose_of(mover_from_world);
+    float *color = nullptr, *depth = nullptr;
+    const size_t h = static_cast<size_t>(height), w = static_cast<size_t>(width);
+    auto color_array = array({h, w, 3}, color), depth_array = array({h, w}, depth);
+    {
+        nb::gil_scoped_release release;
+        self.render(camera, gloss, vector_at(gloss_light.data()), mover, mover_pose, thread_count(threads), color, depth);
+    }
+    return nb::make_tuple(color_array, depth_array);
+}
+
+nb::ndarray<nb::numpy, float> direct_light(const Scene& self, const Points& points, const Points& normals,
+                                           const Rects& lights, int rays, uint64_t seed, int threads) {
+    if (normals.shape(0) != points.shape(0)) throw std::invalid_argument("one point, one normal");
+    std::vector<scene::RectLight> rects;
+    for (size_t i = 0; i < lights.shape(0); ++i) {
+        const float* p = lights.data() + 12 * i;
+        rects.push_back({vector_at(p), vector_at(p + 3), vector_at(p + 6), color_at(p + 9)});
+    }
+    float* out = nullptr;
+    auto result = array({points.shape(0), 3}, out);
+    nb::gil_scoped_release release;
+    self.direct_light(points.data(), normals.data(), points.shape(0), rects, rays, seed, thread_count(threads), out);
+    return result;
+}
+
+nb::ndarray<nb::numpy, float> bounced_light(const Scene& self, const Points& points, const Points& normals, int rays,
+                                            uint64_t seed, int threads) {
+    if (normals.shape(0) != points.shape(0)) throw std::invalid_argument("one point, one normal");
+    float* out = nullptr;
+    auto result = array({points.shape(0), 3}, out);
+    nb::gil_scoped_release release;
+    self.bounced_light(points.data(), normals.data(), points.shape(0), rays, seed, thread_count(threads), out);
+    return result;
+}
+
+void set_light(Scene& self, const Points& light) {
+    if (light.shape(0) != self.surfaces.light_texels()) throw std::invalid_argument("one light texel, one entry");
+    for (size_t i = 0; i < light.shape(0); ++i) self.surfaces.light()[i] = color_at(light.data() + 3 * i);
+}
+
+#define BIND(name, m) NB_MODULE(name, m)
+
+}  // namespace
+
+BIND(MVSGS_MODULE, m) {
+    nb::class_<Scene>(m, "Scene")
+        .def(nb::new_(&make), "corners"_a, "coordinates"_a, "patch_of"_a, "textures"_a, "light_sizes"_a, "gloss"_a, "sky"_a)
+        .def("render", &render, "world_from_cam"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a, "height"_a, "width"_a, "gloss"_a,
+             "gloss_light"_a, "mover"_a.none(), "mover_from_world"_a, "threads"_a = 0)
+        .def("direct_light", &direct_light, "points"_a, "normals"_a, "lights"_a, "rays"_a, "seed"_a, "threads"_a = 0)
+        .def("bounced_light", &bounced_light, "points"_a, "normals"_a, "rays"_a, "seed"_a, "threads"_a = 0)
+        .def("set_light", &set_light, "light"_a);
+}

@@ -1,0 +1,138 @@
+"""The embedded scene, rendered on the fly: exact poses, exact depth, any view, and switches for what is difficult."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from .. import geometry
+from ..scene.difficulties import DifficultPath, Difficulties, Sensor
+from ..scene.renderer import Rendering
+from ..scene.stage import SCENES, stage
+from . import Item
+
+FPS = 20.0
+FOCAL = 0.8  # of the image's width: a field of view of 64 degrees
+SUB_FRAMES = 8  # averaged over one exposure
+
+
+class Synthetic:
+    """A sequence through the room or over the landscape."""
+
+    def __init__(
+        self,
+        scene: str = "room",
+        frames: int = 120,
+        size: tuple[int, int] = (240, 320),
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        seed: int = 0,
+        loop: bool = False,
+        threads: int = 0,
+        **difficulties: Any,
+    ) -> None:
+        """scene: "room" or "aerial"; frames: length of the stream at 20 a second; size: (height, width).
+
+        loop: the last frame leads on to the first. threads: 0 takes what OpenMP gives.
+        `difficulties`: the fields of `scene.difficulties.Difficulties`. Raises ValueError for a bad option, with
+        the valid ones.
+        """
+        known = [f.name for f in fields(Difficulties)]
+        unknown = sorted(set(difficulties) - set(known))
+        if unknown:
+            own = ["scene", "frames", "size", "start", "stop", "stride", "seed", "loop", "threads"]
+            raise ValueError(f"synthetic: no option {', '.join(unknown)}; there are: {', '.join(own + known)}")
+        if scene not in SCENES:
+            raise ValueError(f"synthetic: no scene {scene!r}; there are: {', '.join(SCENES)}")
+        if frames < 1 or stride < 1 or start < 0 or len(size) != 2 or min(size) < 8:
+            raise ValueError("synthetic: frames and stride at least 1, start at least 0, size two numbers of at least 8")
+        self.difficulties = Difficulties(**{k: v for k, v in difficulties.items() if v is not None})
+        self.warnings: list[str] = []
+        self.size = (int(size[0]), int(size[1]))
+        self.seed = seed
+        self.threads = threads
+        self.intrinsics = np.array(
+            [FOCAL * self.size[1], FOCAL * self.size[1], (self.size[1] - 1) / 2, (self.size[0] - 1) / 2]
+        )
+        d = self.difficulties
+        moving = frames - min(d.rest, frames) - min(d.pure_rotation, frames) + d.jump
+        self.stage = stage(scene, seed, d.textureless, max(1, moving) if loop else None, d.moving_object)
+        if loop and moving < 240:
+            self.warnings.append(f"synthetic: a loop of {moving} frames is fast; take at least 240")
+        self.path = DifficultPath(self.stage.path, d)
+        self.sensor = Sensor(d, seed)
+        lost = np.random.default_rng([seed, 5]).random(frames) < d.drop
+        self.numbers = [n for n in range(frames)[start:stop:stride] if not lost[n]]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[Item]:
+        for index, _ in enumerate(self.numbers):
+            yield self[index]
+
+    def __getitem__(self, index: int) -> Item:
+        """Frame `index` of the sequence; the same whichever frames were read before."""
+        n = self.numbers[index]
+        d = self.difficulties
+        pose = self.path.pose(n)
+        view = self._view(pose, self.intrinsics, self.size, n)
+        light = view.color
+        if d.motion_blur > 0:
+            # The exposure is centered on the frame's time, where pose and depth are exact.
+            offsets = d.motion_blur * ((np.arange(SUB_FRAMES) + 0.5) / SUB_FRAMES - 0.5)
+            shots = [self._view(self.path.pose(n + o), self.intrinsics, self.size, n + o).color for o in offsets]
+            light = np.mean(shots, axis=0, dtype=np.float32)
+        covered = d.covered > 0 and d.covered_start <= n < d.covered_start + d.covered
+        return Item(
+            index=index,
+            timestamp=n / FPS,
+            image=self.sensor.image(light, n, covered),
+            intrinsics=self.intrinsics.copy(),
+            world_from_cam=self._to_world(pose),
+            depth=view.depth * np.float32(d.scale),
+        )
+
+    def render(
+        self, world_from_cam: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Any view: image (H, W, 3) uint8 RGB, without noise, blur or exposure drift, and depth (H, W) float32.
+
+        world_from_cam (4, 4) in the world of the items' poses (origin and scale included), intrinsics (4,) at `size`.
+        """
+        d = self.difficulties
+        pose = np.array(world_from_cam, dtype=np.float64)
+        pose[:3, 3] = (pose[:3, 3] - d.origin) / d.scale
+        view = self.stage.renderer.render(pose, intrinsics, size, gloss=d.gloss, threads=self.threads)
+        return Sensor(Difficulties(), self.seed).image(view.color, 0), view.depth * np.float32(d.scale)
+
+    def _view(self, pose: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], s: float) -> Rendering:
+        d = self.difficulties
+        moving = d.moving_object > 0
+        return self.stage.renderer.render(
+            pose,
+            intrinsics,
+            size,
+            gloss=d.gloss,
+            mover=self.stage.ball if moving else None,
+            world_from_mover=self._ball_pose(s) if moving else None,
+            threads=self.threads,
+        )
+
+    def _ball_pose(self, s: float) -> np.ndarray:
+        a, b = self.stage.ball_path
+        across = 0.5 - 0.5 * np.cos(2.0 * np.pi * s / 90.0)
+        pose = np.eye(4)
+        pose[:3, 3] = a + across * (b - a)
+        pose[2, 3] += 0.12 * np.linalg.norm(b - a) * abs(np.sin(2.0 * np.pi * s / 17.0))
+        pose[:3, :3] = geometry.so3_exp(np.array([0.09 * s, 0.05 * s, 0.02 * s]))
+        return pose
+
+    def _to_world(self, pose: np.ndarray) -> np.ndarray:
+        world = pose.copy()
+        world[:3, 3] = pose[:3, 3] * self.difficulties.scale + self.difficulties.origin
+        return world

@@ -1,0 +1,53 @@
+"""The scenes by name: what is built, lit and walked through; kept in memory, because building takes seconds."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import room
+from .lighting import Lighting
+from .materials import marbled, rug
+from .patches import blob
+from .path import Path, RoomPath
+from .renderer import SceneRenderer
+
+SCENES = ("room",)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A scene ready to be filmed."""
+
+    renderer: SceneRenderer
+    path: Path
+    ball: SceneRenderer  # stands at its own origin
+    ball_path: tuple[np.ndarray, np.ndarray]  # ends (3,) between which it rolls, scene units
+
+
+@functools.lru_cache(maxsize=4)
+def renderer_of(scene: str, seed: int, textureless: int) -> SceneRenderer:
+    """The scene built and lit; the same object for the same arguments."""
+    return SceneRenderer(room.build(seed, textureless), room.LIGHTING, seed)
+
+
+@functools.lru_cache(maxsize=4)
+def ball_of(radius: float, seed: int) -> SceneRenderer:
+    """A colorful ball of a radius in scene units."""
+    rng = np.random.default_rng([seed, 4])
+    tones = [(196, 60, 40), (236, 214, 160), (40, 90, 140), (240, 240, 232), (60, 130, 80)]
+    skin = marbled(rng, tones, grain=5) if radius > 1.0 else rug(rng, tones)
+    light = Lighting(texel=radius / 4, horizon=(0.5,) * 3, zenith=(0.9,) * 3, below=(0.25,) * 3)
+    ball = blob((0, 0, 0), (radius, radius, radius), skin, rows=16, columns=24)
+    return SceneRenderer([ball], light, seed)
+
+
+def stage(scene: str, seed: int, textureless: int, loop_frames: int | None, moving_object: float) -> Stage:
+    """Raises ValueError for an unknown scene."""
+    if scene not in SCENES:
+        raise ValueError(f"no scene {scene!r}; there are: {', '.join(SCENES)}")
+    ball = ball_of(0.2 * max(moving_object, 0.01), seed)
+    ends = (np.array([0.9, 1.0, 0.5]), np.array([4.3, 3.5, 0.5]))
+    return Stage(renderer_of(scene, seed, textureless), RoomPath(seed, loop_frames), ball, ends)
