@@ -138,7 +138,7 @@ def render(splats: Splats, view: View) -> Render:
         visible=radii > 0,
         radii=radii,
         screen=screen,
-        weight_sum=weight_sum,
-        weight_max=weight_max,
+        weight_sum=weight_sum if view.weights else None,
+        weight_max=weight_max if view.weights else None,
         refused=refused,
     )

@@ -1,0 +1,113 @@
+// Front-to-back blending, tile by tile: splats outside, the 4x4 blocks that a splat's ellipse touches inside, so that a
+// splat's parameters stay in registers and blocks which are full drop out.
+#include <omp.h>
+
+#include "splats/tile.hpp"
+
+namespace splats {
+namespace {
+
+struct Pixels {
+    Lanes transmittance[16], red[16], green[16], blue[16], depth[16];
+};
+
+template <bool Exact, bool Weights>
+int64_t blend_tile(Frame& frame, const Tile& tile, Pixels& pixels) {
+    uint32_t open = 0;  // blocks with a pixel that is not full
+    for (int block = 0; block < 16; ++block) {
+        int row, column;
+        for (int lane = 0; lane < kLanes; ++lane) {
+            const bool inside = tile.pixel(block, lane, row, column);
+            pixels.transmittance[block][lane] = inside ? 1.0f : 0.0f;
+            open |= uint32_t(inside) << block;
+        }
+        pixels.red[block] = pixels.green[block] = pixels.blue[block] = pixels.depth[block] = Lanes{};
+    }
+    int64_t evaluated = 0;
+    uint32_t index = tile.begin;
+    for (; index < tile.end && open; ++index) {
+        Pair& pair = frame.pairs[index];
+        uint32_t blocks = pair.blocks & open, hit = 0;
+        const ScreenSplat& s = frame.splats[pair.splat];
+        if (index + 8 < tile.end) __builtin_prefetch(&frame.splats[frame.pairs[index + 8].splat]);
+        const Placed placed(s, tile);
+        Lanes weight_sum{}, weight_max{};
+        for (; blocks; blocks &= blocks - 1) {
+            const int block = __builtin_ctz(blocks);
+            Lanes u, v, log2_m, power;
+            placed.at(s, block, u, v);
+            const Lanes exponent = log2_alpha<Exact>(s, u, v, log2_m, power);
+            const Lanes before = pixels.transmittance[block];
+            const Ints counted = (exponent >= kLog2MinAlpha) & (before >= kMinTransmittance);
+            evaluated += kLanes;
+            if (!any(counted)) continue;
+            hit |= 1u << block;
+            Lanes weight = before * minimum(exp2_of_negative(exponent), all(kMaxAlpha));
+            weight = counted ? weight : Lanes{};
+            const Lanes after = before - weight;
+            pixels.transmittance[block] = after;
+            pixels.red[block] += s.red * weight;
+            pixels.green[block] += s.green * weight;
+            pixels.blue[block] += s.blue * weight;
+            pixels.depth[block] += s.depth * weight;
+            if (!any(after >= kMinTransmittance)) open &= ~(1u << block);
+            if constexpr (Weights) {
+                weight_sum += weight;
+                weight_max = maximum(weight_max, weight);
+            }
+        }
+        pair.blocks = uint16_t(hit);
+        if constexpr (Weights) {
+            frame.weight_slots[2 * size_t(pair.slot)] = sum(weight_sum);
+            frame.weight_slots[2 * size_t(pair.slot) + 1] = largest(weight_max);
+        }
+    }
+    for (; index < tile.end; ++index) {
+        Pair& pair = frame.pairs[index];
+        pair.blocks = 0;
+        if constexpr (Weights)
+            frame.weight_slots[2 * size_t(pair.slot)] = frame.weight_slots[2 * size_t(pair.slot) + 1] = 0.0f;
+    }
+    return evaluated;
+}
+
+void write(const Frame& frame, const Tile& tile, const Pixels& pixels, float* color, float* depth, float* opacity) {
+    for (int block = 0; block < 16; ++block) {
+        for (int lane = 0; lane < kLanes; ++lane) {
+            int row, column;
+            if (!tile.pixel(block, lane, row, column)) continue;
+            const size_t at = size_t(row) * frame.camera.width + column;
+            const float left = pixels.transmittance[block][lane], covered = 1.0f - left;
+            color[3 * at] = pixels.red[block][lane] + left * frame.background[0];
+            color[3 * at + 1] = pixels.green[block][lane] + left * frame.background[1];
+            color[3 * at + 2] = pixels.blue[block][lane] + left * frame.background[2];
+            depth[at] = covered > 0.0f ? pixels.depth[block][lane] / covered : 0.0f;
+            opacity[at] = covered;
+        }
+    }
+}
+
+template <bool Exact, bool Weights>
+void blend_all(Frame& frame, float* color, float* depth, float* opacity, int threads) {
+    const int tiles = frame.tiles_x * frame.tiles_y;
+    int64_t evaluated = 0;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : evaluated)
+    for (int index = 0; index < tiles; ++index) {
+        const Tile tile(frame, index);
+        Pixels pixels;
+        evaluated += blend_tile<Exact, Weights>(frame, tile, pixels);
+        write(frame, tile, pixels, color, depth, opacity);
+    }
+    frame.exponentials = evaluated;
+}
+
+}  // namespace
+
+void blend(Frame& frame, bool weights, float* color, float* depth, float* opacity, int threads) {
+    if (weights) frame.weight_slots.resize(2 * size_t(frame.pair_count));
+    auto* chosen = frame.exact ? (weights ? blend_all<true, true> : blend_all<true, false>)
+                               : (weights ? blend_all<false, true> : blend_all<false, false>);
+    chosen(frame, color, depth, opacity, threads);
+}
+
+}  // namespace splats

@@ -1,0 +1,147 @@
+// What a forward pass computes and a backward pass reads again: splats on the image, and their pairs with tiles.
+#pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+#include <memory>
+#include <new>
+#include <utility>
+#include <vector>
+
+#include "splats/lanes.hpp"
+
+namespace splats {
+
+constexpr int kTile = 16;              // pixels; 16 blocks of 4x4, one vector each
+constexpr float kBlur = 0.3f;          // px^2 on the diagonal of the image covariance
+constexpr float kMaxAlpha = 0.99f;
+constexpr float kMinTransmittance = 1e-4f;
+constexpr float kLog2MinAlpha = -7.994353436858858f;  // log2(1 / 255)
+constexpr float kMinCompensation = 0.005f;
+constexpr float kMaxVariance = 1e16f;  // px^2
+constexpr float kMinQuaternion = 1e-8f;
+constexpr float kMaxReach = 1e12f;
+constexpr float kMinBeta = 0.1f, kMaxBeta = 20.0f;
+constexpr float kCenterM = 1e-6f;      // the exact density is flat below this m
+constexpr float kSqrtHalfLog2e = 0.8493218002880191f;  // sqrt(log2(e) / 2)
+constexpr float kHalfLog2e = 0.7213475204444817f;
+
+// Grow-only memory without initialization, aligned to cache lines.
+template <class T>
+class Buffer {
+   public:
+    T* resize(size_t count) {
+        if (count > capacity_) {
+            release();
+            capacity_ = count + count / 4 + 64;
+            data_ = static_cast<T*>(::operator new(capacity_ * sizeof(T), std::align_val_t(64)));
+        }
+        return data_;
+    }
+    T& operator[](size_t i) { return data_[i]; }
+    const T& operator[](size_t i) const { return data_[i]; }
+    T* data() { return data_; }
+    const T* data() const { return data_; }
+    Buffer() = default;
+    Buffer(const Buffer&) = delete;
+    Buffer& operator=(const Buffer&) = delete;
+    ~Buffer() { release(); }
+
+   private:
+    void release() {
+        if (data_) ::operator delete(data_, std::align_val_t(64));
+        data_ = nullptr;
+        capacity_ = 0;
+    }
+    T* data_ = nullptr;
+    size_t capacity_ = 0;
+};
+
+struct Camera {
+    double rotation[3][3];  // world_from_cam
+    double center[3];       // of the camera, world
+    float fx, fy, cx, cy;   // px
+    int width, height;
+    float near;
+    float slope_min[2], slope_max[2];  // limits of x/z and y/z in the Jacobian
+};
+
+// Read-only parameters; shapes as in model.py.
+struct Parameters {
+    const float *means, *log_scales, *quaternions, *opacity_logits, *sh, *betas;
+    int64_t count;
+    int bases, degree;
+    bool exact, antialiased;
+};
+
+// A splat on the image, one cache line. With d = pixel - mean: u = pitch_u (dx - shear dy), v = pitch_v dy;
+// Gaussian: log2(alpha) = log2_opacity - u^2 - v^2; exact: m = u^2 + v^2 and
+// log2(alpha) = log2_opacity - log2(e)/2 m^(beta/2). The mean is split, for dx keeps its precision far from the corner.
+struct alignas(64) ScreenSplat {
+    float whole_x, whole_y, part_x, part_y;  // mean = whole + part, px
+    float pitch_u, shear, pitch_v;
+    float log2_opacity;
+    float red, green, blue, depth;
+    float half_beta;
+    float radius;        // px, 0 = not visible
+    uint32_t slot;       // first of the splat's pairs
+    uint32_t slot_count;
+};
+
+// The ellipse alpha = 1/255: where it ends on a row is shear dy +- sqrt(reach - pitch_v^2 dy^2) / pitch_u.
+struct Footprint {
+    float half_height;  // of the box, px
+    float turn;         // dy at which the ellipse reaches furthest right
+    float inverse_pitch_u, pitch_v_squared, reach;
+};
+
+struct Pair {
+    uint32_t splat;
+    uint32_t slot;    // place in the order by splat: where the backward pass leaves this pair's sums
+    uint16_t blocks;  // which of the tile's 4x4 blocks the ellipse touches; after blending: which got color
+};
+
+struct Frame {
+    Camera camera;
+    bool exact = false, antialiased = false;
+    int degree = 0, tiles_x = 0, tiles_y = 0;
+    float background[3] = {0, 0, 0};
+    int64_t refused = 0, pair_count = 0, visible_count = 0, exponentials = 0;
+    Buffer<ScreenSplat> splats;      // by splat index
+    Buffer<Footprint> footprints;    // by splat index
+    Buffer<uint32_t> order, order_scratch, depth_keys, depth_keys_scratch;
+    std::vector<std::vector<Pair>> chunk_pairs;
+    std::vector<std::vector<uint32_t>> chunk_tiles;
+    Buffer<uint32_t> chunk_counts;   // (chunks, tiles)
+    Buffer<Pair> pairs;              // by tile, front to back
+    Buffer<uint32_t> tile_begin;     // (tiles + 1)
+    Buffer<Lanes> slots;             // by splat: sums of one pair each
+    Buffer<float> weight_slots;      // by splat: (sum, max) of the blending weights of one pair
+};
+
+struct Gradients {
+    float *means, *log_scales, *quaternions, *opacity_logits, *sh, *betas, *screen;
+    double* pose;  // (3, 4): of the rotation and of the camera's center
+    int64_t refused = 0;
+};
+
+// Projects and orders the splats and pairs them with the tiles they touch. tile_mask may be null.
+void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int threads);
+
+// Blends all tiles; color (H, W, 3), depth (H, W), opacity (H, W). weights: fill frame.weight_slots as well.
+void blend(Frame& frame, bool weights, float* color, float* depth, float* opacity, int threads);
+
+// Sums of one pair, as they lie in a slot (through kSumLane).
+enum Sum { kRed, kGreen, kBlue, kDepth, kAlpha, kU, kV, kUU, kUV, kVV, kBeta };
+
+// Fills frame.slots from the gradients of the outputs; depth_gradient and opacity_gradient may be null.
+void blend_backward(Frame& frame, const float* color, const float* depth, const float* opacity,
+                    const float* color_gradient, const float* depth_gradient, const float* opacity_gradient,
+                    int threads);
+
+// Sums the slots of every splat and takes them to its parameters and to the pose.
+void project_backward(Frame& frame, const Parameters& parameters, Gradients& gradients, int threads);
+
+}  // namespace splats

@@ -1,0 +1,123 @@
+// Sixteen floats side by side in the compiler's own vector type: one AVX-512 register, two AVX2 or four SSE ones.
+#pragma once
+
+#include <cstdint>
+#if defined(__AVX512F__) || defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+#pragma GCC diagnostic ignored "-Wpsabi"  // every function here is inlined: no ABI is crossed
+
+namespace splats {
+
+constexpr int kLanes = 16;
+typedef float Lanes __attribute__((vector_size(64)));
+typedef int32_t Ints __attribute__((vector_size(64)));  // also masks: -1 true, 0 false
+
+#define SPLATS_INLINE static inline __attribute__((always_inline))
+#define SPLATS_INLINE_MEMBER inline __attribute__((always_inline))
+
+SPLATS_INLINE Lanes all(float value) { return Lanes{} + value; }
+SPLATS_INLINE Lanes minimum(Lanes a, Lanes b) { return a < b ? a : b; }
+SPLATS_INLINE Lanes maximum(Lanes a, Lanes b) { return a > b ? a : b; }
+
+SPLATS_INLINE bool any(Ints mask) {
+#if defined(__AVX512F__)
+    return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask) != 0;
+#elif defined(__AVX2__)
+    const __m256i* halves = reinterpret_cast<const __m256i*>(&mask);
+    const __m256i both = _mm256_or_si256(halves[0], halves[1]);
+    return !_mm256_testz_si256(both, both);
+#else
+    int32_t joined = 0;
+    for (int i = 0; i < kLanes; ++i) joined |= mask[i];
+    return joined != 0;
+#endif
+}
+
+// 2^x for -126 < x <= 0, relative error 8e-8 plus rounding; other lanes give garbage (the caller masks them).
+// Minimax polynomial of degree 5 on [-1, 0].
+SPLATS_INLINE Lanes exp2_of_negative(Lanes x) {
+    const Ints whole = __builtin_convertvector(x, Ints);  // toward zero
+    const Lanes f = x - __builtin_convertvector(whole, Lanes);
+    Lanes p = 9.387883376e-04f * f + 9.188611733e-03f;
+    p = p * f + 5.527972258e-02f;
+    p = p * f + 2.401721892e-01f;
+    p = p * f + 6.931422526e-01f;
+    p = p * f + 9.999999251e-01f;
+    return (Lanes)((Ints)p + (whole << 23));
+}
+
+// 2^x with x limited to [-126, 126]. Minimax polynomial of degree 5 on [0, 1].
+SPLATS_INLINE Lanes exp2_limited(Lanes x) {
+    x = minimum(maximum(x, all(-126.0f)), all(126.0f));
+    const Ints whole = __builtin_convertvector(x + 128.0f, Ints) - 128;
+    const Lanes f = x - __builtin_convertvector(whole, Lanes);
+    Lanes p = 1.877576675e-03f * f + 8.989340090e-03f;
+    p = p * f + 5.582631805e-02f;
+    p = p * f + 2.401536170e-01f;
+    p = p * f + 6.931530732e-01f;
+    p = p * f + 9.999999251e-01f;
+    return (Lanes)((Ints)p + (whole << 23));
+}
+
+// log2(x) of positive normal x: mantissa in [sqrt(1/2), sqrt(2)), log2(1 + f) = f P(f), P of degree 8.
+SPLATS_INLINE Lanes log2_of_positive(Lanes x) {
+    const Ints bits = (Ints)x;
+    const Ints exponent = (bits - 0x3f3504f3) >> 23;
+    const Lanes f = (Lanes)(bits - (exponent << 23)) - 1.0f;
+    Lanes p = 1.258370513e-01f * f - 2.072697619e-01f;
+    p = p * f + 2.157156012e-01f;
+    p = p * f - 2.389448187e-01f;
+    p = p * f + 2.879162483e-01f;
+    p = p * f - 3.607036829e-01f;
+    p = p * f + 4.809106429e-01f;
+    p = p * f - 7.213473468e-01f;
+    p = p * f + 1.442695004e+00f;
+    return p * f + __builtin_convertvector(exponent, Lanes);
+}
+
+#define SPLATS_MERGE(a, b, ...)                                              \
+    (__builtin_shufflevector(a, b, __VA_ARGS__))
+
+// One step of the sums below: halves of width 8, 4, 2, 1 of `a` and `b` are added crosswise.
+SPLATS_INLINE Lanes merge8(Lanes a, Lanes b) {
+    return SPLATS_MERGE(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+           SPLATS_MERGE(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+}
+SPLATS_INLINE Lanes merge4(Lanes a, Lanes b) {
+    return SPLATS_MERGE(a, b, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27) +
+           SPLATS_MERGE(a, b, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
+}
+SPLATS_INLINE Lanes merge2(Lanes a, Lanes b) {
+    return SPLATS_MERGE(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
+           SPLATS_MERGE(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+}
+SPLATS_INLINE Lanes merge1(Lanes a, Lanes b) {
+    return SPLATS_MERGE(a, b, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30) +
+           SPLATS_MERGE(a, b, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
+}
+
+// The sums over the lanes of sixteen vectors, in one vector: lane kSumLane[i] holds the sum of v[i].
+SPLATS_INLINE Lanes sums(const Lanes (&v)[16]) {
+    const Lanes a0 = merge8(v[0], v[1]), a1 = merge8(v[2], v[3]), a2 = merge8(v[4], v[5]), a3 = merge8(v[6], v[7]);
+    const Lanes a4 = merge8(v[8], v[9]), a5 = merge8(v[10], v[11]), a6 = merge8(v[12], v[13]);
+    const Lanes a7 = merge8(v[14], v[15]);
+    const Lanes b0 = merge4(a0, a1), b1 = merge4(a2, a3), b2 = merge4(a4, a5), b3 = merge4(a6, a7);
+    return merge1(merge2(b0, b1), merge2(b2, b3));
+}
+// Vector i = (8-bit, 4-bit, 2-bit, 1-bit merges): bit 0 of i chose the half of 8 lanes, bit 3 the single lane.
+constexpr int kSumLane[16] = {0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15};
+
+SPLATS_INLINE float sum(Lanes v) {
+    float total = 0.0f;
+    for (int i = 0; i < kLanes; ++i) total += v[i];
+    return total;
+}
+SPLATS_INLINE float largest(Lanes v) {
+    float best = v[0];
+    for (int i = 1; i < kLanes; ++i) best = v[i] > best ? v[i] : best;
+    return best;
+}
+
+}  // namespace splats

@@ -1,0 +1,156 @@
+// Python bindings of the rasterizer and of the losses. Arrays come in as they lie in memory; nothing is copied.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/unique_ptr.h>
+#include <omp.h>
+
+#include <cmath>
+#include <mutex>
+
+#include "splats/frame.hpp"
+
+namespace nb = nanobind;
+using namespace splats;
+
+namespace {
+
+template <class T, class... Shape>
+using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
+using In = Array<const float>;
+using Out = Array<float>;
+
+// Frames come back here, so that the next view finds its memory warm.
+class Pool {
+   public:
+    std::unique_ptr<Frame> take() {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (free_.empty()) return std::make_unique<Frame>();
+        std::unique_ptr<Frame> frame = std::move(free_.back());
+        free_.pop_back();
+        return frame;
+    }
+    void give(std::unique_ptr<Frame> frame) {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (free_.size() < 4) free_.push_back(std::move(frame));
+    }
+
+   private:
+    std::mutex mutex_;
+    std::vector<std::unique_ptr<Frame>> free_;
+};
+
+Pool& pool() {
+    static Pool* instance = new Pool;  // lives as long as the process: frames may come back at its very end
+    return *instance;
+}
+
+// What Python holds between the forward and the backward pass.
+struct Pass {
+    std::unique_ptr<Frame> frame = pool().take();
+    Pass() = default;
+    Pass(const Pass&) = delete;
+    ~Pass() { pool().give(std::move(frame)); }
+};
+
+Parameters parameters(const Frame& frame, In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas) {
+    return {means.data(), log_scales.data(), quaternions.data(), opacity_logits.data(), sh.data(), betas.data(),
+            int64_t(means.shape(0)), int(sh.shape(1)), frame.degree, frame.exact, frame.antialiased};
+}
+
+int thread_count(int threads) { return std::max(1, threads > 0 ? threads : omp_get_max_threads()); }
+
+std::unique_ptr<Pass> forward(In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas,
+                              Array<const double> pose, std::tuple<float, float, float, float> intrinsics, float near,
+                              std::tuple<float, float, float> background, bool exact, bool antialiased, int degree,
+                              nb::object tile_mask, bool weights, int threads, Out color, Out depth, Out opacity,
+                              Out radii) {
+    auto pass = std::make_unique<Pass>();
+    Frame& frame = *pass->frame;
+    Camera& camera = frame.camera;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) camera.rotation[i][j] = pose.data()[4 * i + j];
+        camera.center[i] = pose.data()[4 * i + 3];
+    }
+    std::tie(camera.fx, camera.fy, camera.cx, camera.cy) = intrinsics;
+    std::tie(frame.background[0], frame.background[1], frame.background[2]) = background;
+    camera.height = int(color.shape(0));
+    camera.width = int(color.shape(1));
+    camera.near = near;
+    const float margin_x = 0.3f * 0.5f * camera.width / camera.fx, margin_y = 0.3f * 0.5f * camera.height / camera.fy;
+    camera.slope_min[0] = -(camera.cx + 0.5f) / camera.fx - margin_x;
+    camera.slope_max[0] = (camera.width - 0.5f - camera.cx) / camera.fx + margin_x;
+    camera.slope_min[1] = -(camera.cy + 0.5f) / camera.fy - margin_y;
+    camera.slope_max[1] = (camera.height - 0.5f - camera.cy) / camera.fy + margin_y;
+    frame.exact = exact;
+    frame.antialiased = antialiased;
+    frame.degree = degree;
+    frame.tiles_x = (camera.width + kTile - 1) / kTile;
+    frame.tiles_y = (camera.height + kTile - 1) / kTile;
+    const Parameters p = parameters(frame, means, log_scales, quaternions, opacity_logits, sh, betas);
+    Array<const bool> mask;
+    if (!tile_mask.is_none()) mask = nb::cast<Array<const bool>>(tile_mask);
+    {
+        const nb::gil_scoped_release released;
+        bin(frame, p, mask.is_valid() ? mask.data() : nullptr, thread_count(threads));
+        blend(frame, weights, color.data(), depth.data(), opacity.data(), thread_count(threads));
+        for (int64_t i = 0; i < p.count; ++i) radii.data()[i] = frame.splats[i].radius;
+    }
+    return pass;
+}
+
+int64_t backward(Pass& pass, In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas, In color,
+                 In depth, In opacity, In color_gradient, nb::object depth_gradient, nb::object opacity_gradient,
+                 int threads, Out on_means, Out on_log_scales, Out on_quaternions, Out on_opacity_logits, Out on_sh,
+                 Out on_betas, Out on_screen, Array<double> on_pose) {
+    Frame& frame = *pass.frame;
+    const Parameters p = parameters(frame, means, log_scales, quaternions, opacity_logits, sh, betas);
+    In of_depth, of_opacity;
+    if (!depth_gradient.is_none()) of_depth = nb::cast<In>(depth_gradient);
+    if (!opacity_gradient.is_none()) of_opacity = nb::cast<In>(opacity_gradient);
+    Gradients gradients{on_means.data(), on_log_scales.data(), on_quaternions.data(), on_opacity_logits.data(),
+                        on_sh.data(), on_betas.data(), on_screen.data(), on_pose.data(), 0};
+    const nb::gil_scoped_release released;
+    blend_backward(frame, color.data(), depth.data(), opacity.data(), color_gradient.data(),
+                   of_depth.is_valid() ? of_depth.data() : nullptr,
+                   of_opacity.is_valid() ? of_opacity.data() : nullptr, thread_count(threads));
+    project_backward(frame, p, gradients, thread_count(threads));
+    return gradients.refused;
+}
+
+// (sum, max) of the blending weights of every splat; the pass must have been made with weights.
+void weights(const Pass& pass, Out weight_sum, Out weight_max) {
+    const Frame& frame = *pass.frame;
+    const size_t count = weight_sum.shape(0);
+    for (size_t i = 0; i < count; ++i) {
+        const ScreenSplat& s = frame.splats[i];
+        float sum = 0.0f, most = 0.0f;
+        for (uint32_t k = s.slot; k < s.slot + s.slot_count; ++k) {
+            sum += frame.weight_slots[2 * size_t(k)];
+            most = std::max(most, frame.weight_slots[2 * size_t(k) + 1]);
+        }
+        weight_sum.data()[i] = sum;
+        weight_max.data()[i] = most;
+    }
+}
+
+}  // namespace
+
+#define SPLATS_MODULE(name) NB_MODULE(name, m)
+SPLATS_MODULE(MVSGS_MODULE) {
+    nb::set_leak_warnings(false);  // a render may well outlive the interpreter's other modules
+    nb::class_<Pass>(m, "Pass")
+        .def_prop_ro("refused", [](const Pass& pass) { return pass.frame->refused; })
+        .def_prop_ro("pairs", [](const Pass& pass) { return pass.frame->pair_count; })
+        .def_prop_ro("exponentials", [](const Pass& pass) { return pass.frame->exponentials; });
+    m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("pose"),
+          nb::arg("intrinsics"), nb::arg("near"), nb::arg("background"), nb::arg("exact"), nb::arg("antialiased"),
+          nb::arg("degree"), nb::arg("tile_mask").none(), nb::arg("weights"), nb::arg("threads"), nb::arg("color"),
+          nb::arg("depth"), nb::arg("opacity"), nb::arg("radii"));
+    m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
+          nb::arg("color"), nb::arg("depth"), nb::arg("opacity"), nb::arg("color_gradient"),
+          nb::arg("depth_gradient").none(), nb::arg("opacity_gradient").none(), nb::arg("threads"),
+          nb::arg("on_means"), nb::arg("on_log_scales"), nb::arg("on_quaternions"), nb::arg("on_opacity_logits"),
+          nb::arg("on_sh"), nb::arg("on_betas"), nb::arg("on_screen"), nb::arg("on_pose"));
+    m.def("weights", &weights);
+}

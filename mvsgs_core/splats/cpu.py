@@ -1,0 +1,107 @@
+"""The C++ rasterizer behind PyTorch's autograd: tensors go in as they lie in memory, nothing is copied."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mvsgs_core import native
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.rasterizer import Render, View
+
+
+class _Rasterize(torch.autograd.Function):
+    """(parameters, screen, pose) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor,
+        betas: Tensor, screen: Tensor, pose: Tensor, view: View, extra: dict[str, Any],
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        height, width = view.size
+        parameters = [t.detach().contiguous() for t in (means, log_scales, quaternions, opacity_logits, sh, betas)]
+        color = torch.empty(height, width, 3)
+        depth, opacity = torch.empty(height, width), torch.empty(height, width)
+        radii = torch.empty(len(means))
+        passed = native.load("splats").forward(
+            *parameters,
+            pose=pose.detach().contiguous(),
+            intrinsics=view.intrinsics,
+            near=view.near,
+            background=view.background,
+            exact=view.density == "exact",
+            antialiased=view.antialiased,
+            degree=view.degree,
+            tile_mask=view.tile_mask,
+            weights=view.weights,
+            threads=view.threads,
+            color=color,
+            depth=depth,
+            opacity=opacity,
+            radii=radii,
+        )
+        extra.update(passed=passed, radii=radii)
+        ctx.passed, ctx.threads = passed, view.threads
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*parameters, color, depth, opacity)
+        return color, depth, opacity
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        *parameters, color, depth, opacity = ctx.saved_tensors
+        on_color, on_depth, on_opacity = (None if g is None else g.contiguous() for g in gradients)
+        results = [torch.empty_like(parameter) for parameter in parameters]
+        on_screen = torch.empty(len(parameters[0]), 2)
+        on_pose = torch.zeros(4, 4, dtype=torch.float64)
+        native.load("splats").backward(
+            ctx.passed,
+            *parameters,
+            color=color,
+            depth=depth,
+            opacity=opacity,
+            color_gradient=torch.zeros_like(color) if on_color is None else on_color,
+            depth_gradient=on_depth,
+            opacity_gradient=on_opacity,
+            threads=ctx.threads,
+            on_means=results[0],
+            on_log_scales=results[1],
+            on_quaternions=results[2],
+            on_opacity_logits=results[3],
+            on_sh=results[4],
+            on_betas=results[5],
+            on_screen=on_screen,
+            on_pose=on_pose,
+        )
+        return (*results, on_screen, on_pose, None, None)
+
+
+def render(splats: Splats, view: View) -> Render:
+    """See `rasterizer.rasterize`. Raises ValueError unless the splats are float32 in main memory."""
+    if splats.means.dtype != torch.float32 or splats.means.device.type != "cpu":
+        raise ValueError(
+            f"the cpu back end takes float32 splats on the CPU, got {splats.means.dtype} on {splats.means.device}: "
+            "take backend='reference' for float64"
+        )
+    count = len(splats)
+    screen = torch.zeros(count, 2, requires_grad=torch.is_grad_enabled())
+    extra: dict[str, Any] = {}
+    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), screen, view.pose, view, extra)
+    weight_sum = weight_max = None
+    if view.weights:
+        weight_sum, weight_max = torch.empty(count), torch.empty(count)
+        native.load("splats").weights(extra["passed"], weight_sum, weight_max)
+    return Render(
+        color=color,
+        depth=depth,
+        opacity=opacity,
+        visible=extra["radii"] > 0,
+        radii=extra["radii"],
+        screen=screen,
+        weight_sum=weight_sum,
+        weight_max=weight_max,
+        refused=extra["passed"].refused,
+    )
