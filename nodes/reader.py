@@ -22,7 +22,7 @@ class Reader(Node):
         start: int = 0  # first frame of the original sequence
         stop: int | None = None  # frame to stop before; null: the end
         stride: int = 1  # every which frame
-        size: Any = None  # [height, width], or a number of pixels at the same aspect; null: as it is
+        size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as it is
         realtime: bool = False  # play at the recorded rate instead of as fast as it is read
         options: dict[str, Any] = field(default_factory=dict)  # of that format: see its class in mvsgs_core.datasets
 
@@ -48,10 +48,8 @@ class Reader(Node):
 
     def _open(self) -> Sequence:
         c = self.config
-        size = tuple(c.size) if isinstance(c.size, list | tuple) else c.size
-        return open_dataset(
-            c.name, path=c.path, start=c.start, stop=c.stop, stride=c.stride, size=size, **dict(c.options)
-        )
+        selected = {"start": c.start, "stop": c.stop, "stride": c.stride, "size": c.size}
+        return open_dataset(c.name, path=c.path, **selected, **c.options)
 
 
 def _ground_truth(item: Item) -> GroundTruth:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from PIL import Image, ImageOps
+from PIL import Image
 
+from mvsgs_core.datasets.files import upright_size
 from mvsgs_core.datasets.lens import Lens, guess_lens
 
 
@@ -35,11 +36,15 @@ def lens_for_images(
     intrinsics: Sequence[float] | str, distortion: Sequence[float], images: Iterable[Path]
 ) -> tuple[Lens, list[str]]:
     """`lens_from_option` for the size of the first of `images` whose header can be read."""
+    return lens_from_option(intrinsics, distortion, image_size(images))
+
+
+def image_size(images: Iterable[Path]) -> tuple[int, int]:
+    """(height, width) of the first image whose header can be read. Raises ValueError if there is none."""
     for path in images:
         try:
             with Image.open(path) as opened:
-                width, height = ImageOps.exif_transpose(opened).size
+                return upright_size(opened)
         except (OSError, SyntaxError, ValueError):
             continue  # reading the sequence reports it
-        return lens_from_option(intrinsics, distortion, (height, width))
     raise ValueError("intrinsics are for the size of the images, but none of them can be opened")

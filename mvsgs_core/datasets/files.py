@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
+_ORIENTATION = 0x0112  # EXIF tag
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,13 @@ def read_image(path: Path, *, turn_upright: bool = True) -> np.ndarray:
             return np.array(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError) as error:
         raise UnreadableImageError(f"{path.name}: {error}") from error
+
+
+def upright_size(image: Image.Image) -> tuple[int, int]:
+    """(height, width) of an opened image as EXIF says it should be shown, without decoding it."""
+    width, height = image.size
+    turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)  # a quarter turn
+    return (width, height) if turned else (height, width)
 
 
 def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> np.ndarray:

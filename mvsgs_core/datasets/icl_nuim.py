@@ -9,8 +9,9 @@ import numpy as np
 
 from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import Layout, images_in
+from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record, Size
+from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
 from mvsgs_core.datasets.tum import pose_from_row, read_trajectory
 
 LAYOUT = Layout(

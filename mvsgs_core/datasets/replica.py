@@ -11,8 +11,9 @@ import numpy as np
 
 from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import Layout, natural_order
+from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record, Size
+from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
 
 LAYOUT = Layout(
     "Replica (NICE-SLAM layout)",
@@ -57,9 +58,7 @@ class Replica(ImageSequence):
         missing = sum(record.world_from_cam is None for record in records)
         if missing and len(poses):
             pose_notes.append(f"traj.txt has no pose for {missing} of {len(records)} frames")
-        super().__init__(
-            records, start=start, stop=stop, stride=stride, size=size, depth_format=DepthFormat(per_meter)
-        )
+        super().__init__(records, start=start, stop=stop, stride=stride, size=size, depth_format=DepthFormat(per_meter))
         self.warnings += notes + pose_notes
 
 
@@ -69,7 +68,9 @@ def _camera(folder: Path) -> tuple[Lens, float]:
         if path.is_file():
             try:
                 c = json.loads(path.read_text())["camera"]
-                lens = Lens((float(c["fx"]), float(c["fy"]), float(c["cx"]), float(c["cy"])), (int(c["h"]), int(c["w"])))
+                lens = Lens(
+                    (float(c["fx"]), float(c["fy"]), float(c["cx"]), float(c["cy"])), (int(c["h"]), int(c["w"]))
+                )
                 return lens, float(c["scale"])
             except (KeyError, TypeError, ValueError) as error:
                 raise ValueError(f"{path} must hold camera: w, h, fx, fy, cx, cy, scale ({error!r})") from error

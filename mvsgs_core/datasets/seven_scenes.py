@@ -11,8 +11,9 @@ import numpy as np
 from mvsgs_core.camera import project, unproject
 from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import Layout, natural_order
+from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record, Size
+from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
 
 LAYOUT = Layout(
     "7-Scenes",

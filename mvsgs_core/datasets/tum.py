@@ -10,8 +10,9 @@ import numpy as np
 
 from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import Layout
+from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record, Size
+from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
 from mvsgs_core.geometry import rotation_from_quaternion
 
 LAYOUT = Layout(

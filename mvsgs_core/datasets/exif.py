@@ -1,0 +1,56 @@
+"""Intrinsics from the EXIF header of a photograph: good to a few percent, a start where nothing better is known."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from PIL import Image
+
+from mvsgs_core.datasets.files import upright_size
+from mvsgs_core.datasets.lens import Lens
+
+_EXIF_IFD = 0x8769
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405  # millimeters
+_PLANE_X_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210  # sensor pixels per unit
+_PIXEL_WIDTH, _PIXEL_HEIGHT = 0xA002, 0xA003  # of the picture as taken
+_UNIT_MILLIMETERS = {2: 25.4, 3: 10.0, 4: 1.0}
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)  # CIPA DCG-001: "35 mm equivalent" compares diagonals
+
+
+def read_exif_lens(path: Path) -> Lens | None:
+    """Focal length from the header, principal point in the middle, no distortion; None where the header lacks it.
+
+    Prefers focal length times the resolution of the sensor, which is exact for a picture that was scaled but not
+    cropped, over the 35 mm equivalent, which is rounded to whole millimeters.
+    """
+    try:
+        with Image.open(path) as image:
+            header = image.getexif().get_ifd(_EXIF_IFD)
+            height, width = upright_size(image)
+    except (OSError, SyntaxError, ValueError):
+        return None
+    focal = _from_sensor(header, max(height, width))
+    if focal is None:
+        focal_35mm = _positive(header.get(_FOCAL_LENGTH_35MM))
+        if focal_35mm is None:
+            return None
+        focal = focal_35mm * math.hypot(width, height) / _DIAGONAL_35MM
+    return Lens((focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), (height, width))
+
+
+def _from_sensor(header: dict[int, object], longer_side: int) -> float | None:
+    focal, resolution = _positive(header.get(_FOCAL_LENGTH)), _positive(header.get(_PLANE_X_RESOLUTION))
+    sides = [_positive(header.get(tag)) for tag in (_PIXEL_WIDTH, _PIXEL_HEIGHT)]
+    unit = _UNIT_MILLIMETERS.get(int(_positive(header.get(_PLANE_UNIT)) or 2))
+    if focal is None or resolution is None or unit is None or sides[0] is None or sides[1] is None:
+        return None
+    return focal * resolution / unit * longer_side / max(sides[0], sides[1])
+
+
+def _positive(value: object) -> float | None:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None

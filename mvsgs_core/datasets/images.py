@@ -1,0 +1,140 @@
+"""A folder of photographs or frames, calibrated in one of several ways."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mvsgs_core.datasets.calibration import image_size, lens_for_images
+from mvsgs_core.datasets.colmap import find_colmap, read_colmap
+from mvsgs_core.datasets.exif import read_exif_lens
+from mvsgs_core.datasets.files import IMAGE_SUFFIXES, Layout, images_in, natural_order
+from mvsgs_core.datasets.framing import Size
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.model import Model
+from mvsgs_core.datasets.sequence import ImageSequence, Record
+from mvsgs_core.datasets.strecha import find_strecha, read_strecha
+from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transforms
+
+LAYOUT = Layout(
+    "A folder of images",
+    "photographs or frames (" + ", ".join(IMAGE_SUFFIXES) + ") in the order of their names, in the folder or in its "
+    "subfolder images/; beside them, if there is one, a COLMAP model (sparse/0), a transforms.json or .camera files",
+    "your own camera; frames of a video: ffmpeg -i video.mp4 -qscale:v 2 images/%05d.jpg (or dataset=video directly)",
+)
+_SUBFOLDERS = ("images", "rgb", "input", "frames")
+
+
+class Images(ImageSequence):
+    """Images in natural order, undistorted where the distortion is known.
+
+    intrinsics: [fx, fy, cx, cy] in pixels of the images, "auto" for a guess, null for what is found: a COLMAP model, a
+    transforms.json, Strecha's .camera files, whose poses then are the ground truth, or EXIF headers, in this order.
+    model: path of a COLMAP model's folder, a transforms.json or a folder of .camera files that lies elsewhere.
+    rate: images per second, for the timestamps. crop: see `Framing`.
+    Raises FileNotFoundError and ValueError, which say what was expected.
+    """
+
+    def __init__(
+        self,
+        path: str | Path | None = None,
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Size = None,
+        intrinsics: Sequence[float] | str | None = None,
+        distortion: Sequence[float] = (),
+        model: str | Path | None = None,
+        rate: float = 30.0,
+        crop: int | None = None,
+    ) -> None:
+        if rate <= 0:
+            raise ValueError(f"rate is a positive number of images per second, got {rate}")
+        if intrinsics is not None and model is not None:
+            raise ValueError("give intrinsics or model, not both: a model has its own intrinsics")
+        folder = LAYOUT.folder(path)
+        images = _find_images(folder)
+        notes: list[str] = []
+        found = None if intrinsics is not None else _find_model(folder, images, model)
+        if found is not None:
+            records = _from_model(found, folder, images, rate, notes)
+        else:
+            lenses = _lenses(images, intrinsics, distortion, notes)
+            records = [Record(i / rate, image, lens) for i, (image, lens) in enumerate(zip(images, lenses))]
+        super().__init__(
+            records, start=start, stop=stop, stride=stride, size=size, crop=crop, turn_upright=found is None
+        )
+        self.warnings += notes
+
+
+def _find_images(folder: Path) -> list[Path]:
+    for candidate in (folder, *(folder / name for name in _SUBFOLDERS)):
+        images = images_in(candidate) if candidate.is_dir() else []
+        if images:
+            return images
+    below = [p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not below:
+        raise LAYOUT.missing(f"{folder} has no image")
+    return sorted(below, key=lambda p: natural_order(p.relative_to(folder).as_posix()))
+
+
+def _find_model(folder: Path, images: list[Path], given: str | Path | None) -> Model | None:
+    place = folder if given is None else Path(given).expanduser()
+    if given is not None and not place.exists():
+        raise FileNotFoundError(f"model {place} is missing: a folder with cameras and images of COLMAP, or {NAMES[0]}")
+    for base in dict.fromkeys((place, images[0].parent, images[0].parent.parent) if given is None else (place,)):
+        transforms = base if base.is_file() else find_transforms(base)
+        colmap = find_colmap(base)
+        if colmap is not None:
+            return read_colmap(colmap)
+        if transforms is not None:
+            return read_transforms(transforms, image_size(images))
+        strecha = find_strecha(base)
+        if strecha is not None:
+            return read_strecha(strecha)
+    if given is not None:
+        raise ValueError(f"model {place} is neither a COLMAP model, nor a {NAMES[0]}, nor a folder of .camera files")
+    return None
+
+
+def _from_model(model: Model, folder: Path, images: list[Path], rate: float, notes: list[str]) -> list[Record]:
+    shots = model.lookup(images, folder)
+    unknown = [image.name for image, shot in zip(images, shots) if shot is None]
+    if len(unknown) == len(images):
+        names = ", ".join(list(model.shots)[:3])
+        raise ValueError(f"the {model.kind} knows none of the images: it names {names}, here is {unknown[0]}")
+    common = model.common_lens
+    records = []
+    for i, (image, shot) in enumerate(zip(images, shots)):
+        if shot is not None:
+            records.append(Record(i / rate, image, shot.lens, shot.world_from_cam))
+        elif common is not None:
+            records.append(Record(i / rate, image, common))
+    if unknown:
+        consequence = "they have no true pose" if common is not None else "left out, their camera is unknown"
+        notes.append(f"images that the {model.kind} does not know, {consequence}: {len(unknown)} (first: {unknown[0]})")
+    return records
+
+
+def _lenses(
+    images: list[Path], intrinsics: Sequence[float] | str | None, distortion: Sequence[float], notes: list[str]
+) -> list[Lens]:
+    if intrinsics is not None:
+        lens, warnings = lens_for_images(intrinsics, distortion, images)
+        notes += warnings
+        return [lens] * len(images)
+    found = [read_exif_lens(image) for image in images]
+    known = [lens for lens in found if lens is not None]
+    if not known:
+        raise ValueError(
+            f"no calibration for {images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal "
+            "lengths were found; set intrinsics=[fx,fy,cx,cy] in pixels, or intrinsics=auto for a guess"
+        )
+    notes.append(
+        f"intrinsics are from EXIF: focal length {known[0].intrinsics[0]:.0f} pixels for "
+        f"{known[0].size[1]}x{known[0].size[0]}, good to a few percent, distortion unknown"
+    )
+    if len(known) < len(images):
+        notes.append(f"images without an EXIF focal length, which take the first one's: {len(images) - len(known)}")
+    return [lens if lens is not None else known[0] for lens in found]

@@ -1,0 +1,67 @@
+"""A calibrated photo set, whatever wrote it: each image's lens and, where known, its pose."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from mvsgs_core.datasets.lens import Lens
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image of a model."""
+
+    lens: Lens
+    world_from_cam: np.ndarray  # (4, 4) float64
+
+
+@dataclass(frozen=True)
+class Model:
+    """Shots by the image name that the model's file gives, a path with forward slashes."""
+
+    kind: str  # for messages: "COLMAP model", ...
+    shots: Mapping[str, Shot]
+
+    def lookup(self, images: list[Path], folder: Path) -> list[Shot | None]:
+        """The shot of each image, by its path below `folder`, else by its bare name where that is unique."""
+        bare = Counter(_bare(name) for name in self.shots)
+        by_bare = {_bare(name): shot for name, shot in self.shots.items() if bare[_bare(name)] == 1}
+        by_path = {_without_suffix(name): shot for name, shot in self.shots.items()}
+        found = []
+        for image in images:
+            relative = _without_suffix(image.relative_to(folder).as_posix())
+            found.append(by_path.get(relative) or by_bare.get(_bare(relative)))
+        return found
+
+    @property
+    def common_lens(self) -> Lens | None:
+        """The lens of all shots if they share one: it then holds for images without a pose too."""
+        lenses = {shot.lens for shot in self.shots.values()}
+        return lenses.pop() if len(lenses) == 1 else None
+
+
+def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
+    """A 4x4 pose as written in a file, its rotation made exactly orthonormal. Raises ValueError if it is no pose."""
+    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
+        raise ValueError(f"{where}: a pose must be 4x4 finite numbers")
+    u, singular, vt = np.linalg.svd(matrix[:3, :3])
+    if np.any(np.abs(singular - 1.0) > 1e-2) or np.linalg.det(u @ vt) < 0:
+        raise ValueError(f"{where}: its upper left 3x3 is no rotation (singular values {np.round(singular, 4)})")
+    pose = np.eye(4)
+    pose[:3, :3] = u @ vt
+    pose[:3, 3] = matrix[:3, 3]
+    return pose
+
+
+def _without_suffix(name: str) -> str:
+    path = PurePosixPath(name)
+    return str(path.with_suffix("")) if path.suffix.lower().lstrip(".").isalpha() else str(path)
+
+
+def _bare(name: str) -> str:
+    return PurePosixPath(_without_suffix(name)).name

@@ -1,0 +1,59 @@
+"""transforms.json, as NeRF, instant-ngp and nerfstudio write it: OpenGL camera axes, COLMAP's pixels."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvsgs_core.datasets.files import IMAGE_SUFFIXES
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.model import Model, Shot, rigid
+
+NAMES = ("transforms.json", "transforms_train.json")
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def find_transforms(folder: Path) -> Path | None:
+    return next((folder / name for name in NAMES if (folder / name).is_file()), None)
+
+
+def read_transforms(path: Path, image_size: tuple[int, int]) -> Model:
+    """The model of a transforms.json; image_size (height, width) where the file does not say it.
+
+    Raises ValueError for a malformed file.
+    """
+    try:
+        content = json.loads(path.read_text())
+        frames = content["frames"]
+        shots = {}
+        for frame in frames:
+            matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+            pose = rigid(matrix, f"{path.name}: {frame['file_path']}") @ _OPENGL_FROM_OPENCV
+            shots[_relative(frame["file_path"])] = Shot(_lens({**content, **frame}, image_size), pose)
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is no transforms.json: {error!r}") from error
+    return Model("transforms.json", shots)
+
+
+def _relative(name: str) -> str:
+    name = name.replace("\\", "/").removeprefix("./")
+    return name if name.lower().endswith(IMAGE_SUFFIXES) else name + ".png"  # NeRF's own sets leave the suffix out
+
+
+def _lens(c: Mapping[str, Any], image_size: tuple[int, int]) -> Lens:
+    height, width = int(c.get("h", image_size[0])), int(c.get("w", image_size[1]))
+    if "fl_x" in c:
+        fx = float(c["fl_x"])
+        fy = float(c.get("fl_y", fx))
+    else:
+        fx = 0.5 * width / math.tan(0.5 * float(c["camera_angle_x"]))
+        fy = 0.5 * height / math.tan(0.5 * float(c["camera_angle_y"])) if "camera_angle_y" in c else fx
+    cx, cy = float(c.get("cx", 0.5 * width)) - 0.5, float(c.get("cy", 0.5 * height)) - 0.5
+    fisheye = c.get("camera_model") == "OPENCV_FISHEYE" or bool(c.get("is_fisheye", False))
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    return Lens((fx, fy, cx, cy), (height, width), tuple(float(c.get(name, 0.0)) for name in names), fisheye)
