@@ -1,0 +1,70 @@
+"""The whole map put right: edges between keyframes that see the same, matched again, and global bundle adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core.tracking.bundle_adjustment import Solution, Solver
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.local_map import LocalMap
+
+
+@dataclass(frozen=True)
+class BackEndConfig:
+    edges: int = 6  # by proximity, at most, from each keyframe
+    rematch: float = 1.0  # pixels: edges that the map contradicts by more are matched again
+    steps: int = 10  # of each global bundle adjustment
+    robust_scales: tuple[float, ...] = (4.0, 1.0, 0.5)  # pixels, one bundle adjustment each
+
+
+class BackEnd:
+    def __init__(self, graph: KeyframeGraph, local_map: LocalMap, config: BackEndConfig, threads: int) -> None:
+        self.graph = graph
+        self.local_map = local_map
+        self.config = config
+        self.threads = threads
+
+    def extend_edges(self, index: int, segment: int) -> int:
+        """Adds edges from one keyframe to those that see the same; returns how many were matched."""
+        others = [i for i in self.local_map.members(segment) if i != index]
+        matched = 0
+        for other in self.local_map.nearby(index, others, self.config.edges, apart=1):
+            if (index, other) not in self.graph.edges:
+                matched += 1
+                self.local_map.match_edge(index, other, enough=0.0)
+        return matched
+
+    def rematch_edges(self, index: int) -> int:
+        """Matches again the edges from one keyframe that its poses and depths no longer agree with."""
+        matched = 0
+        for source, to in [pair for pair in self.graph.edges if pair[0] == index]:
+            edge = self.graph.edges[source, to]
+            expected, inside = self.graph.predict(source, to)
+            seen = (edge.weight > 0) & inside
+            if seen.sum() and np.median(np.linalg.norm(expected - edge.target.T, axis=1)[seen]) < self.config.rematch:
+                continue
+            matched += 1
+            self.local_map.match_edge(source, to)
+        return matched
+
+    def adjust(self, segment: int) -> list[Solution]:
+        """Global bundle adjustment; the median depth of the segment is kept."""
+        members = self.local_map.members(segment)
+        if len(members) < 3:
+            return []
+        before = self._median_inverse_depth(members)
+        solutions = []
+        for scale in self.config.robust_scales:
+            solver = Solver(steps=self.config.steps, robust_scale=scale, lm=1e-5, threads=self.threads)
+            solution = self.graph.optimize(members, set(members[1:]), set(members), solver, prior=True)
+            solutions.append(solution)
+        self.graph.rescale(members, self._median_inverse_depth(members) / before)
+        return solutions
+
+    def _median_inverse_depth(self, members: list[int]) -> float:
+        return float(np.median([1.0 / self.graph.keyframes[index].median_depth for index in members]))
+
+
+__all__ = ["BackEnd", "BackEndConfig"]

@@ -1,0 +1,166 @@
+"""Where the points of one image lie in another: one interface, several methods.
+
+`LucasKanade` is the tracker's own: subpixel, needs a guess. `DenseInverseSearch` gives guesses from frame to frame,
+`FeatureFlow` where motion is large. Another one (a network) is named in the configuration as "module:Class".
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from mvsgs_core import native
+from mvsgs_core.tracking.features import match_features
+from mvsgs_core.tracking.image import BORDER, TrackingImage
+
+
+@dataclass(frozen=True)
+class Matches:
+    """N points found in another image."""
+
+    target: np.ndarray  # (N, 2) float64 pixels; NaN where lost
+    weight: np.ndarray  # (N,) float64, 0 (lost) to 1
+
+    @property
+    def alive(self) -> np.ndarray:
+        return self.weight > 0
+
+
+class Flow(Protocol):
+    needs_color: bool
+
+    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
+        """points of `a` (N, 2) and where they are expected in `b` (N, 2)."""
+        ...
+
+
+@dataclass
+class LucasKanade:
+    """Pyramidal Lucas-Kanade there and back; the weight falls with the distance from where it came."""
+
+    start_level: int = 2  # 0 is full size: the guess may be wrong by about 8 * 2^level pixels
+    iterations: int = 10
+    window_sigma: float = 4.0  # pixels, of the 16x16 window
+    min_eigenvalue: float = 1.0  # gray levels² per pixel²
+    distance_sigma: float = 0.5  # pixels
+    max_distance: float = 1.5  # pixels
+    min_correlation: float = 0.7
+    threads: int = 1
+    needs_color: bool = False
+
+    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
+        found = native.load("tracking").lucas_kanade(
+            a=a.pyramid,
+            b=b.pyramid,
+            points=np.ascontiguousarray(points, dtype=np.float32),
+            guess=np.ascontiguousarray(np.nan_to_num(guess, nan=-1e6), dtype=np.float32),
+            border=BORDER,
+            start_level=self.start_level,
+            iterations=self.iterations,
+            window_sigma=self.window_sigma,
+            min_eigenvalue=self.min_eigenvalue,
+            threads=self.threads,
+        ).astype(np.float64)
+        distance, correlation = found[:, 2], found[:, 3]
+        alive = (distance < self.max_distance) & (correlation > self.min_correlation)
+        weight = np.where(alive, np.exp(-0.5 * np.square(np.where(alive, distance, 0.0) / self.distance_sigma)), 0.0)
+        return Matches(np.where(alive[:, None], found[:, :2], np.nan), weight)
+
+
+@dataclass
+class DenseInverseSearch:
+    """OpenCV's DIS flow at half size: quick and complete, for small motion; weights are all 1."""
+
+    preset: str = "fast"  # ultrafast, fast, medium
+    needs_color: bool = False
+
+    @cached_property
+    def _method(self) -> Any:
+        presets = {
+            "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
+            "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
+            "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
+        }
+        return cv2.DISOpticalFlow_create(presets[self.preset])
+
+    def field(self, a: TrackingImage, b: TrackingImage) -> np.ndarray:
+        """(H / 2, W / 2, 2) float32, in pixels of the full size."""
+        return np.asarray(2.0 * self._method.calc(a.half, b.half, None))
+
+    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
+        height, width = b.size
+        target = points + sample_field(self.field(a, b), points)
+        inside = np.all((target >= 0) & (target <= [width - 1, height - 1]), axis=1)
+        return Matches(np.where(inside[:, None], target, np.nan), inside.astype(np.float64))
+
+
+@dataclass
+class FeatureFlow:
+    """ORB features that agree with one epipolar geometry (MAGSAC), spread to the points; for large motion."""
+
+    neighbors: int = 3
+    needs_color: bool = False
+
+    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
+        from_a, in_b = match_features(a, b)
+        if len(from_a) < 15:
+            return Matches(np.full(points.shape, np.nan), np.zeros(len(points)))
+        target = spread(from_a, in_b - from_a, points, self.neighbors, radius=0.15 * a.size[1])
+        return Matches(target, np.isfinite(target[:, 0]).astype(np.float64))
+
+
+def spread(
+    points: np.ndarray, displacement: np.ndarray, queries: np.ndarray, neighbors: int = 5, radius: float = 1e6
+) -> np.ndarray:
+    """Queries (M, 2) moved by the median displacement of their nearest points (N, 2); NaN where none is near."""
+    if len(points) == 0:
+        return np.full((len(queries), 2), np.nan)
+    kernel = native.load("tracking").median_of_nearest
+    at, to = (np.ascontiguousarray(p, dtype=np.float64) for p in (points, queries))
+    moved = [
+        kernel(at, np.ascontiguousarray(displacement[:, n], dtype=np.float64), to, neighbors, radius) for n in (0, 1)
+    ]
+    return np.asarray(to + np.stack(moved, axis=1))
+
+
+def sample_field(field: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Half-size flow field (H, W, 2) at full-size points (N, 2), bilinear, clamped to the border."""
+    at = ((points.astype(np.float32) + 0.5) * 0.5 - 0.5).reshape(-1, 1, 2)
+    at = np.nan_to_num(at, nan=0.0)
+    sampled = cv2.remap(field, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled).reshape(-1, 2).astype(np.float64)
+
+
+FLOWS = {
+    "lucas_kanade": "mvsgs_core.tracking.flow:LucasKanade",
+    "dis": "mvsgs_core.tracking.flow:DenseInverseSearch",
+    "features": "mvsgs_core.tracking.flow:FeatureFlow",
+}
+
+
+def make_flow(name: str, **options: Any) -> Flow:
+    """A flow by its name in FLOWS or as "module:Class". Raises ValueError for a name that is neither."""
+    path = FLOWS.get(name, name)
+    module, _, attribute = path.partition(":")
+    if not attribute:
+        raise ValueError(f"no flow {name!r}: give one of {', '.join(FLOWS)}, or module:Class")
+    flow: Flow = getattr(importlib.import_module(module), attribute)(**options)
+    return flow
+
+
+__all__ = [
+    "FLOWS",
+    "DenseInverseSearch",
+    "FeatureFlow",
+    "Flow",
+    "LucasKanade",
+    "Matches",
+    "make_flow",
+    "sample_field",
+    "spread",
+]

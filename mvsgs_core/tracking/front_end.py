@@ -1,0 +1,115 @@
+"""Follows the camera from frame to frame against the newest keyframe, and says which frames become keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.tracking.bundle_adjustment import Solver
+from mvsgs_core.tracking.flow import DenseInverseSearch, Matches, sample_field
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.localization import Localization, localize
+from mvsgs_core.tracking.matcher import Matcher
+
+
+@dataclass(frozen=True)
+class FrontEndConfig:
+    still_flow: float = 0.001  # of the width: median flow below which a frame did not move and is skipped
+    keyframe_flow: float = 0.05  # of the width: median flow since the last keyframe that makes one
+    keyframe_share: float = 0.5  # of the textured points: fewer found make a keyframe
+    feature_share: float = 0.5  # fewer found, and features are tried
+    lost_share: float = 0.2  # fewer found: the frame is lost
+    lost_inliers: float = 0.5  # of the matches, within 2 pixels of one pose: fewer, and the frame is lost
+
+
+@dataclass(frozen=True)
+class Step:
+    """One frame against the reference keyframe."""
+
+    matches: Matches
+    share: float  # of the textured points that were found
+    flow: float  # pixels, median since the reference
+    still: bool  # nothing moved since the last frame: nothing was done
+    localization: Localization | None  # None before the start
+
+
+class FrontEnd:
+    """Holds the reference keyframe's points as they are carried along."""
+
+    def __init__(self, graph: KeyframeGraph, matcher: Matcher, config: FrontEndConfig, threads: int) -> None:
+        self.graph = graph
+        self.matcher = matcher
+        self.config = config
+        self.between = DenseInverseSearch()
+        self.solver = Solver(steps=8, robust_scale=1.0, threads=threads)
+        self.reference: TrackingImage | None = None
+        self.last: TrackingImage | None = None
+        self.carried = np.zeros((0, 2))  # (M, 2) where the reference's points were, or should have been, last
+        self.pose: np.ndarray | None = None  # (4, 4) cam_from_world of the last frame
+        self.step: Step | None = None
+
+    def refer_to(self, image: TrackingImage) -> None:
+        """Starts over from a new reference keyframe, which is also the last frame."""
+        self.reference = self.last = image
+        self.carried = image.cells.points.astype(np.float64)
+        self.step = None
+
+    def follow(self, image: TrackingImage, started: bool) -> Step:
+        """Finds the reference's points in the next frame, and, once started, its pose."""
+        assert self.reference is not None and self.last is not None
+        field = self.between.field(self.last, image)
+        moved = float(np.median(np.hypot(field[..., 0], field[..., 1])))
+        if moved < self.config.still_flow * image.size[1] and self.step is not None and self._same(image):
+            return Step(
+                self.step.matches, self.step.share, self.step.flow, True, self.step.localization if started else None
+            )
+        guess = self.carried + sample_field(field, self.carried)
+        matches, share = self.matcher.match(self.reference, image, guess, self.config.feature_share)
+        alive = matches.alive
+        flow = np.inf
+        if alive.any():
+            flow = float(np.median(np.linalg.norm(matches.target[alive] - self.reference.cells.points[alive], axis=1)))
+        found: Localization | None = None
+        if started:
+            start = self.pose if self.pose is not None else self.graph.keyframes[self.reference.index].cam_from_world
+            found = localize(self.graph, {self.reference.index: matches}, start, self.solver)
+            guess, _ = self.graph.predict_pose(self.reference.index, found.cam_from_world)
+        step = Step(matches, share, flow, False, found)
+        if not self.is_lost(step):
+            self.carried = np.where(alive[:, None], matches.target, np.nan_to_num(guess, nan=-1e3))
+            self.last = image
+            self.pose = found.cam_from_world if found else None
+            self.step = step
+        return step
+
+    def is_lost(self, step: Step) -> bool:
+        """Too few points found, or no pose that they agree on."""
+        if step.share < self.config.lost_share or step.matches.alive.sum() < 30:
+            return True
+        found = step.localization
+        return found is not None and (bool(found.failure) or found.inliers < self.config.lost_inliers)
+
+    def wants_keyframe(self, step: Step, flow: float) -> bool:
+        """flow: share of the width that the image must have moved."""
+        assert self.reference is not None
+        return step.flow > flow * self.reference.size[1] or step.share < self.config.keyframe_share
+
+    def cam_from_reference(self, step: Step) -> np.ndarray:
+        """(4, 4) identity before the start."""
+        if step.localization is None or self.reference is None:
+            return np.eye(4)
+        return step.localization.cam_from_world @ geometry.inverse(
+            self.graph.keyframes[self.reference.index].cam_from_world
+        )
+
+    def _same(self, image: TrackingImage) -> bool:
+        """Whether the last image still explains this one: a covered lens does not move either."""
+        assert self.last is not None
+        change = np.abs(self.last.half.astype(np.int16) - image.half)
+        return float(np.mean(change)) < 6.0
+
+
+__all__ = ["FrontEnd", "FrontEndConfig", "Step"]

@@ -1,0 +1,172 @@
+"""The keyframe graph: what the tracker knows of the scene. Keyframes with points and inverse depths, edges of matches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.tracking.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.image import TrackingImage
+
+PRIOR_SIGMA = 0.7  # of the inverse depth that a keyframe was given, relative: holds what no match can triangulate
+
+
+@dataclass
+class Keyframe:
+    """A kept frame. M points, one a cell; the map's unit is the median depth of the first keyframes."""
+
+    image: TrackingImage
+    cam_from_world: np.ndarray  # (4, 4) float64
+    inverse_depth: np.ndarray  # (M,) float64
+    prior: np.ndarray  # (M,) float64, what the inverse depth is weakly drawn to
+    information: np.ndarray  # (M,) float64 of the inverse depth, without the prior; 0: never triangulated
+    segment: int
+
+    @property
+    def index(self) -> int:
+        return self.image.index
+
+    @property
+    def points(self) -> np.ndarray:
+        """(M, 2) float32."""
+        return self.image.cells.points
+
+    @property
+    def triangulated(self) -> np.ndarray:
+        """(M,) bool: the depth is known to better than about 30 %, for an error of one pixel."""
+        return self.information * self.inverse_depth**2 > 10.0
+
+    @property
+    def median_depth(self) -> float:
+        known = self.triangulated
+        return float(1.0 / np.median(self.inverse_depth[known] if known.sum() > 10 else self.inverse_depth))
+
+
+@dataclass
+class Edge:
+    """Where the points of one keyframe were found in another."""
+
+    target: np.ndarray  # (2, M) float32, 0 where lost
+    weight: np.ndarray  # (M,) float32, 0 to 1
+    share: float  # of the textured points that were found
+
+
+class KeyframeGraph:
+    """Keyframes in the order of their indices, and directed edges by their positions in that order."""
+
+    def __init__(self, intrinsics: np.ndarray) -> None:
+        self.intrinsics = np.asarray(intrinsics, dtype=np.float64)  # (4,) at the tracker's size
+        self.keyframes: dict[int, Keyframe] = {}  # by frame index
+        self.edges: dict[tuple[int, int], Edge] = {}  # by frame indices
+
+    def add(self, keyframe: Keyframe) -> None:
+        self.keyframes[keyframe.index] = keyframe
+
+    def remove(self, index: int) -> None:
+        del self.keyframes[index]
+        for pair in [pair for pair in self.edges if index in pair]:
+            del self.edges[pair]
+
+    def connect(self, source: int, to: int, matches: Matches, min_share: float) -> bool:
+        """Adds an edge; False, and no edge, where too few of the textured points were found."""
+        textured = self.keyframes[source].image.cells.textured
+        share = float(matches.alive[textured].sum() / max(1, textured.sum()))
+        if share < min_share or matches.alive.sum() < 30:
+            return False
+        target = np.nan_to_num(matches.target.T).astype(np.float32)
+        self.edges[source, to] = Edge(target, matches.weight.astype(np.float32), share)
+        return True
+
+    def neighbors(self, index: int) -> set[int]:
+        return {b if a == index else a for a, b in self.edges if index in (a, b)}
+
+    def predict(self, source: int, to: int) -> tuple[np.ndarray, np.ndarray]:
+        """Where the points of `source` should be in `to`: (M, 2), NaN behind the camera; and inside the image (M,)."""
+        return self.predict_pose(source, self.keyframes[to].cam_from_world)
+
+    def predict_pose(self, source: int, cam_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        keyframe = self.keyframes[source]
+        pixels, z = reproject(
+            np.stack([keyframe.cam_from_world, cam_from_world]),
+            keyframe.inverse_depth[None],
+            keyframe.points.T[None],
+            self.intrinsics,
+            np.array([0]),
+            np.array([1]),
+        )
+        at = np.where(z[0] > 0.05, pixels[0], np.nan).T
+        height, width = keyframe.image.size
+        with np.errstate(invalid="ignore"):
+            inside = np.all((at >= 0) & (at <= [width - 1, height - 1]), axis=1)
+        return at, inside
+
+    def problem(self, indices: Iterable[int], free_poses: set[int], free_depths: set[int], prior: bool) -> Graph:
+        """The bundle adjustment of these keyframes and every edge among them that has something free at an end."""
+        order = sorted(indices)
+        number = {index: n for n, index in enumerate(order)}
+        pairs = [
+            (a, b)
+            for a, b in self.edges
+            if a in number and b in number and (a in free_poses or b in free_poses or a in free_depths)
+        ]
+        frames = [self.keyframes[index] for index in order]
+        cells = len(frames[0].inverse_depth)
+        information = np.empty((len(pairs), 3, cells))
+        target = np.empty((len(pairs), 2, cells))
+        for n, (a, b) in enumerate(pairs):
+            edge = self.edges[a, b]
+            target[n] = edge.target
+            information[n] = self.keyframes[a].image.cells.information.T * edge.weight
+        inverse_depth = np.stack([k.inverse_depth for k in frames])
+        priors = np.stack([k.prior for k in frames])
+        return Graph(
+            cam_from_world=np.stack([k.cam_from_world for k in frames]),
+            inverse_depth=inverse_depth,
+            pixels=np.stack([k.points.T for k in frames]).astype(np.float64),
+            intrinsics=self.intrinsics,
+            source=np.array([number[a] for a, _ in pairs], np.int32),
+            to=np.array([number[b] for _, b in pairs], np.int32),
+            target=target,
+            information=information,
+            free_pose=np.array([index in free_poses for index in order]),
+            free_depth=np.array([index in free_depths for index in order]),
+            damping=1e-3 / inverse_depth**2,
+            prior=priors if prior else None,
+            prior_weight=np.square(1.0 / (PRIOR_SIGMA * priors)) if prior else None,
+        )
+
+    def optimize(
+        self, indices: Iterable[int], free_poses: set[int], free_depths: set[int], solver: Solver, prior: bool = True
+    ) -> Solution:
+        """Bundle adjustment of a part of the graph, written back unless it failed."""
+        order = sorted(indices)
+        solution = adjust(self.problem(order, free_poses, free_depths, prior), solver)
+        if not solution.failure:
+            for n, index in enumerate(order):
+                keyframe = self.keyframes[index]
+                if index in free_poses:
+                    keyframe.cam_from_world = solution.cam_from_world[n]
+                if index in free_depths:
+                    keyframe.inverse_depth = solution.inverse_depth[n]
+                    keyframe.information = solution.information[n]
+        return solution
+
+    def rescale(self, indices: Iterable[int], factor: float) -> None:
+        """Multiplies every length of these keyframes, as seen from the world's origin."""
+        for index in indices:
+            keyframe = self.keyframes[index]
+            keyframe.cam_from_world = keyframe.cam_from_world.copy()
+            keyframe.cam_from_world[:3, 3] *= factor
+            keyframe.inverse_depth = keyframe.inverse_depth / factor
+            keyframe.prior = keyframe.prior / factor
+            keyframe.information = keyframe.information * factor**2
+
+    def world_from_cam(self, index: int) -> np.ndarray:
+        return geometry.inverse(self.keyframes[index].cam_from_world)
+
+
+__all__ = ["Edge", "Keyframe", "KeyframeGraph"]

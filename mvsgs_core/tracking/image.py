@@ -1,0 +1,123 @@
+"""A frame as the tracker sees it: reduced, gray, with what is computed from it once and kept while it is needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from mvsgs_core.camera import resize_image
+
+CELL = 8  # pixels: one point a cell
+BORDER = 24  # pixels around every pyramid level, so that windows need no bounds checks
+LEVELS = 4
+
+
+@dataclass(frozen=True)
+class Cells:
+    """One point per 8x8 cell, at its most textured pixel. M = (H / 8) * (W / 8), by rows."""
+
+    points: np.ndarray  # (M, 2) float32 u, v
+    information: np.ndarray  # (M, 3) float64 xx, xy, yy: 1 along well textured directions, down to 0
+    textured: np.ndarray  # (M,) bool: can be tracked
+
+
+@dataclass
+class TrackingImage:
+    """A gray image (H, W) uint8, both sizes multiples of 8."""
+
+    index: int
+    timestamp: float  # seconds
+    gray: np.ndarray
+    color: np.ndarray | None = None  # (H, W, 3) uint8 RGB: only for a flow that wants it
+    _features: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
+
+    @staticmethod
+    def of(index: int, timestamp: float, image: np.ndarray, size: tuple[int, int], color: bool) -> TrackingImage:
+        """From an RGB image of any size."""
+        small = resize_image(image, size)
+        gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        return TrackingImage(index, timestamp, gray, small if color else None)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.gray.shape[0], self.gray.shape[1]
+
+    @cached_property
+    def pyramid(self) -> list[np.ndarray]:
+        """Levels (H / 2^l + 48, W / 2^l + 48) float32, bordered."""
+        level = self.gray.astype(np.float32)
+        levels = []
+        for n in range(LEVELS):
+            if n:
+                level = cv2.pyrDown(level)
+            levels.append(cv2.copyMakeBorder(level, BORDER, BORDER, BORDER, BORDER, cv2.BORDER_REPLICATE))
+        return levels
+
+    @cached_property
+    def half(self) -> np.ndarray:
+        """(H / 2, W / 2) uint8, for flow from frame to frame."""
+        return np.asarray(cv2.resize(self.gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+
+    @cached_property
+    def sharpness(self) -> float:
+        """Mean squared Laplacian: falls with motion blur."""
+        return float(np.mean(np.square(cv2.Laplacian(self.gray, cv2.CV_32F))))
+
+    @cached_property
+    def cells(self) -> Cells:
+        return find_cells(self.gray)
+
+    def features(self, count: int = 800) -> tuple[np.ndarray, np.ndarray]:
+        """ORB keypoints (N, 2) float32 and descriptors (N, 32) uint8."""
+        if self._features is None:
+            orb = cv2.ORB_create(nfeatures=count, scaleFactor=1.2, nlevels=6, fastThreshold=7)
+            keypoints, descriptors = orb.detectAndCompute(self.gray, None)
+            if descriptors is None:
+                self._features = np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
+            else:
+                self._features = np.array([k.pt for k in keypoints], np.float32), descriptors
+        return self._features
+
+    def release(self) -> None:
+        """Forgets what can be computed again: a keyframe outside the window keeps its pixels and features only."""
+        for name in ("pyramid", "half"):
+            self.__dict__.pop(name, None)
+
+
+def find_cells(gray: np.ndarray, noise: float = 20.0) -> Cells:
+    """Points and their information matrices, from the structure tensor (mean over 7x7 pixels).
+
+    noise: squared gradient (gray levels² per pixel²) at which a direction counts half.
+    """
+    height, width = gray.shape
+    image = cv2.GaussianBlur(gray, (3, 3), 0).astype(np.float32)
+    gx = 0.5 * (np.roll(image, -1, 1) - np.roll(image, 1, 1))
+    gy = 0.5 * (np.roll(image, -1, 0) - np.roll(image, 1, 0))
+    gx[:, [0, -1]] = 0.0
+    gy[[0, -1]] = 0.0
+    xx, xy, yy = (cv2.blur(product, (7, 7)) for product in (gx * gx, gx * gy, gy * gy))
+    half_trace = 0.5 * (xx + yy)
+    root = np.sqrt(np.maximum(half_trace**2 - (xx * yy - xy * xy), 0.0))
+    smallest = half_trace - root
+    score = smallest + 0.05 * (half_trace + root)
+    score[:3] = score[-3:] = 0.0
+    score[:, :3] = score[:, -3:] = 0.0
+    rows, columns = height // CELL, width // CELL
+    tiles = score.reshape(rows, CELL, columns, CELL).transpose(0, 2, 1, 3).reshape(rows * columns, CELL * CELL)
+    best = np.argmax(tiles, axis=1)
+    cell_v, cell_u = np.divmod(np.arange(rows * columns), columns)
+    v, u = cell_v * CELL + best // CELL, cell_u * CELL + best % CELL
+    tensor = np.stack([xx[v, u], xy[v, u], yy[v, u]], axis=1).astype(np.float64)
+    largest = (half_trace + root)[v, u]
+    # λ / (λ + noise) for both eigenvalues keeps the eigenvectors: G (G + noise I)^-1.
+    a, b, c = tensor[:, 0] + noise, tensor[:, 1], tensor[:, 2] + noise
+    det = a * c - b * b
+    information = np.stack([1.0 - noise * c / det, noise * b / det, 1.0 - noise * a / det], axis=1)
+    points = np.stack([u, v], axis=1).astype(np.float32)
+    return Cells(points, information, (largest > noise) & (smallest[v, u] > 0.05 * noise))
+
+
+__all__ = ["BORDER", "CELL", "LEVELS", "Cells", "TrackingImage", "find_cells"]

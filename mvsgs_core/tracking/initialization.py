@@ -1,0 +1,132 @@
+"""Start-up: poses and depths of the first keyframes from nothing but their matches.
+
+Two starts from essential matrices and one from identity poses are bundle adjusted; the lowest cost wins, if the
+cameras moved enough against the depths for it to mean anything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.camera import matrix
+from mvsgs_core.tracking.bundle_adjustment import Solution, Solver, adjust, reproject
+from mvsgs_core.tracking.graph import KeyframeGraph
+
+
+@dataclass(frozen=True)
+class StartCriteria:
+    """When a start counts as one. Pixels at the tracker's size."""
+
+    max_cost: float = 0.7  # robust cost (Cauchy, 1 pixel) a match
+    min_parallax: float = 2.0  # pixels, median over the matches of the longest pair: what a rotation can't explain
+    min_baseline: float = 0.03  # largest distance of two cameras over the median depth
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start-up attempt; `failure` is empty where it may be used, else the reason why not."""
+
+    cam_from_world: np.ndarray  # (K, 4, 4)
+    inverse_depth: np.ndarray  # (K, M), median 1
+    information: np.ndarray  # (K, M)
+    cost: float  # a match
+    parallax: float  # pixels
+    baseline: float  # over the median depth
+    failure: str
+
+
+def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, threads: int) -> Start:
+    """Solves keyframes `order` of the graph, without changing it."""
+    everything = set(order)
+    problem = graph.problem(order, everything - {order[0]}, everything, prior=True)
+    k, m = problem.inverse_depth.shape
+    problem = replace(problem, prior=np.ones((k, m)), prior_weight=np.full((k, m), 0.05), damping=np.full((k, m), 0.01))
+    matched = float(np.sum(problem.information[:, 0] > 0))
+    starts = [np.tile(np.eye(4), (k, 1, 1)), *_essential_starts(graph, order)]
+    best: Solution | None = None
+    for poses in starts:
+        attempt: Solution | None = None
+        current = replace(problem, cam_from_world=poses, inverse_depth=np.ones((k, m)))
+        for scale, steps in ((8.0, 12), (3.0, 8), (1.0, 12)):
+            solver = Solver(steps=steps, robust_scale=scale, lm=1e-3, threads=threads)
+            attempt = adjust(current, solver)
+            if attempt.failure:
+                break
+            current = replace(current, cam_from_world=attempt.cam_from_world, inverse_depth=attempt.inverse_depth)
+        if attempt is not None and not attempt.failure and (best is None or attempt.cost < best.cost):
+            best = attempt
+    if best is None:
+        nothing = np.ones((k, m))
+        return Start(starts[0], nothing, 0.0 * nothing, np.inf, 0.0, 0.0, "no start could be solved")
+    poses, depths = best.cam_from_world, best.inverse_depth
+    known = best.information * depths**2 > 10.0
+    scale = float(np.median(depths[known])) if known.sum() > 50 else float(np.median(depths))
+    poses = poses.copy()
+    poses[:, :3, 3] *= scale
+    depths = depths / scale
+    centers = geometry.inverse(poses)[:, :3, 3]
+    baseline = float(np.max(np.linalg.norm(centers[:, None] - centers[None], axis=-1)))
+    parallax = _parallax(poses, depths, problem.pixels, graph.intrinsics, problem.source, problem.to, problem.information)
+    cost = best.cost / max(matched, 1.0)
+    failure = ""
+    if not np.isfinite(cost) or cost > criteria.max_cost:
+        failure = f"the matches do not agree (cost {cost:.2f} a match)"
+    elif parallax < criteria.min_parallax or baseline < criteria.min_baseline:
+        failure = f"too little parallax ({parallax:.1f} pixels, baseline {baseline:.3f} of the depth)"
+    elif known.mean() < 0.15:
+        failure = "too few points could be triangulated"
+    return Start(poses, depths, best.information * scale**2, cost, parallax, baseline, failure)
+
+
+def _parallax(
+    poses: np.ndarray,
+    depths: np.ndarray,
+    pixels: np.ndarray,
+    intrinsics: np.ndarray,
+    source: np.ndarray,
+    to: np.ndarray,
+    information: np.ndarray,
+) -> float:
+    """Largest median, over the edges, of the distance between a point's projection and that at infinity."""
+    full, z = reproject(poses, depths, pixels, intrinsics, source, to)
+    far, z_far = reproject(poses, np.zeros_like(depths), pixels, intrinsics, source, to)
+    seen = (information[:, 0] > 0) & (z > 0.05) & (z_far > 0.05)
+    distance = np.linalg.norm(full - far, axis=1)
+    medians = [float(np.median(d[s])) for d, s in zip(distance, seen) if s.sum() > 30]
+    return max(medians, default=0.0)
+
+
+def _essential_starts(graph: KeyframeGraph, order: list[int]) -> list[np.ndarray]:
+    """Poses (K, 4, 4) from the two pairs whose essential matrices hold over the widest flow, spread by time."""
+    rated = []
+    for a, b in graph.edges:
+        if a not in order or b not in order or a >= b:
+            continue
+        edge = graph.edges[a, b]
+        moved = np.linalg.norm(edge.target.T - graph.keyframes[a].points, axis=1)[edge.weight > 0]
+        rated.append((float(np.median(moved)) * edge.share, a, b))
+    camera = matrix(graph.intrinsics)
+    starts = []
+    for _, a, b in sorted(rated, reverse=True)[:2]:
+        edge = graph.edges[a, b]
+        seen = edge.weight > 0
+        here, there = graph.keyframes[a].points[seen].astype(np.float64), edge.target.T[seen].astype(np.float64)
+        cv2.setRNGSeed(0)
+        essential, mask = cv2.findEssentialMat(here, there, camera, cv2.USAC_MAGSAC, 0.999, 1.0)
+        if essential is None or essential.shape != (3, 3):
+            continue
+        _, rotation, translation, _ = cv2.recoverPose(essential, here, there, camera, mask=mask)
+        relative = np.eye(4)
+        relative[:3, :3], relative[:3, 3] = rotation, 0.1 * translation.ravel()
+        twist = geometry.se3_log(relative)
+        at = np.array([(index - a) / (b - a) for index in order])
+        poses = geometry.se3_exp(at[:, None] * twist)
+        starts.append(poses @ geometry.inverse(poses[0]))
+    return starts
+
+
+__all__ = ["Start", "StartCriteria", "start_up"]

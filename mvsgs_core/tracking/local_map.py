@@ -1,0 +1,140 @@
+"""A new keyframe becomes part of the map: coarse depth, edges to its neighbors, bundle adjustment of the window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core import native
+from mvsgs_core.tracking.bundle_adjustment import Solution, Solver
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matcher import Matcher
+
+
+@dataclass(frozen=True)
+class LocalMapConfig:
+    recent: int = 3  # keyframes before, matched both ways
+    proximity: int = 3  # older keyframes that see the same, matched both ways
+    proximity_flow: float = 0.25  # of the image width: largest mean flow to such a keyframe
+    window: int = 12  # keyframes in the local bundle adjustment; the two oldest poses are held
+    steps: int = 5  # of the local bundle adjustment
+    robust_scale: float = 1.0  # pixels
+    min_share: float = 0.25  # of the textured points that an edge must have found
+
+
+class LocalMap:
+    """Grows the graph by one keyframe at a time."""
+
+    def __init__(self, graph: KeyframeGraph, matcher: Matcher, config: LocalMapConfig, threads: int) -> None:
+        self.graph = graph
+        self.matcher = matcher
+        self.config = config
+        self.threads = threads
+
+    def insert(
+        self, image: TrackingImage, cam_from_world: np.ndarray, segment: int, matches: dict[int, Matches]
+    ) -> Keyframe:
+        """Adds a keyframe with its pose; `matches`: points of older keyframes, by index, found in it."""
+        inverse_depth = self._carry_depth(image, cam_from_world, matches)
+        keyframe = Keyframe(
+            image, cam_from_world, inverse_depth, inverse_depth.copy(), np.zeros(len(inverse_depth)), segment
+        )
+        earlier = self.members(segment)
+        self.graph.add(keyframe)
+        recent = earlier[-self.config.recent :]
+        for index in recent:
+            if index in matches:
+                self.graph.connect(index, image.index, matches[index], self.config.min_share)
+            else:
+                self.match_edge(index, image.index)
+            self.match_edge(image.index, index)
+        for index in self.nearby(image.index, earlier[: -self.config.recent], self.config.proximity):
+            self.match_edge(image.index, index)
+            self.match_edge(index, image.index)
+        return keyframe
+
+    def members(self, segment: int) -> list[int]:
+        return sorted(index for index, k in self.graph.keyframes.items() if k.segment == segment)
+
+    def match_edge(self, source: int, to: int, enough: float | None = None) -> bool:
+        """Matches an edge from where the map says the points should be."""
+        guess, _ = self.graph.predict(source, to)
+        a, b = self.graph.keyframes[source].image, self.graph.keyframes[to].image
+        matches, _ = self.matcher.match(a, b, guess, self.config.min_share if enough is None else enough)
+        return self.graph.connect(source, to, matches, self.config.min_share)
+
+    def nearby(self, index: int, candidates: list[int], count: int, apart: int = 2) -> list[int]:
+        """Keyframes that see the same from close by: smallest mean flow first, no two next to each other in time."""
+        flows = self.graph_flow(index, candidates)
+        limit = self.config.proximity_flow * self.graph.keyframes[index].image.size[1]
+        order = {candidate: n for n, candidate in enumerate(candidates)}
+        chosen: list[int] = []
+        for candidate in sorted(flows, key=lambda c: flows[c]):
+            if flows[candidate] > limit or len(chosen) == count:
+                break
+            if all(abs(order[candidate] - order[c]) >= apart for c in chosen):
+                chosen.append(candidate)
+        return chosen
+
+    def graph_flow(self, index: int, candidates: list[int], min_overlap: float = 0.5) -> dict[int, float]:
+        """Mean flow in pixels from keyframe `index` to each candidate, where enough of it would be seen there."""
+        if not candidates:
+            return {}
+        keyframe = self.graph.keyframes[index]
+        some = np.flatnonzero(keyframe.image.cells.textured)[::4]
+        if len(some) == 0:
+            return {}
+        fx, fy, cx, cy = self.graph.intrinsics
+        u, v = keyframe.points[some].astype(np.float64).T
+        rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)])
+        poses = np.stack([self.graph.keyframes[c].cam_from_world for c in candidates])
+        relative = poses @ self.graph.world_from_cam(index)
+        points = relative[:, :3, :3] @ rays + relative[:, :3, 3:] * keyframe.inverse_depth[some]
+        z = np.where(points[:, 2] > 0.05, points[:, 2], np.inf)
+        to_u, to_v = fx * points[:, 0] / z + cx, fy * points[:, 1] / z + cy
+        height, width = keyframe.image.size
+        inside = np.isfinite(z) & (to_u >= 0) & (to_v >= 0) & (to_u < width) & (to_v < height)
+        seen = inside.sum(axis=1)
+        flow = np.where(inside, np.hypot(to_u - u, to_v - v), 0.0).sum(axis=1) / np.maximum(seen, 1)
+        return {c: float(f) for c, f, n in zip(candidates, flow, seen) if n > min_overlap * len(some)}
+
+    def adjust_window(self, newest: int) -> Solution:
+        """Bundle adjustment of the newest keyframes; older neighbors take part, held."""
+        members = self.members(self.graph.keyframes[newest].segment)
+        window = members[-self.config.window :]
+        held = set(window[:2]) if len(members) > len(window) else {window[0]}
+        around = {n for index in window for n in self.graph.neighbors(index)} & set(members)
+        solver = Solver(steps=self.config.steps, robust_scale=self.config.robust_scale, threads=self.threads)
+        return self.graph.optimize(set(window) | around, set(window) - held, set(window), solver)
+
+    def _carry_depth(self, image: TrackingImage, pose: np.ndarray, matches: dict[int, Matches]) -> np.ndarray:
+        """Inverse depths (M,): the median of the five nearest points of other keyframes found or expected here."""
+        at, depths = [], []
+        for index, found in matches.items():
+            keyframe = self.graph.keyframes[index]
+            expected, inside = self.graph.predict_pose(index, pose)
+            seen = found.alive | inside
+            relative = pose @ self.graph.world_from_cam(index)
+            fx, fy, cx, cy = self.graph.intrinsics
+            u, v = keyframe.points.T.astype(np.float64)
+            row = relative[2]
+            z = row[0] * (u - cx) / fx + row[1] * (v - cy) / fy + row[2] + row[3] * keyframe.inverse_depth
+            seen &= z > 0.05
+            if (seen & keyframe.triangulated).sum() > 50:
+                seen &= keyframe.triangulated
+            at.append(np.where(found.alive[:, None], found.target, expected)[seen])
+            depths.append((keyframe.inverse_depth / np.where(z > 0.05, z, 1.0))[seen])
+        points = np.concatenate(at) if at else np.zeros((0, 2))
+        if len(points) == 0:
+            return np.ones(len(image.cells.points))
+        values = np.concatenate(depths)
+        near = native.load("tracking").median_of_nearest(
+            points, values, image.cells.points.astype(np.float64), 5, float(image.size[1])
+        )
+        return np.where(np.isfinite(near), near, np.median(values))
+
+
+__all__ = ["LocalMap", "LocalMapConfig"]

@@ -1,0 +1,71 @@
+"""The pose of one frame against keyframes whose depths are known: motion-only bundle adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core.tracking.bundle_adjustment import Graph, Solver, adjust, reproject
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.graph import KeyframeGraph
+
+
+@dataclass(frozen=True)
+class Localization:
+    """A pose and how well the matches support it."""
+
+    cam_from_world: np.ndarray  # (4, 4)
+    inliers: float  # share of the matches with known depth that agree with the pose
+    count: int  # matches with known depth
+    error: float  # pixels, median over those matches
+    failure: str = ""
+
+
+def localize(
+    graph: KeyframeGraph,
+    matches: dict[int, Matches],
+    start: np.ndarray,
+    solver: Solver,
+    inlier_pixels: float = 2.0,
+) -> Localization:
+    """The pose (4, 4) that explains where the points of keyframes (by index) were found, from a start near it.
+
+    Points that were never triangulated are left out: in a pure rotation their depths would invent a translation.
+    """
+    order = sorted(matches)
+    frames = [graph.keyframes[index] for index in order]
+    k = len(order)
+    cells = len(frames[0].inverse_depth)
+    weights = np.stack([np.where(f.triangulated, matches[i].weight, 0.0) for i, f in zip(order, frames)])
+    if (weights > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
+        weights = np.stack([matches[i].weight for i in order])
+    target = np.stack([np.nan_to_num(matches[i].target.T) for i in order])
+    information = np.stack([f.image.cells.information.T for f in frames]) * weights[:, None]
+    problem = Graph(
+        cam_from_world=np.stack([*(f.cam_from_world for f in frames), start]),
+        inverse_depth=np.stack([*(f.inverse_depth for f in frames), np.ones(cells)]),
+        pixels=np.stack([*(f.points.T for f in frames), np.zeros((2, cells))]).astype(np.float64),
+        intrinsics=graph.intrinsics,
+        source=np.arange(k, dtype=np.int32),
+        to=np.full(k, k, np.int32),
+        target=target,
+        information=information,
+        free_pose=np.arange(k + 1) == k,
+        free_depth=np.zeros(k + 1, bool),
+    )
+    solution = adjust(problem, solver)
+    pose = solution.cam_from_world[k]
+    pixels, z = reproject(
+        solution.cam_from_world, problem.inverse_depth, problem.pixels, graph.intrinsics, problem.source, problem.to
+    )
+    used = weights > 0
+    error = np.where(z > 0, np.linalg.norm(pixels - target, axis=1), np.inf)[used]
+    if len(error) == 0:
+        return Localization(start, 0.0, 0, np.inf, "no match has a known depth")
+    return Localization(
+        pose, float(np.mean(error < inlier_pixels)), len(error), float(np.median(error)), solution.failure
+    )
+
+
+__all__ = ["Localization", "localize"]

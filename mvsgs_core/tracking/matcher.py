@@ -1,0 +1,51 @@
+"""Matches the points of a keyframe in another image: the flow, and features where the flow loses too many."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core.tracking.flow import FeatureFlow, Flow, Matches
+from mvsgs_core.tracking.image import TrackingImage
+
+
+class Matcher:
+    """`flow` refines the guess; where too few points survive, features give another guess, and the better one wins."""
+
+    def __init__(self, flow: Flow) -> None:
+        self.flow = flow
+        self.features = FeatureFlow()
+        self.calls = 0
+        self.feature_calls = 0  # how often features had to help
+
+    def match(self, a: TrackingImage, b: TrackingImage, guess: np.ndarray, enough: float) -> tuple[Matches, float]:
+        """Points of a's cells (M) in b. guess: (M, 2), NaN where there is none.
+
+        enough: share of the textured points below which features are tried; 0 never tries them.
+        Returns the matches and the share of the textured points that were found.
+        """
+        self.calls += 1
+        matches, share = self._flow(a, b, guess)
+        if share < enough:
+            self.feature_calls += 1
+            spread = self.features.match(a, b, a.cells.points, guess)
+            if spread.alive.sum() > 0:
+                other, other_share = self._flow(a, b, spread.target)
+                if other_share > share:
+                    return other, other_share
+        return matches, share
+
+    def _flow(self, a: TrackingImage, b: TrackingImage, guess: np.ndarray) -> tuple[Matches, float]:
+        cells = a.cells
+        height, width = b.size
+        with np.errstate(invalid="ignore"):
+            near = np.all((guess > -16) & (guess < [width + 15, height + 15]), axis=1)
+        wanted = np.flatnonzero(cells.textured & near)
+        target, weight = np.full((len(near), 2), np.nan), np.zeros(len(near))
+        if len(wanted):
+            found = self.flow.match(a, b, cells.points[wanted], guess[wanted])
+            target[wanted], weight[wanted] = found.target, found.weight
+        share = float((weight > 0).sum() / max(1, cells.textured.sum()))
+        return Matches(target, weight), share
+
+
+__all__ = ["Matcher"]

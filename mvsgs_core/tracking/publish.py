@@ -1,0 +1,77 @@
+"""What the outside was told of each keyframe, so that only what changed is told again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core.tracking.graph import KeyframeGraph
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Keyframe poses as they are now, absolute."""
+
+    index: np.ndarray  # (K,) int64
+    world_from_cam: np.ndarray  # (K, 4, 4) float64
+    scale: np.ndarray  # (K,) float64: depths now over depths when the keyframe was first told
+
+
+@dataclass
+class _Told:
+    world_from_cam: np.ndarray
+    scale: float
+    inverse_depth: np.ndarray  # when first told
+    known: np.ndarray
+
+
+class Publisher:
+    """tolerance: of the median depth (positions), radians (rotations) and share (scales) that counts as a change."""
+
+    def __init__(self, graph: KeyframeGraph, tolerance: float) -> None:
+        self.graph = graph
+        self.tolerance = tolerance
+        self._told: dict[int, _Told] = {}
+
+    def tell(self, index: int) -> None:
+        """A keyframe was sent as it is now, with scale 1."""
+        keyframe = self.graph.keyframes[index]
+        self._told[index] = _Told(
+            self.graph.world_from_cam(index), 1.0, keyframe.inverse_depth.copy(), keyframe.triangulated.copy()
+        )
+
+    @property
+    def told(self) -> set[int]:
+        return set(self._told)
+
+    def corrections(self, everything: bool = False) -> Correction | None:
+        """Every keyframe that moved noticeably since it was last told; None where none did."""
+        moved = []
+        for index, told in self._told.items():
+            if index not in self.graph.keyframes:
+                continue
+            pose, scale = self.graph.world_from_cam(index), self._scale(index, told)
+            shift = np.linalg.norm(pose[:3, 3] - told.world_from_cam[:3, 3]) / self.graph.keyframes[index].median_depth
+            turn = np.linalg.norm(pose[:3, :3] - told.world_from_cam[:3, :3]) / np.sqrt(2.0)
+            if everything or max(shift, turn, abs(np.log(scale / told.scale))) > self.tolerance:
+                moved.append((index, pose, scale))
+        if not moved:
+            return None
+        for index, pose, scale in moved:
+            self._told[index].world_from_cam, self._told[index].scale = pose, scale
+        return Correction(
+            np.array([m[0] for m in moved], np.int64),
+            np.stack([m[1] for m in moved]),
+            np.array([m[2] for m in moved], np.float64),
+        )
+
+    def _scale(self, index: int, told: _Told) -> float:
+        keyframe = self.graph.keyframes[index]
+        known = keyframe.triangulated & told.known
+        if known.sum() < 20:
+            return told.scale
+        return float(np.median(told.inverse_depth[known] / keyframe.inverse_depth[known]))
+
+
+__all__ = ["Correction", "Publisher"]
