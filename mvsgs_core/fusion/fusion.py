@@ -1,0 +1,157 @@
+"""Online fusion: depth maps in, with two more keyframes of lag refined and filtered ones out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.fusion.backend import FusionBackend, make_fusion_backend
+from mvsgs_core.fusion.confidence import probability_of_inlier
+from mvsgs_core.fusion.normals import normals_of
+from mvsgs_core.fusion.views import DepthView, warps_between
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """Refinement and filters; lengths are relative to depth."""
+
+    lag: int = 2  # keyframes after the reference that are waited for
+    window: int = 4  # keyframes before the reference that may be neighbors
+    neighbors: int = 4  # depth maps that a reference is checked with
+    refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
+    sigma: float = 0.01  # relative depth: width of the support
+    violation: float = 1.0  # weight of free-space violations against support
+    least_confidence: float = 0.1  # a neighbor's pixel below takes no part in the refinement
+    check: bool = True  # geometric consistency
+    relative: float = 0.01  # relative depth difference that still agrees
+    round_trip: bool = False  # check by projecting back, instead of the paper's one way
+    pixels: float = 1.0  # round trip: distance to where it started
+    least_views: int = 3  # views that must agree, the reference counted
+    confidence: float = 0.7  # least confidence of a kept pixel
+    device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda"
+    threads: int | None = None  # of the C++ kernels; None: all
+
+
+@dataclass(frozen=True)
+class FusedDepth:
+    """One keyframe's filtered depth."""
+
+    view: DepthView  # as it came, pose and scale corrected
+    depth: np.ndarray  # (H, W) float32, 0 where filtered out
+    unfiltered: np.ndarray  # (H, W) float32 refined depth before the filters
+    confidence: np.ndarray  # (H, W) float32 refined, calibrated
+    normals: np.ndarray  # (H, W, 3) float32 camera frame, 0 where depth is 0
+    consistent: np.ndarray  # (H, W) uint8 neighbors that agree
+    counts: dict[str, float] = field(default_factory=dict)  # pixels kept, and rejected by each filter
+    problem: str = ""  # a limit that had to be relaxed, or why nothing is kept
+
+
+class DepthFusion:
+    """Feeds on depth maps in stream order; `add` and `flush` yield each keyframe's exactly once, in order."""
+
+    def __init__(self, config: FusionConfig | None = None) -> None:
+        self.config = config or FusionConfig()
+        self._backend = make_fusion_backend(self.config.device, self.config.threads)
+        self._views: list[DepthView] = []
+        self._waiting: list[int] = []
+
+    def add(self, view: DepthView) -> Iterator[FusedDepth]:
+        """Fused depth of the keyframe `lag` before this one; of all that wait if a new segment or size starts."""
+        if self._views and (view.segment != self._views[-1].segment or view.size != self._views[-1].size):
+            yield from self.flush()
+            self._views.clear()
+        self._views.append(view)
+        self._waiting.append(view.index)
+        while len(self._waiting) > self.config.lag:
+            yield self._next()
+        del self._views[: max(0, len(self._views) - self.config.window - self.config.lag - 1)]
+
+    def flush(self) -> Iterator[FusedDepth]:
+        """Fused depth of the keyframes that still wait."""
+        while self._waiting:
+            yield self._next()
+
+    def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
+        """Corrected poses (world_from_cam (4, 4), scale) by keyframe index: stored depths are scaled with them."""
+        self._views = [v.moved(*poses[v.index]) if v.index in poses else v for v in self._views]
+
+    def _next(self) -> FusedDepth:
+        index = self._waiting.pop(0)
+        reference = next(v for v in self._views if v.index == index)
+        others = [v for v in self._views if v.index != index]
+        return fuse(reference, nearest_views(reference, others, self.config.neighbors), self.config, self._backend)
+
+
+def nearest_views(reference: DepthView, others: list[DepthView], count: int) -> list[DepthView]:
+    """Of the maps that have depth at all, those that see most of the reference's points; ties: the wider baseline."""
+    known = reference.depth > 0
+    if not known.any():
+        return []
+    v, u = np.nonzero(known)
+    chosen = slice(None, None, max(1, len(v) // 300))
+    u, v = u[chosen], v[chosen]
+    z = reference.depth[v, u].astype(np.float64)
+    fx, fy, cx, cy = reference.intrinsics
+    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
+    world = points @ reference.world_from_cam[:3, :3].T + reference.world_from_cam[:3, 3]
+    scored = []
+    for other in others:
+        if not (other.depth > 0).any():
+            continue
+        cam_from_world = geometry.inverse(other.world_from_cam)
+        local = world @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+        front = local[:, 2] > 1e-9
+        safe = np.where(front, local[:, 2], 1.0)
+        x = other.intrinsics[0] * local[:, 0] / safe + other.intrinsics[2]
+        y = other.intrinsics[1] * local[:, 1] / safe + other.intrinsics[3]
+        overlap = np.mean(front & (x >= 0) & (x < other.size[1]) & (y >= 0) & (y < other.size[0]))
+        baseline = np.linalg.norm(other.world_from_cam[:3, 3] - reference.world_from_cam[:3, 3])
+        if overlap > 0.1:
+            scored.append((-round(float(overlap), 1), -float(baseline), other.index, other))
+    return [entry[3] for entry in sorted(scored, key=lambda entry: entry[:3])[:count]]
+
+
+def fuse(
+    reference: DepthView, neighbors: list[DepthView], config: FusionConfig, backend: FusionBackend
+) -> FusedDepth:
+    """Refines and filters one map with its neighbors', all of one size."""
+    known = reference.depth > 0
+    depth, confidence = reference.depth, reference.confidence
+    consistent = np.zeros(reference.size, dtype=np.uint8)
+    problem = ""
+    counts: dict[str, float] = {"pixels": float(depth.size), "known": float(known.sum())}
+    if neighbors:
+        there, back = warps_between(reference, neighbors)
+        depths = np.ascontiguousarray(np.stack([n.depth for n in neighbors]))
+        confidences = np.ascontiguousarray(np.stack([n.confidence for n in neighbors]))
+        if config.refine:
+            splatted = backend.splat(depths, confidences, back, config.least_confidence, reference.size)
+            fused = backend.fuse(
+                depth, confidence, depths, confidences, splatted, there, config.sigma, config.violation,
+                config.least_confidence,
+            )  # fmt: skip
+            depth = fused.depth
+        consistent = backend.consistent_views(
+            depth, depths, there, back, config.relative, config.pixels, config.round_trip
+        )
+        if config.refine:
+            confidence = probability_of_inlier(fused, consistent)
+    keep = depth > 0
+    sure = confidence >= config.confidence
+    counts["rejected: confidence"] = float((keep & ~sure).sum())
+    if config.check:
+        needed = config.least_views - 1
+        if len(neighbors) < needed:
+            needed = len(neighbors)
+            problem = "too few neighbors for the consistency check" if needed else "no neighbor to check depth with"
+        agreed = consistent >= max(needed, 1)
+        counts["rejected: consistency"] = float((keep & ~agreed).sum())
+        keep = keep & agreed
+    keep = keep & sure
+    counts["kept"] = float(keep.sum())
+    filtered = np.where(keep, depth, 0.0).astype(np.float32)
+    normals = normals_of(filtered, reference.intrinsics)
+    return FusedDepth(reference, filtered, depth, confidence, normals, consistent, counts, problem)

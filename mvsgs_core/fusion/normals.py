@@ -1,0 +1,44 @@
+"""Surface normals of a depth map: a plane's inverse depth is linear in the pixel, so its gradient gives the normal."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from mvsgs_core import camera
+
+
+def normals_of(depth: np.ndarray, intrinsics: np.ndarray, radius: int = 2, largest_jump: float = 0.05) -> np.ndarray:
+    """(H, W, 3) float32 unit normals in the camera frame, toward the camera; 0 where depth (H, W) is 0.
+
+    For n·X = d in front of the camera, 1 / z = a u + b v + c with (a, b, c) = K⁻ᵀ n / d. Differences across a relative
+    jump of depth above `largest_jump` are left out; the rest is averaged over (2 radius + 1)² pixels. A pixel without
+    any usable difference faces the camera.
+    """
+    known = depth > 0
+    inverse = np.where(known, 1.0 / np.where(known, depth, 1.0), 0.0).astype(np.float32)
+    slope_u = _mean_difference(inverse, known, 1, radius, largest_jump)
+    slope_v = _mean_difference(inverse, known, 0, radius, largest_jump)
+    u, v = camera.pixel_grid(*depth.shape)
+    fx, fy, cx, cy = (float(k) for k in intrinsics)
+    offset = inverse - slope_u * u - slope_v * v
+    normal = np.stack([fx * slope_u, fy * slope_v, cx * slope_u + cy * slope_v + offset], axis=-1)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    unit = -normal / np.maximum(length, 1e-12)  # n·X = d > 0 points away from the camera
+    return np.where(known[..., None], unit, 0.0).astype(np.float32)
+
+
+def _mean_difference(inverse: np.ndarray, known: np.ndarray, axis: int, radius: int, largest_jump: float) -> np.ndarray:
+    """(H, W) float64: mean, over the window, of the differences between neighboring pixels along `axis`."""
+    here = (slice(None), slice(None, -1)) if axis == 1 else (slice(None, -1), slice(None))
+    there = (slice(None), slice(1, None)) if axis == 1 else (slice(1, None), slice(None))
+    difference = np.zeros(inverse.shape)
+    usable = np.zeros(inverse.shape)
+    step = inverse[there].astype(np.float64) - inverse[here]
+    good = known[there] & known[here] & (np.abs(step) < largest_jump * np.maximum(inverse[there], inverse[here]))
+    difference[here] = np.where(good, step, 0.0)
+    usable[here] = good
+    window = (2 * radius + 1, 2 * radius + 1)
+    total = cv2.boxFilter(difference, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    count = cv2.boxFilter(usable, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(total / np.maximum(count, 1.0))

@@ -1,0 +1,126 @@
+"""The heavy steps of stereo, on the CPU in C++ or in PyTorch: same arrays in, same arrays out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from mvsgs_core import native
+
+
+@dataclass(frozen=True)
+class CostOptions:
+    """Windowed ZNCC of a sweep."""
+
+    radius: int = 2  # pixels: a window of 2 radius + 1
+    best: int = 2  # views whose cost counts, of all
+    noise: float = 4.0  # gray levels²: added to both variances
+
+
+@dataclass(frozen=True)
+class SmoothOptions:
+    """Semi-global smoothing, and the softmax that gives depth and probability."""
+
+    small_jump: float = 0.04  # cost of a change by one hypothesis
+    large_jump: float = 0.25  # cost of a larger change
+    edge: float = 12.0  # gray levels that halve these
+    break_steps: float = 4.0  # hypotheses: a larger jump of the surface ends the path
+    temperature: float = 0.02  # of the softmax, in cost
+    paths: int = 8  # directions, 4 or 8
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a stage found, each (H, W)."""
+
+    index: np.ndarray  # float32 expected hypothesis
+    probability: np.ndarray  # float32 softmax mass within one hypothesis of the best
+    margin: np.ndarray  # float32 how much worse the best other hypothesis is, in cost, at most 1
+    best: np.ndarray  # int32 the best hypothesis
+
+
+class Backend(Protocol):
+    """Images (H, W) and (N, H, W) float32; warps (N, 12) float32; `first`, `step` (H, W) float32: hypothesis k of a
+
+    pixel is the inverse depth first + k step. Costs are (H, D, W) float32 in [0, 1].
+    """
+
+    def cost_volume(
+        self,
+        reference: np.ndarray,
+        neighbors: np.ndarray,
+        warps: np.ndarray,
+        first: np.ndarray,
+        step: np.ndarray,
+        hypotheses: int,
+        options: CostOptions,
+    ) -> np.ndarray: ...
+
+    def semi_global(
+        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
+    ) -> Choice: ...
+
+    def view_correlation(
+        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,
+        options: CostOptions,
+    ) -> np.ndarray: ...  # fmt: skip
+
+
+class NativeBackend:
+    """The C++ kernels; `threads` None: all that OpenMP has."""
+
+    def __init__(self, threads: int | None = None) -> None:
+        self._kernels = native.load("stereo")
+        self._threads = threads or 0
+
+    def cost_volume(
+        self,
+        reference: np.ndarray,
+        neighbors: np.ndarray,
+        warps: np.ndarray,
+        first: np.ndarray,
+        step: np.ndarray,
+        hypotheses: int,
+        options: CostOptions,
+    ) -> np.ndarray:
+        return np.asarray(
+            self._kernels.cost_volume(
+                reference, neighbors, warps, first, step, hypotheses, options.radius, options.best, options.noise,
+                threads=self._threads,
+            )
+        )  # fmt: skip
+
+    def semi_global(
+        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
+    ) -> Choice:
+        return Choice(
+            *self._kernels.semi_global(
+                cost, reference, first, step, options.small_jump, options.large_jump, options.edge,
+                options.break_steps, options.temperature, options.paths, threads=self._threads,
+            )
+        )  # fmt: skip
+
+    def view_correlation(
+        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,
+        options: CostOptions,
+    ) -> np.ndarray:  # fmt: skip
+        return np.asarray(
+            self._kernels.view_correlation(
+                reference, neighbors, warps, inverse_depth, options.radius, options.noise, threads=self._threads
+            )
+        )
+
+
+def make_backend(device: str, threads: int | None = None) -> Backend:
+    """`device` "auto" (CUDA if there is one), "cpu" (C++), "torch" (PyTorch on the CPU) or a torch device like "cuda"."""
+    if device == "auto":
+        import torch
+
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    if device == "cpu":
+        return NativeBackend(threads)
+    from mvsgs_core.mvs.torch_backend import TorchBackend
+
+    return TorchBackend("cpu" if device == "torch" else device)

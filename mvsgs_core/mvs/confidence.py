@@ -1,0 +1,68 @@
+"""Confidence of a stereo depth as a calibrated probability that it is an inlier (within 5 % of the truth)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Logistic regression on `Evidence.features`.
+WEIGHTS = np.array([-3.0, 2.0, 1.5, 1.5, 1.0, -1.0, 0.3])
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for a pixel's depth, each (H, W) float32."""
+
+    correlation: np.ndarray  # ZNCC at the solution, mean of the two best views, 0 to 1
+    support: np.ndarray  # part of the views that correlate above 0.6
+    probability: np.ndarray  # of the last stage's softmax
+    first_probability: np.ndarray  # of the first stage's
+    relative_pixel: np.ndarray  # relative change of depth that moves the point by one pixel
+    texture: np.ndarray  # gray levels: local contrast of the reference
+
+    @staticmethod
+    def of(
+        correlation: np.ndarray,
+        probability: np.ndarray,
+        margin: np.ndarray,
+        first_probability: np.ndarray,
+        relative_pixel: np.ndarray,
+        gray: np.ndarray,
+    ) -> Evidence:
+        """From ZNCC of each view (N, H, W), -2 where not seen, and maps (H, W)."""
+        import cv2
+
+        del margin
+        ordered = np.sort(np.clip(correlation, 0.0, 1.0), axis=0)[::-1]
+        best = ordered[: min(2, len(ordered))].mean(axis=0)
+        mean = cv2.blur(gray, (5, 5))
+        variance = np.maximum(cv2.blur(gray * gray, (5, 5)) - mean * mean, 0.0)
+        return Evidence(
+            correlation=best,
+            support=np.mean(correlation > 0.6, axis=0, dtype=np.float32),
+            probability=probability,
+            first_probability=first_probability,
+            relative_pixel=np.asarray(relative_pixel, dtype=np.float32),
+            texture=np.sqrt(variance),
+        )
+
+    def features(self) -> np.ndarray:
+        """(F, H, W) float32, the first all ones."""
+        return np.stack(
+            [
+                np.ones_like(self.correlation),
+                self.correlation,
+                self.support,
+                self.probability,
+                self.first_probability,
+                np.log(np.clip(self.relative_pixel, 1e-4, 1.0) / 0.01),
+                np.log(1.0 + self.texture),
+            ]
+        ).astype(np.float32)
+
+
+def probability_of_inlier(evidence: Evidence) -> np.ndarray:
+    """(H, W) float32 in [0, 1]."""
+    logit = np.tensordot(WEIGHTS.astype(np.float32), evidence.features(), axes=1)
+    return np.asarray(1.0 / (1.0 + np.exp(-logit)), dtype=np.float32)

@@ -1,0 +1,99 @@
+"""Inverse-depth ranges: of a keyframe from the tracker's coarse grid, of a stage from the stage before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mvsgs_core import camera
+from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.warp import apply_warp, relative_warp
+
+
+@dataclass(frozen=True)
+class RangeChoice:
+    """How the search range follows from sparse, partly wrong coarse depth."""
+
+    percentile: float = 2.0  # of the valid inverse depths, at each end
+    margin: float = 1.6  # factor beyond these percentiles
+    least_cells: int = 24  # fewer valid cells: ask the neighbors' grids
+    least_weight: float = 0.05  # a cell below is unknown
+
+
+@dataclass(frozen=True)
+class SearchRange:
+    """Inverse depths [low, high] to search, both positive."""
+
+    low: float
+    high: float
+    source: str  # "own grid", "neighbors' grids", "previous keyframe" or "given"
+
+    def typical(self) -> np.ndarray:
+        """(3,) inverse depths: near the far end, the middle, near the near end."""
+        return self.low + (self.high - self.low) * np.array([0.15, 0.4, 0.75])
+
+
+def valid_cells(view: StereoView, choice: RangeChoice) -> np.ndarray:
+    """(K,) float64 inverse depths that the tracker knows."""
+    good = np.isfinite(view.inverse_depth) & (view.inverse_depth > 0) & (view.weight >= choice.least_weight)
+    return view.inverse_depth[good].astype(np.float64)
+
+
+def range_of(inverse_depths: np.ndarray, choice: RangeChoice, source: str) -> SearchRange:
+    """Percentiles with a margin; robust to a few per cent of outliers."""
+    low, high = np.percentile(inverse_depths, [choice.percentile, 100.0 - choice.percentile])
+    return SearchRange(float(low / choice.margin), float(high * choice.margin), source)
+
+
+def search_range(
+    reference: StereoView, others: list[StereoView], previous: SearchRange | None, choice: RangeChoice
+) -> SearchRange | None:
+    """The reference's own range; else that of its neighbors' points seen from it; else the previous one; else None."""
+    own = valid_cells(reference, choice)
+    if len(own) >= choice.least_cells:
+        return range_of(own, choice, "own grid")
+    gathered = [own, *(_seen_from(reference, other, choice) for other in others)]
+    points = np.concatenate(gathered)
+    if len(points) >= choice.least_cells:
+        return range_of(points, choice, "neighbors' grids")
+    if previous is not None:
+        return SearchRange(previous.low, previous.high, "previous keyframe")
+    return None
+
+
+def _seen_from(reference: StereoView, other: StereoView, choice: RangeChoice) -> np.ndarray:
+    """(K,) inverse depths, in the reference, of the cells of another view that project into it."""
+    good = np.isfinite(other.inverse_depth) & (other.inverse_depth > 0) & (other.weight >= choice.least_weight)
+    if not good.any():
+        return np.empty(0)
+    size = other.inverse_depth.shape[:2]
+    u, v = camera.pixel_grid(*size)
+    warp = relative_warp(
+        camera.scale_intrinsics(other.intrinsics, other.size, size),
+        other.world_from_cam,
+        reference.intrinsics,
+        reference.world_from_cam,
+    )
+    w = other.inverse_depth[good].astype(np.float64)
+    x, y, z = apply_warp(warp, u[good], v[good], w)
+    height, width = reference.size
+    inside = (z > 1e-6) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    return np.asarray(w[inside] / z[inside])
+
+
+def upsample_surface(inverse_depth: np.ndarray, size: tuple[int, int], largest_gap: float) -> np.ndarray:
+    """(H, W) float32 of a coarse map: linear on a surface, nearest across a jump larger than `largest_gap`.
+
+    A linear mix across a jump would center the next search between the two surfaces, on neither of them.
+    """
+    smooth = cv2.medianBlur(np.ascontiguousarray(inverse_depth, dtype=np.float32), 3)
+    if smooth.shape[:2] == tuple(size):
+        return np.asarray(smooth)
+    linear = cv2.resize(smooth, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
+    kernel = np.ones((3, 3), np.uint8)
+    spread = cv2.dilate(smooth, kernel) - cv2.erode(smooth, kernel)
+    jump = cv2.resize(spread, (size[1], size[0]), interpolation=cv2.INTER_NEAREST) > largest_gap
+    nearest = cv2.resize(smooth, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
+    return np.ascontiguousarray(np.where(jump, nearest, linear), dtype=np.float32)

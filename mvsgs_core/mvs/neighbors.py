@@ -1,0 +1,84 @@
+"""Which keyframes a reference is matched with: enough baseline, enough overlap, a similar viewing direction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.warp import apply_warp, relative_warp
+
+
+@dataclass(frozen=True)
+class NeighborChoice:
+    """How neighbors are scored; angles are between the viewing rays at the scene's median depth."""
+
+    count: int = 4  # views
+    best_angle: float = 7.0  # degrees of parallax that score 1
+    angle_below: float = 4.0  # degrees, width of the score below that
+    angle_above: float = 12.0  # degrees, width above
+    least_angle: float = 0.4  # degrees: less gives no depth
+    least_overlap: float = 0.3  # part of the reference that the neighbor sees
+    turn: float = 30.0  # degrees between the optical axes that halve the score
+
+
+@dataclass(frozen=True)
+class Neighbor:
+    view: StereoView
+    angle: float  # degrees of parallax
+    overlap: float  # 0 to 1
+    score: float
+
+
+def score_neighbor(
+    reference: StereoView, other: StereoView, inverse_depths: np.ndarray, choice: NeighborChoice
+) -> Neighbor:
+    """Baseline, overlap and turn of one candidate; score 0 if it fails a limit. `inverse_depths` (K,): typical ones."""
+    warp = relative_warp(reference.intrinsics, reference.world_from_cam, other.intrinsics, other.world_from_cam)
+    height, width = reference.size
+    u, v, w = np.meshgrid(
+        np.linspace(0, width - 1, 7), np.linspace(0, height - 1, 7), inverse_depths.astype(np.float64), indexing="ij"
+    )
+    x, y, z = apply_warp(warp, u, v, w)
+    oh, ow = other.size
+    overlap = float(np.mean((z > 0) & (x >= 0) & (x <= ow - 1) & (y >= 0) & (y <= oh - 1)))
+    median_depth = 1.0 / float(np.median(inverse_depths))
+    center = reference.world_from_cam[:3, 3] + median_depth * reference.world_from_cam[:3, 2]
+    ray_a = center - reference.world_from_cam[:3, 3]
+    ray_b = center - other.world_from_cam[:3, 3]
+    angle = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(ray_a, ray_b)), ray_a @ ray_b)))
+    turned = float(
+        np.degrees(np.arccos(np.clip(reference.world_from_cam[:3, 2] @ other.world_from_cam[:3, 2], -1.0, 1.0)))
+    )
+    if angle < choice.least_angle or overlap < choice.least_overlap:
+        return Neighbor(other, angle, overlap, 0.0)
+    width_of_score = choice.angle_below if angle < choice.best_angle else choice.angle_above
+    by_angle = np.exp(-0.5 * ((angle - choice.best_angle) / width_of_score) ** 2)
+    by_turn = 1.0 / (1.0 + (turned / choice.turn) ** 2)
+    return Neighbor(other, angle, overlap, float(by_angle * by_turn * overlap) + 1e-6)
+
+
+def select_neighbors(
+    reference: StereoView, candidates: list[StereoView], inverse_depths: np.ndarray, choice: NeighborChoice
+) -> list[Neighbor]:
+    """Up to `choice.count` neighbors, best first. Half of them from each side in time where these score at all well,
+
+    because what one side does not see, behind an edge, the other often does.
+    """
+    scored = [score_neighbor(reference, c, inverse_depths, choice) for c in candidates if c.index != reference.index]
+    usable = sorted((n for n in scored if n.score > 0), key=lambda n: (-n.score, n.view.index))
+    if not usable:
+        return []
+    limit = 0.3 * usable[0].score
+    good = [n for n in usable if n.score >= limit]
+    half = choice.count // 2
+    before = [n for n in good if n.view.index < reference.index][:half]
+    after = [n for n in good if n.view.index > reference.index][: choice.count - half]
+    chosen = before + after
+    for neighbor in usable:
+        if len(chosen) >= choice.count:
+            break
+        if neighbor not in chosen:
+            chosen.append(neighbor)
+    return sorted(chosen, key=lambda n: (-n.score, n.view.index))

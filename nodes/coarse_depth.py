@@ -1,0 +1,38 @@
+"""Keyframe -> Depth: the tracker's own coarse depth, enlarged. The paper's ablation A, and a way to run without stereo."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from msgs import Depth, Keyframe
+from mvsgs_core import camera
+from mvsgs_core.mvs.coarse import enlarge_inverse_depth
+from nodes import Node
+
+
+class CoarseDepth(Node):
+    """Passes on what the tracker knows, at the size that stereo would have."""
+
+    @dataclass
+    class Config:
+        area: int = 320 * 240  # pixels of a depth map, aspect kept
+
+    config: Config
+
+    def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
+        size = camera.fit_size(*keyframe.image.shape[:2], self.config.area)
+        with self.stats.time("enlarge"):
+            depth, confidence = enlarge_inverse_depth(keyframe.inverse_depth, keyframe.inverse_depth_weight, size)
+        self.stats.count("keyframes")
+        yield Depth(
+            index=keyframe.index,
+            timestamp=keyframe.timestamp,
+            image=keyframe.image,
+            intrinsics=keyframe.intrinsics,
+            world_from_cam=keyframe.world_from_cam,
+            scale=keyframe.scale,
+            depth=depth,
+            confidence=confidence,
+            segment=keyframe.segment,
+        )

@@ -1,0 +1,112 @@
+"""Depth -> View: depth maps refined by their neighbors' and filtered, with two keyframes of lag."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from msgs import Depth, Poses, View
+from mvsgs_core import camera
+from mvsgs_core.fusion.fusion import DepthFusion as Fusion
+from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
+from mvsgs_core.fusion.views import DepthView
+from nodes import Node
+
+
+class DepthFusion(Node):
+    """Geometric consistency and temporal refinement; see mvsgs_core.fusion."""
+
+    @dataclass
+    class Config:
+        lag: int = 2  # keyframes after the reference that are waited for
+        window: int = 4  # keyframes before the reference that may be neighbors
+        neighbors: int = 4  # depth maps that a reference is checked with
+        refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
+        sigma: float = 0.01  # relative depth: width of the support
+        check: bool = True  # geometric consistency
+        relative: float = 0.01  # relative depth difference that still agrees
+        round_trip: bool = False  # check by projecting back, instead of the paper's one way
+        least_views: int = 3  # views that must agree, the reference counted
+        confidence: float = 0.7  # least confidence of a kept pixel
+        device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
+        threads: int | None = None  # of the C++ kernels; null: all
+
+    config: Config
+
+    def __init__(self, config: Config | None = None) -> None:
+        super().__init__(config)
+        c = self.config
+        self._fusion = Fusion(
+            FusionConfig(
+                lag=c.lag,
+                window=c.window,
+                neighbors=c.neighbors,
+                refine=c.refine,
+                sigma=c.sigma,
+                check=c.check,
+                relative=c.relative,
+                round_trip=c.round_trip,
+                least_views=c.least_views,
+                confidence=c.confidence,
+                device=c.device,
+                threads=c.threads,
+            )
+        )
+        self._depths: dict[int, Depth] = {}  # not sent yet
+        self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
+
+    def on_depth(self, depth: Depth) -> Iterator[View]:
+        self._depths[depth.index] = depth
+        view = DepthView(
+            index=depth.index,
+            depth=depth.depth,
+            confidence=depth.confidence,
+            intrinsics=camera.scale_intrinsics(depth.intrinsics, depth.image.shape[:2], depth.depth.shape),
+            world_from_cam=depth.world_from_cam,
+            scale=depth.scale,
+            segment=depth.segment,
+        )
+        if depth.index in self._poses:  # corrected before its depth came
+            view = view.moved(*self._poses[depth.index])
+        yield from self._timed(self._fusion.add(view))
+
+    def on_poses(self, poses: Poses) -> Iterator[View]:
+        for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
+            self._poses[int(i)] = (pose, float(scale))
+        self._fusion.move(self._poses)
+        yield from ()
+
+    def on_end(self) -> Iterator[View]:
+        yield from self._timed(self._fusion.flush())
+
+    def _timed(self, fused: Iterator[FusedDepth]) -> Iterator[View]:
+        while True:
+            with self.stats.time("fusion"):
+                found = next(fused, None)
+            if found is None:
+                return
+            yield self._message(found)
+
+    def _message(self, found: FusedDepth) -> View:
+        message = self._depths.pop(found.view.index)
+        self.stats.count("keyframes")
+        for name, value in found.counts.items():
+            self.stats.count(f"pixels {name}" if name != "pixels" else name, value)
+        if found.problem:
+            self.stats.warn(f"some keyframes: {found.problem}")
+            self.stats.count(found.problem)
+        self.stats.values["part kept"] = found.counts["kept"] / found.counts["pixels"]
+        return View(
+            index=message.index,
+            timestamp=message.timestamp,
+            image=message.image,
+            intrinsics=message.intrinsics,
+            world_from_cam=found.view.world_from_cam,
+            scale=found.view.scale,
+            depth=found.depth,
+            confidence=found.confidence,
+            normals=found.normals,
+            segment=message.segment,
+        )

@@ -1,0 +1,117 @@
+"""Keyframe -> Depth: multi-view stereo with two keyframes of lag."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from msgs import Depth, Keyframe, Poses
+from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth
+from mvsgs_core.mvs.hypotheses import RangeChoice
+from mvsgs_core.mvs.neighbors import NeighborChoice
+from mvsgs_core.mvs.stereo import Stage, StereoConfig
+from nodes import Node
+
+
+class Mvs(Node):
+    """Plane-sweep cascade without weights; see mvsgs_core.mvs."""
+
+    @dataclass
+    class Config:
+        area: int = 320 * 240  # pixels of a depth map, aspect kept
+        lag: int = 2  # keyframes after the reference that are waited for
+        window: int = 8  # keyframes before the reference that may be neighbors
+        neighbors: int = 4  # views that a reference is matched with
+        best_views: int = 2  # of these, per pixel and hypothesis: the others may be occluded
+        stages: list[dict[str, Any]] = field(default_factory=list)  # of the cascade, empty: the defaults of the core
+        paths: int = 8  # directions of the smoothing, 4 or 8
+        range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
+        least_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
+        device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
+        threads: int | None = None  # of the C++ kernels; null: all
+
+    config: Config
+
+    def __init__(self, config: Config | None = None) -> None:
+        super().__init__(config)
+        c = self.config
+        stereo = StereoConfig(best_views=c.best_views, paths=c.paths)
+        if c.stages:
+            stereo = replace(stereo, stages=tuple(Stage(**stage) for stage in c.stages))
+        self._cascade = Cascade(
+            CascadeConfig(
+                area=c.area,
+                lag=c.lag,
+                window=c.window,
+                device=c.device,
+                threads=c.threads,
+                neighbors=NeighborChoice(count=c.neighbors),
+                ranges=RangeChoice(margin=c.range_margin, least_cells=c.least_cells),
+                stereo=stereo,
+            )
+        )
+        self._keyframes: dict[int, Keyframe] = {}  # without depth yet
+        self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
+
+    def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
+        self._keyframes[keyframe.index] = keyframe
+        with self.stats.time("prepare"):
+            view = self._cascade.prepare(
+                keyframe.index,
+                keyframe.image,
+                keyframe.intrinsics,
+                keyframe.world_from_cam,
+                keyframe.inverse_depth,
+                keyframe.inverse_depth_weight,
+                keyframe.scale,
+                keyframe.segment,
+            )
+        if keyframe.index in self._poses:  # corrected before it came
+            view = view.moved(*self._poses[keyframe.index])
+        yield from self._timed(self._cascade.add(view))
+
+    def on_poses(self, poses: Poses) -> Iterator[Depth]:
+        for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
+            self._poses[int(i)] = (pose, float(scale))
+        self._cascade.move(self._poses)
+        yield from ()
+
+    def on_end(self) -> Iterator[Depth]:
+        yield from self._timed(self._cascade.flush())
+
+    def _timed(self, depths: Iterator[CascadeDepth]) -> Iterator[Depth]:
+        while True:
+            with self.stats.time("stereo"):
+                found = next(depths, None)
+            if found is None:
+                return
+            yield self._message(found)
+
+    def _message(self, found: CascadeDepth) -> Depth:
+        keyframe = self._keyframes.pop(found.view.index)
+        self.stats.count("keyframes")
+        if found.problem:
+            self.stats.skip(f"keyframe: {found.problem}")
+            self.stats.warn(f"some keyframes got no depth: {found.problem}")
+        elif found.search is not None and found.search.source != "own grid":
+            self.stats.count(f"range from {found.search.source}")
+            self.stats.warn(f"some depth ranges come from the {found.search.source}: the tracker knew too little depth")
+        self.stats.count("neighbors", len(found.neighbors))
+        self.stats.count("hypotheses", found.result.counts.get("hypotheses", 0.0))
+        self.stats.skip("hypotheses outside the range", found.result.counts.get("hypotheses_pruned", 0.0))
+        kept = found.result.confidence
+        self.stats.values["mean confidence"] = float(np.mean(kept))
+        return Depth(
+            index=keyframe.index,
+            timestamp=keyframe.timestamp,
+            image=keyframe.image,
+            intrinsics=keyframe.intrinsics,
+            world_from_cam=found.view.world_from_cam,
+            scale=found.view.scale,
+            depth=found.result.depth,
+            confidence=found.result.confidence,
+            segment=keyframe.segment,
+        )

@@ -1,0 +1,160 @@
+"""Keyframe -> Depth -> View through the nodes, on a rendered scene whose depth is known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from msgs import Depth, Keyframe, Poses, View
+from nodes import handlers, outputs
+from nodes.coarse_depth import CoarseDepth
+from nodes.depth_fusion import DepthFusion
+from nodes.mvs import Mvs
+from tests.core.mvs.plane_scene import FAR, NEAR, look, render, true_depth
+
+SIZE = (120, 160)
+
+
+def keyframe(index: int, **changes: object) -> Keyframe:
+    pose = look(0.08 * index)
+    depth = true_depth(pose, SIZE)
+    values: dict[str, object] = {
+        "index": index,
+        "timestamp": 0.1 * index,
+        "image": render(pose, SIZE)[0],
+        "intrinsics": render(pose, SIZE)[1],
+        "world_from_cam": pose,
+        "scale": 1.0,
+        "inverse_depth": np.ascontiguousarray(1.0 / depth[4::8, 4::8]).astype(np.float32),
+        "inverse_depth_weight": np.ones((15, 20), dtype=np.float32),
+        "segment": 0,
+    }
+    values.update(changes)
+    return Keyframe(**values)  # type: ignore[arg-type]
+
+
+def stereo(**changes: object) -> Mvs:
+    return Mvs(Mvs.Config(area=SIZE[0] * SIZE[1], device="cpu", threads=1, **changes))  # type: ignore[arg-type]
+
+
+def fusion(**changes: object) -> DepthFusion:
+    return DepthFusion(DepthFusion.Config(device="cpu", threads=1, **changes))  # type: ignore[arg-type]
+
+
+def test_contract() -> None:
+    assert set(handlers(Mvs)) == {Keyframe, Poses}
+    assert outputs(Mvs) == (Depth,)
+    assert set(handlers(DepthFusion)) == {Depth, Poses}
+    assert outputs(DepthFusion) == (View,)
+    assert outputs(CoarseDepth) == (Depth,)
+
+
+def test_every_keyframe_becomes_one_view_in_order_and_is_right() -> None:
+    mvs, depth_fusion = stereo(), fusion()
+    depths = [d for i in range(7) for d in mvs.on_keyframe(keyframe(i))]
+    assert [d.index for d in depths] == [0, 1, 2, 3, 4]  # two keyframes of lag
+    depths += list(mvs.on_end())
+    views = [v for d in depths for v in depth_fusion.on_depth(d)]
+    assert [v.index for v in views] == [0, 1, 2, 3, 4]
+    views += list(depth_fusion.on_end())
+    assert [v.index for v in views] == list(range(7))
+    view = views[3]
+    truth = true_depth(view.world_from_cam, view.depth.shape)
+    kept = view.depth > 0
+    assert kept.mean() > 0.6
+    assert np.mean(np.abs(view.depth - truth)[kept] < 0.02 * truth[kept]) > 0.97
+    assert np.all(view.normals[~kept] == 0)
+    np.testing.assert_allclose(np.linalg.norm(view.normals[kept], axis=-1), 1.0, atol=1e-5)
+    assert mvs.stats.counts["keyframes"] == 7
+    assert mvs.stats.skipped["hypotheses outside the range"] > 0
+
+
+def test_corrected_poses_move_what_is_stored() -> None:
+    """Half-way through the tracker doubles the scale: depths computed before it must double with it."""
+    mvs, depth_fusion = stereo(), fusion()
+    depths = [d for i in range(6) for d in mvs.on_keyframe(keyframe(i))]
+    views = [v for d in depths for v in depth_fusion.on_depth(d)]
+    doubled = np.stack([look(0.08 * i) for i in range(6)])
+    doubled[:, :3, 3] *= 2.0
+    correction = Poses(1, np.arange(6), doubled, np.full(6, 2.0))
+    assert list(mvs.on_poses(correction)) == []
+    assert list(depth_fusion.on_poses(correction)) == []
+    late = list(mvs.on_end())
+    assert all(d.scale == 2.0 for d in late)
+    views = [v for d in late for v in depth_fusion.on_depth(d)] + list(depth_fusion.on_end())
+    assert views
+    for view in views:
+        assert view.scale == 2.0
+        kept = view.depth > 0
+        truth = 2.0 * true_depth(look(0.08 * view.index), view.depth.shape)
+        assert kept.mean() > 0.3
+        assert np.median(np.abs(view.depth - truth)[kept] / truth[kept]) < 0.02
+
+
+def test_a_standing_camera_gives_no_depth_and_says_so() -> None:
+    mvs, depth_fusion = stereo(), fusion()
+    pose = look(0.0)
+    depths = [d for i in range(4) for d in mvs.on_keyframe(keyframe(i, world_from_cam=pose))] + list(mvs.on_end())
+    views = [v for d in depths for v in depth_fusion.on_depth(d)] + list(depth_fusion.on_end())
+    assert [v.index for v in views] == [0, 1, 2, 3]
+    assert not any((v.depth > 0).any() for v in views)
+    assert any("no neighbor with a baseline" in w for w in mvs.stats.warnings)
+
+
+def test_without_coarse_depth_the_neighbors_give_the_range() -> None:
+    mvs = stereo()
+    nothing = np.zeros((15, 20), dtype=np.float32)
+    depths = [
+        d
+        for i in range(5)
+        for d in mvs.on_keyframe(keyframe(i, inverse_depth=nothing) if i == 2 else keyframe(i))
+    ]
+    depth = next(d for d in depths if d.index == 2).depth
+    truth = true_depth(look(0.16), depth.shape)
+    assert np.mean(np.abs(depth - truth) < 0.05 * truth) > 0.7
+    assert any("neighbors' grids" in w for w in mvs.stats.warnings)
+
+
+def test_with_no_range_at_all_there_is_no_depth() -> None:
+    mvs = stereo()
+    nothing = np.zeros((15, 20), dtype=np.float32)
+    depths = [d for i in range(3) for d in mvs.on_keyframe(keyframe(i, inverse_depth=nothing))]
+    depths += list(mvs.on_end())
+    assert len(depths) == 3
+    assert not any((d.depth > 0).any() for d in depths)
+    assert any("no depth range" in w for w in mvs.stats.warnings)
+
+
+def test_segments_are_not_matched_with_each_other() -> None:
+    mvs = stereo()
+    depths = [d for i in range(3) for d in mvs.on_keyframe(keyframe(i))]
+    depths += [d for i in range(3, 6) for d in mvs.on_keyframe(keyframe(i, segment=1))]
+    depths += list(mvs.on_end())
+    assert [(d.index, d.segment) for d in depths] == [(0, 0), (1, 0), (2, 0), (3, 1), (4, 1), (5, 1)]
+
+
+def test_coarse_depth_passes_the_grid_on() -> None:
+    message = keyframe(0)
+    (depth,) = CoarseDepth(CoarseDepth.Config(area=SIZE[0] * SIZE[1])).on_keyframe(message)
+    truth = true_depth(message.world_from_cam, depth.depth.shape)
+    known = depth.depth > 0
+    assert known.mean() > 0.9
+    assert np.median(np.abs(depth.depth - truth)[known] / truth[known]) < 0.02
+    assert depth.depth[known].min() > 0.5 * NEAR
+    assert depth.depth[known].max() < 2.0 * FAR
+
+
+def test_passthrough_sends_depth_as_it_came() -> None:
+    node = fusion(lag=0, window=0, refine=False, check=False, confidence=0.0)
+    depth = next(iter(CoarseDepth(CoarseDepth.Config(area=SIZE[0] * SIZE[1])).on_keyframe(keyframe(0))))
+    (view,) = node.on_depth(depth)
+    np.testing.assert_array_equal(view.depth, depth.depth)
+    np.testing.assert_array_equal(view.confidence, depth.confidence)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_pose_that_is_not_finite_is_refused(bad: float) -> None:
+    pose = look(0.0)
+    pose[0, 3] = bad
+    with pytest.raises(ValueError, match="not finite"):
+        list(stereo().on_keyframe(keyframe(0, world_from_cam=pose)))
