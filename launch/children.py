@@ -29,8 +29,10 @@ class Child:
         self.log = log
         self.pipe = pipe[0]
         self._text = b""
+        # SIGINT waits, blocked, until the node can handle it. Its own session: the terminal's Ctrl-C reaches only the
+        # launcher, which decides whom to stop.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         with log.open("wb") as output:
-            # Its own session: the terminal's Ctrl-C reaches only the launcher, which decides whom to stop.
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "nodes", str(spec)],
                 stdin=subprocess.DEVNULL,
@@ -40,6 +42,7 @@ class Child:
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": python_path(), "PYTHONUNBUFFERED": "1", **environment},
             )
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         os.close(pipe[1])
         os.set_blocking(self.pipe, False)
 

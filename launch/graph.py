@@ -6,6 +6,7 @@ choices and edges all come from `conf/`.
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 from collections.abc import Collection, Mapping
@@ -108,7 +109,7 @@ def build(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | None = N
     settings = Settings(
         **check_parameters("", "config.yaml", Settings, {k: v for k, v in config.items() if k not in sections})
     )
-    device = _resolve_device(settings.device)
+    device = _Device(settings.device)
     slots: dict[str, Slot] = {}
     for name, section in sections.items():
         if section.get("_target_") is not None:
@@ -119,7 +120,7 @@ def build(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | None = N
     return Graph({name: slots[name] for name in order(slots, edges)}, edges, settings, resolved, warnings)
 
 
-def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None, device: str) -> Slot:
+def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None, device: _Device) -> Slot:
     node = load_node(name, str(section["_target_"]))
     inputs, accepted = _handlers(name, node), set(inspect.signature(node.Config).parameters)
     reads = dict(section.get("reads") or {})
@@ -132,7 +133,7 @@ def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None
         reads = {key: value for key, value in reads.items() if key in {t.__name__ for t in inputs}}
     parameters = check_parameters(name, f"{node.__module__}.{node.__qualname__}", node.Config, given)
     if parameters.get("device") == "auto":
-        parameters["device"] = device
+        parameters["device"] = device.resolved
     typed: dict[type, str] = {}
     for message, sender in reads.items():
         if message not in msgs.TYPES:
@@ -255,14 +256,24 @@ def _section(slot: Slot) -> dict[str, Any]:
     return {"_target_": slot.target, **({"reads": reads} if reads else {}), **placement, **slot.config}
 
 
-def _resolve_device(device: str) -> str:
-    import torch
+class _Device:
+    """The global `device`; torch, which knows what there is, is loaded only for a node that needs to know."""
 
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    kind, _, number = device.partition(":")
-    if kind not in ("cpu", "cuda") or (number and not number.isdigit()):
-        raise GraphError(f"device={device}: must be auto, cpu, cuda or cuda:<number>")
-    if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
-        raise GraphError(f"device={device}: this machine has {torch.cuda.device_count()} CUDA devices; use device=cpu")
-    return device
+    def __init__(self, wanted: str) -> None:
+        kind, _, number = wanted.partition(":")
+        if kind not in ("auto", "cpu", "cuda") or (number and not number.isdigit()):
+            raise GraphError(f"device={wanted}: must be auto, cpu, cuda or cuda:<number>")
+        self._wanted = wanted
+
+    @functools.cached_property
+    def resolved(self) -> str:
+        if self._wanted == "cpu":
+            return "cpu"
+        import torch
+
+        if self._wanted == "auto":
+            return "cuda" if torch.cuda.is_available() else "cpu"
+        there = torch.cuda.device_count()
+        if int(self._wanted.partition(":")[2] or 0) >= there:
+            raise GraphError(f"device={self._wanted}: this machine has {there} CUDA devices; use device=cpu")
+        return self._wanted

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import random
 import resource
-import time
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import nodes
 from launch.graph import Graph
 from msgs import End, Message
+from nodes.parameters import make_config
 from nodes.runner import Runner, own_stats
 
 Observer = Callable[[str, nodes.Node, Any], None]
@@ -74,4 +74,5 @@ class _Inline:
 def _seed(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed)
-    importlib.import_module("torch").manual_seed(seed)
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(seed)

@@ -45,7 +45,8 @@ class Job:
 
 
 def run(job: Job) -> int:
-    """Runs one job and returns its exit code. In a sweep, raises RunFailed, or SystemExit once the user has stopped it."""
+    """Runs one job and returns its exit code. In a sweep a failure is raised instead: RunFailed, after which the sweep
+    goes on, or SystemExit where the user stopped it."""
     if job.number is not None:
         print(f"job {job.number}: {' '.join(job.overrides)}", flush=True)
     code = _run(job)

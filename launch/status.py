@@ -13,7 +13,7 @@ class NodeStatus:
     """The newest figures of one node."""
 
     name: str
-    state: str = "starting"  # as the node says it: starting, running, ending, done, failed; or external
+    state: str = "starting"  # as the node says it: starting, waiting, running, ending, done, failed; or external
     received: Any = field(default_factory=dict)  # messages, by type
     queue: Any = field(default_factory=dict)  # messages that wait, by type
     sent: Any = field(default_factory=dict)
@@ -22,17 +22,18 @@ class NodeStatus:
     skipped: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     cpu_seconds: float = 0.0
-    bytes: float = 0.0  # resident memory
+    memory: float = 0.0  # resident, bytes
     error: str | None = None
     traceback: str | None = None
+    peer: bool = False  # it failed because another node is gone
 
-    def update(self, line: bytes | str) -> None:
+    def update(self, line: bytes) -> None:
         """Folds one JSON line in. Raises ValueError for anything else."""
         news = json.loads(line)
         if not isinstance(news, dict):
             raise ValueError(f"{self.name}: a status must be a JSON object, not {line!r}")
         for key, value in news.items():
-            name = {"in": "received", "out": "sent"}.get(key, key)
+            name = {"in": "received", "out": "sent", "bytes": "memory"}.get(key, key)
             if name in self.__dataclass_fields__ and name != "name" and value is not None:
                 setattr(self, name, value)
 

@@ -40,8 +40,8 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
     depth = _get(report, "depth")
     if depth and depth.get("abs_rel") is not None:
         lines.append(
-            f"depth       relative error {_number(depth['abs_rel'])}, within 5 %: {_percent(depth.get('inlier_ratio'))}, "
-            f"complete: {_percent(depth.get('completeness'))}"
+            f"depth       relative error {_number(depth['abs_rel'])}, within 5 %: "
+            f"{_percent(depth.get('inlier_ratio'))}, complete: {_percent(depth.get('completeness'))}"
         )
     splats, size = _get(report, "map", "splats"), _get(report, "map", "bytes")
     if splats is not None:

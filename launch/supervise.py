@@ -31,7 +31,7 @@ from launch.status import NodeStatus
 
 TERMINATE_SECONDS = 3.0  # from SIGTERM to SIGKILL
 REFRESH_SECONDS = 0.25
-BLAME_SECONDS = 0.15  # how long to listen, after a failure, for the one that caused it
+BLAME_SECONDS = 1.5  # how long to listen, after a node failed for want of a neighbor, for what befell that one
 
 
 @dataclass(frozen=True)
@@ -132,14 +132,14 @@ class Supervisor:
                 self._children[name].send(signal.SIGINT)
 
     def _blame(self) -> Outcome:
-        """The failure that came first. One node's death makes others fail, so all that happened at once is looked at:
-        a node that was killed is the cause, then the one that is furthest upstream."""
+        """The failure that came first. One node's death makes its neighbors fail, and they may be heard before it."""
         until = time.monotonic() + BLAME_SECONDS
         while (left := until - time.monotonic()) > 0:
             self._listen(left)
+            if any(child.failure() and not child.status.peer for child in self._children.values()):
+                break
         failed = [child for child in self._children.values() if child.failure()]
-        killed = [child for child in failed if (child.process.poll() or 0) < 0]
-        child = (killed or failed)[0]
+        child = min(failed, key=lambda child: (child.status.peer, (child.process.poll() or 0) >= 0))
         child.read_status()
         return Outcome(1, child.name, child.failure() or "", child.last_words(), child.log)
 
@@ -178,13 +178,13 @@ class Supervisor:
         def collect(number: int, frame: FrameType | None) -> None:
             self._signals.append(number)
 
-        previous: dict[int, Any] = {}
+        previous: dict[signal.Signals, Any] = {}
         wakeup = signal.set_wakeup_fd(self._wakeup.fileno(), warn_on_full_buffer=False)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             previous[number] = signal.signal(number, collect)
         try:
             yield
         finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+            for stopped_by, handler in previous.items():
+                signal.signal(stopped_by, handler)
             signal.set_wakeup_fd(wakeup)

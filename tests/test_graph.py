@@ -1,0 +1,178 @@
+"""Composition: what a configuration becomes, what is refused and with which words, and the inline run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from launch.compose import CONF, compose, vocabulary
+from launch.graph import Edge, Graph
+from launch.inline import run_inline
+from launch.parameters import GraphError, convert
+from launch.placement import thread_plan
+from msgs import Frame, GroundTruth, Keyframe, Poses
+from tests.fake_graph.stages import Relay, Sink
+
+FAKE = Path(__file__).parent / "fake_graph" / "conf"
+STAGES = "tests.fake_graph.stages"
+
+
+def fake(*overrides: str) -> Graph:
+    return compose(overrides, FAKE)
+
+
+def test_edges_come_from_reads_and_senders_precede_readers() -> None:
+    graph = fake()
+    assert list(graph.slots) == ["source", "relay", "sink"]
+    assert set(graph.edges) == {
+        Edge(Frame, "source", "relay", False),
+        Edge(GroundTruth, "source", "sink", False),
+        Edge(Keyframe, "relay", "sink", False),
+        Edge(Poses, "relay", "sink", False),
+    }
+    assert graph.sources == ["source"]
+
+
+def test_parameters_are_the_choice_files_then_the_command_lines_then_the_defaults() -> None:
+    slot = fake("relay.stride=7", "relay.gain=2").slots["relay"]
+    assert slot.config == {
+        "stride": 7, "gain": 2.0, "fail_at": None, "kill_at": None, "hang_at": None, "seconds": 0.0,
+    }  # fmt: skip
+    assert isinstance(slot.config["gain"], float)
+
+
+def test_output_and_device_reach_the_nodes_that_have_them(tmp_path: Path) -> None:
+    graph = fake(f"output={tmp_path}", "device=cpu", "source.device=auto")
+    assert graph.slots["sink"].config["output"] == str(tmp_path)
+    assert graph.slots["source"].config["device"] == "cpu"
+    assert fake("source.device=cuda:3").slots["source"].config["device"] == "cuda:3"
+    assert Path(fake().settings.output).parent == Path.cwd() / "runs"
+
+
+def test_best_effort_on_either_side() -> None:
+    def best_effort(*overrides: str) -> set[tuple[str, bool]]:
+        return {(edge.message.__name__, edge.best_effort) for edge in fake(*overrides).edges}
+
+    assert ("Frame", True) in best_effort("relay.reads.Frame=source?")
+    assert ("Frame", True) in best_effort("source=live")
+    assert ("GroundTruth", False) in best_effort("source=live")
+
+
+REFUSED = [
+    (["relya=plain"], "did you mean relay", "slots: source, relay, sink"),
+    (["relay=fancy"], "no choice 'fancy'", "there are: plain"),
+    (["relay.strid=5"], "did you mean stride", "gain: float = 1.0"),
+    (["+relay.strid=5"], "no parameter 'strid'", "stride: int = 1"),
+    (["relay.stride=abc"], "relay.stride=abc", "must be int"),
+    (["relay.stride=2.5"], "relay.stride=2.5", "must be int"),
+    (["source.count=true"], "source.count=True", "must be int"),
+    (["source.size=[1,2,3]"], "source.size", "must be [int, int]"),
+    (["source.mode=red"], "source.mode=red", "'gray' or 'color'"),
+    (["relay.fail_at=x"], "relay.fail_at=x", "must be int or null"),
+    (["relay.threads=x"], "relay.threads=x", "must be int or null"),
+    (["relay.device=cpu"], "no parameter 'device'", "stride: int"),
+    (["buffer=many"], "buffer=many", "must be int"),
+    (["transport=udp"], "transport=udp", "'ipc' or 'tcp'"),
+    (["device=tpu"], "device=tpu", "auto, cpu, cuda"),
+    (["device=cuda:99", "source.device=auto"], "device=cuda:99", "CUDA devices"),
+    (["sink.labels.color=3"], "sink.labels.color", ""),
+    (["relay._target_=nowhere.Node"], "no module 'nowhere'", "PYTHONPATH"),
+    (["relay._target_=Node"], "relay._target_=Node", "module.Class"),
+    ([f"relay._target_={STAGES}.Rely"], "did you mean Relay", "has: Source, Relay, Sink"),
+    ([f"relay._target_={STAGES}.np"], "is no node", "has: Source"),
+    ([f"relay._target_={STAGES}.Bare"], "neither run() nor", ""),
+    ([f"relay._target_={STAGES}.Untyped"], "must take one message", ""),
+    ([f"relay._target_={STAGES}.Source"], "nobody sends", "yields Frame, GroundTruth"),
+    (["relay._target_=null"], "nobody sends tests.fake_graph.stages.Sink a Keyframe", "that slot is off"),
+    (["~relay.reads"], f"relay: nobody sends {STAGES}.Relay a Frame", "set relay.reads.Frame to"),
+    (["relay.reads.Frame=sink"], f"relay: nobody sends {STAGES}.Relay a Frame", "that does: source"),
+    (["relay.reads.Frame=camera"], "no such slot", "there are: source, relay, sink"),
+    (["relay.reads.Poses=source"], "does not take a Poses", "it takes: Frame"),
+    (["relay.reads.Pose=source"], "no such message", "Keyframe"),
+    (["source.reads.Frame=relay"], "is a source", "can read nothing"),
+    (["nonsense"], "nonsense", "slot=choice"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "what", "valid"), REFUSED, ids=lambda v: v[0] if isinstance(v, list) else "")
+def test_refused_before_anything_starts(overrides: list[str], what: str, valid: str) -> None:
+    with pytest.raises(GraphError) as refusal:
+        fake(*overrides)
+    assert what in str(refusal.value)
+    assert valid in str(refusal.value)
+
+
+def test_a_cycle_is_refused_with_its_path() -> None:
+    with pytest.raises(GraphError, match=r"a cycle: (relay -> sink -> relay|sink -> relay -> sink)"):
+        fake(f"sink._target_={STAGES}.Loop", "relay.reads.Frame=sink")
+
+
+def test_another_target_starts_from_its_own_defaults() -> None:
+    graph = fake(f"relay._target_={STAGES}.Uncorrected", "relay.every=3", "device=cpu")
+    assert graph.slots["relay"].config == {"device": "cpu", "every": 3}  # and no `stride` of the old choice
+    assert Poses not in {edge.message for edge in graph.edges}
+    assert any("Poses" in warning and "Uncorrected" in warning for warning in graph.warnings)
+    with pytest.raises(GraphError, match="no parameter 'stride'"):
+        fake(f"relay._target_={STAGES}.Uncorrected", "relay.stride=3")
+
+
+def test_external_keeps_the_choice() -> None:
+    assert fake("relay=external").slots["relay"].placement.external
+    assert fake("relay=external").slots["relay"].node is Relay
+
+
+def test_inline_is_depth_first_and_deterministic(tmp_path: Path) -> None:
+    orders = []
+    for _ in range(2):
+        sent: list[tuple[str, str]] = []
+        nodes = run_inline(
+            fake(f"output={tmp_path}", "source.count=3", "relay.stride=2"),
+            lambda slot, node, message: sent.append((slot, type(message).__name__)),  # noqa: B023
+        )
+        orders.append(sent)
+    frame = [("source", "Frame"), ("relay", "Keyframe"), ("source", "GroundTruth")]
+    assert orders[0] == [*frame, ("source", "Frame"), ("source", "GroundTruth"), *frame, ("relay", "Poses")]
+    assert orders[0] == orders[1]
+    sink = nodes["sink"]
+    assert isinstance(sink, Sink)
+    assert (sink.keyframes, sink.truths, sink.poses) == ([0, 2], [0, 1, 2], 1)
+    assert sink.seen_upstream["source"]["counts"] == {"frames": 3}
+    assert sink.seen_upstream["relay"]["counts"] == {"keyframes": 2, "idle": 6}  # all idle work is done
+
+
+def test_inline_lets_an_exception_through(tmp_path: Path) -> None:
+    with pytest.raises(ArithmeticError, match="frame 1 cannot be relayed"):
+        run_inline(fake(f"output={tmp_path}", "relay.fail_at=1"))
+
+
+@given(st.integers(1, 64))
+def test_threads_fit_the_cores(cores: int) -> None:
+    graph = fake("relay.threads=5", "sink.cpu=[0]")
+    plan = thread_plan(graph, cores)
+    assert plan["relay"] == 5
+    assert plan["sink"] == 1
+    assert 1 <= plan["source"] <= max(2, cores)
+
+
+@given(st.one_of(st.integers(-(2**53), 2**53), st.floats(allow_nan=False), st.text(), st.booleans(), st.none()))
+def test_a_value_is_converted_to_its_type_or_refused(value: object) -> None:
+    for annotation in (int, float, bool, int | None, float | str):
+        fits = isinstance(value, annotation) and (annotation is bool or not isinstance(value, bool))
+        try:
+            converted = convert(value, annotation, "x")
+        except GraphError:
+            assert not fits
+        else:
+            assert isinstance(converted, annotation)
+            assert converted == value
+
+
+def test_every_choice_file_of_the_project_composes() -> None:
+    """One at a time, with the default choices elsewhere: its node exists, its parameters and reads hold."""
+    slots, _ = vocabulary(CONF)
+    for slot in slots:
+        for path in sorted((CONF / slot).glob("*.yaml")):
+            compose([f"{slot}={path.stem}", "device=cpu"])

@@ -1,0 +1,277 @@
+"""The launcher as a user runs it: real processes, signals, exit codes, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+FAKE = ROOT / "tests" / "fake_graph" / "conf"
+DOWN = 5.0  # seconds in which a graph must be gone
+
+
+class Launch:
+    """One run of the launcher, in a temporary directory of its own so that whatever it leaves there is found."""
+
+    def __init__(self, folder: Path, *overrides: str, conf: Path = FAKE) -> None:
+        self.output = folder / "out"
+        self._sockets = Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))  # short: a socket's path must fit
+        self.process = subprocess.Popen(
+            [sys.executable, ROOT / "launch/run_all.py", "--config-path", conf, f"output={self.output}", *overrides],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=folder,
+            env={**os.environ, "TMPDIR": str(self._sockets), "PYTHONPATH": ""},
+        )
+
+    def finish(self, seconds: float = 60.0) -> tuple[int, str, str]:
+        """Exit code and what was printed; then no process, socket or temporary file of the run may be left."""
+        out, err = self.process.communicate(timeout=seconds)
+        assert self.nodes() == []
+        assert list(self._sockets.iterdir()) == []
+        self._sockets.rmdir()
+        return self.process.returncode, out, err
+
+    def nodes(self) -> list[int]:
+        """Processes of this run's nodes: their spec lies in its temporary directory."""
+        found = []
+        for process in psutil.process_iter(["cmdline", "status"]):
+            line = " ".join(process.info["cmdline"] or [])
+            if f"{self._sockets}/" in line and process.info["status"] != psutil.STATUS_ZOMBIE:
+                found.append(process.pid)
+        return found
+
+    def node(self, name: str) -> psutil.Process:
+        return next(p for p in map(psutil.Process, self.nodes()) if f"/{name}.json" in " ".join(p.cmdline()))
+
+    def wait_until_running(self) -> None:
+        """Until the sink's log says so: by then every node is."""
+        until = time.monotonic() + 30
+        log = self.output / "logs" / "sink.log"
+        while time.monotonic() < until and self.process.poll() is None:
+            if log.exists() and "running" in log.read_text():
+                return
+            time.sleep(0.05)
+        raise AssertionError(f"the graph did not come up: {self.process.communicate(timeout=10)}")
+
+    def kill(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+
+
+@pytest.fixture
+def launch(tmp_path: Path) -> Iterator[type[Launch]]:
+    runs: list[Launch] = []
+
+    class Started(Launch):
+        def __init__(self, *overrides: str, conf: Path = FAKE) -> None:
+            super().__init__(tmp_path, *overrides, conf=conf)
+            runs.append(self)
+
+    yield Started
+    for run in runs:
+        run.kill()
+
+
+def sink(output: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((output / "sink.json").read_text())
+    return content
+
+
+def test_everything_arrives_and_the_run_leaves_its_files(launch: type[Launch]) -> None:
+    run = launch("source.count=40", "relay.stride=2", "buffer=2")
+    code, out, _ = run.finish()
+    assert code == 0, out
+    arrived = sink(run.output)
+    assert arrived["keyframes"] == list(range(0, 40, 2))
+    assert arrived["truths"] == list(range(40))
+    assert arrived["poses"] == 1
+    upstream = arrived["upstream"]
+    assert upstream["source"] == {"frames": 40}
+    assert upstream["relay"]["keyframes"] == 20
+    saved = yaml.safe_load((run.output / "config.yaml").read_text())
+    assert saved["source"]["count"] == 40
+    assert saved["relay"]["reads"] == {"Frame": "source"}
+    assert sorted(path.name for path in (run.output / "logs").iterdir()) == ["relay.log", "sink.log", "source.log"]
+    assert str(run.output) in out
+
+
+def test_over_tcp(launch: type[Launch]) -> None:
+    run = launch("transport=tcp", "source.count=20")
+    assert run.finish()[0] == 0
+    assert sink(run.output)["keyframes"] == list(range(20))
+
+
+def test_in_one_process(launch: type[Launch]) -> None:
+    run = launch("--inline", "source.count=6")
+    assert run.finish()[0] == 0
+    assert sink(run.output)["keyframes"] == list(range(6))
+    assert not (run.output / "logs").exists()
+
+
+def test_threads_and_cores_reach_the_node(launch: type[Launch]) -> None:
+    run = launch("sink.threads=3", "source.count=0", "source.period=0.02", "relay.cpu=[0]")
+    run.wait_until_running()
+    assert run.node("relay").cpu_affinity() == [0]
+    run.process.send_signal(signal.SIGINT)
+    assert run.finish()[0] == 0
+    assert sink(run.output)["threads"] == "3"
+
+
+def test_a_refused_command_line_starts_nothing(launch: type[Launch]) -> None:
+    run = launch("relay.strid=3")
+    code, _, err = run.finish()
+    assert code == 2
+    assert "did you mean stride" in err
+    assert "Traceback" not in err
+    assert not run.output.exists()
+
+
+def test_a_failing_node_stops_the_graph_and_its_traceback_is_last(launch: type[Launch]) -> None:
+    run = launch("relay.fail_at=7", "source.count=0", "source.period=0.01")
+    run.wait_until_running()
+    began = time.monotonic()
+    code, _, err = run.finish()
+    assert time.monotonic() - began < DOWN
+    assert code == 1
+    assert re.search(r"^relay failed: ArithmeticError: frame 7 cannot be relayed$", err, re.MULTILINE)
+    assert err.rstrip().endswith("ArithmeticError: frame 7 cannot be relayed")
+    assert "Traceback" in err
+
+
+def test_a_killed_node_is_named(launch: type[Launch]) -> None:
+    run = launch("relay.kill_at=7", "source.count=0", "source.period=0.01")
+    run.wait_until_running()
+    began = time.monotonic()
+    code, _, err = run.finish()
+    assert time.monotonic() - began < DOWN
+    assert code == 1
+    assert "relay failed: killed by signal 9" in err
+
+
+@pytest.mark.parametrize("victim", ["source", "relay", "sink"])
+def test_a_node_killed_from_outside_stops_the_graph(launch: type[Launch], victim: str) -> None:
+    run = launch("source=live")
+    run.wait_until_running()
+    began = time.monotonic()
+    run.node(victim).kill()
+    code, _, err = run.finish()
+    assert time.monotonic() - began < DOWN
+    assert code == 1
+    assert f"{victim} failed: killed by signal 9" in err
+
+
+def test_the_first_ctrl_c_ends_the_stream_and_finishes_the_run(launch: type[Launch]) -> None:
+    run = launch("source=live", "source.best_effort=[]", "relay.seconds=0.02")
+    run.wait_until_running()
+    time.sleep(0.5)
+    run.process.send_signal(signal.SIGINT)
+    code, out, _ = run.finish()
+    assert code == 0
+    assert "Ctrl-C" in out
+    arrived = sink(run.output)
+    assert arrived["keyframes"] == arrived["truths"]  # all that was sent went all the way
+    assert len(arrived["keyframes"]) > 5
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
+def test_a_second_ctrl_c_stops_everything(launch: type[Launch], delay: float) -> None:
+    run = launch("source.count=100", "relay.seconds=1")
+    run.wait_until_running()
+    run.process.send_signal(signal.SIGINT)
+    time.sleep(delay + 0.05)
+    began = time.monotonic()
+    run.process.send_signal(signal.SIGINT)
+    code, out, _ = run.finish()
+    assert time.monotonic() - began < DOWN
+    assert code == 130
+    assert "stopped" in out
+
+
+@pytest.mark.parametrize("delay", [0.6, 1.2, 1.8])
+def test_ctrl_c_while_starting(launch: type[Launch], delay: float) -> None:
+    run = launch("source=live")
+    time.sleep(delay)
+    run.process.send_signal(signal.SIGINT)
+    code, _, err = run.finish(20)
+    assert code in (0, 130, -signal.SIGINT), err
+
+
+def test_a_node_that_ignores_sigterm_is_killed(launch: type[Launch]) -> None:
+    run = launch("source=live", "source.best_effort=[]", "relay.hang_at=3")
+    run.wait_until_running()
+    time.sleep(0.5)
+    began = time.monotonic()
+    run.process.send_signal(signal.SIGINT)
+    time.sleep(0.1)
+    run.process.send_signal(signal.SIGINT)
+    assert run.finish()[0] == 130
+    assert time.monotonic() - began < DOWN
+
+
+def test_sigterm_for_the_launcher_takes_the_nodes_along(launch: type[Launch]) -> None:
+    run = launch("source=live")
+    run.wait_until_running()
+    run.process.send_signal(signal.SIGTERM)
+    began = time.monotonic()
+    assert run.finish()[0] == 128 + signal.SIGTERM
+    assert time.monotonic() - began < DOWN
+
+
+def test_no_node_outlives_a_launcher_that_was_killed(launch: type[Launch]) -> None:
+    run = launch("source=live")
+    run.wait_until_running()
+    run.process.kill()
+    until = time.monotonic() + DOWN
+    while run.nodes() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert run.nodes() == []
+
+
+def test_an_external_node_is_run_by_hand(launch: type[Launch]) -> None:
+    run = launch("relay=external", "source.count=10")
+    assert run.process.stdout is not None
+    command = ""
+    for line in run.process.stdout:
+        if "-m nodes" in line:
+            command = line.strip()
+            break
+    by_hand = subprocess.run(command, shell=True, timeout=30, check=False, capture_output=True)
+    assert by_hand.returncode == 0, by_hand.stderr
+    assert run.finish()[0] == 0
+    assert sink(run.output)["keyframes"] == list(range(10))
+
+
+def test_a_sweep_gives_each_job_its_own_output(launch: type[Launch]) -> None:
+    run = launch("-m", "relay.stride=1,2", "source.count=4")
+    code, out, _ = run.finish()
+    assert code == 0, out
+    assert sink(run.output / "0")["keyframes"] == [0, 1, 2, 3]
+    assert sink(run.output / "1")["keyframes"] == [0, 2]
+
+
+def test_a_sweep_goes_on_after_a_failure_and_says_so_at_the_end(launch: type[Launch]) -> None:
+    run = launch("-m", "relay.fail_at=1,null", "source.count=4")
+    assert run.finish()[0] == 1
+    assert sink(run.output / "1")["keyframes"] == [0, 1, 2, 3]
+
+
+def test_help_names_slots_and_choices() -> None:
+    shown = subprocess.run([sys.executable, ROOT / "launch/run_all.py", "--help"], capture_output=True, text=True)
+    assert shown.returncode == 0, shown.stderr
+    for word in ("dataset: ", "tum", "mapper", "--inline", "tracker=external", "_target_=my_tracker"):
+        assert word in shown.stdout
