@@ -31,9 +31,9 @@ def plaster(rng: np.random.Generator, color: RGB, contrast: float = 14.0, densit
         stains = fractal(rng, shape, (height * 1.2, width * 1.2), 4)
         trowel = warped(fractal(rng, shape, (height * 9, width * 4), 4), rng, (height * 2, width * 2), 12)
         speckle = smooth(rng, shape, (height * 110, width * 110))
-        shade = contrast * (0.7 * stains + 0.6 * np.abs(trowel) + 0.35 * speckle)
+        shade = contrast * (0.8 * stains + 1.1 * np.abs(trowel) - 0.4 + 0.5 * speckle)
         colors = np.asarray(color, np.float32) + shade[..., None] * np.array([1.0, 0.98, 0.9], np.float32)
-        for _ in range(int(height * width * 0.8)):
+        for _ in range(int(height * width * 1.5)):
             steps = rng.normal(0, 4, (rng.integers(6, 40), 2)) + rng.normal(0, 4, 2)
             line = np.cumsum(steps, axis=0) + rng.uniform(0, 1, 2) * (shape[1], shape[0])
             tone = [float(c) - contrast * 2.2 for c in color]
@@ -66,7 +66,7 @@ def _rings(
     fibers = fractal(rng, shape, (height * 150, width * 5), 3, 0.7)
     tone = fractal(rng, shape, (height * 3, width * 2), 4)
     knots = fractal(rng, shape, (height * 6, width * 3), 2)
-    return np.asarray(0.42 * rings + 0.5 * fibers + 0.4 * tone - 1.3 * np.clip(knots - 0.75, 0, 1))
+    return np.asarray(0.24 * rings + 0.55 * fibers + 0.5 * tone - 1.3 * np.clip(knots - 0.75, 0, 1))
 
 
 def planks(rng: np.random.Generator, dark: RGB, light: RGB, board: float = 0.13, density: float = 240.0) -> Material:
@@ -206,7 +206,7 @@ def wallpaper(rng: np.random.Generator, ground: RGB, palette: Sequence[RGB], den
             rng, shape, (height * 120, width * 120)
         )
         colors = np.asarray(ground, np.float32) + tone[..., None]
-        for _ in range(int(11 * height * width)):
+        for _ in range(int(26 * height * width)):
             at, heading = rng.uniform(0, 1, 2) * (width, height) * density, rng.uniform(0, 2 * np.pi)
             color = np.asarray(palette[rng.integers(len(palette))]) + rng.normal(0, 12, 3)
             bend, count, size = rng.normal(0, 0.12), rng.integers(5, 13), rng.uniform(0.55, 1.35)

@@ -46,7 +46,7 @@ class Shake:
 class RoomPath:
     """Around the room's table, looking across it at the furniture on the far side, up and down, near and far."""
 
-    TURN = np.radians(0.75)  # a frame
+    TURN = np.radians(0.9)  # a frame
     CENTER = np.array([2.6, 2.2, 0.0])
 
     def __init__(self, seed: int, loop_frames: int | None = None) -> None:

@@ -12,10 +12,14 @@ from .noise import blend, fractal, smooth, to_texture, warped
 from .patches import Material, Texture
 
 
+# Hues of dyes, inks and pigments as a home has them: many warm ones and blues, few greens, hardly a purple.
+HUES = (0.0, 0.02, 0.05, 0.07, 0.09, 0.11, 0.13, 0.16, 0.27, 0.36, 0.5, 0.56, 0.59, 0.62, 0.95)
+
+
 def random_color(rng: np.random.Generator, saturation: tuple[float, float], value: tuple[float, float]) -> np.ndarray:
     """(3,) sRGB 0 to 255 of random hue."""
-    rgb = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*saturation), rng.uniform(*value))
-    return 255.0 * np.array(rgb)
+    hue = (HUES[rng.integers(len(HUES))] + rng.normal(0.0, 0.012)) % 1.0
+    return 255.0 * np.array(colorsys.hsv_to_rgb(hue, 0.85 * rng.uniform(*saturation), rng.uniform(*value)))
 
 
 def painting(rng: np.random.Generator, kind: str, density: float = 420.0) -> Material:
@@ -27,7 +31,7 @@ def painting(rng: np.random.Generator, kind: str, density: float = 420.0) -> Mat
         colors = np.ascontiguousarray(compose(rng, shape), dtype=np.float32)
         for _ in range(int(2600 * height * width) + 150):
             x, y = int(rng.integers(shape[1])), int(rng.integers(shape[0]))
-            tone = [float(c) for c in colors[y, x] + rng.normal(0, 16, 3)]
+            tone = [float(c) for c in colors[y, x] + rng.normal(0, 15) + rng.normal(0, 6, 3)]
             axes = (int(rng.integers(3, 13)), int(rng.integers(1, 4)))
             cv2.ellipse(colors, (x, y), axes, float(rng.normal(20, 40)), 0, 360, tone, -1, cv2.LINE_AA)
         canvas = smooth(rng, shape, (height * 200, width * 200))
@@ -39,20 +43,22 @@ def painting(rng: np.random.Generator, kind: str, density: float = 420.0) -> Mat
 def _landscape(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
     h, w = shape
     y = np.linspace(0, 1, h, dtype=np.float32)[:, None]
-    top, horizon = random_color(rng, (0.3, 0.6), (0.5, 0.8)), random_color(rng, (0.15, 0.5), (0.8, 1.0))
-    colors = blend(np.array([top, horizon]), y * 1.8 + 0.25 * fractal(rng, shape, (5, 4), 5))
-    for level in np.linspace(0.35, 0.85, 5):
-        ridge = level + 0.13 * (1.1 - level) * fractal(rng, (4, w), (2, 5), 6, 0.6)[0]
-        tone = (1.0 - 0.5 * level) * random_color(rng, (0.3, 0.6), (0.45, 0.75))
+    skies = (((96, 140, 190), (226, 222, 206)), ((120, 120, 150), (240, 190, 130)), ((70, 96, 130), (190, 206, 214)))
+    colors = blend(np.array(skies[rng.integers(3)]), y * 1.8 + 0.3 * fractal(rng, shape, (6, 5), 5))
+    far, near = np.array([[126, 140, 150], [96, 116, 96], [150, 136, 92]]), np.array([[44, 58, 30], [92, 84, 40]])
+    for level in np.linspace(0.35, 0.85, 6):
+        ridge = level + 0.15 * (1.1 - level) * fractal(rng, (4, w), (2, 5), 6, 0.6)[0]
+        t = (level - 0.35) * 2
+        tone = (1 - t) * far[rng.integers(3)] + t * near[rng.integers(2)] + rng.normal(0, 9, 3)
         grain = fractal(rng, shape, (18, 14), 5, 0.7)
-        land = tone.astype(np.float32) * (1.0 + 0.28 * grain)[..., None]
+        land = tone.astype(np.float32) * (1.0 + 0.35 * grain)[..., None]
         colors = np.where((y > ridge[None])[..., None], land, colors)
     return np.asarray(colors)
 
 
 def _abstract(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
     labels, distance = cells(rng, shape, 26)
-    palette = np.array([random_color(rng, (0.3, 0.95), (0.2, 1.0)) for _ in range(labels.max() + 1)], np.float32)
+    palette = np.array([random_color(rng, (0.15, 0.9), (0.2, 1.0)) for _ in range(labels.max() + 1)], np.float32)
     colors = warped(palette[labels] + 0.5 * distance[..., None], rng, (4, 4), 14)
     for _ in range(24):
         points = np.cumsum(rng.normal(0, 0.09, (7, 2)), axis=0) + rng.uniform(0, 1, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from . import furniture, materials, prints
@@ -54,9 +55,9 @@ def _shell(rng: np.random.Generator, bare: set[str]) -> list[Patch]:
     leaves = [(92, 122, 84), (146, 158, 100), (178, 120, 84), (84, 112, 124), (190, 164, 108), (140, 84, 78)]
     coat: dict[str, Material] = {
         "west": materials.wallpaper(rng, (206, 198, 176), leaves),
-        "north": materials.plaster(rng, (172, 188, 186), 16),
+        "north": materials.plaster(rng, (164, 182, 182), 22),
         "east": materials.masonry(rng, [(112, 54, 40), (176, 96, 70), (150, 84, 66), (196, 130, 98)], (178, 168, 152)),
-        "south": materials.plaster(rng, (214, 190, 148), 17),
+        "south": materials.plaster(rng, (206, 180, 138), 22),
     }
     w, d, h = WIDTH, LENGTH, HEIGHT
     quads = {
@@ -67,7 +68,7 @@ def _shell(rng: np.random.Generator, bare: set[str]) -> list[Patch]:
     }
     parts = [surface(q, materials.plain((206, 202, 192)) if n in bare else coat[n]) for n, q in quads.items()]
     parts.append(surface(quad((0, d, 0), (w, 0, 0), (0, -d, 0)), materials.planks(rng, (84, 50, 28), (190, 136, 84)), gloss=0.2))
-    ceiling = materials.plaster(rng, (222, 218, 208), 12, density=130)
+    ceiling = materials.plaster(rng, (216, 212, 202), 18, density=130)
     parts.append(surface(quad((0, 0, h), (w, 0, 0), (0, d, 0)), ceiling))
     for x in (0.7, 1.95, 3.2, 4.45):
         beam = materials.wood(rng, *furniture.WALNUT, density=200)
@@ -83,7 +84,7 @@ def _shell(rng: np.random.Generator, bare: set[str]) -> list[Patch]:
 def _window(rng: np.random.Generator) -> list[Patch]:
     (y0, z0), (y1, z1) = WINDOW
     x, wood = WIDTH, materials.wood(rng, (150, 140, 124), (236, 232, 222))
-    garden = prints.painting(rng, "landscape", density=180)(z1 - z0, y1 - y0)
+    garden = cv2.GaussianBlur(prints.painting(rng, "landscape", density=240)(z1 - z0, y1 - y0), (0, 0), 2.5)
     pane = Patch(quad((x - 0.03, y1, z1), (0, y0 - y1, 0), (0, 0, z0 - z1)), garden, emission=1.5)
     parts = [pane]
     for a, b in ((y0 - 0.07, y0), (y1, y1 + 0.07), (0.5 * (y0 + y1) - 0.025, 0.5 * (y0 + y1) + 0.025)):
