@@ -48,8 +48,8 @@ class Reader(Node):
 
     def _open(self) -> Sequence:
         c = self.config
-        selected = {"start": c.start, "stop": c.stop, "stride": c.stride, "size": c.size}
-        return open_dataset(c.name, path=c.path, **selected, **c.options)
+        given = {key: value for key, value in (("path", c.path), ("size", c.size)) if value is not None}
+        return open_dataset(c.name, start=c.start, stop=c.stop, stride=c.stride, **given, **c.options)
 
 
 def _ground_truth(item: Item) -> GroundTruth:

@@ -69,6 +69,7 @@ class Video:
             raise ValueError(f"no frame left: {self._path.name} has {self._count}, wanted from {start}")
         if self._rate != rate:
             self.warnings.append(f"{self._path.name} gives no frame rate: {_DEFAULT_RATE:.0f} per second assumed")
+        self._opening_warnings = len(self.warnings)
 
     def __len__(self) -> int:
         """Frames selected, as far as the container knows its own length; 0 where it does not and `stop` is null."""
@@ -76,9 +77,9 @@ class Video:
         return len(range(end)[self._wanted])
 
     def __iter__(self) -> Iterator[Item]:
-        opening_warnings = len(self.warnings)
+        del self.warnings[self._opening_warnings :]  # those of an earlier pass
         capture = self._open()
-        number = index = 0
+        number = index = undecoded = 0
         last = -math.inf
         try:
             while (self._wanted.stop is None or number < self._wanted.stop) and capture.grab():
@@ -92,15 +93,19 @@ class Video:
                     if decoded:
                         yield self._item(index, seconds, frame)
                         index += 1
+                    else:
+                        undecoded += 1
                 number += 1
         finally:
             capture.release()
-        del self.warnings[opening_warnings:]
         promised = min(self._count, self._wanted.stop or self._count)
         if number < _SHORT * promised:
             self.warnings.append(
                 f"{self._path.name} ends after {number} of {promised} frames: it is cut off or damaged"
             )
+
+        if undecoded:
+            self.warnings.append(f"frames of {self._path.name} left out because they could not be decoded: {undecoded}")
 
     def _item(self, index: int, seconds: float, frame: np.ndarray) -> Item:
         native = frame.shape[0], frame.shape[1]

@@ -1,0 +1,84 @@
+"""A robot: publishes a camera, a video or a data set as frames that `dataset=robot` maps, from another process or host.
+
+    python examples/robot.py --camera 0 --intrinsics 610 610 320 240
+    python examples/robot.py --video walk.mp4
+    python examples/robot.py --dataset tum ../shared/data/tum_fr1_xyz
+    python launch/run_all.py dataset=robot dataset.path=tcp://127.0.0.1:5555
+
+This uses the project's own transport. A robot in another language writes the same bytes to a ZeroMQ XPUB or PUB socket:
+msgs/WIRE.md has them. Beyond this machine (--address tcp://0.0.0.0:5555) keys are required, see --keys.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from msgs import Frame, GroundTruth
+from mvsgs_core.datasets import open_dataset
+from nodes.addresses import load_keys
+from nodes.camera import Camera
+from nodes.transport import Publisher
+
+
+def frames(arguments: argparse.Namespace) -> Iterator[Frame]:
+    """Frames of whatever the command line names, at the rate at which they were or are taken."""
+    intrinsics = arguments.intrinsics or "auto"
+    if arguments.camera is not None:
+        camera = Camera(Camera.Config(path=arguments.camera, intrinsics=intrinsics))
+        yield from (message for message in camera.run() if not isinstance(message, GroundTruth))
+        return
+    if arguments.video is not None:
+        sequence = open_dataset("video", path=arguments.video, intrinsics=intrinsics)
+    else:
+        name, path = arguments.dataset
+        sequence = open_dataset(name, path=path)
+    began: float | None = None
+    for item in sequence:
+        now = time.monotonic()
+        began = now - item.timestamp if began is None else began
+        if not arguments.fast:
+            time.sleep(max(0.0, began + item.timestamp - now))
+        yield Frame(item.index, item.timestamp, item.image, item.intrinsics)
+    for warning in sequence.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Publishes frames over ZeroMQ for dataset=robot.")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--camera", help="device number or URL")
+    source.add_argument("--video", help="video file")
+    source.add_argument("--dataset", nargs=2, metavar=("NAME", "PATH"), help="data set, such as tum DIR")
+    parser.add_argument("--intrinsics", nargs=4, type=float, metavar=("FX", "FY", "CX", "CY"), help="in pixels")
+    parser.add_argument("--address", default="tcp://127.0.0.1:5555", help="where to publish (default: %(default)s)")
+    parser.add_argument("--keys", type=Path, help="folder with CURVE keys, needed beyond this machine")
+    parser.add_argument("--fast", action="store_true", help="as fast as frames can be read, not at their own rate")
+    return parser.parse_args(arguments)
+
+
+def main() -> None:
+    arguments = parse()
+    publisher = Publisher(arguments.address, keys=None if arguments.keys is None else load_keys(arguments.keys))
+    sent = 0
+    try:
+        print(f"publishing at {arguments.address}, waiting for a reader; Ctrl-C ends", flush=True)
+        while not publisher.ready(1):
+            time.sleep(0.1)
+        for frame in frames(arguments):
+            publisher.send(frame)
+            sent += 1
+    except KeyboardInterrupt:
+        pass
+    finally:
+        publisher.close()  # tells the readers that this is the end
+        print(f"{sent} frames sent")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,174 @@
+"""Source: a live camera. What nobody takes in time is dropped here, and counted; never the newest frame."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from msgs import Frame, GroundTruth
+from mvsgs_core.datasets.calibration import lens_from_option
+from mvsgs_core.datasets.framing import Framing
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.sequence import selection
+from nodes import Node
+
+POLL = 0.5  # s at most between two looks at whether the stream goes on
+RETRY = 0.5  # s between two attempts to open a device that was lost
+
+
+class CameraError(RuntimeError):
+    """A camera that cannot be opened or gives no picture; the message says what to check."""
+
+
+class Camera(Node):
+    """A device or a URL -> Frame, and GroundTruth with the same image to score renders against."""
+
+    @dataclass
+    class Config:
+        path: str = "0"  # device number, or what OpenCV opens: rtsp://host/stream, http://host/video.mjpg, /dev/video2
+        start: int = 0  # frames to leave out at first, while exposure settles
+        stop: int | None = None  # end after so many frames from the first one on; null: until Ctrl-C
+        stride: int = 1  # every which frame of those that are taken
+        size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as it is
+        resolution: list[int] | None = None  # [height, width] asked of the device; null: its own choice
+        fps: float | None = None  # asked of the device, frames per second; null: its own choice
+        intrinsics: list[float] | str = "auto"  # [fx, fy, cx, cy] in pixels of the camera's picture; auto: a guess
+        distortion: list[float] = field(default_factory=list)  # [k1, k2, p1, p2] or with k3, as in OpenCV
+        crop: int | None = None  # pixels cut off after undistortion; null: zoom to hide the empty border
+        timeout: float = 10.0  # s without a picture before the camera counts as lost
+
+    config: Config
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        c = self.config
+        selection(c.start, c.stop, c.stride)  # refuses what is none
+        self._framing = Framing(c.size, c.crop)
+        self._lens: Lens | None = None
+
+    def run(self) -> Iterator[Frame | GroundTruth]:
+        """Ends when the camera is lost after it gave pictures, so that a session still finishes its map.
+
+        Raises CameraError if it cannot be opened or never gives one.
+        """
+        feed = _Feed(self.config)
+        index = 0
+        taken = 0
+        try:
+            while self.config.stop is None or taken < self.config.stop:
+                shot = feed.newest(self.config.timeout)
+                self.stats.counts["dropped"] = feed.dropped
+                if shot is None:
+                    if index == 0:
+                        raise CameraError(f"camera {self.config.path} gave no picture for {self.config.timeout:g} s")
+                    self.stats.warn(f"camera {self.config.path} was lost: no picture for {self.config.timeout:g} s")
+                    return
+                number, taken = taken, taken + 1
+                if number < self.config.start or (number - self.config.start) % self.config.stride:
+                    continue
+                picture, timestamp = shot
+                image, intrinsics = self._frame(picture)
+                self.stats.count("frames")
+                yield Frame(index, timestamp, image, intrinsics)
+                yield GroundTruth(index, timestamp, image, intrinsics, None, None)
+                index += 1
+        finally:
+            feed.close()
+            if feed.reopened:
+                self.stats.warn(f"camera {self.config.path} was lost and found again: {feed.reopened} times")
+
+    def _frame(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """BGR picture -> RGB image as delivered, with its intrinsics."""
+        native = picture.shape[0], picture.shape[1]
+        if self._lens is None:
+            self._lens, notes = lens_from_option(self.config.intrinsics, self.config.distortion, native)
+            for note in notes:
+                self.stats.warn(note)
+        if native != self._lens.size:
+            raise CameraError(f"camera {self.config.path} changed its picture from {self._lens.size} to {native}")
+        rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        return self._framing.image(rgb, self._lens, self._framing.size_of(native))
+
+
+class _Feed:
+    """A thread that reads the camera as fast as it delivers, and keeps the newest picture only."""
+
+    def __init__(self, config: Camera.Config) -> None:
+        self.dropped = 0
+        self.reopened = 0
+        self._config = config
+        self._closing = False
+        self._fresh = threading.Condition()
+        self._newest: tuple[np.ndarray, float] | None = None
+        self._capture = _open(config)
+        self._thread = threading.Thread(target=self._read, name="camera", daemon=True)
+        self._thread.start()
+
+    def newest(self, timeout_s: float) -> tuple[np.ndarray, float] | None:
+        """The newest picture that was not taken yet and its time; None when none comes in time."""
+        deadline = time.monotonic() + timeout_s
+        with self._fresh:
+            while self._newest is None:
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    return None
+                self._fresh.wait(min(left, POLL))
+            shot, self._newest = self._newest, None
+            return shot
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join(timeout=2 * POLL)  # a read that hangs must not hold the run back: the thread is a daemon
+
+    def _read(self) -> None:
+        while not self._closing:
+            read, picture = self._capture.read()
+            if not read:
+                self._reopen()
+                continue
+            with self._fresh:
+                self.dropped += self._newest is not None
+                self._newest = picture, time.time()
+                self._fresh.notify()
+        self._capture.release()
+
+    def _reopen(self) -> None:
+        self._capture.release()
+        while not self._closing:
+            time.sleep(RETRY)
+            try:
+                self._capture = _open(self._config)
+            except CameraError:
+                continue
+            self.reopened += 1
+            return
+
+
+def _open(config: Camera.Config) -> cv2.VideoCapture:
+    if Path(config.path).is_file():
+        raise CameraError(f"{config.path} is a file and no camera: use dataset=video dataset.path={config.path}")
+    if config.path.isdecimal():
+        capture = cv2.VideoCapture(int(config.path))
+        hint = "is it connected, free of other programs, and may you read it (ls -l /dev/video*)?"
+    else:
+        milliseconds = int(1000 * config.timeout)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
+        capture = cv2.VideoCapture(config.path, cv2.CAP_ANY, limits)
+        hint = "is the address right (ffplay shows the same one), and does the network let it through?"
+    if not capture.isOpened():
+        capture.release()
+        raise CameraError(f"camera {config.path} cannot be opened: {hint}")
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # drivers that queue pictures would deliver old ones
+    if config.resolution is not None:
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.resolution[0])
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.resolution[1])
+    if config.fps is not None:
+        capture.set(cv2.CAP_PROP_FPS, config.fps)
+    return capture
