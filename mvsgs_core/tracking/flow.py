@@ -54,18 +54,22 @@ class LucasKanade:
     needs_color: bool = False
 
     def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
-        found = native.load("tracking").lucas_kanade(
-            a=a.pyramid,
-            b=b.pyramid,
-            points=np.ascontiguousarray(points, dtype=np.float32),
-            guess=np.ascontiguousarray(np.nan_to_num(guess, nan=-1e6), dtype=np.float32),
-            border=BORDER,
-            start_level=self.start_level,
-            iterations=self.iterations,
-            window_sigma=self.window_sigma,
-            min_eigenvalue=self.min_eigenvalue,
-            threads=self.threads,
-        ).astype(np.float64)
+        found = (
+            native.load("tracking")
+            .lucas_kanade(
+                a=a.pyramid,
+                b=b.pyramid,
+                points=np.ascontiguousarray(points, dtype=np.float32),
+                guess=np.ascontiguousarray(np.nan_to_num(guess, nan=-1e6), dtype=np.float32),
+                border=BORDER,
+                start_level=self.start_level,
+                iterations=self.iterations,
+                window_sigma=self.window_sigma,
+                min_eigenvalue=self.min_eigenvalue,
+                threads=self.threads,
+            )
+            .astype(np.float64)
+        )
         distance, correlation = found[:, 2], found[:, 3]
         alive = (distance < self.max_distance) & (correlation > self.min_correlation)
         weight = np.where(alive, np.exp(-0.5 * np.square(np.where(alive, distance, 0.0) / self.distance_sigma)), 0.0)
@@ -86,7 +90,7 @@ class DenseInverseSearch:
             "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
             "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
         }
-        return cv2.DISOpticalFlow_create(presets[self.preset])
+        return cv2.DISOpticalFlow.create(presets[self.preset])
 
     def field(self, a: TrackingImage, b: TrackingImage) -> np.ndarray:
         """(H / 2, W / 2, 2) float32, in pixels of the full size."""
@@ -132,7 +136,7 @@ def sample_field(field: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Half-size flow field (H, W, 2) at full-size points (N, 2), bilinear, clamped to the border."""
     at = ((points.astype(np.float32) + 0.5) * 0.5 - 0.5).reshape(-1, 1, 2)
     at = np.nan_to_num(at, nan=0.0)
-    sampled = cv2.remap(field, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    sampled = cv2.remap(field, at, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(sampled).reshape(-1, 2).astype(np.float64)
 
 

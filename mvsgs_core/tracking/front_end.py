@@ -59,7 +59,8 @@ class FrontEnd:
 
     def follow(self, image: TrackingImage, started: bool) -> Step:
         """Finds the reference's points in the next frame, and, once started, its pose."""
-        assert self.reference is not None and self.last is not None
+        assert self.reference is not None
+        assert self.last is not None
         field = self.between.field(self.last, image)
         moved = float(np.median(np.hypot(field[..., 0], field[..., 1])))
         if moved < self.config.still_flow * image.size[1] and self.step is not None and self._same(image):

@@ -1,4 +1,4 @@
-"""The keyframe graph: what the tracker knows of the scene. Keyframes with points and inverse depths, edges of matches."""
+"""The keyframe graph: what the tracker knows of the scene. Keyframes with inverse depths, edges of matches."""
 
 from __future__ import annotations
 

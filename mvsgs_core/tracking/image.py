@@ -48,12 +48,12 @@ class TrackingImage:
     @cached_property
     def pyramid(self) -> list[np.ndarray]:
         """Levels (H / 2^l + 48, W / 2^l + 48) float32, bordered."""
-        level = self.gray.astype(np.float32)
-        levels = []
+        level: np.ndarray = self.gray.astype(np.float32)
+        levels: list[np.ndarray] = []
         for n in range(LEVELS):
             if n:
-                level = cv2.pyrDown(level)
-            levels.append(cv2.copyMakeBorder(level, BORDER, BORDER, BORDER, BORDER, cv2.BORDER_REPLICATE))
+                level = np.asarray(cv2.pyrDown(level))
+            levels.append(np.asarray(cv2.copyMakeBorder(level, *(BORDER,) * 4, cv2.BORDER_REPLICATE)))
         return levels
 
     @cached_property
@@ -73,7 +73,7 @@ class TrackingImage:
     def features(self, count: int = 800) -> tuple[np.ndarray, np.ndarray]:
         """ORB keypoints (N, 2) float32 and descriptors (N, 32) uint8."""
         if self._features is None:
-            orb = cv2.ORB_create(nfeatures=count, scaleFactor=1.2, nlevels=6, fastThreshold=7)
+            orb = cv2.ORB.create(nfeatures=count, scaleFactor=1.2, nlevels=6, fastThreshold=7)
             keypoints, descriptors = orb.detectAndCompute(self.gray, None)
             if descriptors is None:
                 self._features = np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)

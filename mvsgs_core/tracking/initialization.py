@@ -70,7 +70,9 @@ def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, th
     depths = depths / scale
     centers = geometry.inverse(poses)[:, :3, 3]
     baseline = float(np.max(np.linalg.norm(centers[:, None] - centers[None], axis=-1)))
-    parallax = _parallax(poses, depths, problem.pixels, graph.intrinsics, problem.source, problem.to, problem.information)
+    parallax = _parallax(
+        poses, depths, problem.pixels, graph.intrinsics, problem.source, problem.to, problem.information
+    )
     cost = best.cost / max(matched, 1.0)
     failure = ""
     if not np.isfinite(cost) or cost > criteria.max_cost:

@@ -6,9 +6,7 @@ dense bundle adjustment keeps consistent; before that, the first keyframes are s
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +23,7 @@ from mvsgs_core.tracking.initialization import StartCriteria, start_up
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from mvsgs_core.tracking.matcher import Matcher
 from mvsgs_core.tracking.publish import Correction, Publisher
+from mvsgs_core.tracking.stats import TrackingStats
 
 
 @dataclass(frozen=True)
@@ -57,9 +56,7 @@ class Tracker:
         self.records: list[FrameRecord] = []
         self.started = False
         self.segment = 0
-        self.seconds: dict[str, float] = {}
-        self.counts: dict[str, int] = {}
-        self.warnings: list[str] = []
+        self.stats = TrackingStats()
         self.graph: KeyframeGraph | None = None
         self._waiting: list[int] = []  # keyframes before the start
 
@@ -67,17 +64,17 @@ class Tracker:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow."""
         if self.graph is None:
             self._set_up(image.shape[0], image.shape[1], intrinsics)
-        with self._time("image"):
+        with self.stats.time("image"):
             frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color)
-        self._count("frames")
+        self.stats.count("frames")
         record = FrameRecord(index, timestamp, State.NOT_STARTED)
         self.records.append(record)
         if self.front_end.reference is None:
             return self._begin(frame)
-        with self._time("front end"):
+        with self.stats.time("front end"):
             step = self.front_end.follow(frame, self.started)
         if step.still:
-            self._count("still frames")
+            self.stats.skip("frames that did not move")
             record.state, record.same_as = self.records[-2].state, self.records[-2].index
             if self.records[-2].same_as is not None:
                 record.same_as = self.records[-2].same_as
@@ -89,14 +86,23 @@ class Tracker:
         record.cam_from_reference = self.front_end.cam_from_reference(step)
         return self._go_on(frame, step, record) if self.started else self._wait(frame, step, record)
 
-    def finish(self) -> Correction | None:
+    @property
+    def pending(self) -> set[int]:
+        """Frames that may still become keyframes that are told: their images are needed until then."""
+        return set(self._waiting)
+
+    def idle(self) -> Update | None:
+        """A slice of background work; None when there is nothing to do."""
+        return None
+
+    def finish(self) -> Iterator[Update]:
         """The stream has ended: a start by force if there was none, and the global bundle adjustment."""
         if self.graph is None:
-            return None
-        with self._time("global bundle adjustment"):
+            return
+        with self.stats.time("global bundle adjustment"):
             for segment in sorted({k.segment for k in self.graph.keyframes.values()}):
                 self._adjust_globally(segment)
-        return self.publisher.corrections(everything=True)
+        yield Update(State.TRACKED, (), self.publisher.corrections(everything=True))
 
     def path(self) -> Path:
         """Every frame's pose, after `finish`."""
@@ -122,7 +128,7 @@ class Tracker:
     def _begin(self, frame: TrackingImage) -> Update:
         """First keyframe of a segment that has not started yet."""
         if frame.cells.textured.mean() < 0.05:
-            self._warn("frames without texture before the start")
+            self.stats.warn("frames without texture before the start")
             return Update(State.NOT_STARTED)
         self._add_waiting(frame)
         self.front_end.refer_to(frame)
@@ -139,7 +145,7 @@ class Tracker:
         assert self.graph is not None
         if not self.front_end.wants_keyframe(step, self.config.start_flow):
             return Update(State.NOT_STARTED)
-        with self._time("start"):
+        with self.stats.time("start"):
             earlier = list(self._waiting)
             self._add_waiting(frame)
             self._connect_waiting(frame, earlier, step.matches)
@@ -147,7 +153,7 @@ class Tracker:
             if len(self._waiting) < self.config.start_keyframes:
                 return Update(State.NOT_STARTED)
             start = start_up(self.graph, self._waiting, self.config.start, self.config.threads)
-            self._count("start attempts")
+            self.stats.count("start attempts")
             if start.failure:
                 if len(self._waiting) >= self.config.start_limit:
                     self.graph.remove(self._waiting.pop(0))
@@ -192,25 +198,24 @@ class Tracker:
                 continue
             at = found.target[found.alive]
             back = spread(at, image.cells.points[found.alive] - at, points)
-            self.graph.connect(
-                frame.index, index, self.matcher.match(frame, image, back, share)[0], share
-            )
+            self.graph.connect(frame.index, index, self.matcher.match(frame, image, back, share)[0], share)
 
     def _go_on(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """A tracked frame; perhaps a keyframe."""
-        assert self.graph is not None and step.localization is not None
+        assert self.graph is not None
+        assert step.localization is not None
         record.state = State.TRACKED
         if not self.front_end.wants_keyframe(step, self.config.front_end.keyframe_flow):
             return Update(State.TRACKED)
         assert self.front_end.reference is not None
-        with self._time("local map"):
+        with self.stats.time("local map"):
             reference = self.front_end.reference.index
             self.local_map.insert(frame, step.localization.cam_from_world, self.segment, {reference: step.matches})
-        with self._time("local bundle adjustment"):
+        with self.stats.time("local bundle adjustment"):
             solution = self.local_map.adjust_window(frame.index)
         if solution.failure:
-            self._warn(f"local bundle adjustment failed: {solution.failure}")
-        self._count("keyframes")
+            self.stats.warn(f"local bundle adjustment failed: {solution.failure}")
+        self.stats.count("keyframes")
         for index in self.local_map.members(self.segment)[: -self.config.local_map.window]:
             self.graph.keyframes[index].image.release()
         self.front_end.refer_to(frame)
@@ -221,7 +226,7 @@ class Tracker:
 
     def _lose(self, frame: TrackingImage, record: FrameRecord) -> Update:
         record.state = State.LOST if self.started else State.NOT_STARTED
-        self._count("lost frames")
+        self.stats.count("lost frames")
         return Update(record.state)
 
     def _adjust_globally(self, segment: int) -> None:
@@ -229,26 +234,11 @@ class Tracker:
         if len(members) < 3 or not set(members) <= self.publisher.told:
             return
         for index in members:
-            self._count("edges matched again", self.back_end.rematch_edges(index))
-            self._count("edges by proximity", self.back_end.extend_edges(index, segment))
+            self.stats.count("edges matched again", self.back_end.rematch_edges(index))
+            self.stats.count("edges by proximity", self.back_end.extend_edges(index, segment))
         for solution in self.back_end.adjust(segment):
             if solution.failure:
-                self._warn(f"global bundle adjustment failed: {solution.failure}")
-
-    def _warn(self, text: str) -> None:
-        if text not in self.warnings:
-            self.warnings.append(text)
-
-    def _count(self, name: str, n: int = 1) -> None:
-        self.counts[name] = self.counts.get(name, 0) + n
-
-    @contextmanager
-    def _time(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+                self.stats.warn(f"global bundle adjustment failed: {solution.failure}")
 
 
 __all__ = ["Tracker", "TrackerConfig", "Update"]

@@ -1,0 +1,120 @@
+"""Frame -> Keyframe, Poses, Trajectory: the weight-free tracker (mvsgs_core.tracking)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from msgs import Frame, Keyframe, Poses, Trajectory
+from mvsgs_core import geometry
+from mvsgs_core.tracking import tracker as core
+from mvsgs_core.tracking.back_end import BackEndConfig
+from mvsgs_core.tracking.coarse_depth import coarse_map
+from mvsgs_core.tracking.front_end import FrontEndConfig
+from mvsgs_core.tracking.local_map import LocalMapConfig
+from mvsgs_core.tracking.publish import Correction
+from nodes import Node
+
+
+class Tracker(Node):
+    """Dense bundle adjustment over semi-dense matches; see mvsgs_core.tracking.tracker."""
+
+    @dataclass
+    class Config:
+        area: int = 320 * 240  # pixels of the tracker's own image, aspect kept
+        flow: str = "lucas_kanade"  # lucas_kanade, dis, features, or module:Class
+        keyframe_flow: float = 0.05  # of the width: median flow that makes a keyframe
+        keyframe_share: float = 0.5  # of the textured points: fewer found make a keyframe
+        still_flow: float = 0.001  # of the width: median flow below which a frame is skipped
+        start_keyframes: int = 6  # before a start is tried
+        window: int = 12  # keyframes of the local bundle adjustment
+        recent: int = 3  # keyframes before a new one that it is matched with
+        proximity: int = 3  # older keyframes that it is matched with
+        steps: int = 5  # of the local bundle adjustment
+        global_edges: int = 6  # of each keyframe in the global bundle adjustment
+        tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
+        threads: int | None = None  # of the C++ kernels; null: 1
+
+    config: Config
+
+    def __init__(self, config: Config | None = None) -> None:
+        super().__init__(config)
+        c = self.config
+        self._tracker = core.Tracker(
+            core.TrackerConfig(
+                area=c.area,
+                flow=c.flow,
+                start_keyframes=c.start_keyframes,
+                tolerance=c.tolerance,
+                threads=c.threads or 1,
+                front_end=FrontEndConfig(
+                    still_flow=c.still_flow, keyframe_flow=c.keyframe_flow, keyframe_share=c.keyframe_share
+                ),
+                local_map=LocalMapConfig(window=c.window, recent=c.recent, proximity=c.proximity, steps=c.steps),
+                back_end=BackEndConfig(edges=c.global_edges),
+            )
+        )
+        self._frames: dict[int, Frame] = {}  # those that may still become keyframes of the first start
+        self._revision = 0
+
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
+        self._frames[frame.index] = frame
+        update = self._tracker.add(frame.index, frame.timestamp, frame.image, frame.intrinsics)
+        yield from self._send(update)
+
+    def on_idle(self) -> list[Keyframe | Poses] | None:
+        update = self._tracker.idle()
+        return None if update is None else list(self._send(update))
+
+    def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
+        for update in self._tracker.finish():
+            yield from self._send(update)
+        path = self._tracker.path()
+        self._report()
+        yield Trajectory(
+            index=path.index,
+            timestamp=path.timestamp,
+            world_from_cam=path.world_from_cam,
+            keyframe=path.keyframe,
+            state=path.state,
+            segment=path.segment,
+        )
+
+    def _send(self, update: core.Update) -> Iterator[Keyframe | Poses]:
+        for index in update.keyframes:
+            yield self._keyframe(index)
+        if update.correction is not None:
+            yield self._poses(update.correction)
+        for index in [index for index in self._frames if index not in self._tracker.pending]:
+            del self._frames[index]
+        self.stats.values["tracking"] = update.state.name.lower()
+        self._report()
+
+    def _keyframe(self, index: int) -> Keyframe:
+        frame, keyframe = self._frames[index], self._tracker.keyframe(index)
+        inverse_depth, weight = coarse_map(keyframe)
+        return Keyframe(
+            index=index,
+            timestamp=frame.timestamp,
+            image=frame.image,
+            intrinsics=frame.intrinsics,
+            world_from_cam=geometry.inverse(keyframe.cam_from_world),
+            scale=1.0,
+            inverse_depth=inverse_depth,
+            inverse_depth_weight=weight,
+            segment=keyframe.segment,
+        )
+
+    def _poses(self, correction: Correction) -> Poses:
+        self._revision += 1
+        return Poses(self._revision, correction.index, correction.world_from_cam, correction.scale.astype(np.float64))
+
+    def _report(self) -> None:
+        core_stats = self._tracker.stats
+        self.stats.counts.update(core_stats.counts)
+        self.stats.seconds.update(core_stats.seconds)
+        self.stats.skipped.update(core_stats.skipped)
+        for warning in core_stats.warnings:
+            self.stats.warn(warning)
