@@ -40,7 +40,7 @@ def thread_plan(graph: Graph, cores: int | None = None) -> dict[str, int]:
         if name == heaviest:
             share = max(share, min(2, cores))
         pinned = len(slot.placement.cpu) if slot.placement.cpu else share
-        plan[name] = slot.placement.threads or min(share, pinned)
+        plan[name] = slot.placement.threads or slot.config.get("threads") or min(share, pinned)
     return plan
 
 

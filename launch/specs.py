@@ -75,6 +75,7 @@ def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_
     """The JSON that `python -m nodes` runs a node from."""
     slot = graph.slots[name]
     settings = graph.settings
+    own_threads = {"threads": threads} if "threads" in slot.config else {}  # a node's kernels keep to its share too
     outputs: dict[str, dict[str, Any]] = {}
     for edge in graph.out_of(name):
         output = outputs.setdefault(
@@ -84,7 +85,7 @@ def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_
     return {
         "name": name,
         "target": slot.target,
-        "config": slot.config,
+        "config": slot.config | own_threads,
         "inputs": [
             {
                 "type": edge.message.__name__,
