@@ -28,7 +28,7 @@ from msgs import End, Message
 from msgs.codec import MAX_MESSAGE_BYTES, NEWEST, RELIABLE, CodecError, Decoded, decode, encode, type_name
 from nodes.addresses import Keys, TransportError, check_address, save_keys
 
-PEER_GRACE = 1.0  # s between a disconnection and its report: whoever failed first should be heard first
+PEER_GRACE = 0.5  # s between a disconnection and its report: whoever failed first should be heard first
 NEWEST_GOODBYE = 5.0  # s that a best-effort reader has to take its End
 
 

@@ -1,0 +1,250 @@
+"""Nodes in processes of their own: nothing lost, everything ends, and whatever fails takes the graph down in time."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.processes import ENVIRONMENT, Graph, graph
+from tests.shared_data import ROOT
+
+DOWN = 5.0  # s in which a graph must be down after a failure
+
+
+def test_a_diamond_with_a_slow_reader_loses_nothing_and_keeps_the_order() -> None:
+    count = 1000
+    with graph(buffer=2) as g:
+        g.diamond(source={"count": count}, join={"delay": 0.001}, left={"delay": 0.0005})
+        assert g.wait(60) == dict.fromkeys(("join", "left", "right", "source"), 0)
+        assert g.joined["received"] == {"Keyframe": list(range(count)), "GroundTruth": list(range(count))}
+        assert g.sockets() == []
+
+
+def test_statistics_of_all_nodes_reach_the_end_once() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 5}, join={"slices": 3})
+        g.wait(20)
+        upstream = g.joined["upstream"]
+        assert set(upstream) == {"source", "left", "right"}
+        assert upstream["source"]["counts"] == {"frames": 5}
+        assert upstream["left"]["received"] == {"source.Frame": 5}
+        assert upstream["left"]["sent"] == {"Keyframe": 5}
+        for stats in upstream.values():
+            assert stats["wall_seconds"] > 0
+            assert stats["cpu_seconds"] > 0
+            assert stats["peak_bytes"] > 10**7
+        states = [line["state"] for line in g.processes["left"].lines]
+        assert list(dict.fromkeys(states)) == ["starting", "waiting", "running", "ending", "done"]
+        last = g.processes["left"].last
+        assert last["in"] == {"source.Frame": 5}
+        assert last["out"] == {"Keyframe": 5}
+        assert last["bytes"] > 10**7
+        assert g.processes["join"].last["counts"]["slices"] >= 3  # background work went on until there was none
+
+
+def test_a_failing_node_says_why_and_takes_the_others_down() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6}, left={"fail_at": 20})
+        codes = g.wait(20)
+        assert codes == dict.fromkeys(("join", "left", "right", "source"), 1)
+        last = g.processes["left"].last
+        assert (last["state"], last["error"], last["peer"]) == ("failed", "RuntimeError: no pose for frame 20", False)
+        assert "in on_frame" in last["traceback"]
+        assert "and a second line" in g.processes["left"].log.read_text()
+        assert g.processes["source"].last["peer"]
+        assert g.sockets() == []
+
+
+@pytest.mark.parametrize("victim", ["source", "left", "join"])
+def test_a_killed_node_is_noticed_by_all_in_time(victim: str) -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6}, join={"delay": 0.002})
+        g.processes["join"].wait_for(lambda status: sum(status.get("in", {}).values()) > 20)
+        g.processes[victim].popen.kill()
+        began = time.monotonic()
+        codes = g.wait(DOWN)
+        assert time.monotonic() - began < DOWN
+        assert codes.pop(victim) == -signal.SIGKILL
+        assert set(codes.values()) == {1}
+        assert any("PeerLost" in g.processes[name].last.get("error", "") for name in codes)
+
+
+def test_sigint_ends_a_source_and_the_graph_finishes_with_what_it_has() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6, "delay": 0.001})
+        time.sleep(random.uniform(0.0, 1.0))  # from before the imports are done to the middle of the stream
+        for process in g.processes.values():
+            process.popen.send_signal(signal.SIGINT)
+        assert set(g.wait(DOWN).values()) == {0}
+        received = g.joined["received"]
+        assert received["Keyframe"] == received["GroundTruth"] == list(range(len(received["Keyframe"])))
+        assert g.sockets() == []
+
+
+def test_sigint_ends_a_source_whose_read_hangs() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6, "hang_at": 7})
+        g.processes["join"].wait_for(lambda status: sum(status.get("in", {}).values()) == 14)
+        g.processes["source"].popen.send_signal(signal.SIGINT)
+        assert set(g.wait(DOWN).values()) == {0}
+        assert g.joined["received"]["Keyframe"] == list(range(7))
+        assert "did not return" in g.joined["upstream"]["source"]["warnings"][0]
+
+
+def test_a_source_that_fails_to_read_is_a_failure_of_the_graph() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6, "fail_at": 3})
+        assert set(g.wait(20).values()) == {1}
+        assert g.processes["source"].last["error"] == "OSError: frame 3 cannot be read"
+
+
+def test_sigterm_stops_a_busy_node_at_once() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6}, left={"delay": 100.0})
+        g.processes["left"].wait_for(lambda status: sum(status.get("in", {}).values()) == 1)
+        began = time.monotonic()
+        g.processes["left"].popen.send_signal(signal.SIGTERM)
+        assert g.processes["left"].popen.wait(DOWN) == -signal.SIGTERM
+        assert time.monotonic() - began < 1.0
+
+
+def test_a_slow_best_effort_reader_never_holds_its_sender_back() -> None:
+    with graph() as g:
+        here = "tests.sample_nodes"
+        g.start("viewer", f"{here}.Left", {"Frame": "source?"}, {}, {"delay": 0.3})
+        g.start("source", f"{here}.Source", {}, {"Frame": 1}, {"count": 200, "delay": 0.002})
+        assert set(g.wait(20).values()) == {0}
+        source, viewer = (g.processes[name].last for name in ("source", "viewer"))
+        assert source["out"] == {"Frame": 200}
+        assert 1 <= viewer["in"]["source.Frame"] < 20
+        running = [line for line in g.processes["source"].lines if line["state"] == "running"]
+        assert running  # it ran for 0.4 s and more, not for the reader's 60
+
+
+def test_a_frozen_best_effort_reader_never_holds_its_sender_back() -> None:
+    with graph() as g:
+        here = "tests.sample_nodes"
+        viewer = g.start("viewer", f"{here}.Left", {"Frame": "source?"}, {}, {})
+        source = g.start("source", f"{here}.Source", {}, {"Frame": 1}, {"count": 1000, "delay": 0.001})
+        viewer.wait_for(lambda status: sum(status.get("in", {}).values()) > 3)
+        viewer.popen.send_signal(signal.SIGSTOP)
+        source.wait_for(lambda status: status.get("state") == "ending")
+        assert source.last["out"] == {"Frame": 1000}
+        assert source.popen.wait(10) == 0  # its goodbye is not waited for without end
+
+
+def test_a_node_that_yields_what_it_does_not_declare_fails() -> None:
+    with graph() as g:
+        g.start("left", "tests.sample_nodes.Wrong", {"Frame": "source"}, {})
+        g.start("source", "tests.sample_nodes.Source", {}, {"Frame": 1}, {"count": 10**6})
+        assert set(g.wait(20).values()) == {1}
+        assert "yields a Frame, but its annotations say Keyframe" in g.processes["left"].last["error"]
+
+
+@pytest.mark.parametrize(
+    ("target", "config", "error"),
+    [
+        ("tests.sample_nodes.Nothing", {}, "is no node"),
+        ("tests.no_such_module.Left", {}, "ModuleNotFoundError"),
+        ("tests.sample_nodes.Left", {"dely": 1}, "has no parameter dely; its parameters are: delay"),
+        ("tests.sample_nodes.Left", {"delay": "long"}, "Left.delay='long': must be float"),
+    ],
+)
+def test_a_wrong_specification_is_refused(target: str, config: dict[str, object], error: str) -> None:
+    with graph() as g:
+        g.start("left", target, {"Frame": "source"}, {}, config)
+        assert g.wait(20) == {"left": 1}
+        assert error in g.processes["left"].last["error"]
+
+
+def test_a_file_that_is_no_specification_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "spec.json"
+    for text, error in (("{", "Expecting"), ('{"name": "a"}', "missing: target"), ("[1]", "must be a JSON object")):
+        path.write_text(text)
+        done = subprocess.run([sys.executable, "-m", "nodes", path], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 2
+        assert error in done.stderr
+
+
+def test_cores_and_threads_are_set() -> None:
+    core = max(os.sched_getaffinity(0))
+    with graph() as g:
+        g.start("left", "tests.sample_nodes.Left", {"Frame": "source"}, {}, cpu=[core], threads=1)
+        left = g.processes["left"]
+        left.wait_for(lambda status: status.get("state") == "running")
+        for task in Path(f"/proc/{left.popen.pid}/task").iterdir():
+            assert os.sched_getaffinity(int(task.name)) == {core}
+
+
+def test_no_node_outlives_a_killed_launcher() -> None:
+    with graph() as g:
+        launcher = subprocess.Popen(
+            [sys.executable, "-c", _LAUNCHER, str(g.directory)],
+            cwd=ROOT,
+            env={**os.environ, **ENVIRONMENT},
+            stdout=subprocess.PIPE,
+        )
+        assert launcher.stdout is not None
+        with launcher.stdout:
+            child = int(launcher.stdout.readline())
+        launcher.kill()
+        launcher.wait()
+        until = time.monotonic() + DOWN
+        while _alive(child):
+            assert time.monotonic() < until
+            time.sleep(0.02)
+
+
+_LAUNCHER = """
+import sys, time
+from tests.processes import Graph
+g = Graph()
+p = g.start("left", "tests.sample_nodes.Left", {"Frame": "source"}, {})
+p.wait_for(lambda status: status.get("state") == "running")
+print(p.popen.pid, flush=True)
+time.sleep(100)
+"""
+
+
+def _alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def _exercise(rounds: int, count: int) -> None:
+    """`python -m tests.test_node`: the long form of the first test, and nodes killed at random moments."""
+    for i in range(rounds):
+        g = Graph(buffer=2)
+        g.diamond(source={"count": count}, join={"delay": 0.002})
+        codes = g.wait(120)
+        kept = g.joined["received"] == {kind: list(range(count)) for kind in ("Keyframe", "GroundTruth")}
+        print(f"diamond {i + 1}: {'all in order' if kept else 'LOST'}, exit codes {codes}, sockets {g.sockets()}")
+        g.close()
+    for i in range(4 * rounds):
+        g = Graph(buffer=2)
+        g.diamond(source={"count": 10**6}, join={"delay": 0.001})
+        time.sleep(random.uniform(0.0, 2.0))
+        victim = random.choice(list(g.processes))
+        g.processes[victim].popen.kill()
+        began = time.monotonic()
+        running = {n for n, p in g.processes.items() if p.last.get("state") == "running"}
+        try:
+            codes = g.wait(DOWN)
+            seconds = time.monotonic() - began
+            print(f"kill {i + 1}: {victim} among {len(running)} running: down after {seconds:.2f} s, {codes}")
+        except AssertionError as error:
+            print(f"kill {i + 1}: {victim} among {len(running)} running: {str(error).splitlines()[0]}")
+        g.close()
+
+
+if __name__ == "__main__":
+    _exercise(int(sys.argv[1]), int(sys.argv[2]))
