@@ -10,19 +10,20 @@
 namespace splats {
 namespace {
 
+constexpr size_t kAhead = 12;     // splats fetched early: the depth order jumps through memory
 constexpr float kMargin = 0.01f;  // px, so that rounding never cuts a pixel off the ellipse
 
 // False if the splat's box misses the image.
 bool place(const Camera& camera, const Parameters& p, const Projection& r, ScreenSplat& s, Footprint& f) {
     const float opacity = r.sigmoid * r.compensation;
-    const float twice_log = 2.0f * std::log(std::fmax(opacity * 255.0f, 1.0f));
-    f.reach = p.exact ? std::fmin(std::pow(twice_log, 2.0f / r.beta), kMaxReach) : twice_log;
+    const float twice_log = 2.0f * std::log(larger(opacity * 255.0f, 1.0f));
+    f.reach = p.exact ? smaller(std::pow(twice_log, 2.0f / r.beta), kMaxReach) : twice_log;
     const float half_width = std::sqrt(f.reach * r.xx);
     f.half_height = std::sqrt(f.reach * r.yy);
     s.radius = 0.0f;
     if (!(r.u + half_width >= 0 && r.u - half_width <= camera.width - 1)) return false;
     if (!(r.v + f.half_height >= 0 && r.v - f.half_height <= camera.height - 1)) return false;
-    s.radius = std::fmax(half_width, f.half_height);
+    s.radius = larger(half_width, f.half_height);
     const double whole_x = std::nearbyint(r.u), whole_y = std::nearbyint(r.v);
     s.whole_x = float(whole_x);
     s.whole_y = float(whole_y);
@@ -73,19 +74,19 @@ class TileWalk {
         const ScreenSplat& s = frame_.splats[id];
         const Footprint& f = frame_.footprints[id];
         const float center_y = s.whole_y + s.part_y, center_x = s.whole_x + s.part_x;
-        const float top = std::fmax(std::ceil(center_y - f.half_height - kMargin), 0.0f);
-        const float bottom = std::fmin(std::floor(center_y + f.half_height + kMargin), float(camera.height - 1));
+        const float top = larger(std::ceil(center_y - f.half_height - kMargin), 0.0f);
+        const float bottom = smaller(std::floor(center_y + f.half_height + kMargin), float(camera.height - 1));
         if (!(top <= bottom)) return;
         const int first_row = int(top) / 4, last_row = int(bottom) / 4;
         for (int row = first_row; row <= last_row; ++row) {
-            const float low = std::fmax(4.0f * row - center_y, -f.half_height);
-            const float high = std::fmin(4.0f * row + 3.0f - center_y, f.half_height);
-            const float right_y = std::fmin(std::fmax(f.turn, low), high);
-            const float left_y = std::fmin(std::fmax(-f.turn, low), high);
+            const float low = larger(4.0f * row - center_y, -f.half_height);
+            const float high = smaller(4.0f * row + 3.0f - center_y, f.half_height);
+            const float right_y = smaller(larger(f.turn, low), high);
+            const float left_y = smaller(larger(-f.turn, low), high);
             const float right = center_x + s.shear * right_y + half_span(f, right_y) + kMargin;
             const float left = center_x + s.shear * left_y - half_span(f, left_y) - kMargin;
-            const float first = std::fmax(std::ceil(left), 0.0f);
-            const float last = std::fmin(std::floor(right), float(camera.width - 1));
+            const float first = larger(std::ceil(left), 0.0f);
+            const float last = smaller(std::floor(right), float(camera.width - 1));
             if (first <= last) mark(row & 3, int(first) / 4, int(last) / 4);
             if ((row & 3) == 3 || row == last_row) flush(id, row >> 2);
         }
@@ -93,7 +94,7 @@ class TileWalk {
 
    private:
     static float half_span(const Footprint& f, float dy) {
-        return std::sqrt(std::fmax(f.reach - f.pitch_v_squared * dy * dy, 0.0f)) * f.inverse_pitch_u;
+        return std::sqrt(larger(f.reach - f.pitch_v_squared * dy * dy, 0.0f)) * f.inverse_pitch_u;
     }
 
     void mark(int block_row, int first, int last) {
@@ -145,9 +146,9 @@ size_t project_all(Frame& frame, const Parameters& p, int threads) {
         if (fate != Fate::kSeen || !place(frame.camera, p, r, s, frame.footprints[i])) continue;
         Shading shading;
         shade(p, int64_t(i), r, shading);
-        s.red = std::fmax(shading.raw[0], 0.0f);
-        s.green = std::fmax(shading.raw[1], 0.0f);
-        s.blue = std::fmax(shading.raw[2], 0.0f);
+        s.red = larger(shading.raw[0], 0.0f);
+        s.green = larger(shading.raw[1], 0.0f);
+        s.blue = larger(shading.raw[2], 0.0f);
     }
     frame.refused = refused;
     size_t seen = 0;
@@ -181,7 +182,11 @@ void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int 
         pairs.clear();
         pair_tiles.clear();
         TileWalk walk(frame, tile_mask, pairs, pair_tiles);
-        for (size_t i = seen * chunk / chunks; i < seen * (chunk + 1) / chunks; ++i) {
+        const size_t end = seen * (chunk + 1) / chunks;
+        for (size_t i = seen * chunk / chunks; i < end; ++i) {
+            const uint32_t soon = frame.order[std::min(i + kAhead, end - 1)];
+            __builtin_prefetch(&frame.splats[soon], 1);
+            __builtin_prefetch(&frame.footprints[soon]);
             ScreenSplat& s = frame.splats[frame.order[i]];
             s.slot = uint32_t(pairs.size());
             walk.visit(frame.order[i]);
@@ -204,8 +209,11 @@ void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int 
     for (int chunk = 0; chunk < chunks; ++chunk) {
         uint32_t before = 0;
         for (int k = 0; k < chunk; ++k) before += uint32_t(frame.chunk_pairs[k].size());
-        for (size_t i = seen * chunk / chunks; i < seen * (chunk + 1) / chunks; ++i)
+        const size_t end = seen * (chunk + 1) / chunks;
+        for (size_t i = seen * chunk / chunks; before && i < end; ++i) {
+            __builtin_prefetch(&frame.splats[frame.order[std::min(i + kAhead, end - 1)]], 1);
             frame.splats[frame.order[i]].slot += before;
+        }
         uint32_t* own = counts + chunk * tiles;
         const std::vector<Pair>& pairs = frame.chunk_pairs[chunk];
         for (size_t i = 0; i < pairs.size(); ++i)

@@ -7,9 +7,10 @@
 namespace splats {
 namespace {
 
-struct Pixels {
-    Lanes transmittance[16], red[16], green[16], blue[16], depth[16];
+struct Block {
+    Lanes transmittance, red, green, blue, depth;
 };
+using Pixels = Block[16];
 
 template <bool Exact, bool Weights>
 int64_t blend_tile(Frame& frame, const Tile& tile, Pixels& pixels) {
@@ -18,10 +19,10 @@ int64_t blend_tile(Frame& frame, const Tile& tile, Pixels& pixels) {
         int row, column;
         for (int lane = 0; lane < kLanes; ++lane) {
             const bool inside = tile.pixel(block, lane, row, column);
-            pixels.transmittance[block][lane] = inside ? 1.0f : 0.0f;
+            pixels[block].transmittance[lane] = inside ? 1.0f : 0.0f;
             open |= uint32_t(inside) << block;
         }
-        pixels.red[block] = pixels.green[block] = pixels.blue[block] = pixels.depth[block] = Lanes{};
+        pixels[block].red = pixels[block].green = pixels[block].blue = pixels[block].depth = Lanes{};
     }
     int64_t evaluated = 0;
     uint32_t index = tile.begin;
@@ -37,20 +38,19 @@ int64_t blend_tile(Frame& frame, const Tile& tile, Pixels& pixels) {
             Lanes u, v, log2_m, power;
             placed.at(s, block, u, v);
             const Lanes exponent = log2_alpha<Exact>(s, u, v, log2_m, power);
-            const Lanes before = pixels.transmittance[block];
+            const Lanes before = pixels[block].transmittance;
             const Ints counted = (exponent >= kLog2MinAlpha) & (before >= kMinTransmittance);
             evaluated += kLanes;
-            if (!any(counted)) continue;
-            hit |= 1u << block;
+            hit |= uint32_t(any(counted)) << block;
             Lanes weight = before * minimum(exp2_of_negative(exponent), all(kMaxAlpha));
             weight = counted ? weight : Lanes{};
             const Lanes after = before - weight;
-            pixels.transmittance[block] = after;
-            pixels.red[block] += s.red * weight;
-            pixels.green[block] += s.green * weight;
-            pixels.blue[block] += s.blue * weight;
-            pixels.depth[block] += s.depth * weight;
-            if (!any(after >= kMinTransmittance)) open &= ~(1u << block);
+            pixels[block].transmittance = after;
+            pixels[block].red += s.red * weight;
+            pixels[block].green += s.green * weight;
+            pixels[block].blue += s.blue * weight;
+            pixels[block].depth += s.depth * weight;
+            if (!any(after >= kMinTransmittance)) [[unlikely]] open &= ~(1u << block);
             if constexpr (Weights) {
                 weight_sum += weight;
                 weight_max = maximum(weight_max, weight);
@@ -77,11 +77,11 @@ void write(const Frame& frame, const Tile& tile, const Pixels& pixels, float* co
             int row, column;
             if (!tile.pixel(block, lane, row, column)) continue;
             const size_t at = size_t(row) * frame.camera.width + column;
-            const float left = pixels.transmittance[block][lane], covered = 1.0f - left;
-            color[3 * at] = pixels.red[block][lane] + left * frame.background[0];
-            color[3 * at + 1] = pixels.green[block][lane] + left * frame.background[1];
-            color[3 * at + 2] = pixels.blue[block][lane] + left * frame.background[2];
-            depth[at] = covered > 0.0f ? pixels.depth[block][lane] / covered : 0.0f;
+            const float left = pixels[block].transmittance[lane], covered = 1.0f - left;
+            color[3 * at] = pixels[block].red[lane] + left * frame.background[0];
+            color[3 * at + 1] = pixels[block].green[lane] + left * frame.background[1];
+            color[3 * at + 2] = pixels[block].blue[lane] + left * frame.background[2];
+            depth[at] = covered > 0.0f ? pixels[block].depth[lane] / covered : 0.0f;
             opacity[at] = covered;
         }
     }

@@ -17,6 +17,8 @@ typedef int32_t Ints __attribute__((vector_size(64)));  // also masks: -1 true, 
 #define SPLATS_INLINE static inline __attribute__((always_inline))
 #define SPLATS_INLINE_MEMBER inline __attribute__((always_inline))
 
+SPLATS_INLINE float smaller(float a, float b) { return a < b ? a : b; }  // one instruction; std::fmin is a call
+SPLATS_INLINE float larger(float a, float b) { return a > b ? a : b; }
 SPLATS_INLINE Lanes all(float value) { return Lanes{} + value; }
 SPLATS_INLINE Lanes minimum(Lanes a, Lanes b) { return a < b ? a : b; }
 SPLATS_INLINE Lanes maximum(Lanes a, Lanes b) { return a > b ? a : b; }

@@ -59,8 +59,8 @@ SPLATS_INLINE Fate project(const Camera& camera, const Parameters& p, int64_t i,
     r.u = camera.fx * point[0] / z + camera.cx;
     r.v = camera.fy * point[1] / z + camera.cy;
     const float raw_x = float(point[0] / z), raw_y = float(point[1] / z);
-    r.slope_x = std::fmin(std::fmax(raw_x, camera.slope_min[0]), camera.slope_max[0]);
-    r.slope_y = std::fmin(std::fmax(raw_y, camera.slope_min[1]), camera.slope_max[1]);
+    r.slope_x = smaller(larger(raw_x, camera.slope_min[0]), camera.slope_max[0]);
+    r.slope_y = smaller(larger(raw_y, camera.slope_min[1]), camera.slope_max[1]);
     r.inside_x = r.slope_x == raw_x;
     r.inside_y = r.slope_y == raw_y;
 
@@ -104,8 +104,8 @@ SPLATS_INLINE Fate project(const Camera& camera, const Parameters& p, int64_t i,
     r.sigmoid = 1.0f / (1.0f + std::exp(-p.opacity_logits[i]));
     r.compensation = 1.0f;
     if (p.antialiased)
-        r.compensation = std::sqrt(std::fmax(r.sharp / r.determinant, kMinCompensation * kMinCompensation));
-    r.beta = std::fmin(std::fmax(p.betas[i], kMinBeta), kMaxBeta);
+        r.compensation = std::sqrt(larger(r.sharp / r.determinant, kMinCompensation * kMinCompensation));
+    r.beta = smaller(larger(p.betas[i], kMinBeta), kMaxBeta);
     r.beta_inside = r.beta == p.betas[i];
     return r.sigmoid * r.compensation >= 1.0f / 255.0f ? Fate::kSeen : Fate::kFaint;
 }

@@ -8,6 +8,10 @@ namespace splats {
 constexpr Lanes kLaneX = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 constexpr Lanes kLaneY = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
 
+// A block's first pixel in its tile; loads, for a conversion from integer would wait for its register's last value.
+alignas(64) constexpr float kBlockX[16] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
+alignas(64) constexpr float kBlockY[16] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
+
 struct Tile {
     int x, y;          // of its first pixel
     int width, height; // pixels on the image, at most 16
@@ -19,7 +23,7 @@ struct Tile {
           begin(frame.tile_begin[index]), end(frame.tile_begin[index + 1]) {}
 
     // The image row and column of a lane; false outside of the image.
-    bool pixel(int block, int lane, int& row, int& column) const {
+    SPLATS_INLINE_MEMBER bool pixel(int block, int lane, int& row, int& column) const {
         const int dx = 4 * (block & 3) + (lane & 3), dy = 4 * (block >> 2) + (lane >> 2);
         row = y + dy;
         column = x + dx;
@@ -32,12 +36,12 @@ struct Placed {
     float dx, dy;         // tile's first pixel - mean
     Lanes inner_u, inner_v;
 
-    Placed(const ScreenSplat& s, const Tile& tile)
+    SPLATS_INLINE_MEMBER Placed(const ScreenSplat& s, const Tile& tile)
         : dx((float(tile.x) - s.whole_x) - s.part_x), dy((float(tile.y) - s.whole_y) - s.part_y),
           inner_u(s.pitch_u * (kLaneX - s.shear * kLaneY)), inner_v(s.pitch_v * kLaneY) {}
 
     SPLATS_INLINE_MEMBER void at(const ScreenSplat& s, int block, Lanes& u, Lanes& v) const {
-        const float x = dx + 4.0f * float(block & 3), y = dy + 4.0f * float(block >> 2);
+        const float x = dx + kBlockX[block], y = dy + kBlockY[block];
         u = inner_u + s.pitch_u * (x - s.shear * y);
         v = inner_v + s.pitch_v * y;
     }
