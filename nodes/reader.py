@@ -23,6 +23,8 @@ class Reader(Node):
         stop: int | None = None  # frame to stop before; null: the end
         stride: int = 1  # every which frame
         size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as it is
+        intrinsics: list[float] | str | None = None  # [fx, fy, cx, cy] in original pixels; auto; null: the set's own
+        distortion: list[float] = field(default_factory=list)  # with intrinsics: [k1, k2, p1, p2(, k3)] as in OpenCV
         realtime: bool = False  # play at the recorded rate instead of as fast as it is read
         options: dict[str, Any] = field(default_factory=dict)  # of that format: see its class in mvsgs_core.datasets
 
@@ -48,7 +50,8 @@ class Reader(Node):
 
     def _open(self) -> Sequence:
         c = self.config
-        given = {key: value for key, value in (("path", c.path), ("size", c.size)) if value is not None}
+        own = {"path": c.path, "size": c.size, "intrinsics": c.intrinsics, "distortion": c.distortion or None}
+        given = {key: value for key, value in own.items() if value is not None}  # not every format takes all of them
         return open_dataset(c.name, start=c.start, stop=c.stop, stride=c.stride, **given, **c.options)
 
 

@@ -24,7 +24,7 @@ def lens_from_option(
         lens = guess_lens(size)
         return lens, [
             f"intrinsics are a guess: {lens.intrinsics[0]:.0f} pixels focal length for {size[1]}x{size[0]} (65 degrees "
-            "across the longer side), no distortion; calibrate the camera and set intrinsics=[fx,fy,cx,cy] for accuracy"
+            "across the longer side), no distortion; calibrate the camera and set dataset.intrinsics=[fx,fy,cx,cy]"
         ]
     values = [float(v) for v in intrinsics]
     if len(values) != 4:

@@ -129,7 +129,7 @@ def _lenses(
     if not known:
         raise ValueError(
             f"no calibration for {images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal "
-            "lengths were found; set intrinsics=[fx,fy,cx,cy] in pixels, or intrinsics=auto for a guess"
+            "lengths were found; set dataset.intrinsics=[fx,fy,cx,cy] in pixels, or dataset.intrinsics=auto for a guess"
         )
     notes.append(
         f"intrinsics are from EXIF: focal length {known[0].intrinsics[0]:.0f} pixels for "

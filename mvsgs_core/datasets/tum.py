@@ -124,8 +124,8 @@ def _find_lens(
         if match:
             return CAMERAS[f"freiburg{match[1]}"], []
     raise ValueError(
-        f"the name of {folder} does not tell which camera took it: set options.camera to one of {', '.join(CAMERAS)}, "
-        f"or intrinsics=[fx,fy,cx,cy] (and options.distortion), or write them into {calibration}"
+        f"the name of {folder} does not tell which camera took it: set dataset.options.camera to one of "
+        f"{', '.join(CAMERAS)}, or dataset.intrinsics=[fx,fy,cx,cy] (and dataset.distortion), or write them into {calibration}"
     )
 
 

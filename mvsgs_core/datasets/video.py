@@ -49,8 +49,8 @@ class Video:
         self._path = LAYOUT.file(Path(path).expanduser())
         if intrinsics is None:
             raise ValueError(
-                "a video does not say what camera took it: set intrinsics=[fx,fy,cx,cy] in pixels of its frames, or "
-                "intrinsics=auto for a guess (65 degrees across the longer side)"
+                "a video does not say what camera took it: set dataset.intrinsics=[fx,fy,cx,cy] in pixels of its "
+                "frames, or dataset.intrinsics=auto for a guess (65 degrees across the longer side)"
             )
         self._wanted = selection(start, stop, stride)
         self._framing = Framing(size, crop)
