@@ -49,7 +49,9 @@ class Synthetic:
         if scene not in SCENES:
             raise ValueError(f"synthetic: no scene {scene!r}; there are: {', '.join(SCENES)}")
         if frames < 1 or stride < 1 or start < 0 or len(size) != 2 or min(size) < 8:
-            raise ValueError("synthetic: frames and stride at least 1, start at least 0, size two numbers of at least 8")
+            raise ValueError(
+                "synthetic: frames and stride at least 1, start at least 0, size two numbers of at least 8"
+            )
         self.difficulties = Difficulties(**{k: v for k, v in difficulties.items() if v is not None})
         self.warnings: list[str] = []
         self.size = (int(size[0]), int(size[1]))

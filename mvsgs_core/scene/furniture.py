@@ -81,7 +81,11 @@ def book_stack(rng: np.random.Generator, count: int) -> list[Patch]:
         faces = box_faces((-w / 2, -d / 2, 0), (w / 2, d / 2, t))
         pages = materials.wood(rng, (190, 176, 140), (238, 230, 206))
         lying = prints.spine(rng)
-        sides = [surface(faces["top"], prints.cover(rng)), surface(faces["left"], pages), surface(faces["right"], pages)]
+        sides = [
+            surface(faces["top"], prints.cover(rng)),
+            surface(faces["left"], pages),
+            surface(faces["right"], pages),
+        ]
         sides.append(surface(faces["back"], pages))
         front = surface(faces["front"].transpose(1, 0, 2)[::-1], lying)
         parts += transformed([*sides, front], rng.normal(0, 0.3), (0, 0, z))
@@ -104,7 +108,9 @@ def bookshelf(rng: np.random.Generator, width: float, height: float, boards: int
         parts += transformed(book_row(rng, 0.03, split, z, pitch - 0.03), 0, (0, 0.04, 0))
         if k % 2 == 0:
             parts += transformed(vase(rng, rng.uniform(0.12, 0.22)), 0, (split + 0.12, 0.15, z))
-            parts += transformed(book_stack(rng, int(rng.integers(2, 5))), rng.uniform(-0.4, 0.4), (width - 0.2, 0.15, z))
+            parts += transformed(
+                book_stack(rng, int(rng.integers(2, 5))), rng.uniform(-0.4, 0.4), (width - 0.2, 0.15, z)
+            )
         else:
             parts += transformed(book_row(rng, split + 0.16, width - 0.03, z, pitch - 0.03), 0, (0, 0.05, 0))
             parts += transformed(framed(rng, 0.13, 0.17, "still_life"), 0.0, (split + 0.08, 0.12, z + 0.09))
@@ -172,7 +178,11 @@ def plant(rng: np.random.Generator, height: float, leaves: int) -> list[Patch]:
     clay = materials.marbled(rng, [(120, 62, 40), (176, 104, 72), (150, 84, 58)], grain=10)
     parts = [
         lathe((0, 0, 0), [(0.16 * height, pot), (0.17 * height, 0.85 * pot), (0.11 * height, 0)], clay, segments=18),
-        lathe((0, 0, 0), [(1e-4, 0.92 * pot), (0.155 * height, 0.92 * pot)], materials.marbled(rng, [(38, 28, 20), (84, 64, 46)])),
+        lathe(
+            (0, 0, 0),
+            [(1e-4, 0.92 * pot), (0.155 * height, 0.92 * pot)],
+            materials.marbled(rng, [(38, 28, 20), (84, 64, 46)]),
+        ),
     ]
     for k in range(leaves):
         turn, rise, reach = k * 2.39996 + rng.normal(0, 0.3), rng.uniform(0.35, 0.75), rng.uniform(0.2, 0.48)

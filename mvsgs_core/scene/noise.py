@@ -44,13 +44,14 @@ def warped(field: np.ndarray, rng: np.random.Generator, cells: tuple[float, floa
 
 
 def blend(palette: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Colors (h, w, 3) float32 from a palette (k, 3) by a field (h, w) clipped to [0, 1]."""
-    k = len(palette)
-    position = np.clip(field, 0.0, 1.0) * (k - 1)
-    low = np.minimum(position.astype(np.int32), k - 2)
-    t = (position - low)[..., None].astype(np.float32)
-    colors = np.asarray(palette, dtype=np.float32)
-    return np.asarray(colors[low] * (1 - t) + colors[low + 1] * t)
+    """Colors (h, w, 3) float32 from a palette (k, 3) by a field (h, w) clipped to [0, 1], in 256 steps."""
+    stops = np.linspace(0.0, 1.0, len(palette))
+    table = np.stack(
+        [np.interp(np.linspace(0.0, 1.0, 256), stops, channel) for channel in np.asarray(palette).T], axis=-1
+    )
+    steps = (np.clip(field, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    steps = np.ascontiguousarray(np.broadcast_to(steps, field.shape))
+    return np.asarray(cv2.LUT(cv2.merge([steps] * 3), table[None].astype(np.float32)))
 
 
 def to_texture(colors: np.ndarray) -> np.ndarray:

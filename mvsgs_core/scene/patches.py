@@ -133,15 +133,14 @@ def transformed(patches: Sequence[Patch], yaw: float, shift: Sequence[float]) ->
 
 
 def sample(points: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Points (len(v), len(u), 3) of a grid at parameters in [0, 1], bilinear."""
+    """Points (len(v), len(u), 3) at parameters in [0, 1], on the two triangles that `triangles` makes of each cell."""
     m, n = points.shape[0] - 1, points.shape[1] - 1
     i = np.minimum((v * m).astype(int), m - 1)
     j = np.minimum((u * n).astype(int), n - 1)
-    a, b = (v * m - i)[:, None, None], (u * n - j)[None, :, None]
-    low, high = points[i], points[i + 1]
-    top = low[:, j] * (1 - b) + low[:, j + 1] * b
-    bottom = high[:, j] * (1 - b) + high[:, j + 1] * b
-    return np.asarray(top * (1 - a) + bottom * a)
+    y, x = (v * m - i)[:, None, None], (u * n - j)[None, :, None]
+    a, b = points[i][:, j], points[i][:, j + 1]
+    c, d = points[i + 1][:, j], points[i + 1][:, j + 1]
+    return np.where(x + y <= 1.0, a + x * (b - a) + y * (c - a), d + (1.0 - x) * (c - d) + (1.0 - y) * (b - d))
 
 
 def normals(points: np.ndarray) -> np.ndarray:

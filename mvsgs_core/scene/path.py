@@ -75,3 +75,42 @@ class RoomPath:
         target = self.CENTER + 1.3 * np.array([np.cos(across), np.sin(across), 0.0])
         target[2] = 1.0 + 0.28 * slow[3]
         return look_at(eye, target) @ shake
+
+
+class FlightPath:
+    """Back and forth over the land with the camera held north, looking straight down at times and ahead at others."""
+
+    SPEED = 1.25  # meters a frame
+    REACH = np.array([85.0, 80.0])  # half the area flown over, x and y
+    HEIGHT = 78.0
+
+    def __init__(self, seed: int, loop_frames: int | None = None) -> None:
+        rng = np.random.default_rng([seed, 7])
+        self.shake = Shake(rng, 0.12, np.radians(0.25))
+        self.loop_frames = loop_frames
+        self.phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+
+    def pose(self, s: float) -> np.ndarray:
+        if self.loop_frames is None:
+            lap = 4.0 * self.REACH[1] / self.SPEED
+            # Legs along y, drifting in x; the two periods have no common multiple, so that no leg is flown twice.
+            place = self.REACH * np.array([_zigzag(s / (5.318 * lap) - 0.25), _zigzag(s / lap - 0.25)])
+            slow = np.sin(np.array([0.0213, 0.0131, 0.0179]) * s + self.phases)
+            shake = self.shake.pose(s)
+        else:
+            turn = 2.0 * np.pi * s / self.loop_frames
+            place = 0.8 * self.REACH * np.array([np.sin(turn), -np.cos(turn)])
+            slow = np.sin(np.array([2, 1, 3]) * turn + self.phases)
+            fade = np.clip(min(s, self.loop_frames - s) / 15.0, 0.0, 1.0)
+            shake = geometry.se3_exp(fade * geometry.se3_log(self.shake.pose(s)))
+        eye = np.array([*place, self.HEIGHT + 6.0 * slow[0]])
+        tilt, heading = np.radians(23.0 + 17.0 * slow[1]), 0.12 * slow[2]
+        ahead = np.array([np.sin(heading), np.cos(heading), 0.0])
+        down = np.array([0.0, 0.0, -1.0])
+        return look_at(eye, eye + np.sin(tilt) * ahead + np.cos(tilt) * down, north=ahead) @ shake
+
+
+def _zigzag(t: float) -> float:
+    """Triangle wave of period 1 between -1 and 1 with rounded corners; rises through 0 at t = 0."""
+    sharp = 0.985
+    return float(np.arcsin(sharp * np.sin(2.0 * np.pi * t)) / np.arcsin(sharp))

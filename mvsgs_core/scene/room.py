@@ -67,7 +67,9 @@ def _shell(rng: np.random.Generator, bare: set[str]) -> list[Patch]:
         "south": quad((w, 0, h), (-w, 0, 0), (0, 0, -h)),
     }
     parts = [surface(q, materials.plain((206, 202, 192)) if n in bare else coat[n]) for n, q in quads.items()]
-    parts.append(surface(quad((0, d, 0), (w, 0, 0), (0, -d, 0)), materials.planks(rng, (84, 50, 28), (190, 136, 84)), gloss=0.2))
+    parts.append(
+        surface(quad((0, d, 0), (w, 0, 0), (0, -d, 0)), materials.planks(rng, (84, 50, 28), (190, 136, 84)), gloss=0.2)
+    )
     ceiling = materials.plaster(rng, (216, 212, 202), 18, density=130)
     parts.append(surface(quad((0, 0, h), (w, 0, 0), (0, d, 0)), ceiling))
     for x in (0.7, 1.95, 3.2, 4.45):
@@ -92,7 +94,9 @@ def _window(rng: np.random.Generator) -> list[Patch]:
     parts += box((x - 0.08, y0 - 0.07, z1), (x, y1 + 0.07, z1 + 0.08), wood, skip=("right",))
     parts += box((x - 0.07, y0, 1.74), (x, y1, 1.78), wood, skip=("right",))
     parts += box((x - 0.24, y0 - 0.1, z0 - 0.04), (x, y1 + 0.1, z0), wood, skip=("right",))
-    parts += box((x - 0.17, y0 - 0.4, z1 + 0.16), (x - 0.15, y1 + 0.4, z1 + 0.18), materials.wood(rng, *furniture.WALNUT))
+    parts += box(
+        (x - 0.17, y0 - 0.4, z1 + 0.16), (x - 0.15, y1 + 0.4, z1 + 0.18), materials.wood(rng, *furniture.WALNUT)
+    )
     for middle, phase in ((y0 - 0.17, 0.0), (y1 + 0.17, 2.0)):
         u = np.linspace(-1, 1, 41)
         wave = 0.035 * np.sin(13 * u + phase) + 0.012 * np.sin(29 * u + 2 * phase)
@@ -184,7 +188,13 @@ def _middle(rng: np.random.Generator) -> list[Patch]:
     tones = [(96, 38, 34), (200, 172, 120), (48, 62, 88), (168, 96, 58), (206, 194, 168), (94, 104, 82)]
     parts = box((1.35, 1.35, 0), (3.85, 3.05, 0.012), materials.rug(rng, tones))
     parts += transformed(furniture.table(rng), 0.12, (2.6, 2.2, 0.012))
-    for at, turn in (((2.15, 1.5), 0.15), ((3.0, 1.6), -0.3), ((2.3, 2.9), 3.3), ((3.2, 2.85), 2.7), ((3.6, 2.15), 1.5)):
+    for at, turn in (
+        ((2.15, 1.5), 0.15),
+        ((3.0, 1.6), -0.3),
+        ((2.3, 2.9), 3.3),
+        ((3.2, 2.85), 2.7),
+        ((3.6, 2.15), 1.5),
+    ):
         tone = furniture.OAK if turn > 0 else furniture.WALNUT
         parts += transformed(furniture.chair(rng, tone), turn, (*at, 0.012))
     top = 0.752
