@@ -1,0 +1,135 @@
+"""End to end: the real stages, as processes, on the embedded scene; a node from outside the repository."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from launch.compose import compose
+from launch.inline import run_inline
+from msgs import Keyframe
+from tests.shared_data import shared
+
+ROOT = Path(__file__).resolve().parent.parent
+# Small, so that starting the processes takes longer than the mapping.
+SMALL = [
+    "dataset=synthetic", "dataset.size=[120,160]", "dataset.options.frames=60", "device=cpu", "mapper.iterations=20",
+    "mapper.refinement=100", "evaluator.lpips=off",
+]  # fmt: skip
+
+
+def run_all(folder: Path, *overrides: str, expect: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, ROOT / "launch/run_all.py", f"output={folder / 'out'}", *overrides],
+        cwd=folder, capture_output=True, text=True, timeout=240, env={**os.environ, "PYTHONPATH": ""},
+    )  # fmt: skip
+    assert done.returncode == expect, done.stdout + done.stderr
+    return done
+
+
+def report(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "out" / "report.json").read_text())
+    return content
+
+
+def positions(path: Path) -> np.ndarray:
+    return np.loadtxt(path)[:, :4]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A run of the default graph, shared by the tests that look at it: its folder, what it printed."""
+    folder = tmp_path_factory.mktemp("room")
+    return folder, run_all(folder, *SMALL).stdout
+
+
+def test_the_room_is_mapped(room: tuple[Path, str]) -> None:
+    scores = report(room[0])
+    assert scores["rendering"]["keyframes"]["psnr"] > 20
+    assert scores["rendering"]["held_out"]["psnr"] > 18
+    assert scores["rendering"]["held_out"]["count"] >= 3
+    assert scores["trajectory"]["frames"] == 60
+    assert scores["trajectory"]["frames_tracked"] >= 50
+    track = positions(room[0] / "out" / "trajectory.txt")
+    assert np.isfinite(track).all()
+    assert scores["trajectory"]["ate_rmse"] < 0.1
+    assert scores["depth"]["inlier_ratio"] > 0.5
+
+
+def test_the_report_has_every_figure(room: tuple[Path, str]) -> None:
+    scores = report(room[0])
+    for rendering in ("rendering", "rendering_before_refinement"):
+        for part in ("keyframes", "held_out", "all"):
+            assert set(scores[rendering][part]) >= {"psnr", "ssim", "lpips", "count"}
+    assert set(scores["trajectory"]) >= {"ate_rmse", "scale", "frames", "frames_tracked", "keyframes"}
+    assert set(scores["depth"]) >= {"abs_rel", "inlier_ratio", "completeness"}
+    assert scores["map"]["splats"] > 500
+    assert scores["map"]["bytes"] > 0
+    assert scores["time"]["wall"] > 0
+    assert scores["time"]["keyframes_per_second"] > 0
+    nodes = {"dataset", "tracker", "mvs", "depth_fusion", "mapper"}
+    assert nodes <= set(scores["time"]["stages"])
+    assert nodes <= set(scores["memory"]["peak_bytes"])
+    assert isinstance(scores["skipped"], dict)
+
+
+def test_every_file_is_there_and_named_on_the_screen(room: tuple[Path, str]) -> None:
+    folder, printed = room
+    for name in ("report.json", "report.html", "map.ply", "trajectory.txt", "config.yaml", "logs"):
+        assert (folder / "out" / name).exists()
+        assert name in printed
+    assert "PSNR" in printed
+    assert "ATE" in printed
+    for name in ("dataset", "tracker", "mvs", "depth_fusion", "mapper", "evaluator"):
+        assert (folder / "out" / "logs" / f"{name}.log").read_text()
+
+
+def test_inline_tracks_exactly_as_the_processes_do(room: tuple[Path, str], tmp_path: Path) -> None:
+    """The tracker hears nothing but frames, so that it must come to the same poses in both."""
+    threads = ["tracker.threads=1", "mapper._target_=null", "evaluator._target_=null"]
+    keyframes: dict[int, np.ndarray] = {}
+
+    def observe(slot: str, node: object, message: object) -> None:
+        if isinstance(message, Keyframe):
+            keyframes[message.index] = message.world_from_cam
+
+    run_inline(compose([*SMALL[:4], *threads, f"output={tmp_path}"]), observe)
+    assert len(keyframes) == report(room[0])["trajectory"]["keyframes"]
+
+
+def test_a_tracker_from_outside_the_repository(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "examples" / "my_tracker.py", tmp_path)
+    printed = run_all(tmp_path, *SMALL, "tracker._target_=my_tracker.Strided", "tracker.stride=6").stdout
+    scores = report(tmp_path)
+    assert scores["trajectory"]["frames_tracked"] >= 50
+    assert scores["trajectory"]["keyframes"] >= 8
+    assert scores["trajectory"]["ate_rmse"] < 0.1
+    assert scores["rendering"]["keyframes"]["psnr"] > 18
+    assert "gets no Poses" in printed
+
+
+def test_a_missing_sequence_is_explained(tmp_path: Path) -> None:
+    failed = run_all(tmp_path, "dataset=tum", "dataset.path=nowhere", expect=1)
+    assert "dataset failed: FileNotFoundError" in failed.stderr
+    assert "nowhere" in failed.stderr.rstrip().splitlines()[-1] or "rgb.txt" in failed.stderr
+
+
+def test_a_real_sequence_end_to_end(tmp_path: Path) -> None:
+    path = shared("data/tum_fr1_xyz")
+    run_all(
+        tmp_path, "dataset=tum", f"dataset.path={path}", "dataset.stop=40", "dataset.size=[240,320]", "device=cpu",
+        "mapper.iterations=20", "mapper.refinement=100", "evaluator.lpips=off",
+    )  # fmt: skip
+    scores = report(tmp_path)
+    assert scores["trajectory"]["frames"] == 40
+    assert scores["trajectory"]["frames_tracked"] >= 30
+    assert scores["trajectory"]["ate_rmse"] < 0.05  # meters
+    assert scores["rendering"]["keyframes"]["psnr"] > 16
