@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .. import geometry
-from ..scene.difficulties import DifficultPath, Difficulties, Sensor
+from ..scene.difficulties import Difficulties, DifficultPath, Sensor
 from ..scene.renderer import Rendering
 from ..scene.stage import SCENES, stage
 from . import Item
@@ -88,7 +88,7 @@ class Synthetic:
             # The exposure is centered on the frame's time, where pose and depth are exact.
             offsets = d.motion_blur * ((np.arange(SUB_FRAMES) + 0.5) / SUB_FRAMES - 0.5)
             shots = [self._view(self.path.pose(n + o), self.intrinsics, self.size, n + o).color for o in offsets]
-            light = np.mean(shots, axis=0, dtype=np.float32)
+            light = np.asarray(np.mean(shots, axis=0, dtype=np.float32))
         covered = d.covered > 0 and d.covered_start <= n < d.covered_start + d.covered
         return Item(
             index=index,

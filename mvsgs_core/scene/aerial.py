@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 
@@ -131,7 +133,7 @@ def _draw_roads(rng: np.random.Generator, ground: Ground, colors: np.ndarray) ->
             on = mask > 0
             colors[on] = np.asarray(tone, np.float32) + rough * wear[on][:, None]
         if k < 2:
-            for a, b in zip(road[:-1], road[1:]):
+            for a, b in itertools.pairwise(road):
                 p, q = (((e * (1, -1) + HALF) * DENSITY).astype(int) for e in (a, a + 0.5 * (b - a)))
                 cv2.line(colors, tuple(map(int, p)), tuple(map(int, q)), (226.0, 224.0, 214.0), 1, cv2.LINE_AA)
 

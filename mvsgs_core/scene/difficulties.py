@@ -80,7 +80,7 @@ def _without(s: float, start: int, length: int) -> tuple[float, float | None]:
 
 
 class Sensor:
-    """From linear light to the image that a camera gives: exposure, response curve, noise. One stream of noise a frame."""
+    """From linear light to the image that a camera gives: exposure, response curve, noise of its own a frame."""
 
     STEPS = 8192
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from . import materials, prints
@@ -220,7 +222,7 @@ def sideboard(rng: np.random.Generator, length: float = 1.7, height: float = 0.8
     columns = np.linspace(-x + 0.03, x - 0.03, 4)
     for k in range(3):
         rows = np.linspace(0.15, height - 0.04, 4 if k == 1 else 2)
-        for low, high in zip(rows[:-1], rows[1:]):
+        for low, high in itertools.pairwise(rows):
             a, b = columns[k] + 0.008, columns[k + 1] - 0.008
             parts += box((a, -depth - 0.018, low + 0.008), (b, -depth, high - 0.008), front, skip=("back",))
             knob = (0.5 * (a + b) if k == 1 else (b - 0.05 if k == 0 else a + 0.05), -depth - 0.03, 0.5 * (low + high))

@@ -10,7 +10,7 @@ import numpy as np
 from .noise import blend, fractal, smooth, to_texture, warped
 from .patches import Material, Texture
 
-RGB = Sequence[float]  # 0 to 255, sRGB
+RGB = Sequence[float] | np.ndarray  # 0 to 255, sRGB
 
 
 def shape_of(height: float, width: float, density: float) -> tuple[int, int]:
@@ -189,12 +189,11 @@ def rug(rng: np.random.Generator, palette: Sequence[RGB], density: float = 260.0
 
 def _on_border(along: float, depth: float, height: float, width: float) -> tuple[float, float]:
     """(x, y) at length `along` around a rectangle, `depth` inside its edge."""
-    side = 0
     for side, length in enumerate((width, height, width, height)):
-        if along < length:
-            break
+        if along < length or side == 3:
+            return ((along, depth), (width - depth, along), (along, height - depth), (depth, along))[side]
         along -= length
-    return ((along, depth), (width - depth, along), (along, height - depth), (depth, along))[side]
+    raise AssertionError("a rectangle has four sides")
 
 
 def wallpaper(rng: np.random.Generator, ground: RGB, palette: Sequence[RGB], density: float = 260.0) -> Material:
@@ -208,7 +207,7 @@ def wallpaper(rng: np.random.Generator, ground: RGB, palette: Sequence[RGB], den
         colors = np.asarray(ground, np.float32) + tone[..., None]
         for _ in range(int(26 * height * width)):
             at, heading = rng.uniform(0, 1, 2) * (width, height) * density, rng.uniform(0, 2 * np.pi)
-            color = np.asarray(palette[rng.integers(len(palette))]) + rng.normal(0, 12, 3)
+            color = np.asarray(palette[int(rng.integers(len(palette)))]) + rng.normal(0, 12, 3)
             bend, count, size = rng.normal(0, 0.12), rng.integers(5, 13), rng.uniform(0.55, 1.35)
             for leaf in range(count):
                 step = rng.uniform(0.02, 0.04) * size * density

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+Vector = Sequence[float] | np.ndarray  # (3,) scene units
 Texture = np.ndarray  # (h, w, 3) uint8 sRGB; row 0 is v = 0
 # A material paints a texture for a surface of (height, width) in scene units (v, u).
 Material = Callable[[float, float], Texture]
@@ -35,7 +36,7 @@ def surface(points: np.ndarray, material: Material, *, gloss: float = 0.0, two_s
     return Patch(np.asarray(points, dtype=np.float64), material(*extent(points)), gloss=gloss, two_sided=two_sided)
 
 
-def quad(corner: Sequence[float], along_u: Sequence[float], along_v: Sequence[float]) -> np.ndarray:
+def quad(corner: Vector, along_u: Vector, along_v: Vector) -> np.ndarray:
     """(2, 2, 3) points of a parallelogram."""
     c, u, v = (np.asarray(x, dtype=np.float64) for x in (corner, along_u, along_v))
     return np.stack([np.stack([c, c + u]), np.stack([c + v, c + u + v])])
@@ -44,7 +45,7 @@ def quad(corner: Sequence[float], along_u: Sequence[float], along_v: Sequence[fl
 BOX_SIDES = ("front", "back", "left", "right", "top", "bottom")
 
 
-def box_faces(low: Sequence[float], high: Sequence[float]) -> dict[str, np.ndarray]:
+def box_faces(low: Vector, high: Vector) -> dict[str, np.ndarray]:
     """Outward quads of an axis-aligned box by side; v runs down on the sides, "front" is the -y side."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
@@ -59,8 +60,8 @@ def box_faces(low: Sequence[float], high: Sequence[float]) -> dict[str, np.ndarr
 
 
 def box(
-    low: Sequence[float],
-    high: Sequence[float],
+    low: Vector,
+    high: Vector,
     material: Material,
     *,
     skip: Sequence[str] = ("bottom",),
@@ -71,7 +72,7 @@ def box(
 
 
 def lathe(
-    center: Sequence[float],
+    center: Vector,
     profile: Sequence[tuple[float, float]],
     material: Material,
     *,
@@ -79,7 +80,7 @@ def lathe(
     gloss: float = 0.0,
     two_sided: bool = False,
 ) -> Patch:
-    """Surface of revolution about a vertical axis: profile of (radius, height), from the top down for an outward front."""
+    """Surface of revolution about a vertical axis; profile of (radius, height), from the top down to face outward."""
     angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     radius, height = np.asarray(profile, dtype=np.float64).T
     points = np.stack(
@@ -94,7 +95,7 @@ def lathe(
 
 
 def cylinder(
-    center: Sequence[float], radius: float, height: float, material: Material, *, segments: int = 16, gloss: float = 0.0
+    center: Vector, radius: float, height: float, material: Material, *, segments: int = 16, gloss: float = 0.0
 ) -> list[Patch]:
     """A standing cylinder with its lid; `center` is the middle of the base."""
     side = lathe(center, [(radius, height), (radius, 0.0)], material, segments=segments, gloss=gloss)
@@ -103,8 +104,8 @@ def cylinder(
 
 
 def blob(
-    center: Sequence[float],
-    radii: Sequence[float],
+    center: Vector,
+    radii: Vector,
     material: Material,
     *,
     square: float = 1.0,
@@ -125,7 +126,7 @@ def blob(
     return surface(np.asarray(center) + shape * np.asarray(radii), material)
 
 
-def transformed(patches: Sequence[Patch], yaw: float, shift: Sequence[float]) -> list[Patch]:
+def transformed(patches: Sequence[Patch], yaw: float, shift: Vector) -> list[Patch]:
     """Patches turned about the vertical axis (radians) and then moved."""
     c, s = np.cos(yaw), np.sin(yaw)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
