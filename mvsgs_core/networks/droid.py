@@ -61,9 +61,10 @@ class _ConvGru(nn.Module):
 
     def __init__(self, hidden: int, inputs: int) -> None:
         super().__init__()
-        for gate in ("convz", "convr", "convq"):
-            setattr(self, gate, nn.Conv2d(hidden + inputs, hidden, 3, padding=1))
-            setattr(self, f"{gate}_glo", nn.Conv2d(hidden, hidden, 1))
+        both = hidden + inputs
+        self.convz, self.convz_glo = nn.Conv2d(both, hidden, 3, padding=1), nn.Conv2d(hidden, hidden, 1)
+        self.convr, self.convr_glo = nn.Conv2d(both, hidden, 3, padding=1), nn.Conv2d(hidden, hidden, 1)
+        self.convq, self.convq_glo = nn.Conv2d(both, hidden, 3, padding=1), nn.Conv2d(hidden, hidden, 1)
         self.w = nn.Conv2d(hidden, hidden, 1)
 
     def forward(self, net: Tensor, inputs: Tensor) -> Tensor:

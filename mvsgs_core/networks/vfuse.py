@@ -133,7 +133,14 @@ class VFuse(nn.Module):
         return Fused(depth, _window_confidence(radius) * seen, bounds, window, statistics, volume, logits, probability)
 
     def _statistics(
-        self, middle: Tensor, depths: Tensor, confidences: Tensor, known: Tensor, count: Tensor, near: float, extent: float
+        self,
+        middle: Tensor,
+        depths: Tensor,
+        confidences: Tensor,
+        known: Tensor,
+        count: Tensor,
+        near: float,
+        extent: float,
     ) -> Tensor:
         """(5, H, W): center, then mean and deviation over the views of depth and of confidence."""
         rows = [(middle - near) / extent]

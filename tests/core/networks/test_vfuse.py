@@ -75,6 +75,6 @@ def test_holes_and_odd_sizes(net: VFuse, views: FusionInput) -> None:
     assert torch.isfinite(fused.depth).all()
     empty = splat_views(FusionInput(depths, views.confidences, views.cam_from_world, views.cameras, 2.0, 8.0))[0]
     assert (fused.depth[(empty == 0).all(dim=0)] == 0).all()
+    cut = views.depths[:, :60], views.confidences[:, :60]
     with pytest.raises(ValueError, match="multiples of 8"):
-        cut = views.depths[:, :60], views.confidences[:, :60]
         net(FusionInput(*cut, views.cam_from_world, views.cameras, 2.0, 8.0))
