@@ -48,7 +48,7 @@ def run(job: Job) -> int:
     """Runs one job and returns its exit code. In a sweep a failure is raised instead: RunFailed, after which the sweep
     goes on, or SystemExit where the user stopped it."""
     if job.number is not None:
-        print(f"job {job.number}: {' '.join(job.overrides)}", flush=True)
+        print(f"job {job.number}: {' '.join(text.lstrip('+') for text in job.overrides)}", flush=True)
     code = _run(job)
     if job.number is not None and code:
         if code > 128:

@@ -13,6 +13,7 @@ from typing import Any
 
 from launch.graph import Edge, Graph
 from launch.parameters import GraphError
+from nodes.addresses import TransportError, load_keys
 
 LONGEST_SOCKET_PATH = 107  # bytes that a Unix socket's address holds
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -44,7 +45,12 @@ class RunDirectory:
 
 
 def addresses(graph: Graph, directory: Path) -> dict[str, str]:
-    """Topic (`slot.MessageType`) -> address. Raises GraphError for a host that may not be listened on."""
+    """Topic (`slot.MessageType`) -> address. Raises GraphError for a host that may not be listened on, or bad keys."""
+    if graph.settings.keys is not None:
+        try:
+            load_keys(Path(graph.settings.keys))
+        except TransportError as error:
+            raise GraphError(f"keys={graph.settings.keys}: {error}") from error
     topics = list(dict.fromkeys(_topic(edge) for edge in graph.edges))
     if graph.settings.transport == "ipc":
         return {topic: f"ipc://{directory}/{topic}" for topic in topics}
@@ -100,7 +106,7 @@ def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_
         "seed": settings.seed,
         "threads": threads,
         "cpu": slot.placement.cpu,
-        "keys": settings.keys,
+        "keys": None if settings.keys is None else str(Path(settings.keys).absolute()),
         "status_fd": status_fd,
     }
 

@@ -18,6 +18,8 @@ import psutil
 import pytest
 import yaml
 
+from nodes.transport import create_keys
+
 ROOT = Path(__file__).resolve().parent.parent
 FAKE = ROOT / "tests" / "fake_graph" / "conf"
 DOWN = 5.0  # seconds in which a graph must be gone
@@ -114,6 +116,19 @@ def test_over_tcp(launch: type[Launch]) -> None:
     run = launch("transport=tcp", "source.count=20")
     assert run.finish()[0] == 0
     assert sink(run.output)["keyframes"] == list(range(20))
+
+
+def test_beyond_loopback_only_with_keys(launch: type[Launch], tmp_path: Path) -> None:
+    code, _, err = launch("transport=tcp", "host=0.0.0.0").finish()
+    assert code == 2
+    assert "keys=DIR" in err
+    code, _, err = launch("transport=tcp", f"keys={tmp_path}").finish()
+    assert code == 2
+    assert "no keys at" in err
+    create_keys(tmp_path / "keys")
+    run = launch("transport=tcp", f"keys={tmp_path / 'keys'}", "source.count=3")
+    assert run.finish()[0] == 0
+    assert sink(run.output)["keyframes"] == [0, 1, 2]
 
 
 def test_in_one_process(launch: type[Launch]) -> None:
