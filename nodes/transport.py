@@ -198,17 +198,26 @@ class _Reader:
     delivery: bytes
 
     def __init__(
-        self, address: str, message_type: type, topic: str, buffer: int, keys: Keys | None, max_bytes: int
+        self,
+        address: str,
+        type: type,
+        *,
+        topic: str = "",
+        buffer: int = 8,
+        keys: Keys | None = None,
+        max_bytes: int = MAX_MESSAGE_BYTES,
     ) -> None:
         check_address(address)
         self.topic = topic or address
-        self.type = message_type
         self.received = self.skipped = self.expected = 0
         self.ended = False
+        self._type = type
+        self._buffer = max(1, buffer)
         self._max_bytes = max_bytes
+        self._frames: deque[zmq.Frame] = deque()  # taken over, not asked for yet
         self._lost_at: float | None = None
         self._socket = _open(zmq.SUB, address, keys, max_bytes)
-        self._socket.rcvhwm = max(1, buffer)
+        self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl = 50
         lost = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
         self.monitor = self._socket.get_monitor_socket(lost | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
@@ -231,14 +240,19 @@ class _Reader:
         if self._lost_at is not None and not self.ended and time.monotonic() - self._lost_at > PEER_GRACE:
             raise PeerLost(f"the publisher of {self.topic} disappeared before the end")
 
+    @property
+    def waiting(self) -> int:
+        return len(self._frames)
+
     def _close_socket(self) -> None:
-        self._socket.disable_monitor()
-        self.monitor.close()
-        self._socket.close(linger=500)  # ms for the goodbye to leave
+        if not self._socket.closed:
+            self._socket.disable_monitor()
+            self.monitor.close()
+            self._socket.close(linger=500)  # ms for the goodbye to leave
 
     def _decode(self, frame: zmq.Frame) -> Decoded:
         try:
-            decoded = decode(frame.buffer, expect=(self.type, End), max_bytes=self._max_bytes)
+            decoded = decode(frame.buffer, expect=(self._type, End), max_bytes=self._max_bytes)
         except CodecError as error:
             raise CodecError(f"{self.topic}: {error}") from error
         if isinstance(decoded.message, End):
@@ -253,24 +267,9 @@ class ReliableReader(_Reader):
 
     delivery = RELIABLE
 
-    def __init__(
-        self,
-        address: str,
-        message_type: type,
-        *,
-        topic: str = "",
-        buffer: int = 8,
-        keys: Keys | None = None,
-        max_bytes: int = MAX_MESSAGE_BYTES,
-    ) -> None:
-        super().__init__(address, message_type, topic, buffer, keys, max_bytes)
-        self._frames: deque[zmq.Frame] = deque()
-        self._buffer = max(1, buffer)
-        self.pollable = self._socket
-
     @property
-    def waiting(self) -> int:
-        return len(self._frames)
+    def pollable(self) -> zmq.Socket[bytes]:
+        return self._socket
 
     def take(self) -> Message | None:
         """The next message, if one has arrived; after End nothing. Raises TransportError if one was lost."""
@@ -311,12 +310,11 @@ class NewestReader(_Reader):
         keys: Keys | None = None,
         max_bytes: int = MAX_MESSAGE_BYTES,
     ) -> None:
-        super().__init__(address, type, topic, 2, keys, max_bytes)
+        super().__init__(address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes)
+        self._frames = deque(maxlen=1)  # a newer one takes the older one's place
         self._late = late
-        self._newest: zmq.Frame | None = None
         self._end: zmq.Frame | None = None
         self._closing = False
-        self._lock = threading.Lock()
         wake = f"inproc://newest-{id(self)}"
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self.pollable = context.socket(zmq.PAIR)
@@ -328,18 +326,15 @@ class NewestReader(_Reader):
         self._thread = threading.Thread(target=self._drain, name=f"newest {self.topic}", daemon=True)
         self._thread.start()
 
-    @property
-    def waiting(self) -> int:
-        return int(self._newest is not None)
-
     def take(self) -> Message | None:
         """The newest message that was not taken yet, or None. Raises CodecError for a frame that is no message."""
         while self.pollable.poll(0):
             self.pollable.recv()
-        with self._lock:
-            frame, self._newest = self._newest, None
-            if frame is None:
-                frame, self._end = self._end, None
+        frame: zmq.Frame | None
+        try:
+            frame = self._frames.popleft()
+        except IndexError:
+            frame, self._end = self._end, None
         if frame is None or self.ended:
             return None
         message, sequence = self._decode(frame)
@@ -374,16 +369,13 @@ class NewestReader(_Reader):
                 is_end = type_name(frame.buffer) == "End"
             except CodecError:
                 is_end = False  # reported to the owner when it decodes the frame
-            with self._lock:
-                if is_end:
-                    self._end = frame
-                else:
-                    self._newest = frame
             if is_end:
+                self._end = frame
                 self._socket.unsubscribe(self.delivery)
-            if not self._wake.poll(0, zmq.POLLOUT):
-                continue
-            self._wake.send(b"")
+            else:
+                self._frames.append(frame)
+            if self._wake.poll(0, zmq.POLLOUT):
+                self._wake.send(b"")
         self._wake.close()
 
 

@@ -231,18 +231,21 @@ def _exercise(rounds: int, count: int) -> None:
         g.close()
     for i in range(4 * rounds):
         g = Graph(buffer=2)
-        g.diamond(source={"count": 10**6}, join={"delay": 0.001})
-        time.sleep(random.uniform(0.0, 2.0))
+        g.diamond(source={"count": 300}, join={"delay": 0.001})
+        for process in g.processes.values():  # before, a launcher would have to stop the others
+            process.wait_for(lambda status: status.get("state") == "running")
+        time.sleep(random.uniform(0.0, 1.0))
         victim = random.choice(list(g.processes))
         g.processes[victim].popen.kill()
         began = time.monotonic()
-        running = {n for n, p in g.processes.items() if p.last.get("state") == "running"}
+        states = {name: process.last["state"] for name, process in g.processes.items()}
         try:
             codes = g.wait(DOWN)
-            seconds = time.monotonic() - began
-            print(f"kill {i + 1}: {victim} among {len(running)} running: down after {seconds:.2f} s, {codes}")
+            print(
+                f"kill {i + 1}: {victim}, {states}: down after {time.monotonic() - began:.2f} s, {codes} {g.sockets()}"
+            )
         except AssertionError as error:
-            print(f"kill {i + 1}: {victim} among {len(running)} running: {str(error).splitlines()[0]}")
+            print(f"kill {i + 1}: {victim}, {states}: {str(error).splitlines()[0]}")
         g.close()
 
 

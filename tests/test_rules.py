@@ -1,0 +1,107 @@
+"""Rules of the whole repository that no other tool checks."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+
+from tests.shared_data import ROOT
+
+PACKAGES = ("msgs", "nodes", "launch", "mvsgs_core", "examples")  # the product; benchmarks and tests may use more
+SOURCES = {".py", ".cpp", ".h", ".hpp", ".cu", ".yaml", ".txt", ".toml", ".js", ".html"}
+MAX_LINES = 400
+SERIALIZERS = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "msgpack_numpy"}
+
+
+def python_files(*packages: str) -> list[Path]:
+    return sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
+
+
+@lru_cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(), str(path))
+
+
+def imports(path: Path) -> set[str]:
+    """Top-level names of all modules that a file imports, wherever in it, relative ones as their package."""
+    found = set()
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+def calls(path: Path) -> Iterator[tuple[str, ast.Call]]:
+    """Every call with the text of what is called."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func), node
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def test_only_the_transport_imports_zmq() -> None:
+    assert [name(path) for path in python_files(*PACKAGES) if "zmq" in imports(path)] == ["nodes/transport.py"]
+
+
+def test_the_core_knows_no_node_and_no_message() -> None:
+    files = python_files("mvsgs_core")
+    assert files
+    assert {name(p): imports(p) & {"msgs", "nodes", "launch", "zmq"} for p in files} == {name(p): set() for p in files}
+
+
+def test_messages_know_neither_torch_nor_nodes() -> None:
+    files = python_files("msgs")
+    assert {name(p): imports(p) & {"torch", "nodes", "launch"} for p in files} == {name(p): set() for p in files}
+
+
+def test_importing_messages_and_the_transport_loads_no_torch() -> None:
+    code = (
+        "import sys, nodes.process, msgs.codec; print(sorted({'torch', 'cv2', 'open3d', 'hydra'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_nothing_is_pickled() -> None:
+    for path in python_files(*PACKAGES, "bench"):
+        assert not imports(path) & SERIALIZERS, name(path)
+        for function, call in calls(path):
+            unsafe = any(k.arg == "allow_pickle" and ast.unparse(k.value) != "False" for k in call.keywords)
+            assert not unsafe, f"{name(path)}:{call.lineno}: {function} with allow_pickle"
+
+
+def test_weights_are_loaded_without_code() -> None:
+    for path in python_files(*PACKAGES, "bench", "tests"):
+        for function, call in calls(path):
+            if function.endswith("torch.load"):
+                safe = any(k.arg == "weights_only" and ast.unparse(k.value) == "True" for k in call.keywords)
+                assert safe, f"{name(path)}:{call.lineno}: torch.load without weights_only=True"
+
+
+def tracked_files() -> list[Path]:
+    done = subprocess.run(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip("no git checkout: which files belong to the project is unknown")
+    return [path for line in done.stdout.splitlines() if (path := ROOT / line).is_file()]
+
+
+def test_no_file_has_more_than_400_lines() -> None:
+    sources = [path for path in tracked_files() if path.suffix in SOURCES and path.name != "constraints.txt"]
+    assert len(sources) > 50
+    lengths = {name(path): len(path.read_text().splitlines()) for path in sources}
+    assert {path: lines for path, lines in lengths.items() if lines > MAX_LINES} == {}
+
+
+def test_no_module_is_called_utils() -> None:
+    assert [name(p) for p in tracked_files() if p.stem in {"utils", "util", "helpers", "misc", "common"}] == []
