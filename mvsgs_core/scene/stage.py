@@ -21,6 +21,7 @@ SCENES = ("room", "aerial")
 class Stage:
     """A scene ready to be filmed."""
 
+    name: str
     renderer: SceneRenderer
     path: Path
     ball: SceneRenderer  # stands at its own origin
@@ -54,6 +55,6 @@ def stage(scene: str, seed: int, textureless: int, loop_frames: int | None, movi
     renderer = renderer_of(scene, seed, textureless)
     if scene == "aerial":
         ends = (np.array([-90.0, -60.0, 22.0]), np.array([90.0, 80.0, 22.0]))
-        return Stage(renderer, FlightPath(seed, loop_frames), ball_of(5.0 * size, seed), ends)
+        return Stage(scene, renderer, FlightPath(seed, loop_frames), ball_of(5.0 * size, seed), ends)
     ends = (np.array([0.9, 1.0, 0.5]), np.array([4.3, 3.5, 0.5]))
-    return Stage(renderer, RoomPath(seed, loop_frames), ball_of(0.2 * size, seed), ends)
+    return Stage(scene, renderer, RoomPath(seed, loop_frames), ball_of(0.2 * size, seed), ends)
