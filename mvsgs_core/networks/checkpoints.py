@@ -1,0 +1,70 @@
+"""Loads the official checkpoints into our networks, with each conversion stated. No pickle is ever executed."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+def read(file: Path, *, inside: str | None = None) -> dict[str, Tensor]:
+    """State dict of a checkpoint: the prefix `module.` goes, and so does all that is no tensor.
+
+    inside: key under which the file keeps it ("state_dict", "model", ...). Raises FileNotFoundError, or ValueError,
+    saying what is wrong, for a file that is truncated, no checkpoint, or holds code.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"no weights at {file}")
+    try:
+        content: Any = torch.load(file, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, ValueError, KeyError) as error:
+        raise ValueError(f"{file} is truncated or no PyTorch checkpoint: {error}") from error
+    except pickle.UnpicklingError:
+        content = _with_configuration(file)
+    if inside is not None:
+        if not isinstance(content, Mapping) or inside not in content:
+            raise ValueError(f"{file} has no {inside!r}: it is another checkpoint")
+        content = content[inside]
+    if not isinstance(content, Mapping):
+        raise ValueError(f"{file} holds a {type(content).__name__}, no state dict")
+    state = {str(k).removeprefix("module."): v for k, v in content.items() if isinstance(v, Tensor)}
+    if not state:
+        raise ValueError(f"{file} holds no tensors")
+    return state
+
+
+def _with_configuration(file: Path) -> Any:
+    """A checkpoint that also pickles its configuration (MVSFormer's do): known harmless types only are allowed."""
+    import argparse
+    import collections
+    import pathlib
+
+    allowed: list[Any] = [argparse.Namespace, collections.OrderedDict, collections.defaultdict, pathlib.PosixPath]
+    try:
+        with torch.serialization.safe_globals(allowed):
+            return torch.load(file, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise ValueError(
+            f"{file} holds Python objects beside the weights, which are not executed ({str(error).splitlines()[0]}); "
+            "save its state dict alone, in an environment that you trust: "
+            "torch.save(torch.load(FILE, weights_only=False)['state_dict'], NEW_FILE)"
+        ) from error
+
+
+def load(net: nn.Module, state: Mapping[str, Tensor], file: Path) -> None:
+    """Loads strictly: every key used, every parameter set. Raises ValueError naming what does not fit."""
+    try:
+        net.load_state_dict(dict(state), strict=True)
+    except RuntimeError as error:
+        raise ValueError(f"{file} does not fit {type(net).__name__}: {error}") from error
+    net.eval().requires_grad_(False)
+
+
+def droid_rows(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """DROID's file holds a third output row in two heads that its own loader cuts off."""
+    cut = {"update.weight.2.weight", "update.weight.2.bias", "update.delta.2.weight", "update.delta.2.bias"}
+    return {key: value[:2] if key in cut else value for key, value in state.items()}

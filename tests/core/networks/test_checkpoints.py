@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from mvsgs_core.networks import checkpoints
+
+
+class _Evil:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return (print, ("executed",))
+
+
+def test_prefix_and_place(tmp_path: Path) -> None:
+    net = nn.Linear(2, 3)
+    state = {f"module.{k}": v for k, v in net.state_dict().items()}
+    torch.save({"state_dict": state, "epoch": 3, "arguments": argparse.Namespace(lr=1.0)}, tmp_path / "a.pth")
+    other = nn.Linear(2, 3)
+    checkpoints.load(other, checkpoints.read(tmp_path / "a.pth", inside="state_dict"), tmp_path / "a.pth")
+    assert torch.equal(other.weight, net.weight)
+    assert not other.weight.requires_grad
+
+
+def test_bad_files_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "w.pth"
+    with pytest.raises(FileNotFoundError, match=r"w\.pth"):
+        checkpoints.read(file)
+    torch.save({"weight": torch.zeros(2)}, file)
+    with pytest.raises(ValueError, match="has no 'model'"):
+        checkpoints.read(file, inside="model")
+    with pytest.raises(ValueError, match="does not fit Linear"):
+        checkpoints.load(nn.Linear(2, 3), checkpoints.read(file), file)
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="truncated or no PyTorch checkpoint"):
+        checkpoints.read(file)
+    file.write_bytes(b"")
+    with pytest.raises(ValueError, match="truncated or no PyTorch checkpoint"):
+        checkpoints.read(file)
+    torch.save({"state_dict": {"a": torch.zeros(1)}, "evil": _Evil()}, file)
+    with pytest.raises(ValueError, match="not executed"):
+        checkpoints.read(file)
+    assert "executed" not in capsys.readouterr().out
+
+
+def test_droid_rows() -> None:
+    state = {"update.weight.2.weight": torch.zeros(3, 128, 3, 3), "update.delta.2.bias": torch.zeros(3)}
+    state["fnet.conv1.bias"] = torch.zeros(32)
+    assert {k: len(v) for k, v in checkpoints.droid_rows(state).items()} == {
+        "update.weight.2.weight": 2,
+        "update.delta.2.bias": 2,
+        "fnet.conv1.bias": 32,
+    }
