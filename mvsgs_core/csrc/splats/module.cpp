@@ -9,6 +9,7 @@
 #include <mutex>
 
 #include "splats/frame.hpp"
+#include "splats/photometric.hpp"
 
 namespace nb = nanobind;
 using namespace splats;
@@ -134,6 +135,18 @@ void weights(const Pass& pass, Out weight_sum, Out weight_max) {
     }
 }
 
+// (weighted L1, SSIM); `gradient` gets that of their weighted sum. pixel_weight may be None.
+std::tuple<double, double> image_loss(In image, In target, nb::object pixel_weight, float l1_weight, float ssim_weight,
+                                      Out gradient, int threads) {
+    In weight;
+    if (!pixel_weight.is_none()) weight = nb::cast<In>(pixel_weight);
+    const nb::gil_scoped_release released;
+    const Photometric result =
+        photometric(image.data(), target.data(), weight.is_valid() ? weight.data() : nullptr, int(image.shape(0)),
+                    int(image.shape(1)), l1_weight, ssim_weight, gradient.data(), thread_count(threads));
+    return {result.l1, result.ssim};
+}
+
 }  // namespace
 
 #define SPLATS_MODULE(name) NB_MODULE(name, m)
@@ -153,4 +166,6 @@ SPLATS_MODULE(MVSGS_MODULE) {
           nb::arg("on_means"), nb::arg("on_log_scales"), nb::arg("on_quaternions"), nb::arg("on_opacity_logits"),
           nb::arg("on_sh"), nb::arg("on_betas"), nb::arg("on_screen"), nb::arg("on_pose"));
     m.def("weights", &weights);
+    m.def("image_loss", &image_loss, nb::arg("image"), nb::arg("target"), nb::arg("pixel_weight").none(),
+          nb::arg("l1_weight"), nb::arg("ssim_weight"), nb::arg("gradient"), nb::arg("threads"));
 }

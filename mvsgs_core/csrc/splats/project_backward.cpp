@@ -11,6 +11,7 @@ namespace splats {
 namespace {
 
 constexpr float kLn2 = 0.6931471805599453f;
+constexpr size_t kAhead = 4;      // splats whose slots are fetched early
 constexpr size_t kChunk = 1024;  // splats whose share of the pose gradient is summed together
 
 struct SplatGradient {
@@ -164,7 +165,9 @@ void project_backward(Frame& frame, const Parameters& p, Gradients& out, int thr
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : refused)
     for (size_t chunk = 0; chunk < chunks; ++chunk) {
         for (size_t i = chunk * kChunk; i < std::min(count, (chunk + 1) * kChunk); ++i) {
-            const ScreenSplat& s = frame.splats[i];
+            const ScreenSplat &s = frame.splats[i], &soon = frame.splats[std::min(i + kAhead, count - 1)];
+            for (uint32_t k = 0; k < std::min(soon.slot_count, 8u); ++k)
+                __builtin_prefetch(&frame.slots[soon.slot + k]);
             SplatGradient g{};
             float* sh = out.sh + width * i;
             if (s.slot_count) {

@@ -1,0 +1,99 @@
+"""SSIM (Wang et al. 2004) of images with channels last: a fused C++ kernel, and its twin in PyTorch.
+
+11x11 Gaussian window of sigma 1.5, separable, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
+channels: the form that 3DGS trains with.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mvsgs_core import native
+
+RADIUS = 5
+SIGMA = 1.5
+C1, C2 = 0.01**2, 0.03**2
+
+
+def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
+    """Mean SSIM of images (H, W, C) in plain PyTorch; differentiable in both."""
+    x, y = image.permute(2, 0, 1)[:, None], target.to(image).permute(2, 0, 1)[:, None]
+    offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=image.dtype, device=image.device)
+    window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    window = window / window.sum()
+
+    def blur(values: Tensor) -> Tensor:
+        rows = torch.nn.functional.conv2d(values, window.view(1, 1, -1, 1), padding=(RADIUS, 0))
+        return torch.nn.functional.conv2d(rows, window.view(1, 1, 1, -1), padding=(0, RADIUS))
+
+    a, b = blur(x), blur(y)
+    variance_x, variance_y, covariance = blur(x * x) - a * a, blur(y * y) - b * b, blur(x * y) - a * b
+    top = (2 * a * b + C1) * (2 * covariance + C2)
+    return (top / ((a * a + b * b + C1) * (variance_x + variance_y + C2))).mean()
+
+
+class _ImageLoss(torch.autograd.Function):
+    """Weighted L1 + ssim_weight (1 - SSIM), with the gradient made in the forward pass."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, pixel_weight: Tensor | None, l1_weight: float, ssim_weight: float,
+        threads: int,
+    ) -> Tensor:  # fmt: skip
+        gradient = torch.empty(image.shape)
+        l1, similarity = native.load("splats").image_loss(
+            image.detach().contiguous(), target.detach().contiguous(), pixel_weight, l1_weight, ssim_weight,
+            gradient, threads,
+        )  # fmt: skip
+        ctx.save_for_backward(gradient)
+        return torch.tensor(l1 + ssim_weight * (1.0 - similarity), dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, on_loss: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * on_loss, None, None, None, None, None
+
+
+def fused(image: Tensor) -> bool:
+    """Whether the C++ kernel takes this image: float32, on the CPU, three channels."""
+    return image.dtype == torch.float32 and image.device.type == "cpu" and image.shape[-1] == 3
+
+
+def image_loss(
+    image: Tensor,
+    target: Tensor,
+    *,
+    l1_weight: float,
+    ssim_weight: float,
+    pixel_weight: Tensor | None = None,
+    threads: int | None = None,
+) -> Tensor:
+    """mean((l1_weight + pixel_weight) |image - target|) + ssim_weight (1 - SSIM), a scalar.
+
+    image, target: (H, W, 3); the gradient goes to `image` only. pixel_weight: (H, W), carries no gradient. float32 on
+    the CPU takes the C++ kernel, anything else (float64, GPU) the same in PyTorch. Raises ValueError if shapes differ.
+    """
+    if image.shape != target.shape or image.dim() != 3:
+        raise ValueError(f"image is {tuple(image.shape)}, target {tuple(target.shape)}: expected two (H, W, C)")
+    if pixel_weight is not None and pixel_weight.shape != image.shape[:2]:
+        raise ValueError(f"pixel_weight is {tuple(pixel_weight.shape)}: expected {tuple(image.shape[:2])}")
+    weight = None if pixel_weight is None else pixel_weight.detach().to(image.dtype).contiguous()
+    if fused(image):
+        loss: Tensor = _ImageLoss.apply(image, target.float(), weight, l1_weight, ssim_weight, threads or 0)
+        return loss
+    target = target.detach().to(image)
+    difference = (image - target).abs()
+    weighted = l1_weight * difference.mean()
+    if weight is not None:
+        weighted = weighted + (weight[..., None] * difference).mean()
+    return weighted + ssim_weight * (1.0 - ssim_reference(image, target))
+
+
+def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
+    """Mean SSIM of images (H, W, 3); the gradient goes to `image` only."""
+    return 1.0 - image_loss(image, target, l1_weight=0.0, ssim_weight=1.0, threads=threads)
