@@ -24,9 +24,7 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     scale is a logarithm: what multiplies the standard deviation is added to it.
     """
     splats = folded(final.splats, final.density) if fold else final.splats
-    extent = float(splats.means.abs().max()) if len(splats) else 0.0
-    far = float(np.abs(final.origin).max()) > FAR * max(extent, 1e-30)
-    origin = final.origin if far else np.zeros(3)
+    origin = relative_origin(final)
     means = splats.means.numpy().astype(np.float64) + (final.origin - origin)
     harmonics = splats.sh.numpy()
     rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)  # all of red, then green, then blue
@@ -52,6 +50,13 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     with path.open("wb") as file:
         file.write("\n".join(header).encode("ascii"))
         file.write(rows.tobytes())
+
+
+def relative_origin(final: Snapshot) -> np.ndarray:
+    """(3,) float64 that exported positions are relative to: 0 unless float32 could not hold world coordinates."""
+    extent = float(final.splats.means.abs().max()) if len(final.splats) else 0.0
+    far = float(np.abs(final.origin).max()) > FAR * max(extent, 1e-30)
+    return final.origin if far else np.zeros(3)
 
 
 def folded(splats: Splats, density: str) -> Splats:

@@ -1,0 +1,64 @@
+"""A triangle mesh of the map: rendered depth fused into a truncated signed distance field (open3d)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mvsgs_core import camera
+from mvsgs_core.open3d_loader import open3d
+from mvsgs_core.splats.rasterizer import rasterize
+from mvsgs_core.splats.snapshot import Snapshot
+
+
+def write_mesh(
+    path: Path,
+    final: Snapshot,
+    world_from_cam: np.ndarray,
+    intrinsics: np.ndarray,
+    size: tuple[int, int],
+    voxel: float = 0.01,
+    min_opacity: float = 0.8,
+) -> tuple[int, int]:
+    """Renders depth from poses (K, 4, 4) with intrinsics (4,) at `size`, fuses it and writes a .ply, .obj or .glb mesh.
+
+    voxel: edge in median depths. Pixels of an opacity below `min_opacity` say nothing. Positions are world coordinates.
+    Returns the numbers of vertices and triangles. Raises ValueError where no pose sees the map.
+    """
+    o3d = open3d()
+    views = []
+    for pose in world_from_cam:
+        local = pose.copy()
+        local[:3, 3] -= final.origin
+        with torch.no_grad():
+            render = rasterize(final.splats, local, intrinsics, size, density=final.density)
+        depth = torch.where(render.opacity >= min_opacity, render.depth, 0.0)
+        views.append((local, depth.numpy(), render.color.clamp(0.0, 1.0).numpy()))
+    seen = [depth[depth > 0] for _, depth, _ in views if (depth > 0).any()]
+    if not seen:
+        raise ValueError("no pose sees the map: nothing to fuse; check that the poses are those of this map")
+    median, farthest = float(np.median(np.concatenate(seen))), float(np.max([values.max() for values in seen]))
+    edge = voxel * median
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        attr_names=("tsdf", "weight", "color"),
+        attr_dtypes=(o3d.core.float32, o3d.core.float32, o3d.core.float32),
+        attr_channels=((1), (1), (3)),
+        voxel_size=edge,
+        block_resolution=16,
+        block_count=10000,
+    )
+    matrix = o3d.core.Tensor(camera.matrix(intrinsics))
+    truncation = 6.0  # voxels, of the distance field
+    for local, depth, color in views:
+        extrinsic = o3d.core.Tensor(np.linalg.inv(local))
+        depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth)))
+        color_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color)))
+        blocks = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1.0, farthest, truncation)
+        grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, 1.0, farthest, truncation)
+    mesh = grid.extract_triangle_mesh(weight_threshold=1.0).to_legacy()
+    mesh.translate(final.origin)
+    if not o3d.io.write_triangle_mesh(str(path), mesh):
+        raise OSError(f"open3d could not write {path}")
+    return len(mesh.vertices), len(mesh.triangles)

@@ -1,0 +1,100 @@
+"""Clone, split, prune, relocation and decay: counts, bookkeeping and what the render keeps."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from mvsgs_core.splats.density_control import DensityConfig, control, decay_opacities, relocation
+from mvsgs_core.splats.map_state import PARAMETERS, MapState
+from mvsgs_core.splats.model import Splats
+
+
+def state_of(count: int) -> MapState:
+    state = MapState(1, torch.device("cpu"))
+    generator = torch.Generator().manual_seed(0)
+    state.append(
+        Splats(
+            torch.randn((count, 3), generator=generator), torch.full((count, 3), math.log(0.005)),
+            torch.randn((count, 4), generator=generator), torch.full((count,), 1.0),
+            torch.randn((count, 1, 3), generator=generator), torch.full((count,), 2.0),
+        ),
+        torch.arange(count),
+    )  # fmt: skip
+    return state
+
+
+def lengths(state: MapState) -> set[int]:
+    sizes = {len(getattr(state.splats, name)) for name in PARAMETERS}
+    sizes |= {len(moment) for moments in (state.first, state.second) for moment in moments.values()}
+    return sizes | {len(x) for x in (state.steps, state.anchors, state.screen_gradient, state.screen_views)}
+
+
+def test_small_splats_with_a_large_gradient_are_cloned_large_ones_split() -> None:
+    state = state_of(10)
+    config = DensityConfig(gradient=1.0, split_scale=0.01, prune_opacity=0.05)
+    with torch.no_grad():
+        state.splats.log_scales[4] = math.log(0.1)
+        state.splats.opacity_logits[9] = -6.0
+        state.splats.log_scales[8, 1] = math.log(2.0)
+    state.screen_views += 2.0
+    state.screen_gradient[[3, 4, 9]] = 3.0
+    change = control(state, config, 1.0, torch.Generator().manual_seed(0))
+    assert (change.cloned, change.split, change.pruned) == (1, 1, 2)
+    assert lengths(state) == {10 - 2 + 1 + 1}
+    assert sorted(state.anchors.tolist()) == [0, 1, 2, 3, 3, 4, 4, 5, 6, 7]
+    halves = state.splats.log_scales[state.anchors == 4]
+    torch.testing.assert_close(halves, torch.full((2, 3), math.log(0.1 / 1.6)))
+    assert not state.screen_gradient.any()
+
+
+def test_growth_stops_at_the_limit_with_the_worst_first() -> None:
+    state = state_of(10)
+    state.screen_views += 1.0
+    state.screen_gradient += torch.arange(10) + 1.0
+    change = control(state, DensityConfig(gradient=0.5, max_splats=13), 1.0, torch.Generator())
+    assert change.cloned == 3
+    assert sorted(state.anchors.tolist())[-6:] == [7, 7, 8, 8, 9, 9]
+
+
+def test_none_leaves_everything_alone_and_an_unknown_mode_is_refused() -> None:
+    state = state_of(5)
+    before = state.splats.opacity_logits.clone()
+    control(state, DensityConfig(mode="none", opacity_decay=0.5), 1.0, torch.Generator())
+    assert torch.equal(before, state.splats.opacity_logits)
+    with pytest.raises(ValueError, match="adaptive, relocate, none"):
+        control(state, DensityConfig(mode="sometimes"), 1.0, torch.Generator())
+
+
+def test_relocation_keeps_the_number_and_moves_the_dead_onto_the_living() -> None:
+    state = state_of(20)
+    with torch.no_grad():
+        state.splats.opacity_logits[5:15] = -8.0
+    living = torch.cat([state.splats.means[:5], state.splats.means[15:]]).detach().clone()
+    change = control(state, DensityConfig(mode="relocate"), 1.0, torch.Generator().manual_seed(1))
+    assert change.relocated == 10
+    assert lengths(state) == {20}
+    distances = torch.cdist(state.splats.means.detach()[5:15], living).min(dim=1).values
+    assert distances.max() == 0.0
+
+
+@pytest.mark.parametrize("copies", [1, 2, 7])
+def test_copies_blend_to_the_opacity_of_the_original(copies: int) -> None:
+    opacity = torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
+    shared, shrink = relocation(opacity, torch.full((3,), copies))
+    torch.testing.assert_close(1 - (1 - shared) ** copies, opacity)
+    # The integral over a line of the blended copies, each with std shrink, equals that of the original.
+    x = torch.linspace(-12, 12, 4001, dtype=torch.float64)
+    for o, s, f in zip(opacity, shared, shrink, strict=True):
+        original = torch.trapezoid(o * torch.exp(-0.5 * x * x), x)
+        blended = torch.trapezoid(1 - (1 - s * torch.exp(-0.5 * (x / f) ** 2)) ** copies, x)
+        torch.testing.assert_close(blended, original, rtol=1e-6, atol=0.0)
+
+
+def test_decay_multiplies_opacities() -> None:
+    state = state_of(4)
+    before = torch.sigmoid(state.splats.opacity_logits.detach().clone())
+    decay_opacities(state, 0.8)
+    torch.testing.assert_close(torch.sigmoid(state.splats.opacity_logits.detach()), 0.8 * before)

@@ -1,0 +1,128 @@
+"""Selective Adam: kernel against its PyTorch twin and against torch.optim.Adam; bad gradients; bounds."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from mvsgs_core.splats import optimizer
+from mvsgs_core.splats.map_state import PARAMETERS, MapState
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.optimizer import LearningRates, groups, normalize_quaternions, step, step_reference
+
+RATES = LearningRates()
+
+
+def random_state(count: int, seed: int = 0, bases: int = 4) -> MapState:
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=generator)
+
+    state = MapState(bases, torch.device("cpu"))
+    state.append(
+        Splats(draw(count, 3), draw(count, 3) - 4, draw(count, 4), draw(count), draw(count, bases, 3), draw(count)),
+        torch.arange(count),
+    )
+    state.steps = torch.randint(0, 900, (count,), generator=generator, dtype=torch.int32)
+    return state
+
+
+def set_gradients(state: MapState, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for name in PARAMETERS:
+        parameter = getattr(state.splats, name)
+        parameter.grad = torch.randn(parameter.shape, generator=generator) * 1e-4
+
+
+def all_groups(train_betas: bool = True) -> list[optimizer.Group]:
+    return groups(RATES, 2.0, 0.7, train_betas, "exact")
+
+
+def test_kernel_equals_its_twin_over_many_steps() -> None:
+    kernel, twin = random_state(700), random_state(700)
+    for iteration in range(20):
+        visible = torch.rand(700, generator=torch.Generator().manual_seed(iteration)) < 0.6
+        for state in (kernel, twin):
+            set_gradients(state, iteration)
+        assert step(kernel, visible, all_groups(), RATES.decay_steps, threads=2) == 0
+        assert step_reference(twin, visible, all_groups(), RATES.decay_steps) == 0
+    assert torch.equal(kernel.steps, twin.steps)
+    for name in PARAMETERS:
+        torch.testing.assert_close(getattr(kernel.splats, name), getattr(twin.splats, name), rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(kernel.second[name], twin.second[name], rtol=1e-4, atol=1e-20)
+
+
+def test_a_fresh_splat_seen_every_time_follows_torch_adam() -> None:
+    state = random_state(50)
+    state.steps.zero_()
+    group = [g for g in all_groups() if g.name == "log_scales"]
+    oracle = state.splats.log_scales.detach().clone().requires_grad_(True)
+    adam = torch.optim.Adam([oracle], lr=group[0].rate, eps=optimizer.EPSILON)
+    for iteration in range(10):
+        set_gradients(state, iteration)
+        oracle.grad = state.splats.log_scales.grad.clone()
+        adam.step()
+        step(state, torch.ones(50, dtype=torch.bool), group, RATES.decay_steps, threads=1)
+    torch.testing.assert_close(state.splats.log_scales.detach(), oracle.detach(), rtol=1e-5, atol=1e-6)
+
+
+def test_what_was_not_seen_stays_as_it_was() -> None:
+    state, before = random_state(100), random_state(100)
+    set_gradients(state, 1)
+    visible = torch.zeros(100, dtype=torch.bool)
+    visible[::2] = True
+    step(state, visible, all_groups(), RATES.decay_steps)
+    for name in PARAMETERS:
+        now, then = getattr(state.splats, name), getattr(before.splats, name)
+        assert torch.equal(now[1::2], then[1::2])
+        assert not torch.equal(now[::2], then[::2])
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e38])
+@pytest.mark.parametrize("run", [step, step_reference])
+def test_a_bad_gradient_is_refused_for_that_splat_only(bad: float, run) -> None:  # type: ignore[no-untyped-def]
+    state, before = random_state(40), random_state(40)
+    set_gradients(state, 1)
+    state.splats.sh.grad[7, 2, 1] = bad
+    refused = run(state, torch.ones(40, dtype=torch.bool), all_groups(), RATES.decay_steps)
+    assert refused == 1
+    for name in PARAMETERS:
+        assert torch.isfinite(getattr(state.splats, name)).all()
+        assert torch.isfinite(state.second[name]).all()
+    assert torch.equal(state.splats.sh[7], before.splats.sh[7])
+    assert not torch.equal(state.splats.sh[8], before.splats.sh[8])
+
+
+def test_wild_rates_stay_inside_the_bounds() -> None:
+    state = random_state(30)
+    wild = groups(LearningRates(means=1e4, log_scales=50.0, opacity_logits=1e3, sh=1e3, betas=1e3), 1.0, 1.0, True, "exact")
+    for iteration in range(30):
+        set_gradients(state, iteration)
+        step(state, torch.ones(30, dtype=torch.bool), wild, 100)
+        normalize_quaternions(state)
+    for group in wild:
+        values = getattr(state.splats, group.name)
+        assert torch.isfinite(values).all()
+        assert values.min() >= group.low
+        assert values.max() <= group.high
+
+
+def test_a_zero_quaternion_becomes_the_identity() -> None:
+    state = random_state(3)
+    with torch.no_grad():
+        state.splats.quaternions[1] = 0.0
+    normalize_quaternions(state)
+    torch.testing.assert_close(state.splats.quaternions.norm(dim=1), torch.ones(3))
+    assert state.splats.quaternions[1].tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
+def test_threads_do_not_change_the_result() -> None:
+    one, two = random_state(2000), random_state(2000)
+    for state, threads in ((one, 1), (two, 2)):
+        set_gradients(state, 3)
+        step(state, torch.ones(2000, dtype=torch.bool), all_groups(), RATES.decay_steps, threads=threads)
+    for name in PARAMETERS:
+        assert torch.equal(getattr(one.splats, name), getattr(two.splats, name))
