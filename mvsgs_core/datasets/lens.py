@@ -65,11 +65,10 @@ class Undistortion:
         self.intrinsics = np.array([fx * zoom, fy * zoom, cx, cy])
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
         if lens.distorted:
-            height, width = lens.size
-            u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-            source = _distort(lens, self.intrinsics, np.stack([u, v], axis=-1).reshape(-1, 2))
-            x, y = source.astype(np.float32).reshape(height, width, 2).transpose(2, 0, 1)
-            self._maps = np.ascontiguousarray(x), np.ascontiguousarray(y)
+            undistort = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+            camera, pinhole = matrix(np.array(lens.intrinsics)), matrix(self.intrinsics)
+            size = lens.size[1], lens.size[0]
+            self._maps = undistort(camera, np.array(lens.distortion), np.eye(3), pinhole, size, cv2.CV_32FC1)
 
     def image(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) uint8, bilinear; black where the lens saw nothing."""

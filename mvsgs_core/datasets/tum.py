@@ -125,7 +125,8 @@ def _find_lens(
             return CAMERAS[f"freiburg{match[1]}"], []
     raise ValueError(
         f"the name of {folder} does not tell which camera took it: set dataset.options.camera to one of "
-        f"{', '.join(CAMERAS)}, or dataset.intrinsics=[fx,fy,cx,cy] (and dataset.distortion), or write them into {calibration}"
+        f"{', '.join(CAMERAS)}, or dataset.intrinsics=[fx,fy,cx,cy] (and dataset.distortion), "
+        f"or write them into {calibration}"
     )
 
 

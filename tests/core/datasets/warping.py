@@ -36,7 +36,7 @@ def epipolar_error(a: Item, b: Item, intrinsics: np.ndarray | None = None, mirro
     """
     assert a.world_from_cam is not None
     assert b.world_from_cam is not None
-    sift = cv2.SIFT_create(3000)
+    sift = cv2.SIFT_create(1500)
     points_a, descriptors_a = sift.detectAndCompute(_gray(a.image), None)
     points_b, descriptors_b = sift.detectAndCompute(_gray(b.image), None)
     matches = [

@@ -1,0 +1,82 @@
+"""Video files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mvsgs_core.datasets import open_dataset
+from tests.core.datasets.folders import truncate
+
+FRAMES, RATE = 30, 20.0
+
+
+@pytest.fixture(params=[("avi", "MJPG"), ("mp4", "mp4v")])
+def video(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """Frame i is gray 8 i, blue a little darker."""
+    suffix, code = request.param
+    path = tmp_path / f"walk.{suffix}"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), RATE, (64, 48))
+    assert writer.isOpened()
+    for i in range(FRAMES):
+        writer.write(np.full((48, 64, 3), (max(0, 8 * i - 40), 8 * i, 8 * i), dtype=np.uint8))
+    writer.release()
+    return path
+
+
+def test_frames_and_timestamps(video: Path) -> None:
+    sequence = open_dataset("video", path=video, intrinsics=[50, 51, 31.5, 23.5])
+    for _ in range(2):
+        items = list(sequence)
+        assert len(sequence) == len(items) == FRAMES
+        assert [item.index for item in items] == list(range(FRAMES))
+        np.testing.assert_allclose([item.timestamp for item in items], np.arange(FRAMES) / RATE, atol=1e-3)
+        np.testing.assert_allclose([item.image[..., 0].mean() for item in items], 8 * np.arange(FRAMES), atol=6)
+        assert items[20].image[..., 2].mean() < items[20].image[..., 0].mean() - 20  # RGB
+        np.testing.assert_allclose(items[0].intrinsics, [50, 51, 31.5, 23.5])
+        assert items[0].world_from_cam is None
+        assert items[0].depth is None
+        assert sequence.warnings == []
+
+
+def test_selection_and_size(video: Path) -> None:
+    sequence = open_dataset("video", path=video, intrinsics="auto", start=3, stop=20, stride=4, size=(24, 32))
+    items = list(sequence)
+    assert len(sequence) == len(items) == 5
+    np.testing.assert_allclose([item.timestamp for item in items], [0.15, 0.35, 0.55, 0.75, 0.95], atol=1e-3)
+    assert items[0].image.shape == (24, 32, 3)
+    assert items[0].intrinsics[2] == 15.5
+    assert "65 degrees" in sequence.warnings[0]
+    with pytest.raises(ValueError, match="no frame left"):
+        open_dataset("video", path=video, intrinsics="auto", start=FRAMES)
+
+
+def test_a_camera_must_be_given_or_guessed_knowingly(video: Path) -> None:
+    with pytest.raises(ValueError, match="intrinsics=auto"):
+        open_dataset("video", path=video)
+
+
+def test_a_video_that_is_cut_off_goes_as_far_as_it_can(tmp_path: Path) -> None:
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), RATE, (160, 120))
+    noise = np.random.default_rng(0)
+    for _ in range(FRAMES):
+        writer.write(noise.integers(0, 255, (120, 160, 3), dtype=np.uint8))
+    writer.release()
+    truncate(path, 0.5)
+    sequence = open_dataset("video", path=path, intrinsics="auto")
+    items = list(sequence)
+    assert 5 < len(items) < 25
+    assert any(w.endswith("it is cut off or damaged") for w in sequence.warnings)
+    list(sequence)
+    assert sum("cut off" in w for w in sequence.warnings) == 1
+
+
+def test_what_is_no_video(tmp_path: Path) -> None:
+    path = tmp_path / "walk.mp4"
+    path.write_bytes(b"nothing of the kind")
+    with pytest.raises(ValueError, match="cannot open"):
+        open_dataset("video", path=path, intrinsics="auto")
