@@ -6,6 +6,7 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
 	&& { echo $$p; break; }; done)
 CXX_FOUND := $(shell command -v $${CXX:-c++} || command -v g++ || command -v clang++)
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
+PIP_FLAGS ?=
 DEMO_OUTPUT ?= runs/demo
 BIN := .venv/bin
 PACKAGES := .venv/.packages
@@ -30,12 +31,14 @@ check-system:
 # PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" spares gigabytes of CUDA packages.
 $(PACKAGES): constraints.txt | check-system
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -r constraints.txt
+	@echo "installing packages into .venv (2.6 GB, some minutes)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -r constraints.txt
 	@touch $@
 
 # The package itself, with its C++ kernels: in place, so that an edit of Python needs no reinstallation.
 $(STAMP): $(PACKAGES) pyproject.toml CMakeLists.txt $(KERNELS)
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	@echo "building the C++ kernels"
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--no-build-isolation --no-deps -e .
 	@$(BIN)/python -m pip check --quiet || { echo "constraints.txt lacks what pyproject.toml asks for"; exit 1; }
 	@touch $@
