@@ -1,0 +1,312 @@
+"""The source nodes: recorded, live and remote; and their choices in the launch configuration."""
+
+from __future__ import annotations
+
+import inspect
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+import nodes.camera
+from launch.compose import compose
+from msgs import Depth, Frame, GroundTruth
+from mvsgs_core.datasets.images import Images
+from mvsgs_core.datasets.seven_scenes import SevenScenes
+from mvsgs_core.datasets.tum import Tum
+from mvsgs_core.datasets.video import Video
+from nodes.camera import Camera, CameraError
+from nodes.reader import Reader
+from nodes.robot import Robot
+from nodes.transport import Publisher
+from tests.core.datasets.folders import truncate, write_photos, write_tum
+from tests.shared_data import ROOT
+
+# ---------------------------------------------------------------- recorded
+
+
+def test_reader_sends_each_frame_and_then_its_truth(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr3")
+    truncate(folder / "rgb/1.png")
+    reader = Reader(Reader.Config(name="tum", path=str(folder), size=[24, 32]))
+    messages = list(reader.run())
+    assert [type(m) for m in messages] == [Frame, GroundTruth] * 4
+    for frame, truth in zip(messages[::2], messages[1::2]):
+        assert isinstance(truth, GroundTruth)
+        assert frame.index == truth.index
+        assert frame.timestamp == truth.timestamp
+        assert frame.image.shape == (24, 32, 3)
+        np.testing.assert_array_equal(frame.image, truth.image)
+        assert truth.world_from_cam is not None
+    assert reader.stats.counts == {"frames": 4}
+    assert reader.stats.values == {"frames_expected": 5}
+    assert any("could not be read: 1 (first: 1.png" in w for w in reader.stats.warnings)
+
+
+def test_reader_passes_options_on(tmp_path: Path) -> None:
+    config = Reader.Config(
+        name="images", path=str(write_photos(tmp_path)), start=2, stop=8, stride=3, intrinsics=[50, 50, 31.5, 23.5],
+        options={"rate": 2.0},
+    )  # fmt: skip
+    messages = list(Reader(config).run())
+    assert [(m.index, m.timestamp, m.image[0, 0, 0]) for m in messages[::2]] == [(0, 1.0, 22), (1, 2.5, 25)]
+    assert messages[1].world_from_cam is None
+    assert messages[1].depth is None
+
+
+def test_reader_can_play_at_the_recorded_rate(tmp_path: Path) -> None:
+    reader = Reader(Reader.Config(name="tum", path=str(write_tum(tmp_path / "fr3", 4)), realtime=True))
+    began = time.monotonic()
+    arrivals = [time.monotonic() - began for message in reader.run() if isinstance(message, Frame)]
+    np.testing.assert_array_less(0.1 * np.arange(4) - 0.01, np.array(arrivals) - arrivals[0])
+
+
+# ---------------------------------------------------------------- live
+
+
+class FakeCapture:
+    """Stands for cv2.VideoCapture: a picture every `interval` seconds, gray with its number; `script` may fail."""
+
+    interval = 0.01
+    lost_after: int | None = None  # pictures, then no more until opened again
+    dead_after: int | None = None  # pictures over all captures, then never again
+    opened = 0
+    pictures = 0
+
+    def __init__(self, *arguments: object) -> None:
+        type(self).opened += 1
+        self._own = 0
+
+    def isOpened(self) -> bool:
+        return self.dead_after is None or self.pictures < self.dead_after
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        time.sleep(self.interval)
+        if not self.isOpened() or (self.lost_after is not None and self._own >= self.lost_after):
+            return False, None
+        self._own += 1
+        type(self).pictures += 1
+        return True, np.full((48, 64, 3), (0, 0, self.pictures % 256), dtype=np.uint8)
+
+    def set(self, *_: object) -> bool:
+        return True
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.fixture
+def capture(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[FakeCapture]]:
+    kind = type("Capture", (FakeCapture,), {})
+    monkeypatch.setattr(nodes.camera.cv2, "VideoCapture", kind)
+    monkeypatch.setattr(nodes.camera, "RETRY", 0.01)
+    yield kind
+    assert not [t for t in threading.enumerate() if t.name == "camera"], "the capture thread outlived its node"
+
+
+def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCapture]) -> None:
+    camera = Camera(Camera.Config(start=2, stop=8, stride=2, size=[24, 32]))
+    messages = list(camera.run())
+    assert [type(m) for m in messages] == [Frame, GroundTruth] * 3
+    assert [m.index for m in messages] == [0, 0, 1, 1, 2, 2]
+    assert messages[0].image.shape == (24, 32, 3)
+    assert messages[0].image[0, 0, 1] == 0  # RGB
+    assert messages[0].image[0, 0, 0] > 0
+    assert messages[0].intrinsics[2] == 15.5
+    assert messages[1].world_from_cam is None
+    assert any("guess" in w for w in camera.stats.warnings)
+
+
+def test_a_slow_reader_gets_the_newest_picture_and_the_rest_is_counted(capture: type[FakeCapture]) -> None:
+    camera = Camera(Camera.Config(stop=5, intrinsics=[50, 50, 31.5, 23.5]))
+    lag = []
+    seen = 0
+    for message in camera.run():
+        if isinstance(message, Frame):
+            seen = int(message.image[0, 0, 0])
+            lag.append(capture.pictures - seen)
+            time.sleep(0.15)
+    assert camera.stats.warnings == []
+    assert camera.stats.counts["frames"] == 5
+    assert max(lag) <= 2  # never an old picture, although some 15 were taken meanwhile
+    assert camera.stats.counts["dropped"] >= seen - 5 > 10
+
+
+def test_a_camera_that_comes_back(capture: type[FakeCapture]) -> None:
+    capture.lost_after = 4
+    camera = Camera(Camera.Config(stop=10))
+    assert len(list(camera.run())) == 20
+    assert any("was lost and found again" in w for w in camera.stats.warnings)
+
+
+def test_a_camera_that_dies_ends_the_stream_and_not_the_run(capture: type[FakeCapture]) -> None:
+    capture.dead_after = 3
+    camera = Camera(Camera.Config(timeout=0.3))
+    messages = list(camera.run())
+    assert 2 <= len(messages) <= 6
+    assert "camera 0 was lost: no picture for 0.3 s" in camera.stats.warnings
+
+
+def test_a_camera_that_is_not_there(capture: type[FakeCapture], tmp_path: Path) -> None:
+    capture.dead_after = 0
+    with pytest.raises(CameraError, match="camera 7 cannot be opened: is it connected"):
+        list(Camera(Camera.Config(path="7")).run())
+    with pytest.raises(CameraError, match="rtsp://nowhere/x cannot be opened: is the address right"):
+        list(Camera(Camera.Config(path="rtsp://nowhere/x")).run())
+    capture.dead_after, capture.lost_after = None, 0
+    with pytest.raises(CameraError, match=r"gave no picture for 0\.2 s"):
+        list(Camera(Camera.Config(timeout=0.2)).run())
+    (tmp_path / "walk.mp4").touch()
+    with pytest.raises(CameraError, match="dataset=video"):
+        list(Camera(Camera.Config(path=str(tmp_path / "walk.mp4"))).run())
+
+
+# ---------------------------------------------------------------- remote
+
+
+@pytest.fixture
+def address() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+
+
+def frame(number: int, size: tuple[int, int] = (48, 64), focal: float = 50.0) -> Frame:
+    image = np.full((*size, 3), number, dtype=np.uint8)
+    return Frame(number, number / 10, image, np.array([focal, focal, 31.5, 23.5]))
+
+
+def publish(publisher: Publisher, messages: list[Frame], interval: float = 0.02) -> threading.Thread:
+    def work() -> None:
+        while not publisher.ready(1):
+            time.sleep(0.01)
+        for message in messages:
+            publisher.send(message)
+            time.sleep(interval)
+        publisher.close()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    return thread
+
+
+def test_robot_frames_arrive_and_are_numbered_anew(address: str) -> None:
+    sender = publish(Publisher(address), [frame(i) for i in range(100, 120)])
+    robot = Robot(Robot.Config(path=address, size=[24, 32], start=1, stride=2))
+    messages = list(robot.run())
+    sender.join()
+    frames = messages[::2]
+    assert [m.index for m in frames] == list(range(len(frames)))
+    numbers = [int(m.image[0, 0, 0]) for m in frames]
+    assert numbers == sorted(set(numbers))
+    assert len(frames) >= 5
+    for message, number in zip(frames, numbers):
+        assert message.timestamp == pytest.approx(number / 10)
+        np.testing.assert_allclose(message.intrinsics, [25, 25, 15.5, 11.5])
+    assert all(isinstance(m, GroundTruth) and m.world_from_cam is None for m in messages[1::2])
+
+
+def test_a_slow_robot_reader_skips_and_counts(address: str) -> None:
+    sender = publish(Publisher(address), [frame(i) for i in range(60)], 0.01)
+    robot = Robot(Robot.Config(path=address))
+    numbers = []
+    for message in robot.run():
+        if isinstance(message, Frame):
+            numbers.append(int(message.image[0, 0, 0]))
+            time.sleep(0.1)
+    sender.join()
+    assert numbers[-1] == 59  # the newest is never dropped
+    assert len(numbers) < 30
+    assert robot.stats.counts["dropped"] == numbers[-1] - numbers[0] + 1 - len(numbers)
+
+
+def test_a_robot_that_falls_silent_or_never_speaks(address: str) -> None:
+    with pytest.raises(TimeoutError, match=r"examples/robot\.py"):
+        list(Robot(Robot.Config(path=address, timeout=0.3)).run())
+    publisher = Publisher(address)
+    try:
+        robot = Robot(Robot.Config(path=address, timeout=0.6))
+        stream = robot.run()
+        sender = threading.Thread(target=lambda: [_wait(publisher), publisher.send(frame(3))])
+        sender.start()
+        assert len(list(stream)) == 2
+        sender.join()
+        assert any("the stream ends here" in w for w in robot.stats.warnings)
+    finally:
+        publisher.close()
+
+
+def _wait(publisher: Publisher) -> None:
+    while not publisher.ready(1):
+        time.sleep(0.01)
+
+
+def test_what_a_robot_should_not_send_is_left_out(address: str) -> None:
+    wrong_type = Depth(
+        1, 0.1, np.zeros((4, 4, 3), np.uint8), np.ones(4), np.eye(4), 1.0,
+        np.ones((4, 4), np.float32), np.ones((4, 4), np.float32), 0,
+    )  # fmt: skip
+    odd = [frame(0), wrong_type, frame(2, (32, 32)), frame(3, focal=-1.0), frame(4, focal=float("nan")), frame(5)]
+    sender = publish(Publisher(address), odd, 0.25)
+    robot = Robot(Robot.Config(path=address, timeout=5.0))
+    numbers = [int(m.image[0, 0, 0]) for m in robot.run() if isinstance(m, Frame)]
+    sender.join()
+    assert numbers == [0, 5]
+    assert robot.stats.counts["refused"] == 1
+    text = "\n".join(robot.stats.warnings)
+    assert "what is no Frame" in text
+    assert "another size" in text
+    assert "valid intrinsics" in text
+
+
+def test_the_example_publishes_a_data_set(address: str, tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr3", 6)
+    command = [sys.executable, str(ROOT / "examples/robot.py"), "--dataset", "tum", str(folder), "--address", address]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as example:
+        robot = Robot(Robot.Config(path=address, timeout=30.0))
+        numbers = [int(m.image[0, 0, 0]) for m in robot.run() if isinstance(m, Frame)]
+        output, errors = example.communicate(timeout=20)
+    assert example.returncode == 0, errors
+    assert numbers[-1] == 25
+    assert numbers == sorted(set(numbers))
+    assert "6 frames sent" in output
+    assert "warning: frames without a depth map" in errors
+
+
+# ---------------------------------------------------------------- launch configuration
+
+
+@pytest.mark.parametrize(
+    "choice", ["synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "camera", "robot"]
+)
+def test_every_dataset_choice_composes(choice: str) -> None:
+    graph = compose([f"dataset={choice}"])
+    live = choice in ("camera", "robot")
+    frames = [edge for edge in graph.out_of("dataset") if edge.message is Frame]
+    assert frames
+    assert all(edge.best_effort == live for edge in frames)
+    assert all(not edge.best_effort for edge in graph.out_of("dataset") if edge.message is GroundTruth)
+
+
+def test_options_of_a_choice_reach_the_reader(tmp_path: Path) -> None:
+    folder = write_photos(tmp_path)
+    graph = compose(
+        ["dataset=images", f"dataset.path={folder}", "dataset.intrinsics=[50,50,31.5,23.5]", "dataset.options.rate=5"]
+    )
+    reader = Reader(Reader.Config(**graph.slots["dataset"].config))
+    assert [m.timestamp for m in reader.run() if isinstance(m, Frame)][:2] == pytest.approx([0.0, 0.2])
+
+
+def test_every_choice_lists_all_options_of_its_format() -> None:
+    own = {"path", "start", "stop", "stride", "size", "intrinsics", "distortion"}
+    for name, reader in {"tum": Tum, "seven_scenes": SevenScenes, "images": Images, "video": Video}.items():
+        parameters = set(inspect.signature(reader).parameters)
+        listed = set(OmegaConf.load(ROOT / f"launch/conf/dataset/{name}.yaml").options)
+        assert listed == parameters - own
