@@ -16,7 +16,7 @@ from msgs import GroundTruth, SplatMap, Trajectory, View
 from mvsgs_core import weights
 from mvsgs_core.evaluation import html, pictures, trajectory
 from mvsgs_core.evaluation.evaluation import Evaluation, FinishedMap, Track
-from mvsgs_core.evaluation.lpips import TRUNK, Lpips
+from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.splats.model import Splats
 from nodes import Node
 
@@ -77,12 +77,10 @@ class Evaluator(Node):
             raise ValueError(f"evaluator.lpips={self.config.lpips!r}: it is auto, on or off")
         if self.config.lpips == "off":
             return None
-        trunk = weights.find("lpips_squeezenet1_1_features.pth", "squeezenet1_1-b8a52dc0.pth")
-        heads = weights.find("lpips_v0.1/squeeze.pth", "squeeze.pth")
-        if trunk and heads:
-            return Lpips(trunk, heads)
-        searched = ", ".join(str(f) for f in weights.folders())
-        text = f"LPIPS is left out: no {TRUNK} trunk and squeeze head in {searched}; set MVSGS_WEIGHTS to their folder"
+        try:
+            return Lpips(weights.find("lpips_squeeze_trunk"), weights.find("lpips_squeeze_head"))
+        except FileNotFoundError as error:
+            text = f"LPIPS is left out: {error}"
         if self.config.lpips == "on":
             raise FileNotFoundError(text)
         self.stats.warn(text)

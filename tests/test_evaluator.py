@@ -151,7 +151,7 @@ def test_a_run_that_never_made_a_map_still_reports(tmp_path: Path) -> None:
 def test_missing_lpips_weights_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    with pytest.raises(FileNotFoundError, match="set MVSGS_WEIGHTS"):
+    with pytest.raises(FileNotFoundError, match="set MVSGS_WEIGHTS to the folder"):
         Evaluator(Evaluator.Config(lpips="on"))
     node = Evaluator(Evaluator.Config(lpips="auto"))
     assert any("LPIPS is left out" in w for w in node.stats.warnings)

@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-TRUNK = "squeezenet1_1"
 _TAPS = (1, 4, 7, 9, 10, 11, 12)  # layers of the trunk whose outputs are compared
 _CHANNELS = (64, 128, 256, 384, 384, 512, 512)
 
