@@ -1,0 +1,151 @@
+"""The viewer: a page that answers, and a browser's connection that gets the splats, frustums and pictures."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import urllib.request
+from collections.abc import Iterator
+
+import msgpack
+import numpy as np
+import pytest
+import viser
+import zstandard
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from msgs import Preview
+from nodes import handlers, outputs
+from nodes.viewer import Viewer
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+@pytest.fixture
+def viewer() -> Iterator[Viewer]:
+    node = Viewer(Viewer.Config(port=free_port(), max_frustums=3))
+    yield node
+    node.server.stop()
+
+
+def preview(index: int, splats: int = 50, scale: float = 1.0) -> Preview:
+    rng = np.random.default_rng(index)
+    pose = np.eye(4)
+    pose[:3, 3] = scale * np.array([0.1 * index, 0.0, 0.0])
+    return Preview(
+        index=index,
+        iterations=10 * index,
+        world_from_cam=pose,
+        intrinsics=np.array([500.0, 500.0, 319.5, 239.5]),
+        image=rng.integers(0, 255, (480, 640, 3), dtype=np.uint8),
+        render=rng.integers(0, 255, (480, 640, 3), dtype=np.uint8),
+        means=(scale * rng.normal((0, 0, 2), 0.3, (splats, 3))).astype(np.float32),
+        covariances=np.tile(np.eye(3, dtype=np.float32) * np.float32(1e-4 * scale**2), (splats, 1, 1)),
+        colors=rng.integers(0, 255, (splats, 3), dtype=np.uint8),
+        opacities=rng.uniform(0, 1, splats).astype(np.float32),
+    )
+
+
+def show(viewer: Viewer, message: Preview) -> None:
+    assert list(viewer.on_preview(message)) == []
+
+
+def received(viewer: Viewer) -> str:
+    """What a browser gets on connecting, as text to search for names in."""
+    viewer.server.flush()
+    address = viewer.url.replace("http", "ws")
+    got = ""
+    with connect(address, subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None) as browser:
+        while "ReplayDone" not in got:
+            frame = browser.recv(timeout=10.0)
+            assert isinstance(frame, bytes)
+            length = int.from_bytes(frame[8:16], "little")  # 8 bytes: size unpacked, 8: packed, then zstd of msgpack
+            metadata = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + length])
+            got += str(msgpack.unpackb(metadata, strict_map_key=False, raw=False))
+    return got
+
+
+def test_reads_previews_and_sends_nothing() -> None:
+    assert handlers(Viewer) == {Preview: "on_preview"}
+    assert outputs(Viewer) == ()
+
+
+def test_page_answers_on_loopback_only(viewer: Viewer) -> None:
+    with urllib.request.urlopen(viewer.url, timeout=10) as answer:
+        assert answer.status == 200
+        assert b"<html" in answer.read().lower()
+    assert viewer.server.get_host() == "127.0.0.1"
+    assert viewer.stats.values["url"] == viewer.url
+
+
+def test_browser_gets_splats_frustums_and_pictures(viewer: Viewer) -> None:
+    for index in (4, 9):
+        show(viewer, preview(index))
+    got = received(viewer)
+    for name in ("GaussianSplats", "/splats", "/keyframes/4", "/keyframes/9", "/path", "photo", "render"):
+        assert name in got, name
+    assert "keyframe **9**, 50 splats, 90 iterations" in got
+
+
+def test_map_is_shown_at_unit_distance_whatever_its_scale(viewer: Viewer) -> None:
+    show(viewer, preview(0, scale=1e4))
+    splats = viewer.server.scene.get_handle_by_name("/splats")
+    assert splats is not None
+    assert np.median(np.linalg.norm(splats.centers, axis=1)) == pytest.approx(1.0, rel=1e-3)
+    assert viewer.unit == pytest.approx(2e4, rel=0.1)
+    expected = preview(0, scale=1e4).covariances[0, 0, 0] / viewer.unit**2
+    assert splats.covariances[0, 0, 0] == pytest.approx(expected, rel=2e-3)  # half precision
+
+
+def test_map_grows_and_oldest_frustums_go(viewer: Viewer) -> None:
+    for index in range(5):
+        show(viewer, preview(index, splats=20 + index))
+    splats = viewer.server.scene.get_handle_by_name("/splats")
+    assert splats is not None
+    assert len(splats.centers) == 24
+    drawn = [viewer.server.scene.get_handle_by_name(f"/keyframes/{index}") is not None for index in range(5)]
+    assert drawn == [False, False, True, True, True]
+
+
+def test_splats_that_are_not_finite_are_left_out_and_said(viewer: Viewer) -> None:
+    bad = preview(1)
+    bad.means[7] = np.nan
+    show(viewer, bad)
+    splats = viewer.server.scene.get_handle_by_name("/splats")
+    assert splats is not None
+    assert len(splats.centers) == 49
+    assert "not finite" in viewer.stats.warnings[0]
+    show(viewer, preview(2, splats=0))
+
+
+def test_taken_port_is_said() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        node = Viewer(Viewer.Config(port=port))
+        assert node.server.get_port() != port
+        assert str(port) in node.stats.warnings[0]
+        node.server.stop()
+
+
+def test_ends_with_the_run_unless_kept_open() -> None:
+    brief = Viewer(Viewer.Config(port=free_port()))
+    assert list(brief.on_end()) == []
+    with pytest.raises(OSError):
+        urllib.request.urlopen(brief.url, timeout=2)
+    kept = Viewer(Viewer.Config(port=free_port(), keep_open=True))
+    show(kept, preview(1))
+    ending = threading.Thread(target=lambda: list(kept.on_end()))
+    ending.start()
+    with urllib.request.urlopen(kept.url, timeout=10) as answer:
+        assert answer.status == 200
+    assert ending.is_alive()
+    kept.closed.set()
+    ending.join(timeout=15)
+    assert not ending.is_alive()
