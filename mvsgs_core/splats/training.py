@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mvsgs_core.splats import optimizer
 from mvsgs_core.splats.keyframes import TrainingView
-from mvsgs_core.splats.losses import LossConfig, training_loss
+from mvsgs_core.splats.losses import LossConfig, frequency_of, ges_loss
 from mvsgs_core.splats.map_state import MapState
 from mvsgs_core.splats.rasterizer import TILE, rasterize
 
@@ -27,7 +27,8 @@ class TrainingConfig:
     near: float = 0.02  # splats nearer than this many median depths are left out
     backend: str = "auto"
     threads: int | None = None  # None: all
-    ssim: float = 0.2  # weight of 1 - SSIM; L1 has the rest
+    loss: LossConfig = field(default_factory=lambda: LossConfig(l1=0.8, ssim=0.2, frequency=0.0))  # as 3DGS
+    frequency_horizon: int = 60  # visits of a keyframe over which the frequency-modulated mask runs through its bands
 
 
 @dataclass(frozen=True)
@@ -98,14 +99,15 @@ def train_once(
     if tiles is not None:  # equal to the render where nothing was rendered: no loss, no gradient
         masked = torch.where(pixels_of_tiles(tiles, view.size(level))[..., None], masked, render.color.detach())
         log.skip("tiles_low_error", int((~tiles).sum()))
-    loss = training_loss(render.color, masked, LossConfig(ssim=training.ssim))
+    frequency = frequency_of(view.visits, training.frequency_horizon)
+    loss = ges_loss(render.color, masked, frequency, training.loss, training.threads)
     view.visits += 1
     value = float(loss.detach())
     if not value < float("inf"):
         optimizer.clear_gradients(state)
         log.refuse("iterations", 1, "an iteration whose loss was not finite was refused")
         return
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward()
     if render.screen.grad is not None:
         gradient = render.screen.grad.norm(dim=1)
         state.accumulate_screen(torch.where(torch.isfinite(gradient), gradient, 0.0), render.visible)
