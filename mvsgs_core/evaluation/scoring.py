@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 
@@ -122,13 +123,12 @@ def colorize(values: np.ndarray) -> np.ndarray:
 
 
 def colorize_depth(depth: np.ndarray) -> np.ndarray:
-    """(H, W) depth, 0 unknown, to (H, W, 3) uint8: near bright, far dark (by inverse depth), unknown blue."""
+    """(H, W) depth, 0 unknown, to (H, W, 3) uint8 by inverse depth: near red, far blue, unknown dark gray."""
     known = np.isfinite(depth) & (depth > 0)
-    picture = np.zeros((*depth.shape, 3), dtype=np.uint8)
-    picture[...] = (30, 30, 90)
+    inverse = np.zeros(depth.shape, np.float32)
+    inverse[known] = 1.0 / depth[known]
     if known.any():
-        inverse = 1.0 / depth[known]
-        low, high = np.percentile(inverse, [1, 99])
-        shade = np.clip((inverse - low) / max(high - low, 1e-12), 0, 1)
-        picture[known] = (colorize(shade[None] * 0.9 + 0.05)[0]).astype(np.uint8)
-    return picture
+        low, high = np.percentile(inverse[known], [1, 99])
+        inverse = np.clip((inverse - low) / max(high - low, 1e-12), 0, 1)
+    picture = cv2.applyColorMap((inverse * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    return np.where(known[..., None], picture, np.uint8(40))
