@@ -15,6 +15,7 @@ from launch.graph import Graph
 from launch.status import NodeStatus, total
 
 PLAIN_SECONDS = 5.0  # between two lines
+FOLLOWED = ("frames", "keyframes", "views", "splats", "iterations")
 
 
 class Screen:
@@ -54,21 +55,21 @@ class Screen:
 
 
 class PlainScreen(Screen):
-    """A line every few seconds, for logs and pipes."""
+    """A line every few seconds, with the nodes that have got further, for logs and pipes."""
 
     def start(self, graph: Graph, nodes: dict[str, NodeStatus], processes: dict[str, psutil.Process]) -> None:
         super().start(graph, nodes, processes)
         self._next = PLAIN_SECONDS
-        self._last = ""
+        self._told: set[str] = set()
 
     def refresh(self) -> None:
         super().refresh()
         if self._nodes and self.seconds >= self._next:
             self._next = self.seconds + PLAIN_SECONDS
-            line = "; ".join(filter(None, (brief(status) for status in self._nodes.values())))
-            if line != self._last:
-                self._last = line
-                self.note(f"{self.seconds:6.1f} s  {line}")
+            news = [text for status in self._nodes.values() if (text := brief(status)) not in self._told]
+            self._told.update(news)
+            if any(news):
+                self.note(f"{self.seconds:6.1f} s  {'; '.join(filter(None, news))}")
 
 
 class LiveScreen(Screen):
@@ -133,15 +134,16 @@ def make_screen(kind: str, console: Console | None = None) -> Screen:
 
 
 def progress(status: NodeStatus) -> str:
-    """What the node counts and its latest values, `frames_expected` shown as frames 12/160."""
-    shown = dict(status.counts)
-    values = dict(status.values)
-    expected = values.pop("frames_expected", None)
+    """What a user follows, as the node counts it (`frames_expected` makes frames 12/160); else its first two counts."""
+    known = {
+        name: value for name, value in {**status.counts, **status.values}.items() if isinstance(value, int | float)
+    }
+    expected = known.get("frames_expected")
+    names = [name for name in FOLLOWED if name in known] or list(status.counts)[:2]
     parts = []
-    for name, value in shown.items():
+    for name in names:
         whole = f"/{number(expected)}" if name == "frames" and expected is not None else ""
-        parts.append(f"{number(value)}{whole} {label(name)}")
-    parts += [f"{label(name)} {number(value)}" for name, value in values.items() if isinstance(value, int | float)]
+        parts.append(f"{number(known[name])}{whole} {label(name)}")
     return ", ".join(parts)
 
 
