@@ -11,7 +11,7 @@ import math
 import struct
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ MAX_TEXT = 64 * 2**10  # bytes of one string
 
 _PREFIX = struct.Struct("<c3sBBHI")  # delivery, magic, version, length of the name, zero, length of the header
 _MAGIC = b"MVS"
+_HEADER_KEYS = {"sequence", "scalars", "arrays"}
 _IMAGE_SIZES = frozenset("HWhw")  # named sizes that may not be 0
 
 
@@ -49,6 +50,7 @@ class Decoded(NamedTuple):
 class ArraySpec:
     """What an annotation such as `Annotated[np.ndarray, "float32 h w 3"] | None` asks for."""
 
+    name: str  # of the dtype
     dtype: np.dtype  # little-endian
     dims: tuple[int | str, ...]  # a size, or the name of one
     optional: bool
@@ -57,10 +59,19 @@ class ArraySpec:
 FieldSpec = ArraySpec | type  # `type`: int, float, str, bool or Mapping
 
 
+def _allocate(size: int) -> np.ndarray:
+    return np.empty(size, np.uint8)
+
+
 def encode(
-    message: msgs.Message, sequence: int = 0, *, delivery: bytes = RELIABLE, max_bytes: int = MAX_MESSAGE_BYTES
+    message: msgs.Message,
+    sequence: int = 0,
+    *,
+    delivery: bytes = RELIABLE,
+    max_bytes: int = MAX_MESSAGE_BYTES,
+    allocate: Callable[[int], np.ndarray] = _allocate,
 ) -> memoryview:
-    """The message as one frame.
+    """The message as one frame, in memory of which `allocate(n)` gives at least n bytes (uint8, contiguous).
 
     Raises CodecError where a field differs from its annotation or the frame would be larger than `max_bytes`.
     """
@@ -70,8 +81,9 @@ def encode(
         raise CodecError(f"{type(message).__qualname__} is no message; the types are {', '.join(_SPECS)}")
     scalars: dict[str, Any] = {}
     arrays: dict[str, list[Any]] = {}
+    values: list[tuple[np.ndarray, int]] = []  # with their offsets
     sizes: dict[str, int] = {}
-    values: list[tuple[np.ndarray, list[Any]]] = []
+    end = 0  # of the array section
     for field, spec in specs.items():
         value = getattr(message, field)
         where = f"{name}.{field}"
@@ -82,32 +94,41 @@ def encode(
         else:
             if not isinstance(value, np.ndarray):
                 raise CodecError(f"{where} is a {type(value).__name__}, not an array")
-            _check_array(spec, str(value.dtype), value.shape, sizes, where)
-            arrays[field] = [spec.dtype.name, list(value.shape), 0]
-            values.append((value, arrays[field]))
-    header, total = _lay_out(name, sequence, scalars, arrays, values)
-    if total > max_bytes:
-        raise CodecError(f"{name} takes {total} bytes, more than the {max_bytes} that a message may have")
-    buffer = np.empty(total, np.uint8)
+            if value.dtype != spec.dtype:
+                raise CodecError(f"{where} must be {spec.name}, not {value.dtype}")
+            _check_shape(spec, value.shape, sizes, where)
+            offset = _aligned(end)
+            end = offset + value.nbytes
+            arrays[field] = [spec.name, value.shape, offset]
+            values.append((value, offset))
+    try:
+        header = msgpack.packb({"sequence": sequence, "scalars": scalars, "arrays": arrays})
+    except (ValueError, OverflowError, TypeError) as error:
+        raise CodecError(f"{name}: {error}") from error
+    limit = _header_limit(name)
+    header_at = _PREFIX.size + len(name)
+    header_end = header_at + len(header)
+    section = _aligned(header_end)
+    total = section + end if arrays else header_end
+    if len(header) > limit or total > max_bytes:
+        raise CodecError(
+            f"{name} takes {total} bytes with a header of {len(header)}; a message may have {max_bytes} and {limit}"
+        )
+    buffer = allocate(total)[:total]
     frame = memoryview(buffer)  # type: ignore[arg-type]
-    start = _PREFIX.size + len(name)
     _PREFIX.pack_into(frame, 0, delivery, _MAGIC, VERSION, len(name), 0, len(header))
-    buffer[_PREFIX.size : start] = np.frombuffer(name.encode(), np.uint8)
-    buffer[start : start + len(header)] = np.frombuffer(header, np.uint8)
-    end = start + len(header)
-    for value, entry in values:
-        offset = entry[2]
-        buffer[end:offset] = 0  # no stray memory on the wire
-        end = offset + value.nbytes
-        target = np.frombuffer(buffer, value.dtype.newbyteorder("<"), value.size, offset) if value.size else None
-        if target is not None:
-            np.copyto(target.reshape(value.shape), value)
+    frame[_PREFIX.size : header_at] = name.encode()
+    frame[header_at:header_end] = header
+    end = header_end
+    for value, offset in values:
+        start = section + offset
+        buffer[end:start] = 0  # no stray memory on the wire
+        end = start + value.nbytes
+        buffer[start:end].view(value.dtype).reshape(value.shape)[...] = value
     return frame
 
 
-def decode(
-    frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int = MAX_MESSAGE_BYTES, copy: bool = False
-) -> Decoded:
+def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int = MAX_MESSAGE_BYTES) -> Decoded:
     """The message of a frame (any bytes-like object). Its arrays are read-only views that keep the frame alive.
 
     `expect` restricts the types that are accepted. Raises CodecError for everything that `encode` would not write.
@@ -115,22 +136,20 @@ def decode(
     view = memoryview(frame)
     if view.nbytes > max_bytes:
         raise CodecError(f"a frame of {view.nbytes} bytes, more than the {max_bytes} that a message may have")
-    if not view.contiguous:
-        raise CodecError("the frame's bytes are not contiguous")
-    view = view.cast("B") if view.nbytes else view
     name, header = _split(view)
-    allowed = tuple(msgs.TYPES.values()) if expect is None else expect
-    if name not in _SPECS or msgs.TYPES[name] not in allowed:
+    allowed = _TYPES if expect is None else expect
+    message_type = msgs.TYPES.get(name)
+    if message_type not in allowed:
         raise CodecError(f"a frame of type {name!r} where {' or '.join(t.__name__ for t in allowed)} is expected")
     sequence, scalars, arrays = _unpack_header(header, name)
     specs = _SPECS[name]
-    given = [*scalars, *arrays]
-    if len(set(given)) != len(given) or set(given) != set(specs):
-        raise CodecError(f"{name} has the fields {', '.join(specs)}; this frame has {', '.join(given) or 'none'}")
+    if len(scalars) + len(arrays) != len(specs) or (scalars.keys() | arrays.keys()) != specs.keys():
+        given = ", ".join(map(str, (*scalars, *arrays)))
+        raise CodecError(f"{name} has the fields {', '.join(specs)}; this frame has {given or 'none'}")
     built: dict[str, Any] = {}
     sizes: dict[str, int] = {}
-    end = _aligned(_PREFIX.size + len(name) + len(header)) if arrays else _PREFIX.size + len(name) + len(header)
-    first = end
+    end = _PREFIX.size + len(name) + len(header)
+    section = view[_aligned(end) :]
     for field, spec in specs.items():
         where = f"{name}.{field}"
         if not isinstance(spec, ArraySpec):
@@ -142,16 +161,16 @@ def decode(
                 raise CodecError(f"{where} must be an array" + (" or nil" if spec.optional else ""))
             built[field] = None
         else:
-            built[field], stop = _array(view, arrays[field], spec, sizes, first, where, copy)
-            end = max(end, stop)
+            built[field], stop = _array(section, arrays[field], spec, sizes, where)
+            end = max(end, view.nbytes - section.nbytes + stop)
     if view.nbytes != end:
         raise CodecError(f"the frame of a {name} has {view.nbytes} bytes, its content ends at {end}")
-    return Decoded(msgs.TYPES[name](**built), sequence)
+    return Decoded(message_type(**built), sequence)
 
 
 def type_name(frame: Any) -> str:
     """The message type that a frame says it is, without decoding the rest. Raises CodecError."""
-    return _split(memoryview(frame).cast("B"))[0]
+    return _split(memoryview(frame))[0]
 
 
 def array_specs(message_type: type) -> dict[str, FieldSpec]:
@@ -163,37 +182,14 @@ def _aligned(offset: int) -> int:
     return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
-def _lay_out(
-    name: str,
-    sequence: int,
-    scalars: dict[str, Any],
-    arrays: dict[str, list[Any]],
-    values: list[tuple[np.ndarray, list[Any]]],
-) -> tuple[bytes, int]:
-    """Header and length of the frame; enters the offsets into `arrays`.
-
-    The header's length depends on the offsets that it holds: they are laid out behind a header of the largest size
-    that it can have, 8 bytes more for each offset than with the zeros.
-    """
-    start = _PREFIX.size + len(name)
-    content = {"sequence": sequence, "scalars": scalars, "arrays": arrays}
-    try:
-        longest = len(msgpack.packb(content)) + 8 * len(arrays)
-        end = _aligned(start + longest) if arrays else start + longest
-        for value, entry in values:
-            entry[2] = _aligned(end)
-            end = entry[2] + value.nbytes
-        header = msgpack.packb(content)
-    except (ValueError, OverflowError, TypeError) as error:
-        raise CodecError(f"{name}: {error}") from error
-    limit = MAX_END_HEADER_BYTES if name == "End" else MAX_HEADER_BYTES
-    if len(header) > limit:
-        raise CodecError(f"{name}: a header of {len(header)} bytes, more than {limit}")
-    return header, (end if arrays else start + len(header))
+def _header_limit(name: str) -> int:
+    return MAX_END_HEADER_BYTES if name == "End" else MAX_HEADER_BYTES
 
 
 def _split(view: memoryview) -> tuple[str, memoryview]:
     """Type name and header of a frame."""
+    if view.ndim != 1 or view.format != "B" or not view.contiguous:
+        raise CodecError("a frame must be contiguous bytes")
     if view.nbytes < _PREFIX.size:
         raise CodecError(f"a frame of {view.nbytes} bytes is too short")
     delivery, magic, version, name_length, zero, header_length = _PREFIX.unpack_from(view)
@@ -206,9 +202,8 @@ def _split(view: memoryview) -> tuple[str, memoryview]:
         name = bytes(view[_PREFIX.size : start]).decode("ascii")
     except UnicodeDecodeError:
         raise CodecError("the type name is not ASCII") from None
-    limit = MAX_END_HEADER_BYTES if name == "End" else MAX_HEADER_BYTES
-    if header_length > limit:
-        raise CodecError(f"a header of {header_length} bytes, more than {limit}")
+    if header_length > _header_limit(name):
+        raise CodecError(f"a header of {header_length} bytes, more than {_header_limit(name)}")
     if start + header_length > view.nbytes:
         raise CodecError(
             f"a frame of {view.nbytes} bytes is cut off in its header, which ends at {start + header_length}"
@@ -230,7 +225,7 @@ def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], 
         )
     except (ValueError, TypeError, msgpack.UnpackException) as error:
         raise CodecError(f"{name}: the header is no valid msgpack: {error or type(error).__name__}") from error
-    if not isinstance(content, dict) or set(content) != {"sequence", "scalars", "arrays"}:
+    if not isinstance(content, dict) or content.keys() != _HEADER_KEYS:
         raise CodecError(f"{name}: the header must be a map of sequence, scalars and arrays")
     sequence, scalars, arrays = content["sequence"], content["scalars"], content["arrays"]
     if type(sequence) is not int or not 0 <= sequence < 2**63:
@@ -241,43 +236,44 @@ def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], 
 
 
 def _array(
-    view: memoryview, entry: Any, spec: ArraySpec, sizes: dict[str, int], first: int, where: str, copy: bool
+    section: memoryview, entry: Any, spec: ArraySpec, sizes: dict[str, int], where: str
 ) -> tuple[np.ndarray, int]:
-    """The array and where its bytes end."""
+    """The array and where its bytes end in the array section."""
     if not isinstance(entry, list) or len(entry) != 3 or not isinstance(entry[1], list):
         raise CodecError(f"{where} must be given as [dtype, shape, offset]")
     dtype, shape, offset = entry
-    if any(type(n) is not int or n < 0 for n in (*shape, offset)):
-        raise CodecError(f"{where}: shape {shape} and offset {offset} must be integers from 0")
-    _check_array(spec, dtype, tuple(shape), sizes, where)
+    if dtype != spec.name:
+        raise CodecError(f"{where} must be {spec.name}, not {dtype}")
+    for number in (*shape, offset):
+        if type(number) is not int or number < 0:
+            raise CodecError(f"{where}: shape {shape} and offset {offset} must be integers from 0")
+    _check_shape(spec, shape, sizes, where)
     stop = offset + math.prod(shape) * spec.dtype.itemsize
-    if offset % ALIGNMENT or offset < first or stop > view.nbytes:
+    if offset % ALIGNMENT or stop > section.nbytes:
         raise CodecError(
-            f"{where}: bytes {offset} to {stop} are not inside the frame's {first} to {view.nbytes}, "
+            f"{where}: bytes {offset} to {stop} are not inside the {section.nbytes} bytes of arrays, "
             f"at a multiple of {ALIGNMENT}"
         )
-    array = np.frombuffer(view[offset:stop], spec.dtype).reshape(shape)
+    array = np.frombuffer(section[offset:stop], spec.dtype).reshape(shape)
     if spec.dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
         raise CodecError(f"{where}: a bool is 0 or 1")
-    if copy or not array.flags.aligned:  # a small frame may lie anywhere in memory
-        array = array.copy()
     if where.endswith(".timestamp") and not np.isfinite(array).all():
         raise CodecError(f"{where} is not finite")
+    if not array.flags.aligned:  # a small frame may lie anywhere in memory
+        array = array.copy()
     array.flags.writeable = False
     return array, stop
 
 
-def _check_array(spec: ArraySpec, dtype: Any, shape: tuple[int, ...], sizes: dict[str, int], where: str) -> None:
-    if dtype != spec.dtype.name:
-        raise CodecError(f"{where} must be {spec.dtype.name}, not {dtype}")
+def _check_shape(spec: ArraySpec, shape: Sequence[int], sizes: dict[str, int], where: str) -> None:
     if len(shape) != len(spec.dims):
-        raise CodecError(f"{where} must have the shape ({' '.join(map(str, spec.dims))}), not {shape}")
-    for size, dim in zip(shape, spec.dims, strict=True):
-        expected = dim if isinstance(dim, int) else sizes.setdefault(dim, size)
+        raise CodecError(f"{where} must have the shape ({' '.join(map(str, spec.dims))}), not {tuple(shape)}")
+    for size, dim in zip(shape, spec.dims):
+        expected = dim if type(dim) is int else sizes.setdefault(dim, size)  # type: ignore[arg-type]
         if size != expected:
-            raise CodecError(f"{where} has the shape {shape}, but {dim} is {expected}")
-        if dim in _IMAGE_SIZES and size == 0:
-            raise CodecError(f"{where} is an empty image: shape {shape}")
+            raise CodecError(f"{where} has the shape {tuple(shape)}, but {dim} is {expected}")
+        if size == 0 and dim in _IMAGE_SIZES:
+            raise CodecError(f"{where} is an empty image: shape {tuple(shape)}")
 
 
 def _checked_scalar(value: Any, kind: Any, where: str) -> Any:
@@ -338,8 +334,9 @@ def _field_spec(hint: Any) -> FieldSpec:
     if typing.get_origin(hint) is typing.Annotated:
         dtype, *dims = hint.__metadata__[0].split()
         sizes = tuple(int(dim) if dim.isdigit() else dim for dim in dims)
-        return ArraySpec(np.dtype(dtype).newbyteorder("<"), sizes, optional)
+        return ArraySpec(dtype, np.dtype(dtype).newbyteorder("<"), sizes, optional)
     return typing.get_origin(hint) or hint
 
 
 _SPECS: dict[str, dict[str, FieldSpec]] = {name: _specs_of(t) for name, t in msgs.TYPES.items()}
+_TYPES = tuple(msgs.TYPES.values())

@@ -20,6 +20,7 @@ from collections import Counter, deque
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils.monitor import recv_monitor_message
@@ -27,6 +28,7 @@ from zmq.utils.monitor import recv_monitor_message
 from msgs import End, Message
 from msgs.codec import MAX_MESSAGE_BYTES, NEWEST, RELIABLE, CodecError, Decoded, decode, encode, type_name
 from nodes.addresses import Keys, TransportError, check_address, save_keys
+from nodes.frame_pool import FramePool
 
 PEER_GRACE = 0.5  # s between a disconnection and its report: whoever failed first should be heard first
 NEWEST_GOODBYE = 5.0  # s that a best-effort reader has to take its End
@@ -90,6 +92,10 @@ def _open(kind: int, address: str, keys: Keys | None, max_bytes: int) -> zmq.Soc
     return socket
 
 
+def _readable(socket: zmq.Socket[bytes]) -> bool:
+    return bool(int(socket.events) & zmq.POLLIN)
+
+
 class Publisher:
     """Sends one topic. Until `start`, messages go to whoever listens; after it, a lost reliable reader is an error.
 
@@ -111,6 +117,7 @@ class Publisher:
         self.readers: Counter[bytes] = Counter()  # by delivery
         self._max_bytes = max_bytes
         self._started = self._ended = False
+        self._pool = FramePool()
         self._keys = keys
         self._file = Path(address.removeprefix("ipc://")) if address.startswith("ipc") else None
         if keys is not None:
@@ -135,11 +142,8 @@ class Publisher:
 
     def watch(self) -> None:
         """Takes note of arrivals and departures. Raises PeerLost."""
-        while True:
-            try:
-                event = self.socket.recv(zmq.NOBLOCK)
-            except zmq.Again:
-                return
+        while _readable(self.socket):
+            event = self.socket.recv()
             delivery = RELIABLE if event[1:2] == RELIABLE else NEWEST
             if event[:1] == b"\x01":
                 self.readers[delivery] += 1
@@ -156,7 +160,6 @@ class Publisher:
             self._send(message, sequence, NEWEST)
         if self.readers[RELIABLE] > 0:
             self._send(message, sequence, RELIABLE)
-            self.watch()
 
     def end(self, message: End) -> None:
         self._ended = True
@@ -187,9 +190,16 @@ class Publisher:
             _guard.leave(self._keys)
 
     def _send(self, message: Message, sequence: int, delivery: bytes) -> None:
-        frame = encode(message, sequence, delivery=delivery, max_bytes=self._max_bytes)
+        buffers: list[np.ndarray] = []
+
+        def allocate(size: int) -> np.ndarray:
+            buffers.append(self._pool.take(size))
+            return buffers[0]
+
+        frame = encode(message, sequence, delivery=delivery, max_bytes=self._max_bytes, allocate=allocate)
         self.socket.setsockopt(zmq.XPUB_NODROP, int(delivery == RELIABLE))
-        self.socket.send(frame, copy=False)
+        tracker = self.socket.send(frame, copy=False, track=True)
+        self._pool.give(buffers[0], tracker)
 
 
 class _Reader:
@@ -226,7 +236,7 @@ class _Reader:
 
     def watch(self) -> None:
         """Takes note of a lost connection. Raises TransportError if the publisher refuses this reader's keys."""
-        while self.monitor.poll(0):
+        while _readable(self.monitor):
             event = recv_monitor_message(self.monitor)["event"]
             if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
                 raise TransportError(f"the publisher of {self.topic} refused the keys: both ends need the same file")
@@ -273,11 +283,8 @@ class ReliableReader(_Reader):
 
     def take(self) -> Message | None:
         """The next message, if one has arrived; after End nothing. Raises TransportError if one was lost."""
-        while len(self._frames) < self._buffer:
-            try:
-                self._frames.append(self._socket.recv(zmq.NOBLOCK, copy=False))
-            except zmq.Again:
-                break
+        while len(self._frames) < self._buffer and _readable(self._socket):
+            self._frames.append(self._socket.recv(copy=False))
         if not self._frames or self.ended:
             return None
         message, sequence = self._decode(self._frames.popleft())

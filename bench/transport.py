@@ -1,0 +1,219 @@
+"""Messages between two processes, beside plain pyzmq with multipart zero-copy: latency and throughput.
+
+Ours is what nodes use: one checked frame, publish/subscribe without loss, arrival and departure watched. Plain is the
+least that pyzmq needs for the same arrays: XPUB with NODROP, a msgpack header and one part an array, no copy on either
+side and no check. Both run at the same time in the same two processes, message by message in turns, so that whatever
+else the machine does meets both. Latency runs from before packing to after unpacking, at a rate that leaves no queue.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgpack
+import numpy as np
+import zmq
+
+from bench.table import Row, at_most, main
+from msgs import End, Frame, GroundTruth
+from nodes.transport import Publisher, ReliableReader, shut_down, wait
+
+T = TypeVar("T")
+Sample = Frame | GroundTruth
+BUFFER = 8  # messages, of both
+FRESH = 32  # images sent in turns: a source gives each once, so none waits in a cache
+GOAL = 1.5  # times plain pyzmq
+ROUNDS = 3  # of the throughput; the best counts: other work on the machine only ever slows
+
+
+def samples() -> dict[str, Callable[[int, float], Sample]]:
+    """Message of a kind with this index and time."""
+    rng = np.random.default_rng(0)
+    vga = rng.integers(0, 255, (FRESH, 480, 640, 3), np.uint8)
+    depth = rng.random((FRESH, 480, 640), np.float32)
+    large = rng.integers(0, 255, (FRESH, 1024, 1366, 3), np.uint8)
+    camera = np.array([500.0, 500.0, 320.0, 240.0])
+    return {
+        "VGA RGB (0.9 MB)": lambda i, t: Frame(i, t, vga[i % FRESH], camera),
+        "VGA RGB + depth (2.2 MB)": lambda i, t: GroundTruth(i, t, vga[i % FRESH], camera, None, depth[i % FRESH]),
+        "large RGB (4.2 MB)": lambda i, t: Frame(i, t, large[i % FRESH], camera),
+    }
+
+
+class OursOut:
+    def __init__(self, address: str) -> None:
+        self._publisher = Publisher(address, buffer=BUFFER)
+        while not self._publisher.ready(1):
+            self._publisher.socket.poll(100)
+        self._publisher.start()
+
+    def send(self, message: Sample) -> None:
+        self._publisher.send(message)
+
+    def close(self) -> None:
+        self._publisher.end(End())
+        while not self._publisher.gone():
+            self._publisher.socket.poll(100)
+        self._publisher.close()
+
+
+class OursIn:
+    def __init__(self, address: str, kind: type) -> None:
+        self._reader = ReliableReader(address, kind, buffer=BUFFER)
+
+    def receive(self) -> float:
+        """Waits for a message; its time."""
+        while (message := self._reader.take()) is None:
+            wait([self._reader.pollable, self._reader.monitor], 1.0)
+        return message.timestamp if isinstance(message, Sample) else 0.0
+
+    def close(self) -> None:
+        while not self._reader.ended:
+            self.receive()
+        self._reader.close()
+
+
+class PlainOut:
+    def __init__(self, address: str) -> None:
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XPUB)
+        self._socket.setsockopt(zmq.SNDHWM, BUFFER)
+        self._socket.setsockopt(zmq.XPUB_NODROP, 1)
+        self._socket.bind(address)
+        self._socket.recv()
+
+    def send(self, message: Sample) -> None:
+        arrays = {name: value for name, value in vars(message).items() if isinstance(value, np.ndarray)}
+        header = {name: value for name, value in vars(message).items() if name not in arrays}
+        header["arrays"] = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
+        parts: list[Any] = [msgpack.packb(header), *arrays.values()]
+        self._socket.send_multipart(parts, copy=False)
+
+    def close(self) -> None:
+        self._socket.recv()  # the reader's goodbye
+        self._socket.close(linger=0)
+
+
+class PlainIn:
+    def __init__(self, address: str, kind: type) -> None:
+        self._kind = kind
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        self._socket.setsockopt(zmq.RCVHWM, BUFFER)
+        self._socket.subscribe(b"")
+        self._socket.connect(address)
+
+    def receive(self) -> float:
+        header, *parts = self._socket.recv_multipart(copy=False)
+        values: dict[str, Any] = msgpack.unpackb(header.buffer)
+        for (name, dtype, shape), part in zip(values.pop("arrays"), parts, strict=True):
+            values[name] = np.frombuffer(part.buffer, dtype).reshape(shape)
+        return float(self._kind(**values).timestamp)
+
+    def close(self) -> None:
+        self._socket.unsubscribe(b"")
+        self._socket.close(linger=500)
+
+
+def in_turn(ways: Sequence[T], index: int) -> Iterable[T]:
+    """Ours first, then plain first: neither always follows the other."""
+    return ways if index % 2 == 0 else reversed(ways)
+
+
+def _read(addresses: tuple[str, str], kind: type, counts: tuple[int, int], results: Connection) -> None:
+    """The reading process: seconds of each message by way, then seconds for all messages by way."""
+    ways: tuple[OursIn | PlainIn, ...] = (OursIn(addresses[0], kind), PlainIn(addresses[1], kind))
+    latencies: tuple[list[float], list[float]] = ([], [])
+    for index in range(counts[0]):
+        for way, seconds in in_turn(list(zip(ways, latencies, strict=True)), index):
+            sent = way.receive()
+            seconds.append(time.monotonic() - sent)
+    results.send(latencies)
+    for _ in range(ROUNDS):
+        for way in ways:
+            results.recv()
+            results.send("ready")
+            way.receive()
+            start = time.monotonic()
+            for _ in range(counts[1] - 1):
+                way.receive()
+            results.send(time.monotonic() - start)
+    for way in ways:
+        way.close()
+    shut_down()
+
+
+def measure_pair(
+    addresses: tuple[str, str], sample: Callable[[int, float], Sample], counts: tuple[int, int]
+) -> tuple[list[np.ndarray], list[float]]:
+    """Latencies in s of ours and of plain, and the messages per second of both."""
+    context = multiprocessing.get_context("spawn")
+    ours_end, their_end = context.Pipe()
+    process = context.Process(target=_read, args=(addresses, type(sample(0, 0.0)), counts, their_end))
+    process.start()
+    ways: tuple[OursOut | PlainOut, ...] = (OursOut(addresses[0]), PlainOut(addresses[1]))
+    gap = 0.004 + sample(0, 0.0).image.nbytes * 2e-9  # s between messages: several times what one takes
+    for index in range(counts[0]):
+        for way in in_turn(ways, index):
+            time.sleep(gap)
+            way.send(sample(index, time.monotonic()))
+    latencies = [np.array(seconds) for seconds in ours_end.recv()]
+    rates = [0.0, 0.0]
+    for _ in range(ROUNDS):
+        for i, way in enumerate(ways):
+            ours_end.send("go")
+            ours_end.recv()
+            for index in range(counts[1]):
+                way.send(sample(index, time.monotonic()))
+            rates[i] = max(rates[i], (counts[1] - 1) / ours_end.recv())
+    for way in ways:
+        way.close()
+    process.join()
+    return latencies, rates
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    rows: list[Row] = []
+    counts = (60, 60) if options.quick else (500, 300)
+    for transport in ("ipc", "tcp"):
+        for name, sample in samples().items():
+            with tempfile.TemporaryDirectory(prefix="mvsgs-") as folder:
+                latencies, rates = measure_pair(_addresses(transport, Path(folder)), sample, counts)
+            megabytes = sum(v.nbytes for v in vars(sample(0, 0.0)).values() if isinstance(v, np.ndarray)) / 1e6
+            title = f"{transport}, {name}"
+            for label, quantile in (("median", 0.5), ("99th percentile", 0.99)):
+                ours, plain = (float(np.quantile(seconds, quantile)) for seconds in latencies)
+                rows += [
+                    Row(f"{title}: latency, {label}", ours * 1e3, "ms"),
+                    Row(f"{title}: latency, {label}, plain pyzmq", plain * 1e3, "ms"),
+                    at_most(f"{title}: latency, {label}, ratio", ours / plain, "x", GOAL),
+                ]
+            rows += [
+                Row(f"{title}: throughput", rates[0] * megabytes, "MB/s"),
+                Row(f"{title}: throughput, plain pyzmq", rates[1] * megabytes, "MB/s"),
+                at_most(f"{title}: throughput, plain / ours", rates[1] / rates[0], "x", GOAL),
+            ]
+    shut_down()
+    return rows
+
+
+def _addresses(transport: str, folder: Path) -> tuple[str, str]:
+    if transport == "ipc":
+        return f"ipc://{folder}/ours", f"ipc://{folder}/plain"
+    sockets = [socket.socket(), socket.socket()]
+    for each in sockets:
+        each.bind(("127.0.0.1", 0))
+    ports = [each.getsockname()[1] for each in sockets]
+    for each in sockets:
+        each.close()
+    return f"tcp://127.0.0.1:{ports[0]}", f"tcp://127.0.0.1:{ports[1]}"
+
+
+if __name__ == "__main__":
+    main(measure, "Transport: ours against plain pyzmq multipart zero-copy")
