@@ -44,7 +44,7 @@ class _Rasterize(torch.autograd.Function):
             radii=radii,
         )
         extra.update(passed=passed, radii=radii)
-        ctx.passed, ctx.threads = passed, view.threads
+        ctx.passed, ctx.view = passed, view
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*parameters, color, depth, opacity)
         return color, depth, opacity
@@ -66,7 +66,7 @@ class _Rasterize(torch.autograd.Function):
             color_gradient=torch.zeros_like(color) if on_color is None else on_color,
             depth_gradient=on_depth,
             opacity_gradient=on_opacity,
-            threads=ctx.threads,
+            threads=ctx.view.threads,
             on_means=results[0],
             on_log_scales=results[1],
             on_quaternions=results[2],
@@ -76,7 +76,8 @@ class _Rasterize(torch.autograd.Function):
             on_screen=on_screen,
             on_pose=on_pose,
         )
-        return (*results, on_screen, on_pose, None, None)
+        *shared, on_betas = results
+        return (*shared, on_betas if ctx.view.density == "exact" else None, on_screen, on_pose, None, None)
 
 
 def render(splats: Splats, view: View) -> Render:

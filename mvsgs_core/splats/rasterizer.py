@@ -36,6 +36,7 @@ MIN_TRANSMITTANCE = 1e-4
 CLAMP_MARGIN = 0.3  # of tan(fov): how far beyond the image the Jacobian follows x/z and y/z
 MIN_COMPENSATION = 0.005  # floor of the antialiased opacity factor
 MAX_VARIANCE = 1e16  # px^2
+MAX_REACH = 1e12  # of m, where an exact density of a small exponent ends at the latest
 MIN_QUATERNION = 1e-8
 TILE = 16  # pixels
 

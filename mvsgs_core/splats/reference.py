@@ -5,6 +5,8 @@ Slow and obvious: it says what the fast back ends must compute.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -50,95 +52,129 @@ def axes_on_image(splats: Splats, points: Tensor, view: View) -> Tensor:
     return jacobian @ cam_from_world @ axes
 
 
-def render(splats: Splats, view: View) -> Render:
-    """See `rasterizer.rasterize`."""
-    dtype, count = splats.means.dtype, len(splats)
-    height, width = view.size
+@dataclass
+class Projected:
+    """Splats on the image."""
+
+    centers: Tensor  # (N, 2) px
+    depths: Tensor  # (N,)
+    xx: Tensor  # (N,) covariance with blur, px^2
+    xy: Tensor
+    yy: Tensor
+    determinant: Tensor  # (N,)
+    opacity: Tensor  # (N,)
+    colors: Tensor  # (N, 3)
+    betas: Tensor  # (N,)
+
+
+def project(splats: Splats, screen: Tensor, view: View) -> Projected:
+    """EWA projection of usable splats in front of the camera; `screen` (N, 2) moves them, unit half the image."""
     fx, fy, cx, cy = view.intrinsics
-    screen = torch.zeros(count, 2, dtype=dtype, requires_grad=torch.is_grad_enabled())
-
-    with torch.no_grad():
-        keep = usable(splats)
-        refused = count - int(keep.sum())
-        z = ((splats.means.double() - view.pose[:3, 3]) @ view.pose[:3, 2]).nan_to_num(0.0)
-        kept = torch.nonzero(keep & (z > view.near))[:, 0]
-
-    def pick(tensor: Tensor) -> Tensor:
-        return tensor.index_select(0, kept)
-
-    chosen = Splats(*(pick(tensor) for tensor in splats.tensors().values()))
-    from_camera = chosen.means.double() - view.pose[:3, 3]
+    height, width = view.size
+    dtype = splats.means.dtype
+    from_camera = splats.means.double() - view.pose[:3, 3]
     points = (from_camera @ view.pose[:3, :3]).to(dtype)
     depths = points[:, 2]
     centers = torch.stack([fx * points[:, 0] / depths + cx, fy * points[:, 1] / depths + cy], dim=-1)
-    centers = centers + pick(screen) * torch.tensor([0.5 * width, 0.5 * height], dtype=dtype)
+    centers = centers + screen * torch.tensor([0.5 * width, 0.5 * height], dtype=dtype)
 
-    row_x, row_y = axes_on_image(chosen, points, view).unbind(1)
+    row_x, row_y = axes_on_image(splats, points, view).unbind(1)
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     # the determinant as a sum of squares (Lagrange's identity): no cancellation for needles
     sharp = torch.linalg.cross(row_x, row_y).square().sum(-1)
     determinant = sharp + rasterizer.BLUR * (xx + yy) + rasterizer.BLUR**2
-    xx, yy = xx + rasterizer.BLUR, yy + rasterizer.BLUR
 
-    opacity = torch.sigmoid(chosen.opacity_logits)
+    opacity = torch.sigmoid(splats.opacity_logits)
     if view.antialiased:
         opacity = opacity * (sharp / determinant).clamp(min=rasterizer.MIN_COMPENSATION**2).sqrt()
     directions = from_camera / from_camera.norm(dim=-1, keepdim=True)
-    colors = spherical_harmonics.colors(chosen.sh, directions.to(dtype), view.degree)
-
-    with torch.no_grad():
-        reach = densities.extent(opacity, chosen.betas, view.density).clamp(max=1e12)
-        sane = torch.isfinite(determinant) & (xx < rasterizer.MAX_VARIANCE) & (yy < rasterizer.MAX_VARIANCE)
-        half_x, half_y = (reach * xx).sqrt(), (reach * yy).sqrt()
-        on_image = (centers[:, 0] + half_x >= 0) & (centers[:, 0] - half_x <= width - 1)
-        on_image &= (centers[:, 1] + half_y >= 0) & (centers[:, 1] - half_y <= height - 1)
-        seen = sane & on_image & (opacity >= densities.MIN_ALPHA)
-        refused += int((~sane).sum())
-        order = torch.nonzero(seen)[:, 0]
-        order = order[torch.argsort(pick(z)[order].float(), stable=True)]
-        radii = torch.zeros(count, dtype=dtype)
-        radii[kept[order]] = torch.maximum(half_x, half_y)[order]
-        weight_sum, weight_max = torch.zeros(count, dtype=dtype), torch.zeros(count, dtype=dtype)
-
-    centers, xx, xy, yy, determinant, opacity, betas, depths, colors = (
-        tensor[order] for tensor in (centers, xx, xy, yy, determinant, opacity, chosen.betas, depths, colors)
+    colors = spherical_harmonics.colors(splats.sh, directions.to(dtype), view.degree)
+    return Projected(
+        centers, depths, xx + rasterizer.BLUR, xy, yy + rasterizer.BLUR, determinant, opacity, colors, splats.betas
     )
-    rows_at_once = max(1, PAIRS_AT_ONCE // max(1, width * len(order)))
-    color_rows, depth_rows, opacity_rows = [], [], []
+
+
+@dataclass
+class Choice:
+    """Which splats a view shows."""
+
+    order: Tensor  # (V,) indices, front to back
+    radii: Tensor  # (V,) px
+    refused: int
+
+
+@torch.no_grad()
+def choose(splats: Splats, view: View) -> Choice:
+    """Leaves out what is not usable, behind the near plane, degenerate on the image, too faint or off the image."""
+    height, width = view.size
+    keep = usable(splats)
+    z = ((splats.means.double() - view.pose[:3, 3]) @ view.pose[:3, 2]).nan_to_num(0.0)
+    kept = torch.nonzero(keep & (z > view.near))[:, 0]
+    chosen = Splats(*(tensor[kept] for tensor in splats.tensors().values()))
+    p = project(chosen, torch.zeros_like(chosen.means[:, :2]), view)
+    sane = torch.isfinite(p.determinant) & (p.xx < rasterizer.MAX_VARIANCE) & (p.yy < rasterizer.MAX_VARIANCE)
+    reach = densities.extent(p.opacity, p.betas, view.density).clamp(max=rasterizer.MAX_REACH)
+    half_x, half_y = (reach * p.xx).sqrt(), (reach * p.yy).sqrt()
+    on_image = (p.centers[:, 0] + half_x >= 0) & (p.centers[:, 0] - half_x <= width - 1)
+    on_image &= (p.centers[:, 1] + half_y >= 0) & (p.centers[:, 1] - half_y <= height - 1)
+    seen = torch.nonzero(sane & on_image & (p.opacity >= densities.MIN_ALPHA))[:, 0]
+    seen = seen[torch.argsort(z[kept][seen].float(), stable=True)]
+    refused = int((~keep).sum()) + int((~sane).sum())
+    return Choice(kept[seen], torch.maximum(half_x, half_y)[seen], refused)
+
+
+def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, view: View) -> Tensor:
+    """(P, V) of pixels (P,) by splats (V,); 0 below 1/255 and in tiles left out."""
+    dx, dy = pixel_x[:, None] - p.centers[:, 0], pixel_y[:, None] - p.centers[:, 1]
+    m = p.yy / p.determinant * (dx - p.xy / p.yy * dy) ** 2 + dy * dy / p.yy
+    alpha = (p.opacity * densities.falloff(m, p.betas, view.density)).clamp(max=rasterizer.MAX_ALPHA)
+    counted = alpha >= densities.MIN_ALPHA
+    if view.tile_mask is not None:
+        counted = counted & view.tile_mask[pixel_y // rasterizer.TILE, pixel_x // rasterizer.TILE][:, None]
+    return torch.where(counted, alpha, 0.0)
+
+
+def render(splats: Splats, view: View) -> Render:
+    """See `rasterizer.rasterize`."""
+    dtype, count = splats.means.dtype, len(splats)
+    height, width = view.size
+    screen = torch.zeros(count, 2, dtype=dtype, requires_grad=torch.is_grad_enabled())
+    choice = choose(splats, view)
+    shown = Splats(*(tensor.index_select(0, choice.order) for tensor in splats.tensors().values()))
+    p = project(shown, screen.index_select(0, choice.order), view)
+    background = torch.tensor(view.background, dtype=dtype)
+    weight_sum, weight_max = torch.zeros(count, dtype=dtype), torch.zeros(count, dtype=dtype)
+
+    rows_at_once = max(1, PAIRS_AT_ONCE // max(1, width * len(choice.order)))
+    color, depth, opacity = [], [], []
     for first in range(0, height, rows_at_once):
-        pixel_rows = torch.arange(first, min(first + rows_at_once, height))
-        grid_y, grid_x = torch.meshgrid(pixel_rows, torch.arange(width), indexing="ij")
-        dx = grid_x.reshape(-1, 1) - centers[:, 0]
-        dy = grid_y.reshape(-1, 1) - centers[:, 1]
-        m = yy / determinant * (dx - xy / yy * dy) ** 2 + dy * dy / yy
-        alpha = (opacity * densities.falloff(m, betas, view.density)).clamp(max=rasterizer.MAX_ALPHA)
-        counted = alpha >= densities.MIN_ALPHA
-        if view.tile_mask is not None:
-            tile = rasterizer.TILE
-            counted = counted & view.tile_mask[grid_y // tile, grid_x // tile].reshape(-1, 1)
-        alpha = torch.where(counted, alpha, 0.0)
-        before = torch.cat([torch.ones_like(alpha[:, :1]), torch.cumprod(1.0 - alpha, dim=1)[:, :-1]], dim=1)
-        alpha = alpha * (before >= rasterizer.MIN_TRANSMITTANCE)[:, : alpha.shape[1]]
-        weights = alpha * before[:, : alpha.shape[1]]
-        covered = weights.sum(dim=1)
+        rows = torch.arange(first, min(first + rows_at_once, height))
+        pixel_y, pixel_x = (grid.reshape(-1) for grid in torch.meshgrid(rows, torch.arange(width), indexing="ij"))
+        alpha = alphas(p, pixel_x, pixel_y, view)
+        before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1.0 - alpha], dim=1), dim=1)[:, :-1]
+        before = before[:, : alpha.shape[1]]
+        alpha = alpha * (before >= rasterizer.MIN_TRANSMITTANCE)
+        weights = alpha * before
         transmittance = torch.prod(1.0 - alpha, dim=1)
-        background = torch.tensor(view.background, dtype=dtype)
-        color_rows.append(weights @ colors + transmittance[:, None] * background)
-        seen_depth = torch.where(covered > 0, weights @ depths, 0.0)
-        depth_rows.append(seen_depth / torch.where(covered > 0, covered, 1.0))
-        opacity_rows.append(1.0 - transmittance)
+        covered = weights.sum(dim=1)
+        color.append(weights @ p.colors + transmittance[:, None] * background)
+        depth.append(torch.where(covered > 0, weights @ p.depths, 0.0) / torch.where(covered > 0, covered, 1.0))
+        opacity.append(1.0 - transmittance)
         with torch.no_grad():
-            weight_sum[kept[order]] += weights.sum(dim=0)
-            if len(order):
-                weight_max[kept[order]] = torch.maximum(weight_max[kept[order]], weights.amax(dim=0))
+            weight_sum[choice.order] += weights.sum(dim=0)
+            if len(choice.order):
+                weight_max[choice.order] = torch.maximum(weight_max[choice.order], weights.amax(dim=0))
+
+    radii = torch.zeros(count, dtype=dtype)
+    radii[choice.order] = choice.radii
     return Render(
-        color=torch.cat(color_rows).reshape(height, width, 3),
-        depth=torch.cat(depth_rows).reshape(height, width),
-        opacity=torch.cat(opacity_rows).reshape(height, width),
+        color=torch.cat(color).reshape(height, width, 3),
+        depth=torch.cat(depth).reshape(height, width),
+        opacity=torch.cat(opacity).reshape(height, width),
         visible=radii > 0,
         radii=radii,
         screen=screen,
         weight_sum=weight_sum if view.weights else None,
         weight_max=weight_max if view.weights else None,
-        refused=refused,
+        refused=choice.refused,
     )

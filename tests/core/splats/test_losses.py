@@ -1,0 +1,105 @@
+"""The frequency-modulated loss against reference numbers of the released code, and its rules."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mvsgs_core.splats import densities, losses
+from tests.shared_data import shared
+
+
+@pytest.fixture(scope="module")
+def golden() -> dict[str, np.ndarray]:
+    with np.load(shared("golden/ges") / "loss.npz") as arrays:
+        return {name: arrays[name] for name in arrays}
+
+
+def as_image(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(array.transpose(1, 2, 0).copy())
+
+
+def test_mask_and_loss_have_the_released_codes_values(golden: dict[str, np.ndarray]) -> None:
+    image, target = as_image(golden["image"]), as_image(golden["gt"])
+    last = len(golden["freq"]) - 1
+    for i, frequency in enumerate(golden["freq"]):
+        ends = i in (0, last)  # there rounding errors are blown up to the mask
+        response = losses.edge_response(image, float(frequency)).numpy()
+        wanted = golden["mask_before_threshold"][i]
+        assert np.abs(response - wanted).max() <= (0.03 if ends else 1e-5)
+        sure = np.abs(wanted - 0.5) > (0.03 if ends else 1e-4)
+        mask = losses.frequency_mask(image, float(frequency)).numpy()
+        assert (mask[sure] == golden["mask"][i].astype(bool)[sure]).all()
+        loss = losses.ges_loss(image, target, float(frequency)).item()
+        assert loss == pytest.approx(golden["loss"][i], abs=1e-3 if ends else 1e-5)
+
+
+@pytest.mark.parametrize("frequency", [5, 75])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradient_has_the_released_codes_values(
+    golden: dict[str, np.ndarray], frequency: int, dtype: torch.dtype
+) -> None:
+    image = as_image(golden["image"]).to(dtype).requires_grad_()
+    losses.ges_loss(image, as_image(golden["gt"]), float(frequency)).backward()  # type: ignore[no-untyped-call]
+    assert image.grad is not None
+    wanted = golden[f"dloss_dimage_f{frequency}"].transpose(1, 2, 0)
+    assert np.abs(image.grad.numpy() - wanted).max() <= 1e-4 * np.abs(wanted).max()
+
+
+def test_scale_factor_has_the_released_codes_values() -> None:
+    with np.load(shared("golden/ges") / "phi.npz") as arrays:
+        b = torch.from_numpy(arrays["b"]).double().requires_grad_()
+        phi = densities.scale_factor(b)
+        phi.sum().backward()
+        np.testing.assert_allclose(phi.detach().numpy(), arrays["phi"], rtol=1e-5, atol=1e-6)
+        assert b.grad is not None
+        np.testing.assert_allclose(b.grad.numpy(), arrays["dphi_db"], atol=1e-6)
+        used = torch.exp(-3.0 + densities.log_scale_shift(b.detach()))
+        np.testing.assert_allclose(used.numpy(), arrays["scale_used_for_log_scale_minus3"], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("frequency", [0.0, 30.0, 50.0, 100.0])
+def test_image_without_edges_stays_finite(frequency: float) -> None:
+    flat = torch.full((20, 30, 3), 0.4).requires_grad_()
+    loss = losses.ges_loss(flat, torch.zeros(20, 30, 3), frequency)
+    loss.backward()  # type: ignore[no-untyped-call]
+    assert bool(torch.isfinite(loss))
+    assert flat.grad is not None
+    assert bool(torch.isfinite(flat.grad).all())
+
+
+def test_image_smaller_than_the_lowered_grid() -> None:
+    assert losses.edge_response(torch.rand(3, 2, 3), 20.0).shape == (3, 2)
+
+
+def test_edges_are_left_to_the_second_half() -> None:
+    image = torch.zeros(100, 100, 3)
+    image[:, 50:] = 1.0
+    early, late = losses.frequency_mask(image, 45.0), losses.frequency_mask(image, 55.0)
+    assert not torch.equal(early, late)
+    assert bool((early != late).float().mean() > 0.9)
+
+
+def test_frequency_of_an_online_view() -> None:
+    assert losses.frequency_of(0, 1000) == 0.0
+    assert losses.frequency_of(250, 1000) == 25.0
+    assert losses.frequency_of(5000, 1000) == 100.0
+    with pytest.raises(ValueError, match="frequency 101"):
+        losses.edge_response(torch.rand(10, 10, 3), 101.0)
+
+
+def test_without_the_mask_it_is_l1_and_ssim() -> None:
+    image, target = torch.rand(24, 32, 3), torch.rand(24, 32, 3)
+    plain = losses.ges_loss(image, target, 10.0, losses.LossConfig(l1=0.8, ssim=0.0, frequency=0.0))
+    assert plain.item() == pytest.approx(0.8 * (image - target).abs().mean().item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("beta", [0.5, 1.0, 2.0, 3.0, 4.0])
+def test_std_ratio_by_integration(beta: float) -> None:
+    """Second moment of the exact form in the plane over that of the Gaussian, by quadrature."""
+    r = np.linspace(1e-6, 80.0 ** (1.0 / beta), 1_000_000)
+    density = np.exp(-0.5 * r**beta)
+    variance = np.sum(r**3 * density) / np.sum(r * density) / 2
+    ratio = float(densities.gaussian_std_ratio(torch.tensor([beta], dtype=torch.float64)))
+    assert ratio == pytest.approx(np.sqrt(variance), rel=1e-3)

@@ -1,0 +1,152 @@
+"""Splats that break rasterizers: none may bring NaN or Inf into the image or into any gradient."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mvsgs_core.splats.densities import DENSITIES
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.rasterizer import Render, rasterize
+from tests.core.splats.rasterizer_scenes import copy, gradients, intrinsics, random_splats
+
+SIZE = (40, 56)
+BACKENDS = ("cpu", "reference")
+BAD_VALUES = (math.nan, math.inf, -math.inf)
+
+
+def assert_finite(render: Render, found: dict[str, torch.Tensor]) -> None:
+    for name in ("color", "depth", "opacity", "radii", "weight_sum", "weight_max"):
+        assert bool(torch.isfinite(getattr(render, name)).all()), name
+    for name, gradient in found.items():
+        assert bool(torch.isfinite(gradient).all()), f"gradient of {name}"
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("field", ["means", "log_scales", "quaternions", "opacity_logits", "sh", "betas"])
+def test_a_parameter_that_is_not_finite(backend: str, field: str) -> None:
+    clean = random_splats(60)
+    splats = random_splats(60)
+    for i, bad in enumerate(BAD_VALUES):
+        getattr(splats, field)[i].view(-1)[0] = bad
+    render, found = gradients(copy(splats), SIZE, backend=backend)
+    assert_finite(render, found)
+    assert render.refused == 3
+    assert not bool(render.visible[:3].any())
+    assert all(bool((found[name][:3] == 0).all()) for name in ("means", "sh", "screen"))
+    rest = Splats(*(t[3:] for t in clean.tensors().values()))
+    without, _ = gradients(copy(rest), SIZE, backend=backend)
+    torch.testing.assert_close(render.color, without.color, rtol=0, atol=1e-6)
+
+
+def extremes(name: str) -> Splats:
+    splats = random_splats(60)
+    if name == "zero quaternions":
+        splats.quaternions[:10] = 0.0
+    elif name == "tiny quaternions":
+        splats.quaternions[:10] *= 1e-7
+    elif name == "scales from 1e-12 to 1e6":
+        splats.log_scales[:] = torch.linspace(math.log(1e-12), math.log(1e6), 60)[:, None]
+    elif name == "scales beyond float32":
+        splats.log_scales[:20] = torch.linspace(30.0, 400.0, 20)[:, None]
+        splats.log_scales[20:40] = -torch.linspace(30.0, 400.0, 20)[:, None]
+    elif name == "aspect 1:1e5":
+        splats.log_scales[:30, 0] = math.log(10.0)
+        splats.log_scales[:30, 1:] = math.log(1e-4)
+        splats.log_scales[30:, 0] = math.log(1e-5)
+        splats.log_scales[30:, 1:] = 0.0
+    elif name == "opacity 0 and 1":
+        splats.opacity_logits[:30] = -200.0
+        splats.opacity_logits[30:] = 200.0
+    elif name == "exponents from 0.1 to 20":
+        splats.betas[:] = torch.linspace(0.1, 20.0, 60)
+    elif name == "exponents out of range":
+        splats.betas[:] = torch.linspace(-50.0, 1000.0, 60)
+    elif name == "coincident":
+        splats.means[:] = splats.means[0].clone()
+    elif name == "at and behind the near plane":
+        splats.means[:, 2] = torch.linspace(-1.0, 0.3, 60)
+    elif name == "in the camera":
+        splats.means[:] = torch.from_numpy(np.array([0.1, -0.05, 0.2])).float()
+    elif name == "far away":
+        splats.means[:] *= torch.logspace(0.0, 18.0, 60)[:, None]
+    elif name == "glaring":
+        splats.sh[:] *= 1e6
+    return splats
+
+
+EXTREMES = (
+    "zero quaternions", "tiny quaternions", "scales from 1e-12 to 1e6", "scales beyond float32", "aspect 1:1e5",
+    "opacity 0 and 1", "exponents from 0.1 to 20", "exponents out of range", "coincident",
+    "at and behind the near plane", "in the camera", "far away", "glaring",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_stay_finite(name: str, density: str) -> None:
+    splats = extremes(name)
+    for antialiased in (False, True):
+        render, found = gradients(copy(splats), SIZE, backend="cpu", density=density, antialiased=antialiased)
+        assert_finite(render, found)
+    if name == "zero quaternions":
+        assert render.refused == 10
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_the_reference_stays_finite(name: str) -> None:
+    render, found = gradients(copy(extremes(name)), SIZE, backend="reference", density="exact")
+    assert_finite(render, found)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_zero_splats(backend: str) -> None:
+    background = np.array([0.3, 0.2, 0.1])
+    splats = copy(Splats.empty(4))
+    render = rasterize(splats, np.eye(4), intrinsics(SIZE), SIZE, backend=backend, background=background, weights=True)
+    assert render.color[0, 0].detach().tolist() == pytest.approx([0.3, 0.2, 0.1])
+    assert not bool(render.opacity.any())
+    assert not bool(render.depth.any())
+    assert render.visible.shape == (0,)
+    render.color.sum().backward()
+    assert splats.sh.grad is not None
+    assert splats.sh.grad.shape == (0, 4, 3)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_nothing_in_view(backend: str) -> None:
+    splats = random_splats(30)
+    splats.means[:, 2] *= -1.0
+    render, found = gradients(copy(splats), SIZE, backend=backend)
+    assert_finite(render, found)
+    assert not bool(render.visible.any())
+    assert render.refused == 0
+    assert float(found["means"].abs().max()) == 0.0
+
+
+def test_what_does_not_fit_is_refused_with_its_name() -> None:
+    splats, camera = random_splats(3), intrinsics(SIZE)
+    with pytest.raises(ValueError, match="density 'round'"):
+        rasterize(splats, np.eye(4), camera, SIZE, density="round")
+    with pytest.raises(ValueError, match="backend 'gpu'"):
+        rasterize(splats, np.eye(4), camera, SIZE, backend="gpu")
+    with pytest.raises(ValueError, match="world_from_cam is not finite"):
+        rasterize(splats, np.full((4, 4), np.nan), camera, SIZE)
+    with pytest.raises(ValueError, match="intrinsics"):
+        rasterize(splats, np.eye(4), camera[:3], SIZE)
+    with pytest.raises(ValueError, match="tile_mask"):
+        rasterize(splats, np.eye(4), camera, SIZE, tile_mask=np.ones((2, 2), dtype=bool))
+    with pytest.raises(ValueError, match="0x5 pixels"):
+        rasterize(splats, np.eye(4), camera, (0, 5))
+    with pytest.raises(ValueError, match="degree 2"):
+        rasterize(splats, np.eye(4), camera, SIZE, degree=2)
+    with pytest.raises(ValueError, match="exposure"):
+        rasterize(splats, np.eye(4), camera, SIZE, exposure=torch.eye(3))
+    with pytest.raises(ValueError, match="float64"):
+        rasterize(copy(splats, torch.float64), np.eye(4), camera, SIZE, backend="cpu")
+    splats.betas = splats.betas[:2]
+    with pytest.raises(ValueError, match="betas"):
+        rasterize(splats, np.eye(4), camera, SIZE)
