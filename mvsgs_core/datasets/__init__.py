@@ -40,6 +40,7 @@ READERS = {
     "icl_nuim": "mvsgs_core.datasets.icl_nuim:IclNuim",
     "images": "mvsgs_core.datasets.images:Images",
     "video": "mvsgs_core.datasets.video:Video",
+    "bag": "mvsgs_core.datasets.bag:Bag",
 }
 
 

@@ -1,0 +1,89 @@
+"""ROS 1 and ROS 2 image and camera messages, as `rosbags` gives them, to arrays and lenses."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from mvsgs_core.datasets.files import UnreadableImageError
+from mvsgs_core.datasets.lens import Lens
+
+# channels a pixel, bits a channel, conversion to RGB (None: it is)
+_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
+    "rgb8": (3, 8, None),
+    "bgr8": (3, 8, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, 8, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
+    "8UC3": (3, 8, cv2.COLOR_BGR2RGB),
+    "mono8": (1, 8, cv2.COLOR_GRAY2RGB),
+    "8UC1": (1, 8, cv2.COLOR_GRAY2RGB),
+    "mono16": (1, 16, cv2.COLOR_GRAY2RGB),
+    # ROS names a Bayer pattern by its first row, OpenCV by its second row and column
+    "bayer_rggb8": (1, 8, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8": (1, 8, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": (1, 8, cv2.COLOR_BayerGB2RGB),
+    "yuv422": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
+}
+_RADIAL = ("plumb_bob", "rational_polynomial", "")
+_FISHEYE = ("equidistant", "fisheye")
+
+
+def rgb_of(message: Any) -> np.ndarray:
+    """(H, W, 3) uint8 RGB of a sensor_msgs Image or CompressedImage.
+
+    Raises UnreadableImageError for damaged data or an encoding that is no color or gray image.
+    """
+    if hasattr(message, "encoding"):
+        return _raw(message)
+    try:
+        with Image.open(io.BytesIO(bytes(message.data))) as image:
+            return np.array(image.convert("RGB"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise UnreadableImageError(f"compressed image ({message.format}): {error}") from error
+
+
+def _raw(message: Any) -> np.ndarray:
+    if message.encoding not in _ENCODINGS:
+        known = ", ".join(_ENCODINGS)
+        raise UnreadableImageError(f"encoding {message.encoding!r} is no color or gray image; known are {known}")
+    channels, bits, conversion = _ENCODINGS[message.encoding]
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row = width * channels * bits // 8
+    data = np.asarray(message.data, dtype=np.uint8)
+    if height < 1 or row < 1 or step < row or data.size < step * (height - 1) + row:
+        raise UnreadableImageError(f"{data.size} bytes are no {width}x{height} image in {message.encoding}")
+    padded = np.zeros(step * height, dtype=np.uint8)  # the last row may lack its padding
+    padded[: min(data.size, padded.size)] = data[: padded.size]
+    rows = np.ascontiguousarray(padded.reshape(height, step)[:, :row])
+    if bits == 16:
+        rows = (rows.view(">u2" if message.is_bigendian else "<u2") >> 8).astype(np.uint8)
+    pixels = rows.reshape(height, width, channels) if channels > 1 else rows.reshape(height, width)
+    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+
+
+def lens_of(info: Any, rectified: bool) -> Lens:
+    """The lens of a sensor_msgs CameraInfo; `rectified` is for images that ROS has undistorted already.
+
+    Raises ValueError if the camera was never calibrated or its distortion model is unknown.
+    """
+    d, k, p = (np.asarray(getattr(info, name, getattr(info, name.upper(), None)), dtype=np.float64) for name in "dkp")
+    size = int(info.height), int(info.width)
+    if k[0] <= 0 or min(size) < 1:
+        raise ValueError("the camera_info in the bag is empty: the camera was not calibrated; set dataset.intrinsics")
+    if rectified:
+        fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if p[0] > 0 else (k[0], k[4], k[2], k[5])
+        return Lens((float(fx), float(fy), float(cx), float(cy)), size)
+    if info.distortion_model not in (*_RADIAL, *_FISHEYE):
+        raise ValueError(
+            f"distortion model {info.distortion_model!r} is unknown; known are {(*_RADIAL[:2], *_FISHEYE)}"
+        )
+    intrinsics = float(k[0]), float(k[4]), float(k[2]), float(k[5])
+    return Lens(intrinsics, size, tuple(float(v) for v in d), info.distortion_model in _FISHEYE)

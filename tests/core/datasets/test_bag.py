@@ -1,0 +1,178 @@
+"""ROS 1 and ROS 2 bags."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets.files import UnreadableImageError
+from mvsgs_core.datasets.ros import rgb_of
+
+pytest.importorskip("rosbags")
+
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+HEIGHT, WIDTH = 24, 32
+K = np.array([40.0, 0, 15.5, 0, 41.0, 11.5, 0, 0, 1])
+P = np.array([50.0, 0, 16.5, 0, 0, 51.0, 12.5, 0, 0, 0, 1, 0])
+D = (0.1, 0.02, 0.0, 0.0, 0.0)
+
+
+def picture(number: int) -> np.ndarray:
+    image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    image[...] = (20 + number, 100, 200)
+    return image
+
+
+class Messages:
+    """Messages of either ROS version."""
+
+    def __init__(self, ros: int) -> None:
+        self.ros = ros
+        self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+
+    def header(self, seconds: float) -> Any:
+        t = self.store.types
+        time = t["builtin_interfaces/msg/Time"](int(seconds), round(1e9 * (seconds % 1)))
+        header = t["std_msgs/msg/Header"]
+        return header(0, time, "camera") if self.ros == 1 else header(time, "camera")
+
+    def image(self, number: int, encoding: str, data: np.ndarray, step: int) -> Any:
+        cls = self.store.types["sensor_msgs/msg/Image"]
+        return cls(self.header(100 + number / 10), HEIGHT, WIDTH, encoding, 0, step, data.ravel())
+
+    def compressed(self, number: int, data: bytes) -> Any:
+        cls = self.store.types["sensor_msgs/msg/CompressedImage"]
+        return cls(self.header(100 + number / 10), "png", np.frombuffer(data, dtype=np.uint8))
+
+    def info(self) -> Any:
+        t = self.store.types
+        region = t["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        cls = t["sensor_msgs/msg/CameraInfo"]
+        return cls(self.header(100), HEIGHT, WIDTH, "plumb_bob", np.array(D), K, np.eye(3).ravel(), P, 0, 0, region)
+
+    def write(self, path: Path, messages: list[tuple[str, float, Any]]) -> Path:
+        store, ros = self.store, self.ros
+        with Writer1(path) if ros == 1 else Writer2(path, version=9) as writer:
+            connections: dict[str, Any] = {}
+            for topic, seconds, message in messages:
+                kind = message.__msgtype__
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
+                data = store.serialize_ros1(message, kind) if ros == 1 else store.serialize_cdr(message, kind)
+                writer.write(connections[topic], int(1e9 * seconds), data)
+        return path
+
+
+@pytest.fixture(params=[1, 2])
+def ros(request: pytest.FixtureRequest) -> Messages:
+    return Messages(request.param)
+
+
+def bag_path(folder: Path, ros: Messages) -> Path:
+    return folder / ("walk.bag" if ros.ros == 1 else "walk")
+
+
+def png(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "png")
+    return buffer.getvalue()
+
+
+def test_raw_images_with_their_calibration(tmp_path: Path, ros: Messages) -> None:
+    messages: list[tuple[str, float, Any]] = [("/camera/color/camera_info", 1.0, ros.info())]
+    for i in range(6):
+        bgr = np.ascontiguousarray(picture(i)[..., ::-1])
+        messages.append(("/camera/color/image_raw", 1.0 + i, ros.image(i, "bgr8", bgr, 3 * WIDTH)))
+        deep = np.zeros((HEIGHT, WIDTH, 2), dtype=np.uint8)
+        messages.append(("/camera/depth/image_raw", 1.0 + i, ros.image(i, "16UC1", deep, 2 * WIDTH)))
+    path = ros.write(bag_path(tmp_path, ros), messages)
+    sequence = open_dataset("bag", path=path, start=1, stop=6, stride=2)
+    items = list(sequence)
+    assert len(sequence) == len(items) == 3
+    assert sequence.warnings == []
+    for item, number in zip(items, (1, 3, 5)):
+        assert item.timestamp == pytest.approx(100 + number / 10)
+        assert item.image[10, 10].tolist() == [20 + number, 100, 200]
+        assert item.intrinsics[0] > 40  # zoomed in, to hide what undistortion leaves empty
+        assert item.intrinsics[0] / item.intrinsics[1] == pytest.approx(40 / 41)
+        np.testing.assert_allclose(item.intrinsics[2:], [15.5, 11.5])
+    given = next(iter(open_dataset("bag", path=path, intrinsics=[44, 45, 16, 12])))
+    np.testing.assert_allclose(given.intrinsics, [44, 45, 16, 12])
+    with pytest.raises(ValueError, match="no images at /else; it has them at: /camera/color/image_raw, /camera/depth"):
+        open_dataset("bag", path=path, topic="/else")
+    with pytest.raises(ValueError, match="no frame left"):
+        open_dataset("bag", path=path, start=6)
+
+
+def test_compressed_and_rectified_images(tmp_path: Path, ros: Messages) -> None:
+    topic = "/front/image_rect_color/compressed"
+    contents = [png(picture(0)), png(picture(1))[:-40], png(picture(2))]
+    messages = [(topic, 1.0 + i, ros.compressed(i, data)) for i, data in enumerate(contents)]
+    path = ros.write(bag_path(tmp_path, ros), [("/front/camera_info", 1.0, ros.info()), *messages])
+    sequence = open_dataset("bag", path=path)
+    for _ in range(2):
+        items = list(sequence)
+        assert [(item.index, item.image[0, 0, 0]) for item in items] == [(0, 20), (1, 22)]
+        assert len(sequence.warnings) == 1
+        assert sequence.warnings[0].startswith("images left out because they could not be read: 1")
+    np.testing.assert_allclose(items[0].intrinsics, [50, 51, 16.5, 12.5])  # the projection matrix, no distortion
+
+
+def test_what_is_missing_is_said(tmp_path: Path, ros: Messages) -> None:
+    frame = ros.image(0, "rgb8", picture(0), 3 * WIDTH)
+    path = ros.write(bag_path(tmp_path, ros), [("/left/image", 1.0, frame), ("/right/image", 1.0, frame)])
+    with pytest.raises(ValueError, match=r"several image topics.*/left/image, /right/image"):
+        open_dataset("bag", path=path)
+    with pytest.raises(ValueError, match=r"no camera_info for /left/image.*none in this bag"):
+        open_dataset("bag", path=path, topic="/left/image")
+    sequence = open_dataset("bag", path=path, topic="/left/image", intrinsics="auto", size=[12, 16])
+    assert next(iter(sequence)).image.shape == (12, 16, 3)
+    assert "guess" in sequence.warnings[0]
+    (tmp_path / "other.bag").write_bytes(b"no bag")
+    with pytest.raises(FileNotFoundError, match="is no bag"):
+        open_dataset("bag", path=tmp_path / "other.bag")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data", "expected"),
+    [
+        ("mono8", np.full((HEIGHT, WIDTH), 9, np.uint8), (9, 9, 9)),
+        ("mono16", np.full((HEIGHT, WIDTH), 9 * 256 + 5, "<u2").view(np.uint8), (9, 9, 9)),
+        ("rgba8", np.full((HEIGHT, WIDTH, 4), (1, 2, 3, 4), np.uint8), (1, 2, 3)),
+        ("bgra8", np.full((HEIGHT, WIDTH, 4), (1, 2, 3, 4), np.uint8), (3, 2, 1)),
+        ("bayer_rggb8", np.tile(np.array([[200, 90], [90, 10]], np.uint8), (HEIGHT // 2, WIDTH // 2)), (200, 90, 10)),
+        ("bayer_bggr8", np.tile(np.array([[10, 90], [90, 200]], np.uint8), (HEIGHT // 2, WIDTH // 2)), (200, 90, 10)),
+        ("bayer_grbg8", np.tile(np.array([[90, 200], [10, 90]], np.uint8), (HEIGHT // 2, WIDTH // 2)), (200, 90, 10)),
+        ("bayer_gbrg8", np.tile(np.array([[90, 10], [200, 90]], np.uint8), (HEIGHT // 2, WIDTH // 2)), (200, 90, 10)),
+        ("yuv422", np.tile(np.array([128, 77], np.uint8), (HEIGHT, WIDTH)), None),
+        ("yuv422_yuy2", np.tile(np.array([77, 128], np.uint8), (HEIGHT, WIDTH)), None),
+    ],
+)
+def test_encodings(encoding: str, data: np.ndarray, expected: tuple[int, int, int] | None) -> None:
+    step = data.size // HEIGHT
+    image = rgb_of(Messages(2).image(0, encoding, data, step))
+    assert image.shape == (HEIGHT, WIDTH, 3)
+    inner = image[8:16, 8:16].reshape(-1, 3)
+    assert (inner == inner[0]).all()
+    if expected is None:  # gray in YUV
+        assert np.ptp(inner[0].astype(int)) <= 1
+        assert 60 < inner[0][0] < 90
+    else:
+        assert tuple(inner[0]) == expected
+    padded = np.concatenate([data.reshape(HEIGHT, -1).view(np.uint8), np.full((HEIGHT, 5), 77, np.uint8)], axis=1)
+    np.testing.assert_array_equal(rgb_of(Messages(2).image(0, encoding, padded, step + 5)), image)
+
+
+@pytest.mark.parametrize(("encoding", "size"), [("rgb8", 100), ("32FC1", HEIGHT * WIDTH * 4)])
+def test_damaged_or_unknown_images_are_refused(encoding: str, size: int) -> None:
+    with pytest.raises(UnreadableImageError, match=r"no 32x24 image|no color or gray image"):
+        rgb_of(Messages(2).image(0, encoding, np.zeros(size, np.uint8), 3 * WIDTH))
