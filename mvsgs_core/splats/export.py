@@ -26,9 +26,7 @@ from mvsgs_core.splats.snapshot import Snapshot
 def scaled(final: Snapshot, factor: float) -> Snapshot:
     """The same map in another unit."""
     s = final.splats
-    bigger = Splats(
-        s.means * factor, s.log_scales + math.log(factor), s.quaternions, s.opacity_logits, s.sh, s.betas
-    )
+    bigger = Splats(s.means * factor, s.log_scales + math.log(factor), s.quaternions, s.opacity_logits, s.sh, s.betas)
     poses = final.world_from_cam.copy()
     poses[:, :3, 3] *= factor
     return replace(final, splats=bigger, origin=final.origin * factor, world_from_cam=poses)
@@ -38,7 +36,11 @@ def camera_arguments(parser: argparse.ArgumentParser) -> None:
     """--size and --intrinsics, with which poses become cameras."""
     parser.add_argument("--size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), default=(480, 640))
     parser.add_argument(
-        "--intrinsics", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="pixels at --size; default: 60 degrees"
+        "--intrinsics",
+        type=float,
+        nargs=4,
+        metavar=("FX", "FY", "CX", "CY"),
+        help="pixels at --size; default: 60 degrees",
     )
 
 

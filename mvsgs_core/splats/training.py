@@ -24,7 +24,7 @@ class TrainingConfig:
     exposure: bool = False  # train a color affine for each keyframe
     exposure_rate: float = 1e-3  # learning rate of it
     antialiased: bool = False
-    near: float = 0.02  # splats nearer than this many median depths are left out
+    near: float = 1e-3  # splats nearer than this many median depths are left out
     backend: str = "auto"
     threads: int | None = None  # None: all
     loss: LossConfig = field(default_factory=lambda: LossConfig(l1=0.8, ssim=0.2, frequency=0.0))  # as 3DGS

@@ -1,0 +1,215 @@
+"""Quality and time of the online mapper with true poses and depth, and what each skip and each filter gains.
+
+`python -m bench.mapping [--quick] [--json FILE] [--threads N] [--real FOLDER]`
+
+The synthetic room: 40 keyframes at 320x240, every 3rd frame of 120; held out: the middle frame of every other gap.
+A real sequence (7-Scenes): every 6th frame with its measured depth; held out: the frames between.
+Times are wall times of insertion and optimization, evaluation excluded; figures of one call were taken on one machine
+in one run, so that their ratios mean something even where others use the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bench.table import Row, at_least, at_most, main
+from mvsgs_core.datasets import Item, open_dataset
+from mvsgs_core.evaluation.image_metrics import psnr
+from mvsgs_core.fusion.normals import normals_of
+from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.splats.rasterizer import rasterize
+from mvsgs_core.splats.training import SkipConfig
+
+KITCHEN = Path(__file__).resolve().parent.parent.parent / "shared/data/seven_scenes_redkitchen"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Keyframes to map and frames to score."""
+
+    name: str
+    views: list[PosedView]
+    held_out: list[PosedView]
+
+
+@dataclass
+class Run:
+    """One mapping run: seconds and held-out PSNR at checkpoints; the clock stands still while scoring."""
+
+    seconds: list[float]
+    psnr: list[float]
+    online_psnr: float
+    online_seconds: float
+    splats: int
+    mapper: OnlineMapper
+
+    def time_to(self, level: float) -> float:
+        """Seconds until the held-out PSNR is `level`, linear between checkpoints; inf if never."""
+        for k, value in enumerate(self.psnr):
+            if value >= level:
+                if k == 0 or value == self.psnr[k - 1]:
+                    return self.seconds[k]
+                share = (level - self.psnr[k - 1]) / (value - self.psnr[k - 1])
+                return self.seconds[k - 1] + share * (self.seconds[k] - self.seconds[k - 1])
+        return float("inf")
+
+
+def room(keyframes: int, size: tuple[int, int]) -> Scene:
+    """Every 3rd frame is a keyframe; frame 1 of every other gap is held out."""
+    frames = open_dataset("synthetic", scene="room", frames=3 * keyframes, size=size)
+    views: list[PosedView] = []
+    held_out: list[PosedView] = []
+    for item in frames:
+        if item.index % 3 == 0 or item.index % 6 == 1:
+            (views if item.index % 3 == 0 else held_out).append(_posed(item))
+    return Scene("room", views, held_out)
+
+
+def kitchen(path: Path, frames: int, size: tuple[int, int]) -> Scene:
+    """7-Scenes: frames with depth are the even ones; every 6th is a keyframe, the 3rd after it held out."""
+    views: list[PosedView] = []
+    held_out: list[PosedView] = []
+    for item in open_dataset("seven_scenes", path=str(path), size=size, stop=frames):
+        if item.world_from_cam is None:
+            continue
+        if item.index % 6 == 0 and item.depth is not None:
+            views.append(_posed(item))
+        elif item.index % 6 == 3:
+            held_out.append(_posed(item))
+    return Scene("kitchen", views, held_out)
+
+
+def _posed(item: Item) -> PosedView:
+    assert item.world_from_cam is not None
+    depth = np.zeros(item.image.shape[:2], dtype=np.float32) if item.depth is None else item.depth
+    return PosedView(
+        item.index, item.image, item.intrinsics, item.world_from_cam, depth, normals=normals_of(depth, item.intrinsics)
+    )
+
+
+def held_out_psnr(mapper: OnlineMapper, scene: Scene) -> float:
+    """Mean PSNR over the held-out frames, at their size, without exposure correction."""
+    scores = []
+    for view in scene.held_out:
+        final = mapper.snapshot()
+        pose = view.world_from_cam.copy()
+        pose[:3, 3] -= final.origin
+        with torch.no_grad():
+            color = rasterize(final.splats, pose, view.intrinsics, view.image.shape[:2], density=final.density).color
+        scores.append(psnr(color.clamp(0.0, 1.0).numpy(), view.image.astype(np.float32) / 255.0))
+    return float(np.mean(scores))
+
+
+def run(scene: Scene, config: MapperConfig, checkpoints: int = 10) -> Run:
+    """Maps the scene: all keyframes, then the refinement, scored `checkpoints` times during the latter."""
+    mapper = OnlineMapper(config)
+    clock = 0.0
+    start = time.perf_counter()
+    for view in scene.views:
+        mapper.add_view(view)
+    while mapper.step():
+        pass
+    clock += time.perf_counter() - start
+    online = held_out_psnr(mapper, scene)
+    seconds, values = [clock], [online]
+    every = max(1, config.refinement // checkpoints)
+    start = time.perf_counter()
+    for done in range(config.refinement):
+        mapper.refine(done, config.refinement)
+        if (done + 1) % every == 0 or done + 1 == config.refinement:
+            clock += time.perf_counter() - start
+            seconds.append(clock)
+            values.append(held_out_psnr(mapper, scene))
+            start = time.perf_counter()
+    return Run(seconds, values, online, seconds[0], len(mapper.state), mapper)
+
+
+def all_skips_off(config: MapperConfig) -> MapperConfig:
+    """Every keyframe's every pixel inserted (through the voxel filter), every iteration whole."""
+    nothing = SkipConfig(converged=False, tiles=False, coarse_to_fine=False, selective=False)
+    return replace(config, skipping=nothing, insertion=replace(config.insertion, unexplored=False))
+
+
+def variants(config: MapperConfig) -> dict[str, MapperConfig]:
+    """The default with one thing switched."""
+    insertion, skipping, density = config.insertion, config.skipping, config.density_control
+    return {
+        "no unexplored mask": replace(config, insertion=replace(insertion, unexplored=False)),
+        "unexplored below 40 dB (paper)": replace(config, insertion=replace(insertion, unexplored_psnr=40.0)),
+        "no voxel filter": replace(config, insertion=replace(insertion, voxel=0.0)),
+        "density control none": replace(config, density_control=replace(density, mode="none")),
+        "density control adaptive": replace(config, density_control=replace(density, mode="adaptive")),
+        "density control relocate": replace(config, density_control=replace(density, mode="relocate")),
+        "no skip of converged keyframes": replace(config, skipping=replace(skipping, converged=False)),
+        "no skip of low-error tiles": replace(config, skipping=replace(skipping, tiles=False)),
+        "no coarse-to-fine": replace(config, skipping=replace(skipping, coarse_to_fine=False)),
+        "every splat stepped": replace(config, skipping=replace(skipping, selective=False)),
+    }
+
+
+def rows_of(scene: Scene, name: str, result: Run) -> list[Row]:
+    prefix = f"{scene.name}, {name}"
+    skipped = result.mapper.log.skipped
+    share = skipped.get("iterations_converged", 0) / max(1, result.mapper.iterations)
+    return [
+        Row(f"{prefix}: held-out PSNR", result.psnr[-1], "dB"),
+        Row(f"{prefix}: before refinement", result.online_psnr, "dB"),
+        Row(f"{prefix}: time", result.seconds[-1], "s"),
+        Row(f"{prefix}: splats", result.splats),
+        Row(f"{prefix}: iterations passed over", share),
+    ]
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    torch.set_num_threads(options.threads)
+    quick = options.quick
+    size = (120, 160) if quick else (240, 320)
+    config = MapperConfig()
+    if quick:
+        config = replace(config, iterations=10, refinement=60)
+    if options.iterations is not None:
+        config = replace(config, iterations=options.iterations)
+    if options.refinement is not None:
+        config = replace(config, refinement=options.refinement)
+    config = replace(config, training=replace(config.training, threads=options.threads))
+    scene = room(10 if quick else options.keyframes, size)
+    on, off = run(scene, config), run(scene, all_skips_off(config))
+    level = 0.95 * off.psnr[-1]
+    goal = "" if quick else ">= 30"
+    rows = [
+        Row("room, all skips on: held-out PSNR", on.psnr[-1], "dB", goal, None if quick else on.psnr[-1] >= 30.0),
+        *rows_of(scene, "all skips on", on)[1:],
+        *rows_of(scene, "all skips off", off),
+        Row("room, all skips on: time to 95 % of the final PSNR of all off", on.time_to(level), "s"),
+        Row("room, all skips off: the same", off.time_to(level), "s"),
+        at_most("room, ratio of these times", on.time_to(level) / off.time_to(level), "", 0.4),
+        at_least("room, final PSNR, all on minus all off", on.psnr[-1] - off.psnr[-1], "dB", -0.2),
+    ]
+    scenes = [scene]
+    if options.real.exists() and not quick:
+        scenes.append(kitchen(options.real, options.real_frames, size))
+        rows += rows_of(scenes[1], "default", run(scenes[1], config))
+    for each in [] if quick else scenes:
+        for name, variant in variants(config).items():
+            rows += rows_of(each, name, run(each, variant))
+    return rows
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--keyframes", type=int, default=40)
+    parser.add_argument("--iterations", type=int, help="owed a keyframe; default: the mapper's")
+    parser.add_argument("--refinement", type=int, help="default: the mapper's")
+    parser.add_argument("--real", type=Path, default=KITCHEN, help="7-Scenes RedKitchen")
+    parser.add_argument("--real-frames", type=int, default=150)
+
+
+if __name__ == "__main__":
+    main(measure, "Online mapping with true poses and depth", arguments)
