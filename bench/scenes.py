@@ -1,0 +1,146 @@
+"""Whole runs over scenes and variants: `python -m bench.scenes --scenes room,tum_fr1_xyz --variants full,A`.
+
+Every run goes through launch/run_all.py, so it measures what a user gets. Scenes and variants are Hydra choices in
+bench/conf. Figures of the paper stand beside ours where the scene is the paper's.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from bench.runs import Matrix, Run, choices, figure, machine
+from bench.table import Row, main
+from mvsgs_core.evaluation import svg
+
+COLUMNS = {
+    "KF PSNR": ("rendering.keyframes.psnr", 2),
+    "held-out PSNR": ("rendering.held_out.psnr", 2),
+    "all PSNR": ("rendering.all.psnr", 2),
+    "held-out, unrefined": ("rendering_before_refinement.held_out.psnr", 2),
+    "SSIM": ("rendering.held_out.ssim", 3),
+    "LPIPS": ("rendering.held_out.lpips", 3),
+    "ATE": ("trajectory.ate_rmse", 4),
+    "ATE %": ("trajectory.ate_percent", 2),
+    "abs rel": ("depth.abs_rel", 3),
+    "inliers": ("depth.inlier_ratio", 3),
+    "complete": ("depth.completeness", 3),
+    "KFs": ("trajectory.keyframes", 0),
+    "KF/s": ("time.keyframes_per_second", 2),
+    "wall s": ("time.wall", 1),
+    "splats": ("map.splats", 0),
+    "MB": ("map.bytes", 1),
+    "peak MB": ("memory", 0),
+}
+_UNITS = {"MB": 1e-6, "peak MB": 1e-6}
+
+# Tables I and II of the paper: PSNR, SSIM, LPIPS as published; which frames were scored is not stated there
+PAPER = {
+    "replica_office0": (41.02, 0.98, 0.05),
+    "replica_office1": (42.04, 0.98, 0.05),
+    "replica_office2": (34.00, 0.95, 0.09),
+    "replica_office3": (34.65, 0.96, 0.07),
+    "replica_office4": (33.33, 0.95, 0.10),
+    "replica_room0": (32.20, 0.95, 0.10),
+    "replica_room1": (31.54, 0.92, 0.13),
+    "replica_room2": (35.84, 0.96, 0.07),
+    "tum_desk": (20.67, 0.77, 0.25),
+    "tum_xyz": (24.53, 0.86, 0.15),
+    "tum_office": (22.37, 0.80, 0.24),
+}
+
+
+def value(run: Run, column: str) -> float | None:
+    """A figure of a run in the column's unit; peak memory is the sum over the nodes."""
+    if column == "peak MB":
+        peaks = (run.report or {}).get("memory", {}).get("peak_bytes", {})
+        found = float(sum(peaks.values())) if peaks else None
+    else:
+        found = figure(run.report, COLUMNS[column][0])
+    return None if found is None else found * _UNITS.get(column, 1.0)
+
+
+def markdown(runs: list[Run]) -> str:
+    """One row for each scene and variant: the mean over seeds, with half the spread where there are several."""
+    names = ["scene", "variant", "runs", *COLUMNS]
+    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
+    for scene, variant in dict.fromkeys((r.scene, r.variant) for r in runs):
+        group = [r for r in runs if (r.scene, r.variant) == (scene, variant)]
+        good = [r for r in group if r.report is not None]
+        cells = [scene, variant, f"{len(good)}" if len(good) == len(group) else f"{len(good)} of {len(group)}"]
+        lines.append("| " + " | ".join(cells + [_cell(good, column) for column in COLUMNS]) + " |")
+        if scene in PAPER:
+            psnr, ssim, lpips = PAPER[scene]
+            lines.append(f"| {scene} | *the paper* | | *{psnr}* | | | | *{ssim}* | *{lpips}* |" + " |" * 11)
+    return "\n".join(lines)
+
+
+def _cell(runs: list[Run], column: str) -> str:
+    values = [v for v in (value(r, column) for r in runs) if v is not None]
+    if not values:
+        return "–"
+    digits = COLUMNS[column][1]
+    spread = f" ±{(max(values) - min(values)) / 2:.{digits}f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.{digits}f}{spread}"
+
+
+def time_against_error(runs: list[Run]) -> str:
+    """Held-out PSNR over wall time, one color a variant."""
+    series = []
+    for variant in dict.fromkeys(r.variant for r in runs):
+        points = [(value(r, "wall s"), value(r, "held-out PSNR")) for r in runs if r.variant == variant]
+        x, y = np.array([p for p in points if None not in p], dtype=float).reshape(-1, 2).T
+        series.append(svg.Series(variant, x, y, points=True))
+    return svg.plot(series, "wall time, s", "held-out PSNR, dB", width=900, height=420)
+
+
+def rows(runs: list[Run]) -> list[Row]:
+    found = []
+    for run in runs:
+        name = f"{run.scene}/{run.variant}/seed {run.seed}"
+        if run.report is None:
+            found.append(Row(f"{name}: finished", "no", "", "yes", False))
+            continue
+        for column in COLUMNS:
+            measured = value(run, column)
+            if measured is not None:
+                found.append(Row(f"{name}: {column}", measured))
+    return found
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--scenes", default="room", help=f"comma separated: {', '.join(choices('scene'))}")
+    parser.add_argument("--variants", default="full", help=f"comma separated: {', '.join(choices('variant'))}")
+    parser.add_argument("--seeds", default="0", help="comma separated")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at once; times mean little above 1")
+    parser.add_argument("--output", type=Path, default=Path("runs/bench-scenes"), help="folder of the runs")
+    parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
+    parser.add_argument("overrides", nargs="*", help="of every run: mapper.iterations=30")
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    overrides = list(options.overrides)
+    if options.quick:
+        overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
+    matrix = Matrix(
+        options.scenes.split(","),
+        options.variants.split(","),
+        [int(s) for s in options.seeds.split(",")],
+        overrides,
+        options.jobs,
+    )
+    output = options.output.resolve()
+    gather: Callable[[Path], list[Run]] = matrix.collect if options.collect else matrix.run
+    runs = gather(output)
+    text = f"{markdown(runs)}\n\n{machine()}\n`{' '.join(matrix.command(options.output)[1:])}`\n"
+    (output / "table.md").write_text(text)
+    (output / "time_against_error.svg").write_text(time_against_error(runs))
+    print(text)
+    return rows(runs)
+
+
+if __name__ == "__main__":
+    main(measure, "Whole runs", arguments)
