@@ -181,7 +181,8 @@ class Supervisor:
         previous: dict[signal.Signals, Any] = {}
         wakeup = signal.set_wakeup_fd(self._wakeup.fileno(), warn_on_full_buffer=False)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            previous[number] = signal.signal(number, collect)
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup: outlive the terminal
+                previous[number] = signal.signal(number, collect)
         try:
             yield
         finally:

@@ -37,6 +37,7 @@ class Launch:
             stderr=subprocess.PIPE,
             text=True,
             cwd=folder,
+            start_new_session=True,
             env={**os.environ, "TMPDIR": str(self._sockets), "PYTHONPATH": ""},
         )
 
@@ -69,6 +70,10 @@ class Launch:
                 return
             time.sleep(0.05)
         raise AssertionError(f"the graph did not come up: {self.process.communicate(timeout=10)}")
+
+    def ctrl_c(self) -> None:
+        """As a terminal does it: to all processes of the foreground group."""
+        os.killpg(self.process.pid, signal.SIGINT)
 
     def kill(self) -> None:
         if self.process.poll() is None:
@@ -142,7 +147,7 @@ def test_threads_and_cores_reach_the_node(launch: type[Launch]) -> None:
     run = launch("sink.threads=3", "source.count=0", "source.period=0.02", "relay.cpu=[0]")
     run.wait_until_running()
     assert run.node("relay").cpu_affinity() == [0]
-    run.process.send_signal(signal.SIGINT)
+    run.ctrl_c()
     assert run.finish()[0] == 0
     assert sink(run.output)["threads"] == "3"
 
@@ -194,7 +199,7 @@ def test_the_first_ctrl_c_ends_the_stream_and_finishes_the_run(launch: type[Laun
     run = launch("source=live", "source.best_effort=[]", "relay.seconds=0.02")
     run.wait_until_running()
     time.sleep(0.5)
-    run.process.send_signal(signal.SIGINT)
+    run.ctrl_c()
     code, out, _ = run.finish()
     assert code == 0
     assert "Ctrl-C" in out
@@ -209,10 +214,10 @@ def test_the_first_ctrl_c_ends_the_stream_and_finishes_the_run(launch: type[Laun
 def test_a_second_ctrl_c_stops_everything(launch: type[Launch], delay: float) -> None:
     run = launch("source.count=100", "relay.seconds=1")
     run.wait_until_running()
-    run.process.send_signal(signal.SIGINT)
+    run.ctrl_c()
     time.sleep(delay + 0.05)
     began = time.monotonic()
-    run.process.send_signal(signal.SIGINT)
+    run.ctrl_c()
     code, out, _ = run.finish()
     assert time.monotonic() - began < DOWN
     assert code == 130
@@ -223,7 +228,7 @@ def test_a_second_ctrl_c_stops_everything(launch: type[Launch], delay: float) ->
 def test_ctrl_c_while_starting(launch: type[Launch], delay: float) -> None:
     run = launch("source=live")
     time.sleep(delay)
-    run.process.send_signal(signal.SIGINT)
+    run.ctrl_c()
     code, _, err = run.finish(20)
     assert code in (0, 130, -signal.SIGINT), err
 
@@ -233,9 +238,9 @@ def test_a_node_that_ignores_sigterm_is_killed(launch: type[Launch]) -> None:
     run.wait_until_running()
     time.sleep(0.5)
     began = time.monotonic()
-    run.process.send_signal(signal.SIGINT)
+    run.ctrl_c()
     time.sleep(0.1)
-    run.process.send_signal(signal.SIGINT)
+    run.ctrl_c()
     assert run.finish()[0] == 130
     assert time.monotonic() - began < DOWN
 
