@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.exceptions import McapError
+from mcap.exceptions import InvalidMagic, McapError
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader
 
-from msgs import Frame, GroundTruth, Message
+from msgs import Frame, GroundTruth
 from msgs.codec import decode
 from nodes import Node
 from nodes.recorder import ENCODING
@@ -37,38 +37,46 @@ class Player(Node):
             raise FileNotFoundError(f"dataset.path={c.path}: must be an .mcap file, as recorder=mcap writes it")
         if c.start < 0 or c.stride < 1 or (c.stop is not None and c.stop <= c.start):
             raise ValueError(f"start={c.start}, stop={c.stop}, stride={c.stride}: 0 <= start < stop and stride >= 1")
-        position: dict[int, int] = {}  # frame index -> place in the recording: GroundTruth may come before its Frame
-        for message in self._messages(Path(c.path)):
-            place = position.setdefault(message.index, len(position))
-            if c.stop is not None and place >= c.stop:
-                return
-            if place >= c.start and (place - c.start) % c.stride == 0:
+        last = -1
+        for place, record in self._records(Path(c.path)):
+            last = max(last, place)
+            if place >= c.start and (place - c.start) % c.stride == 0 and (c.stop is None or place < c.stop):
+                message = decode(record, expect=PLAYED).message
+                assert isinstance(message, PLAYED)
                 self.stats.count("frames", isinstance(message, Frame))
                 yield message
+        if last < c.start:
+            raise ValueError(f"{c.path} has {last + 1} frames: start={c.start} is beyond its end")
 
-    def _messages(self, path: Path) -> Iterator[Frame | GroundTruth]:
+    def _records(self, path: Path) -> Iterator[tuple[int, bytes]]:
+        """Messages with their place in their topic: the nth ground truth belongs to the nth frame, wherever it is."""
+        names = [t.__name__ for t in PLAYED]
         with path.open("rb") as file:
-            names = [t.__name__ for t in PLAYED]
+            reader, topics = self._open(file)
+            passed: set[str] = set()  # topics of which the rest is not wanted
             try:
-                for _, channel, record in self._reader(file).iter_messages(topics=names, log_time_order=False):
+                for _, channel, record in reader.iter_messages(topics=names, log_time_order=False):
                     if channel.message_encoding != ENCODING:
-                        raise ValueError(
-                            f"{path}: {channel.message_encoding} messages; only recorder=mcap's can be played"
-                        )
-                    message: Message = decode(record.data, expect=PLAYED).message
-                    assert isinstance(message, PLAYED)
-                    yield message
+                        raise ValueError(f"{path} holds {channel.message_encoding} messages: play recorder=mcap's")
+                    yield record.sequence, record.data
+                    if self.config.stop is not None and record.sequence >= self.config.stop - 1:
+                        passed.add(channel.topic)
+                        if passed == topics:
+                            return
+            except InvalidMagic as error:
+                raise ValueError(f"{path} is no recording: {error}") from error
             except McapError as error:
-                self.stats.warn(f"{path} ends early ({error}): it was cut off; what is there is played")
-                logging.warning("%s: %s", path, error)
+                self.stats.warn(f"{path} was cut off: what is there is played ({type(error).__name__} {error})")
 
-    def _reader(self, file: BinaryIO) -> McapReader:
-        """With the file's index where it has one: a recording that was cut off has none."""
+    def _open(self, file: BinaryIO) -> tuple[McapReader, set[str]]:
+        """A reader and, where the file has its index, the topics to play: a recording that was cut off has none."""
         try:
-            indexed = SeekingReader(file)
-            if indexed.get_summary() is not None:
-                return indexed
+            reader = SeekingReader(file)
+            summary = reader.get_summary()
+            if summary is not None:
+                names = {t.__name__ for t in PLAYED}
+                return reader, names & {channel.topic for channel in summary.channels.values()}
         except McapError:
-            self.stats.warn("the recording has no index: it was cut off; what is there is played")
+            logging.info("no index: read from its beginning")
         file.seek(0)
-        return NonSeekingReader(file)
+        return NonSeekingReader(file), set()

@@ -1,0 +1,137 @@
+"""What was recorded is played again, whole or in part, and a recording that was cut off as far as it goes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from msgs import Frame, GroundTruth, Trajectory
+from msgs.codec import decode
+from nodes import handlers, is_source, outputs
+from nodes.player import Player
+from nodes.recorder import GraphRecorder, Recorder
+from tests.test_codec import MESSAGES, assert_equal, example
+
+
+def recorded(path: Path, count: int = 10, **config: Any) -> list[Frame | GroundTruth]:
+    """Records a frame and its ground truth, `count` times."""
+    recorder = Recorder(Recorder.Config(str(path), **config))
+    rng = np.random.default_rng(0)
+    messages: list[Frame | GroundTruth] = []
+    for index in range(3, 3 + 2 * count, 2):  # a stride of the source: indices are not places
+        image = rng.integers(0, 255, (48, 64, 3), np.uint8)
+        frame = Frame(index, index / 30, image, np.ones(4))
+        truth = GroundTruth(index, index / 30, image, np.ones(4), np.eye(4), np.ones((48, 64), np.float32))
+        recorder.on_frame(frame)
+        recorder.on_ground_truth(truth)
+        messages += [frame, truth]
+    assert list(recorder.on_end()) == []
+    assert recorder.stats.counts["recorded"] == 2 * count
+    return messages
+
+
+def played(path: Path, **config: Any) -> tuple[Player, list[Any]]:
+    player = Player(Player.Config(str(path), **config))
+    return player, list(player.run())
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
+def test_a_recording_is_played_as_it_was(tmp_path: Path, compression: str) -> None:
+    messages = recorded(tmp_path / "a.mcap", compression=compression)
+    player, again = played(tmp_path / "a.mcap")
+    assert len(again) == len(messages)
+    for a, b in zip(messages, again, strict=True):
+        assert_equal(a, b)
+    assert player.stats.counts == {"frames": 10}
+    assert player.stats.warnings == []
+
+
+def test_a_part_of_a_recording_is_played(tmp_path: Path) -> None:
+    recorded(tmp_path / "a.mcap")
+    _, again = played(tmp_path / "a.mcap", start=2, stop=8, stride=3)
+    assert [(type(m), m.index) for m in again] == [(Frame, 7), (GroundTruth, 7), (Frame, 13), (GroundTruth, 13)]
+
+
+def test_ground_truth_may_come_before_its_frame(tmp_path: Path) -> None:
+    recorder = Recorder(Recorder.Config(str(tmp_path / "a.mcap")))
+    image = np.ones((4, 4, 3), np.uint8)
+    for index in (0, 1, 2):  # the two topics reach a recorder in any order
+        recorder.on_ground_truth(GroundTruth(index, 0.0, image, np.ones(4), None, None))
+    for index in (0, 1, 2):
+        recorder.on_frame(Frame(index, 0.0, image, np.ones(4)))
+    list(recorder.on_end())
+    _, again = played(tmp_path / "a.mcap", stop=2)
+    assert sorted((type(m).__name__, m.index) for m in again) == [
+        ("Frame", 0),
+        ("Frame", 1),
+        ("GroundTruth", 0),
+        ("GroundTruth", 1),
+    ]
+
+
+@pytest.mark.parametrize("kept", [0.95, 0.5])
+def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(tmp_path: Path, kept: float) -> None:
+    path = tmp_path / "a.mcap"
+    messages = recorded(path, count=200)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    player, again = played(path)
+    assert len(messages) * kept * 0.6 < len(again) < len(messages)
+    for a, b in zip(messages, again, strict=False):
+        assert_equal(a, b)
+    assert any("cut off" in warning for warning in player.stats.warnings)
+
+
+def test_what_cannot_be_played_says_why(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"must be an \.mcap file"):
+        played(tmp_path / "none.mcap")
+    with pytest.raises(FileNotFoundError, match="path=None"):
+        list(Player().run())
+    (tmp_path / "text.mcap").write_text("no recording\n" * 100)
+    with pytest.raises(ValueError, match="is no recording"):
+        played(tmp_path / "text.mcap")
+    recorded(tmp_path / "a.mcap", 1)
+    with pytest.raises(ValueError, match="0 <= start < stop"):
+        played(tmp_path / "a.mcap", start=3, stop=2)
+    with pytest.raises(ValueError, match="has 1 frames"):
+        played(tmp_path / "a.mcap", start=5)
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    recorded(tmp_path / "a.mcap", 1)
+    with pytest.raises(FileExistsError):
+        recorded(tmp_path / "a.mcap", 1)
+    with pytest.raises(ValueError, match="must be one of lz4, zstd, none"):
+        Recorder(Recorder.Config(compression="gzip"))
+
+
+def test_other_tools_can_read_what_is_in_it(tmp_path: Path) -> None:
+    recorder = GraphRecorder(GraphRecorder.Config(str(tmp_path / "a.mcap")))
+    by_type = {t: getattr(recorder, name) for t, name in handlers(GraphRecorder).items()}
+    sent = {t.__name__: example(t) for t in MESSAGES if t in by_type}
+    for message in sent.values():
+        by_type[type(message)](message)
+    list(recorder.on_end())
+    with (tmp_path / "a.mcap").open("rb") as file:
+        seen = {}
+        for schema, channel, record in make_reader(file).iter_messages():
+            assert schema is not None
+            assert schema.name == channel.topic
+            seen[channel.topic] = decode(record.data).message
+            if channel.topic == "GroundTruth":
+                assert b"depth: float32 H W or nil" in schema.data
+    assert seen.keys() == sent.keys()
+    for name, message in sent.items():
+        assert_equal(message, seen[name])
+    assert isinstance(seen["Trajectory"], Trajectory)
+
+
+def test_the_contract_of_both_nodes() -> None:
+    assert is_source(Player)
+    assert set(outputs(Player)) == {Frame, GroundTruth} == set(handlers(Recorder))
+    assert set(handlers(Recorder)) < set(handlers(GraphRecorder))
+    assert outputs(GraphRecorder) == ()
