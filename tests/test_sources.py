@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.server
 import inspect
 import socket
 import subprocess
@@ -11,6 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
@@ -18,6 +20,7 @@ from omegaconf import OmegaConf
 import nodes.camera
 from launch.compose import compose
 from msgs import Depth, Frame, GroundTruth
+from mvsgs_core.datasets.bag import Bag
 from mvsgs_core.datasets.images import Images
 from mvsgs_core.datasets.seven_scenes import SevenScenes
 from mvsgs_core.datasets.tum import Tum
@@ -168,6 +171,44 @@ def test_a_camera_that_is_not_there(capture: type[FakeCapture], tmp_path: Path) 
         list(Camera(Camera.Config(path=str(tmp_path / "walk.mp4"))).run())
 
 
+class Stream(http.server.BaseHTTPRequestHandler):
+    """Motion JPEG, as network cameras send it; silent after 20 pictures."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=picture")
+        self.end_headers()
+        try:
+            for number in range(20):
+                data = cv2.imencode(".jpg", np.full((48, 64, 3), 10 * number, dtype=np.uint8))[1].tobytes()
+                head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                self.wfile.write(head.encode() + data + b"\r\n")
+                time.sleep(0.02)
+            time.sleep(3.0)
+        except ConnectionError:
+            pass  # the reader left
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_a_network_camera_that_falls_silent() -> None:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Stream)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        camera = Camera(Camera.Config(path=f"http://127.0.0.1:{server.server_port}/video.mjpg", timeout=1.5))
+        began = time.monotonic()
+        values = [int(message.image[0, 0, 0]) for message in camera.run() if isinstance(message, Frame)]
+        assert time.monotonic() - began < 8
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert len(values) > 10
+    assert values == sorted(values)
+    assert any("was lost: no picture for 1.5 s" in w for w in camera.stats.warnings)
+
+
 # ---------------------------------------------------------------- remote
 
 
@@ -284,7 +325,7 @@ def test_the_example_publishes_a_data_set(address: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "choice", ["synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "camera", "robot"]
+    "choice", ["synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "camera", "robot"]
 )
 def test_every_dataset_choice_composes(choice: str) -> None:
     graph = compose([f"dataset={choice}"])
@@ -306,7 +347,7 @@ def test_options_of_a_choice_reach_the_reader(tmp_path: Path) -> None:
 
 def test_every_choice_lists_all_options_of_its_format() -> None:
     own = {"path", "start", "stop", "stride", "size", "intrinsics", "distortion"}
-    for name, reader in {"tum": Tum, "seven_scenes": SevenScenes, "images": Images, "video": Video}.items():
+    for name, reader in {"tum": Tum, "seven_scenes": SevenScenes, "images": Images, "video": Video, "bag": Bag}.items():
         parameters = set(inspect.signature(reader).parameters)
         listed = set(OmegaConf.load(ROOT / f"launch/conf/dataset/{name}.yaml").options)
         assert listed == parameters - own
