@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import geometry
 from ..scene.difficulties import Difficulties, DifficultPath, Sensor
 from ..scene.renderer import Rendering
 from ..scene.stage import SCENES, stage
@@ -121,18 +120,9 @@ class Synthetic:
             size,
             gloss=d.gloss,
             mover=self.stage.ball if moving else None,
-            world_from_mover=self._ball_pose(s) if moving else None,
+            world_from_mover=self.stage.world_from_ball(s, pose) if moving else None,
             threads=self.threads,
         )
-
-    def _ball_pose(self, s: float) -> np.ndarray:
-        a, b = self.stage.ball_path
-        across = 0.5 - 0.5 * np.cos(2.0 * np.pi * s / 90.0)
-        pose = np.eye(4)
-        pose[:3, 3] = a + across * (b - a)
-        pose[2, 3] += 0.12 * np.linalg.norm(b - a) * abs(np.sin(2.0 * np.pi * s / 17.0))
-        pose[:3, :3] = geometry.so3_exp(np.array([0.09 * s, 0.05 * s, 0.02 * s]))
-        return pose
 
     def _to_world(self, pose: np.ndarray) -> np.ndarray:
         world = pose.copy()

@@ -14,7 +14,7 @@ from .path import Path
 class Difficulties:
     """Each switch and its strength; 0 is off. Frames count in the stream before start, stop and stride."""
 
-    textureless: int = 0  # bare walls: 0 to 4; in the landscape, the share of fields without texture in quarters
+    textureless: int = 0  # bare walls, 0 to 4; in the landscape, quarters of the fields without texture
     pure_rotation: int = 0  # frames during which the camera only turns, about its center
     pure_rotation_start: int = 0  # first of them
     rest: int = 0  # frames during which the camera stands perfectly still
@@ -28,7 +28,7 @@ class Difficulties:
     exposure: float = 0.0  # brightness drifts by up to so many stops up and down
     noise: float = 0.0  # standard deviation of the sensor's noise at mid gray, 8-bit levels
     gloss: float = 0.0  # strength of highlights, 1 is plausible: surfaces that change with the view
-    moving_object: float = 0.0  # a ball of so many times its usual size rolls and hops through the scene
+    moving_object: float = 0.0  # a ball of so many times its usual size swings and bounces through the view
     origin: float = 0.0  # added to all world coordinates
     scale: float = 1.0  # multiplies all world lengths
 

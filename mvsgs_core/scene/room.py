@@ -27,16 +27,18 @@ LIGHTING = Lighting(
 
 def build(seed: int, plain_walls: int = 0) -> list[Patch]:
     """Patches of the room. `plain_walls`: how many walls (0 to 4) are bare, painted in one color."""
-    rng = np.random.default_rng([seed, 1])
+    # A stream of its own for every part: what is left out of one changes nothing in the others.
+    walls, shell, window, west, north, south, east, middle = np.random.default_rng([seed, 1]).spawn(8)
     bare = set(WALLS[:plain_walls])
     return [
-        *_shell(rng, bare),
-        *_window(rng),
-        *_west(rng, "west" in bare),
-        *_north(rng, "north" in bare),
-        *_south(rng, "south" in bare),
-        *_east(rng),
-        *_middle(rng),
+        *_walls(walls, bare),
+        *_shell(shell),
+        *_window(window),
+        *_west(west, "west" in bare),
+        *_north(north, "north" in bare),
+        *_south(south, "south" in bare),
+        *_east(east),
+        *_middle(middle),
     ]
 
 
@@ -51,7 +53,7 @@ def against(wall: str, along: float, parts: list[Patch], z: float = 0.0) -> list
     return transformed(parts, yaw, shift)
 
 
-def _shell(rng: np.random.Generator, bare: set[str]) -> list[Patch]:
+def _walls(rng: np.random.Generator, bare: set[str]) -> list[Patch]:
     leaves = [(92, 122, 84), (146, 158, 100), (178, 120, 84), (84, 112, 124), (190, 164, 108), (140, 84, 78)]
     coat: dict[str, Material] = {
         "west": materials.wallpaper(rng, (206, 198, 176), leaves),
@@ -66,10 +68,13 @@ def _shell(rng: np.random.Generator, bare: set[str]) -> list[Patch]:
         "east": quad((w, d, h), (0, -d, 0), (0, 0, -h)),
         "south": quad((w, 0, h), (-w, 0, 0), (0, 0, -h)),
     }
-    parts = [surface(q, materials.plain((206, 202, 192)) if n in bare else coat[n]) for n, q in quads.items()]
-    parts.append(
-        surface(quad((0, d, 0), (w, 0, 0), (0, -d, 0)), materials.planks(rng, (84, 50, 28), (190, 136, 84)), gloss=0.2)
-    )
+    return [surface(q, materials.plain((206, 202, 192)) if n in bare else coat[n]) for n, q in quads.items()]
+
+
+def _shell(rng: np.random.Generator) -> list[Patch]:
+    w, d, h = WIDTH, LENGTH, HEIGHT
+    boards = materials.planks(rng, (84, 50, 28), (190, 136, 84))
+    parts = [surface(quad((0, d, 0), (w, 0, 0), (0, -d, 0)), boards, gloss=0.2)]
     ceiling = materials.plaster(rng, (216, 212, 202), 18, density=130)
     parts.append(surface(quad((0, 0, h), (w, 0, 0), (0, d, 0)), ceiling))
     for x in (0.7, 1.95, 3.2, 4.45):
@@ -161,8 +166,11 @@ def _south(rng: np.random.Generator, bare: bool) -> list[Patch]:
         parts += box((low[0], 0, low[1]), (high[0], 0.05, high[1]), frame, skip=("front",))
     brass = materials.marbled(rng, [(110, 84, 40), (220, 186, 110)])
     parts.append(blob((3.63, 0.08, 1.02), (0.03, 0.03, 0.03), brass))
-    coat = materials.fabric(rng, (70, 84, 120), (150, 120, 80))
-    parts.append(blob((3.1, 0.12, 1.3), (0.16, 0.09, 0.42), coat, square=0.7, bumps=0.04, rng=rng, rows=16))
+    u, v = np.linspace(1, -1, 25), np.linspace(0, 1, 13)[:, None]
+    fold = 0.05 + (0.3 + 0.7 * v) * (0.022 * np.sin(9 * u + 2 * v) + 0.012 * np.sin(21 * u))
+    shawl = np.stack([3.12 + (0.17 + 0.04 * v) * u, fold, 1.72 - 0.95 * v + 0.03 * np.sin(4 * u)], axis=-1)
+    parts.append(surface(shawl, materials.fabric(rng, (70, 84, 120), (170, 120, 70)), two_sided=True))
+    parts += box((2.9, 0, 1.72), (3.34, 0.07, 1.78), frame, skip=("front",))
     parts += transformed(furniture.crate(rng, 0.36), 0.3, (4.85, 0.35, 0))
     if not bare:
         parts += against("south", 2.0, furniture.framed(rng, 0.95, 0.68, "abstract"), 1.7)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
+from .. import geometry
 from . import aerial, room
 from .lighting import Lighting
 from .materials import marbled
@@ -21,11 +23,23 @@ SCENES = ("room", "aerial")
 class Stage:
     """A scene ready to be filmed."""
 
+    REACH: ClassVar[dict[str, float]] = {"room": 0.12, "aerial": 4.0}  # scene units of one unit of the ball's swing
     name: str
     renderer: SceneRenderer
     path: Path
     ball: SceneRenderer  # stands at its own origin
-    ball_path: tuple[np.ndarray, np.ndarray]  # ends (3,) between which it rolls, scene units
+    focus: np.ndarray  # (3,) the middle of where it moves, scene units; relative to the camera in the landscape
+
+    def world_from_ball(self, s: float, world_from_cam: np.ndarray) -> np.ndarray:
+        """Pose (4, 4) of the ball at frame s: it swings and bounces over the table, or flies ahead of the camera."""
+        swing = np.array([6.0 * np.sin(2.0 * np.pi * s / 90.0), 4.5 * np.sin(2.0 * np.pi * s / 127.0), 0.0])
+        swing[2] = 4.0 * abs(np.sin(2.0 * np.pi * s / 34.0))
+        pose = np.eye(4)
+        pose[:3, :3] = geometry.so3_exp(np.array([0.09 * s, 0.05 * s, 0.02 * s]))
+        pose[:3, 3] = self.focus + self.REACH[self.name] * swing
+        if self.name == "aerial":
+            pose[:2, 3] += world_from_cam[:2, 3]
+        return pose
 
 
 @functools.lru_cache(maxsize=4)
@@ -54,7 +68,6 @@ def stage(scene: str, seed: int, textureless: int, loop_frames: int | None, movi
     size = max(moving_object, 0.01)
     renderer = renderer_of(scene, seed, textureless)
     if scene == "aerial":
-        ends = (np.array([-90.0, -60.0, 22.0]), np.array([90.0, 80.0, 22.0]))
-        return Stage(scene, renderer, FlightPath(seed, loop_frames), ball_of(5.0 * size, seed), ends)
-    ends = (np.array([0.9, 1.0, 0.5]), np.array([4.3, 3.5, 0.5]))
-    return Stage(scene, renderer, RoomPath(seed, loop_frames), ball_of(0.2 * size, seed), ends)
+        path: Path = FlightPath(seed, loop_frames)
+        return Stage(scene, renderer, path, ball_of(5.0 * size, seed), np.array([0.0, 30.0, 15.0]))
+    return Stage(scene, renderer, RoomPath(seed, loop_frames), ball_of(0.13 * size, seed), np.array([2.6, 2.2, 1.1]))
