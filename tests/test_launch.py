@@ -78,6 +78,7 @@ class Launch:
     def kill(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
+        self.process.communicate()
 
 
 @pytest.fixture
