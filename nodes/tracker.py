@@ -15,6 +15,7 @@ from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.publish import Correction
+from mvsgs_core.tracking.starting import StartingConfig
 from nodes import Node
 
 
@@ -34,6 +35,8 @@ class Tracker(Node):
         proximity: int = 3  # older keyframes that it is matched with
         steps: int = 5  # of the local bundle adjustment
         global_edges: int = 6  # of each keyframe in the global bundle adjustment
+        loops: bool = True  # old keyframes are looked for by appearance
+        saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
         tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
         threads: int | None = None  # of the C++ kernels; null: 1
 
@@ -46,7 +49,6 @@ class Tracker(Node):
             core.TrackerConfig(
                 area=c.area,
                 flow=c.flow,
-                start_keyframes=c.start_keyframes,
                 tolerance=c.tolerance,
                 threads=c.threads or 1,
                 front_end=FrontEndConfig(
@@ -54,6 +56,9 @@ class Tracker(Node):
                 ),
                 local_map=LocalMapConfig(window=c.window, recent=c.recent, proximity=c.proximity, steps=c.steps),
                 back_end=BackEndConfig(edges=c.global_edges),
+                starting=StartingConfig(keyframes=c.start_keyframes),
+                loops=c.loops,
+                saturation=c.saturation,
             )
         )
         self._frames: dict[int, Frame] = {}  # those that may still become keyframes of the first start
@@ -63,10 +68,6 @@ class Tracker(Node):
         self._frames[frame.index] = frame
         update = self._tracker.add(frame.index, frame.timestamp, frame.image, frame.intrinsics)
         yield from self._send(update)
-
-    def on_idle(self) -> list[Keyframe | Poses] | None:
-        update = self._tracker.idle()
-        return None if update is None else list(self._send(update))
 
     def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
         for update in self._tracker.finish():

@@ -25,6 +25,12 @@ class BackEnd:
         self.local_map = local_map
         self.config = config
         self.threads = threads
+        self.pending = 0  # steps of background bundle adjustment that are still to do
+
+    def work(self, segment: int) -> None:
+        """A portion of the background work, if there is any: one step for each new keyframe."""
+        if self.pending > 0 and len(self.local_map.members(segment)) >= 3:
+            self.pending = 0 if self.step(segment).failure else self.pending - 1
 
     def extend_edges(self, index: int, segment: int) -> int:
         """Adds edges from one keyframe to those that see the same; returns how many were matched."""
@@ -62,6 +68,15 @@ class BackEnd:
             solutions.append(solution)
         self.graph.rescale(members, self._median_inverse_depth(members) / before)
         return solutions
+
+    def step(self, segment: int) -> Solution:
+        """One step of global bundle adjustment: background work between keyframes."""
+        members = self.local_map.members(segment)
+        before = self._median_inverse_depth(members)
+        solver = Solver(steps=1, robust_scale=1.0, lm=1e-5, threads=self.threads)
+        solution = self.graph.optimize(members, set(members[1:]), set(members), solver, prior=True)
+        self.graph.rescale(members, self._median_inverse_depth(members) / before)
+        return solution
 
     def _median_inverse_depth(self, members: list[int]) -> float:
         return float(np.median([1.0 / self.graph.keyframes[index].median_depth for index in members]))

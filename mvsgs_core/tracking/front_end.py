@@ -8,7 +8,7 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.flow import DenseInverseSearch, Matches, sample_field
+from mvsgs_core.tracking.flow import DenseInverseSearch, Matches, sample_field, spread
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.localization import Localization, localize
@@ -56,6 +56,16 @@ class FrontEnd:
         self.reference = self.last = image
         self.carried = image.cells.points.astype(np.float64)
         self.step = None
+
+    def resume(self, reference: TrackingImage, image: TrackingImage, matches: Matches, pose: np.ndarray | None) -> None:
+        """Goes on from a frame whose matches with another keyframe, and pose (4, 4), are known."""
+        self.refer_to(reference)
+        alive = matches.alive
+        near = spread(
+            reference.cells.points[alive], (matches.target - reference.cells.points)[alive], reference.cells.points
+        )
+        self.carried = np.where(alive[:, None], matches.target, near)
+        self.last, self.pose = image, pose
 
     def follow(self, image: TrackingImage, started: bool) -> Step:
         """Finds the reference's points in the next frame, and, once started, its pose."""

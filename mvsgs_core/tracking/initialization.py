@@ -13,7 +13,7 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.camera import matrix
-from mvsgs_core.tracking.bundle_adjustment import Solution, Solver, adjust, reproject
+from mvsgs_core.tracking.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
 from mvsgs_core.tracking.graph import KeyframeGraph
 
 
@@ -21,7 +21,9 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 class StartCriteria:
     """When a start counts as one. Pixels at the tracker's size."""
 
+    certain_cost: float = 0.2  # below, no other start is tried
     max_cost: float = 0.7  # robust cost (Cauchy, 1 pixel) a match
+    min_turn_error: float = 0.8  # pixels by which the best rotations must miss the matches, median of the worst pair
     min_parallax: float = 2.0  # pixels, median over the matches of the longest pair: what a rotation can't explain
     min_baseline: float = 0.03  # largest distance of two cameras over the median depth
 
@@ -46,6 +48,11 @@ def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, th
     k, m = problem.inverse_depth.shape
     problem = replace(problem, prior=np.ones((k, m)), prior_weight=np.full((k, m), 0.05), damping=np.full((k, m), 0.01))
     matched = float(np.sum(problem.information[:, 0] > 0))
+    turned = _rotation_error(problem, threads)
+    if turned < criteria.min_turn_error:
+        ones = np.ones((k, m))
+        reason = f"a camera that only turned explains the matches to {turned:.1f} pixels"
+        return Start(problem.cam_from_world, ones, 0.0 * ones, np.inf, turned, 0.0, reason)
     starts = [np.tile(np.eye(4), (k, 1, 1)), *_essential_starts(graph, order)]
     best: Solution | None = None
     for poses in starts:
@@ -59,6 +66,8 @@ def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, th
             current = replace(current, cam_from_world=attempt.cam_from_world, inverse_depth=attempt.inverse_depth)
         if attempt is not None and not attempt.failure and (best is None or attempt.cost < best.cost):
             best = attempt
+            if best.cost < criteria.certain_cost * matched:
+                break
     if best is None:
         nothing = np.ones((k, m))
         return Start(starts[0], nothing, 0.0 * nothing, np.inf, 0.0, 0.0, "no start could be solved")
@@ -79,9 +88,31 @@ def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, th
         failure = f"the matches do not agree (cost {cost:.2f} a match)"
     elif parallax < criteria.min_parallax or baseline < criteria.min_baseline:
         failure = f"too little parallax ({parallax:.1f} pixels, baseline {baseline:.3f} of the depth)"
-    elif known.mean() < 0.15:
+    elif known.sum() < 0.3 * np.mean(problem.information[:, 0] > 0) * k * m:
         failure = "too few points could be triangulated"
     return Start(poses, depths, best.information * scale**2, cost, parallax, baseline, failure)
+
+
+def _rotation_error(problem: Graph, threads: int) -> float:
+    """Pixels by which the best rotations miss the matches: the largest median over the edges."""
+    k, m = problem.inverse_depth.shape
+    far = replace(
+        problem,
+        cam_from_world=np.tile(np.eye(4), (k, 1, 1)),
+        inverse_depth=np.full((k, m), 1e-9),
+        free_depth=np.zeros(k, bool),
+        prior=None,
+        prior_weight=None,
+    )
+    for scale in (8.0, 2.0):
+        solution = adjust(far, Solver(steps=10, ep=1e-3, robust_scale=scale, threads=threads))
+        if solution.failure:
+            return np.inf
+        far = replace(far, cam_from_world=solution.cam_from_world)
+    pixels, z = reproject(far.cam_from_world, far.inverse_depth, far.pixels, far.intrinsics, far.source, far.to)
+    seen = (far.information[:, 0] > 0) & (z > 0.05)
+    distance = np.linalg.norm(pixels - far.target, axis=1)
+    return max((float(np.median(d[s])) for d, s in zip(distance, seen) if s.sum() > 30), default=0.0)
 
 
 def _parallax(

@@ -101,14 +101,53 @@ class LocalMap:
         flow = np.where(inside, np.hypot(to_u - u, to_v - v), 0.0).sum(axis=1) / np.maximum(seen, 1)
         return {c: float(f) for c, f, n in zip(candidates, flow, seen) if n > min_overlap * len(some)}
 
+    def from_pose(self, pose: np.ndarray, segment: int, limit: float) -> list[int]:
+        """Keyframes whose points would move less than `limit` pixels to a camera at this pose (4, 4), nearest first."""
+        flows = {}
+        for index in self.members(segment):
+            keyframe = self.graph.keyframes[index]
+            # A cheap bound first: the optical axes must nearly agree.
+            if float(keyframe.cam_from_world[2, :3] @ pose[2, :3]) < 0.9:
+                continue
+            at, inside = self.graph.predict_pose(index, pose)
+            seen = inside & keyframe.triangulated
+            if seen.sum() > 0.7 * keyframe.triangulated.sum():
+                flows[index] = float(np.mean(np.linalg.norm(at - keyframe.points, axis=1)[seen]))
+        return sorted((index for index in flows if flows[index] < limit), key=lambda index: flows[index])
+
+    def agreement(self, index: int, pixels: float = 2.0) -> float:
+        """Share of the matches to and from a keyframe that its pose and the depths explain."""
+        good = total = 0
+        for source, to in self.graph.edges:
+            if index not in (source, to):
+                continue
+            edge = self.graph.edges[source, to]
+            expected, _ = self.graph.predict(source, to)
+            seen = edge.weight > 0
+            with np.errstate(invalid="ignore"):
+                good += int((np.linalg.norm(expected - edge.target.T, axis=1)[seen] < pixels).sum())
+            total += int(seen.sum())
+        return good / total if total else 0.0
+
     def adjust_window(self, newest: int) -> Solution:
         """Bundle adjustment of the newest keyframes; older neighbors take part, held."""
         members = self.members(self.graph.keyframes[newest].segment)
         window = members[-self.config.window :]
-        held = set(window[:2]) if len(members) > len(window) else {window[0]}
+        young = len(members) <= len(window)  # nothing older holds the scale: it is put back afterwards
+        held = {window[0]} if young else set(window[:2])
         around = {n for index in window for n in self.graph.neighbors(index)} & set(members)
         solver = Solver(steps=self.config.steps, robust_scale=self.config.robust_scale, threads=self.threads)
-        return self.graph.optimize(set(window) | around, set(window) - held, set(window), solver)
+        before = [self.graph.keyframes[index].inverse_depth for index in window]
+        solution = self.graph.optimize(set(window) | around, set(window) - held, set(window), solver)
+        if young:
+            now = [self.graph.keyframes[index] for index in window]
+            ratios = [
+                np.median((k.inverse_depth / old)[k.triangulated])
+                for k, old in zip(now, before)
+                if k.triangulated.any()
+            ]
+            self.graph.rescale(window, float(np.median(ratios)) if ratios else 1.0)
+        return solution
 
     def _carry_depth(self, image: TrackingImage, pose: np.ndarray, matches: dict[int, Matches]) -> np.ndarray:
         """Inverse depths (M,): the median of the five nearest points of other keyframes found or expected here."""

@@ -1,7 +1,9 @@
 """The tracker: images in; keyframes, corrected poses and the whole path out.
 
 Semi-dense matches (flow.py) of the newest keyframe give each frame's pose; keyframes join a graph (local_map.py) that
-dense bundle adjustment keeps consistent; before that, the first keyframes are solved from nothing (initialization.py).
+dense bundle adjustment keeps consistent; before that, the first keyframes are solved from nothing (starting.py). A lost
+camera is looked for in the map, and starts a new segment meanwhile; loops (loop_closure.py) correct or join.
+All of it happens in `add`, in bounded portions: the same frames always give the same poses, however fast they come.
 """
 
 from __future__ import annotations
@@ -14,15 +16,18 @@ import numpy as np
 from mvsgs_core.camera import fit_size, scale_intrinsics
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
 from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.flow import Matches, make_flow, spread
+from mvsgs_core.tracking.flow import make_flow
 from mvsgs_core.tracking.frames import FrameRecord, Path, State, compact, solve_path
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.initialization import StartCriteria, start_up
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
+from mvsgs_core.tracking.loop_closure import LoopCloser, LoopConfig
 from mvsgs_core.tracking.matcher import Matcher
 from mvsgs_core.tracking.publish import Correction, Publisher
+from mvsgs_core.tracking.recovery import Recovery, RecoveryConfig
+from mvsgs_core.tracking.sighting import Sighting
+from mvsgs_core.tracking.starting import Starter, StartingConfig
 from mvsgs_core.tracking.stats import TrackingStats
 
 
@@ -30,15 +35,17 @@ from mvsgs_core.tracking.stats import TrackingStats
 class TrackerConfig:
     area: int = 320 * 240  # pixels of the tracker's image, same aspect as the input
     flow: str = "lucas_kanade"  # mvsgs_core.tracking.flow.FLOWS, or module:Class
-    start_keyframes: int = 6  # before a start is tried
-    start_flow: float = 0.035  # of the width: median flow between keyframes before the start
-    start_limit: int = 10  # keyframes held before the start; the oldest goes first
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
+    loops: bool = True  # look for old keyframes by appearance
+    saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
+    texture: float = 0.05  # share of the cells that must be textured for an image to be of any use
     threads: int = 1
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
+    starting: StartingConfig = field(default_factory=StartingConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     back_end: BackEndConfig = field(default_factory=BackEndConfig)
-    start: StartCriteria = field(default_factory=StartCriteria)
 
 
 @dataclass(frozen=True)
@@ -54,11 +61,12 @@ class Tracker:
     def __init__(self, config: TrackerConfig | None = None) -> None:
         self.config = config or TrackerConfig()
         self.records: list[FrameRecord] = []
+        self.stats = TrackingStats()
         self.started = False
         self.segment = 0
-        self.stats = TrackingStats()
         self.graph: KeyframeGraph | None = None
-        self._waiting: list[int] = []  # keyframes before the start
+        self._since = 0  # frames since the last keyframe
+        self._path = solve_path([], KeyframeGraph(np.ones(4)), Solver())
 
     def add(self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> Update:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow."""
@@ -69,18 +77,19 @@ class Tracker:
         self.stats.count("frames")
         record = FrameRecord(index, timestamp, State.NOT_STARTED)
         self.records.append(record)
+        self._since += 1
         if self.front_end.reference is None:
-            return self._begin(frame)
+            return self._begin(frame, record)
         with self.stats.time("front end"):
             step = self.front_end.follow(frame, self.started)
         if step.still:
             self.stats.skip("frames that did not move")
-            record.state, record.same_as = self.records[-2].state, self.records[-2].index
-            if self.records[-2].same_as is not None:
-                record.same_as = self.records[-2].same_as
+            last = self.records[-2]
+            record.state, record.same_as = last.state, last.index if last.same_as is None else last.same_as
             return Update(record.state)
         if self.front_end.is_lost(step):
             return self._lose(frame, record)
+        self.recovery.found_again()
         record.reference = self.front_end.reference.index
         record.matches = compact(step.matches)
         record.cam_from_reference = self.front_end.cam_from_reference(step)
@@ -89,26 +98,27 @@ class Tracker:
     @property
     def pending(self) -> set[int]:
         """Frames that may still become keyframes that are told: their images are needed until then."""
-        return set(self._waiting)
-
-    def idle(self) -> Update | None:
-        """A slice of background work; None when there is nothing to do."""
-        return None
+        return set(self.starter.waiting) if self.graph is not None else set()
 
     def finish(self) -> Iterator[Update]:
         """The stream has ended: a start by force if there was none, and the global bundle adjustment."""
         if self.graph is None:
             return
+        if not self.started:
+            yield from self._force_start()
         with self.stats.time("global bundle adjustment"):
             for segment in sorted({k.segment for k in self.graph.keyframes.values()}):
                 self._adjust_globally(segment)
-        yield Update(State.TRACKED, (), self.publisher.corrections(everything=True))
+        with self.stats.time("frames without a pose"):
+            found = self.recovery.fill_in(self.records)
+            self._path = solve_path(self.records, self.graph, Solver(steps=8, threads=self.config.threads))
+        self.stats.count("frames posed in the end", found)
+        self._warn_at_end()
+        yield Update(State.TRACKED if self.started else State.NOT_STARTED, (), self.publisher.corrections(True))
 
     def path(self) -> Path:
         """Every frame's pose, after `finish`."""
-        if self.graph is None:
-            return solve_path([], KeyframeGraph(np.ones(4)), Solver())
-        return solve_path(self.records, self.graph, Solver(steps=8, threads=self.config.threads))
+        return self._path
 
     def keyframe(self, index: int) -> Keyframe:
         assert self.graph is not None
@@ -121,113 +131,185 @@ class Tracker:
         self.flow = make_flow(config.flow)
         self.matcher = Matcher(self.flow)
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, config.threads)
+        self.starter = Starter(self.graph, self.matcher, config.starting, config.threads)
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, config.threads)
+        self.loops = LoopCloser(self.graph, self.local_map, config.loop)
+        self.recovery = Recovery(self.graph, self.matcher, self.loops.retrieval, config.recovery, config.front_end)
         self.back_end = BackEnd(self.graph, self.local_map, config.back_end, config.threads)
         self.publisher = Publisher(self.graph, config.tolerance)
 
-    def _begin(self, frame: TrackingImage) -> Update:
+    def _begin(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """First keyframe of a segment that has not started yet."""
-        if frame.cells.textured.mean() < 0.05:
-            self.stats.warn("frames without texture before the start")
-            return Update(State.NOT_STARTED)
-        self._add_waiting(frame)
+        if frame.cells.textured.mean() < self.config.texture:
+            self.stats.count("frames without texture")
+            record.state = State.NOT_STARTED
+            return Update(record.state)
+        self.recovery.keep(frame)
+        self.starter.add(frame, self.segment)
         self.front_end.refer_to(frame)
-        return Update(State.NOT_STARTED)
-
-    def _add_waiting(self, frame: TrackingImage) -> None:
-        assert self.graph is not None
-        ones = np.ones(len(frame.cells.points))
-        self.graph.add(Keyframe(frame, np.eye(4), ones, ones.copy(), 0.0 * ones, self.segment))
-        self._waiting.append(frame.index)
+        self.front_end.pose = None
+        self._since = 0
+        return Update(record.state)
 
     def _wait(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """Before the start: keyframes are collected until they can be solved."""
-        assert self.graph is not None
-        if not self.front_end.wants_keyframe(step, self.config.start_flow):
+        self.recovery.keep(frame)
+        if not self.front_end.wants_keyframe(step, self.starter.flow(self._since)):
             return Update(State.NOT_STARTED)
         with self.stats.time("start"):
-            earlier = list(self._waiting)
-            self._add_waiting(frame)
-            self._connect_waiting(frame, earlier, step.matches)
+            self.starter.add(frame, self.segment, step.matches)
             self.front_end.refer_to(frame)
-            if len(self._waiting) < self.config.start_keyframes:
+            self._since = 0
+            waiting = list(self.starter.waiting)
+            started = self.starter.try_start()
+        if not started:
+            sighting = self.recovery.relocalize(frame) if self.segment > 0 else None
+            if sighting is None:
                 return Update(State.NOT_STARTED)
-            start = start_up(self.graph, self._waiting, self.config.start, self.config.threads)
-            self.stats.count("start attempts")
-            if start.failure:
-                if len(self._waiting) >= self.config.start_limit:
-                    self.graph.remove(self._waiting.pop(0))
-                return Update(State.NOT_STARTED)
-            for n, index in enumerate(self._waiting):
-                keyframe = self.graph.keyframes[index]
-                keyframe.cam_from_world, keyframe.inverse_depth = start.cam_from_world[n], start.inverse_depth[n]
-                keyframe.information, keyframe.prior = start.information[n], np.ones_like(start.inverse_depth[n])
-        self.started = True
-        self.front_end.pose = self.graph.keyframes[frame.index].cam_from_world
-        told, self._waiting = tuple(self._waiting), []
-        for index in told:
-            self.publisher.tell(index)
-        record.state = State.TRACKED
-        return Update(State.TRACKED, told)
+            self.starter.abandon()
+            self.segment -= 1
+            return self._resume(frame, record, sighting)
+        return self._started(waiting, record)
 
-    def _connect_waiting(self, frame: TrackingImage, earlier: list[int], matches: Matches) -> None:
-        """Edges both ways between a keyframe before the start and those before it, chained from one to the next."""
+    def _started(self, waiting: list[int], record: FrameRecord) -> Update:
         assert self.graph is not None
-        share = self.config.local_map.min_share
-        points = frame.cells.points.astype(np.float64)
-        newest = earlier[-1]
-        forward = {newest: matches}  # matches of an earlier keyframe's points in the new one
-        self.graph.connect(newest, frame.index, matches, share)
-        for n, index in enumerate(reversed(earlier[-5:])):
-            image = self.graph.keyframes[index].image
-            if n:
-                link = self.graph.edges.get((index, newest))
-                if link is None:
-                    continue
-                seen, hop = link.weight > 0, forward[newest]
-                near = self.graph.keyframes[newest].points.astype(np.float64)
-                guess = spread(
-                    near[hop.alive], hop.target[hop.alive] - near[hop.alive], link.target.T[seen].astype(np.float64)
-                )
-                start = image.cells.points.astype(np.float64)
-                guess_all = spread(start[seen], guess - start[seen], start)
-                forward[index], _ = self.matcher.match(image, frame, guess_all, share)
-                self.graph.connect(index, frame.index, forward[index], share)
-            found = forward[index]
-            if found.alive.sum() < 30:
-                continue
-            at = found.target[found.alive]
-            back = spread(at, image.cells.points[found.alive] - at, points)
-            self.graph.connect(frame.index, index, self.matcher.match(frame, image, back, share)[0], share)
+        self.started = True
+        self.local_map.adjust_window(waiting[-1])
+        self.front_end.pose = self.graph.keyframes[waiting[-1]].cam_from_world
+        for index in waiting:
+            self.publisher.tell(index)
+            if self.config.loops:
+                self.loops.add(index)
+        self.stats.count("keyframes", len(waiting))
+        record.state = State.TRACKED
+        return Update(State.TRACKED, tuple(waiting))
 
     def _go_on(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """A tracked frame; perhaps a keyframe."""
         assert self.graph is not None
+        assert self.front_end.reference is not None
         assert step.localization is not None
         record.state = State.TRACKED
+        pose = step.localization.cam_from_world
         if not self.front_end.wants_keyframe(step, self.config.front_end.keyframe_flow):
             return Update(State.TRACKED)
-        assert self.front_end.reference is not None
+        if self._known_here(frame, pose):
+            return Update(State.TRACKED)
+        reference = self.front_end.reference.index
         with self.stats.time("local map"):
-            reference = self.front_end.reference.index
-            self.local_map.insert(frame, step.localization.cam_from_world, self.segment, {reference: step.matches})
+            self.local_map.insert(frame, pose, self.segment, {reference: step.matches})
         with self.stats.time("local bundle adjustment"):
             solution = self.local_map.adjust_window(frame.index)
         if solution.failure:
             self.stats.warn(f"local bundle adjustment failed: {solution.failure}")
+        if self.local_map.agreement(frame.index) < self.config.front_end.lost_inliers:
+            self.graph.remove(frame.index)
+            self.stats.count("keyframes taken back")
+            return self._lose(frame, record)
+        if self.graph.keyframes[frame.index].triangulated.mean() < 0.3 * frame.cells.textured.mean():
+            record.state = State.DEGENERATE
+            self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
         self.stats.count("keyframes")
+        self._since = 0
+        self._close_loops(frame.index)
         for index in self.local_map.members(self.segment)[: -self.config.local_map.window]:
             self.graph.keyframes[index].image.release()
         self.front_end.refer_to(frame)
         self.front_end.pose = self.graph.keyframes[frame.index].cam_from_world
         correction = self.publisher.corrections()
         self.publisher.tell(frame.index)
-        return Update(State.TRACKED, (frame.index,), correction)
+        return Update(record.state, (frame.index,), correction)
+
+    def _known_here(self, frame: TrackingImage, pose: np.ndarray) -> bool:
+        """Enough keyframes already see this from here: the nearest becomes the reference again."""
+        assert self.graph is not None
+        limit = 0.5 * self.config.front_end.keyframe_flow * frame.size[1]
+        close = self.local_map.from_pose(pose, self.segment, limit)
+        if len(close) < self.config.saturation:
+            return False
+        nearest = self.graph.keyframes[close[0]].image
+        guess, _ = self.graph.predict_pose(close[0], pose)
+        matches, share = self.matcher.match(nearest, frame, guess, 0.0)
+        if share < self.config.front_end.keyframe_share:
+            return False
+        self.front_end.resume(nearest, frame, matches, pose)
+        self.stats.skip("keyframes where enough are")
+        return True
+
+    def _close_loops(self, index: int) -> None:
+        assert self.graph is not None
+        if not self.config.loops:
+            return
+        with self.stats.time("loops"):
+            closure = self.loops.search(index)
+            self.loops.add(index)
+            if closure is not None:
+                self.stats.count("loops")
+                if closure.failure:
+                    self.stats.warn(f"a loop could not be closed: {closure.failure}")
+                if closure.moved:
+                    self.stats.count("loops that moved the map")
+                    self.back_end.pending = self.config.back_end.steps
+                if closure.joined is not None:
+                    self.segment = self.graph.keyframes[index].segment
+                    self.stats.count("segments joined")
+        with self.stats.time("background bundle adjustment"):
+            self.back_end.work(self.segment)
 
     def _lose(self, frame: TrackingImage, record: FrameRecord) -> Update:
+        """The frame could not be matched: look for it in the map, else begin anew."""
         record.state = State.LOST if self.started else State.NOT_STARTED
-        self.stats.count("lost frames")
+        record.reference = record.matches = None
+        if frame.cells.textured.mean() < self.config.texture:
+            self.stats.count("frames without texture")
+            return Update(record.state)
+        self.recovery.keep(frame)
+        with self.stats.time("relocalization"):
+            sighting = self.recovery.lost(frame)
+        if sighting is not None:
+            if not self.started:
+                self.starter.abandon()
+                self.segment -= 1
+            return self._resume(frame, record, sighting)
+        if not self.started:
+            self.starter.abandon()
+            return self._begin(frame, record)
+        if self.recovery.hopeless:
+            self.started = False
+            self.segment = 1 + max(k.segment for k in self._keyframes())
+            return self._begin(frame, record)
         return Update(record.state)
+
+    def _resume(self, frame: TrackingImage, record: FrameRecord, sighting: Sighting) -> Update:
+        """Tracking goes on from a keyframe that was found in a frame."""
+        assert self.graph is not None
+        keyframe = self.graph.keyframes[sighting.index]
+        self.started = True
+        self.segment = keyframe.segment
+        self.front_end.resume(keyframe.image, frame, sighting.matches, sighting.localization.cam_from_world)
+        self.recovery.found_again()
+        self.stats.count("relocalized")
+        record.state, record.reference = State.TRACKED, sighting.index
+        record.matches = compact(sighting.matches)
+        return Update(State.TRACKED)
+
+    def _force_start(self) -> Iterator[Update]:
+        """The stream ended before the start: what was collected, with weaker criteria."""
+        assert self.graph is not None
+        frame = self.front_end.last
+        reference = self.front_end.reference
+        step = self.front_end.step
+        if frame is None or reference is None:
+            return
+        if step is not None and frame.index not in self.graph.keyframes:
+            self.starter.add(frame, self.segment, step.matches)
+        waiting = list(self.starter.waiting)
+        record = next(r for r in self.records if r.index == frame.index)
+        if self.starter.try_start(forced=True):
+            self.stats.warn("the start was forced at the end of the stream, on little motion")
+            yield self._started(waiting, record)
+        else:
+            self.starter.abandon()
 
     def _adjust_globally(self, segment: int) -> None:
         members = self.local_map.members(segment)
@@ -239,6 +321,22 @@ class Tracker:
         for solution in self.back_end.adjust(segment):
             if solution.failure:
                 self.stats.warn(f"global bundle adjustment failed: {solution.failure}")
+
+    def _warn_at_end(self) -> None:
+        segments = {k.segment for k in self._keyframes()}
+        if not segments:
+            self.stats.warn(f"tracking never started: {self.starter.reason}")
+        elif len(segments) > 1:
+            self.stats.warn(f"the map is in {len(segments)} segments: no verified loop joins them")
+        states = self._path.state
+        lost, unstarted = int(np.sum(states == State.LOST)), int(np.sum(states == State.NOT_STARTED))
+        if lost:
+            self.stats.warn(f"{lost} of {len(states)} frames were lost")
+        if segments and unstarted:
+            self.stats.warn(f"{unstarted} of {len(states)} frames came before a start and have no pose")
+
+    def _keyframes(self) -> list[Keyframe]:
+        return [] if self.graph is None else list(self.graph.keyframes.values())
 
 
 __all__ = ["Tracker", "TrackerConfig", "Update"]

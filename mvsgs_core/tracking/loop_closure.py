@@ -1,0 +1,142 @@
+"""Loops: an old keyframe seen again moves the map, by a Sim(3) pose graph, or joins two segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.local_map import LocalMap
+from mvsgs_core.tracking.pose_graph import SimilarityEdge, scale_of, solve_pose_graph
+from mvsgs_core.tracking.retrieval import Retrieval
+from mvsgs_core.tracking.sighting import Sighting, SightingCriteria, relative_scale, sight
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    candidates: int = 2  # keyframes that are looked at, for each new one
+    apart: int = 10  # keyframes: nearer ones are no loop
+    agreement: float = 0.03  # of depth, radians, half of the scale: below, the map is right and only gains an edge
+    criteria: SightingCriteria = field(default_factory=SightingCriteria)
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A verified loop. `moved`: the map was changed by more than a bundle adjustment would."""
+
+    source: int
+    to: int
+    moved: bool
+    joined: int | None = None  # segment that is no more
+    failure: str = ""
+
+
+class LoopCloser:
+    def __init__(self, graph: KeyframeGraph, local_map: LocalMap, config: LoopConfig) -> None:
+        self.graph = graph
+        self.local_map = local_map
+        self.config = config
+        self.retrieval = Retrieval()
+        self.tried = 0
+
+    def add(self, index: int) -> None:
+        """A keyframe that may be found again."""
+        self.retrieval.add(index, self.graph.keyframes[index].image.features()[1])
+
+    def search(self, index: int) -> Closure | None:
+        """Looks for old keyframes in the image of this one; the first that verifies is used."""
+        keyframe = self.graph.keyframes[index]
+        order = self.local_map.members(keyframe.segment)
+        place = order.index(index)
+        near = set(order[max(0, place - self.config.apart) :]) | self.graph.neighbors(index) | {index}
+        near |= {m for n in self.graph.neighbors(index) for m in self.graph.neighbors(n)}
+        near = {n for n in near if n in self.graph.keyframes and self.graph.keyframes[n].segment == keyframe.segment}
+        descriptors = keyframe.image.features()[1]
+        usual = set(order[max(0, place - 2) : place])
+        for candidate in self.retrieval.query(descriptors, self.config.candidates, near, usual):
+            self.tried += 1
+            found = sight(self.graph, self.local_map.matcher, candidate, keyframe.image, self.config.criteria)
+            if found is None:
+                continue
+            scale = relative_scale(self.graph, found, index)
+            if scale is not None:
+                return self.close(found, index, scale)
+        return None
+
+    def close(self, found: Sighting, index: int, scale: float) -> Closure:
+        """Moves the map so that the sighting holds. scale: unit of keyframe `index` over that of the sighted one."""
+        old, new = self.graph.keyframes[found.index], self.graph.keyframes[index]
+        joined = new.segment if old.segment != new.segment else None
+        closure = Closure(found.index, index, True, joined)
+        if joined is not None:
+            self._join(found, index, scale)
+        else:
+            agrees = self._disagreement(found, index, scale) < self.config.agreement
+            if not agrees:
+                failure = self._pull(found, index, scale)
+                if failure:
+                    return Closure(found.index, index, False, None, failure)
+            closure = Closure(found.index, index, not agrees)
+        self.graph.connect(found.index, index, found.matches, self.config.criteria.share)
+        self.local_map.match_edge(index, found.index)
+        return closure
+
+    def _disagreement(self, found: Sighting, index: int, scale: float) -> float:
+        difference = found.localization.cam_from_world @ self.graph.world_from_cam(index)
+        shift = float(np.linalg.norm(difference[:3, 3])) / self.graph.keyframes[index].median_depth
+        turn = float(np.linalg.norm(geometry.so3_log(difference[:3, :3])))
+        return max(shift, turn, 0.5 * abs(float(np.log(scale))))
+
+    def _measured(self, found: Sighting, index: int, scale: float) -> np.ndarray:
+        """Similarity (4, 4): camera `index`, in its own unit, from the sighted camera."""
+        relative = found.localization.cam_from_world @ self.graph.world_from_cam(found.index)
+        result = np.eye(4)
+        result[:3, :3], result[:3, 3] = scale * relative[:3, :3], scale * relative[:3, 3]
+        return result
+
+    def _pull(self, found: Sighting, index: int, scale: float) -> str:
+        """Pose graph over the segment; returns why it failed, or nothing."""
+        order = self.local_map.members(self.graph.keyframes[index].segment)
+        number = {k: n for n, k in enumerate(order)}
+        poses = np.stack([self.graph.keyframes[k].cam_from_world for k in order])
+        unit = float(np.median([self.graph.keyframes[k].median_depth for k in order]))
+        sigma = (0.01 * unit, 0.005, 0.01)
+        pairs = {(min(a, b), max(a, b)) for a, b in self.graph.edges if a in number and b in number}
+        pairs |= set(pairwise(order))
+        edges = [
+            SimilarityEdge(number[a], number[b], poses[number[b]] @ geometry.inverse(poses[number[a]]), sigma)
+            for a, b in sorted(pairs)
+        ]
+        edges.append(SimilarityEdge(number[found.index], number[index], self._measured(found, index, scale), sigma))
+        solution = solve_pose_graph(poses, edges, {0})
+        if solution.failure or not np.isfinite(solution.similarities).all():
+            return solution.failure or "the pose graph's solution is not finite"
+        for k, similarity in zip(order, solution.similarities):
+            self._apply(k, similarity)
+        return ""
+
+    def _join(self, found: Sighting, index: int, scale: float) -> None:
+        """Brings the segment of `index` into the frame and unit of the sighted one."""
+        target = self.graph.keyframes[found.index].segment
+        wanted = self._measured(found, index, scale) @ self.graph.keyframes[found.index].cam_from_world
+        other_from_target = self.graph.world_from_cam(index) @ wanted
+        for k in self.local_map.members(self.graph.keyframes[index].segment):
+            self._apply(k, self.graph.keyframes[k].cam_from_world @ other_from_target)
+            self.graph.keyframes[k].segment = target
+
+    def _apply(self, index: int, similarity: np.ndarray) -> None:
+        """Makes a similarity a pose: the keyframe's unit becomes the world's."""
+        keyframe = self.graph.keyframes[index]
+        scale = float(scale_of(similarity))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = similarity[:3, :3] / scale, similarity[:3, 3] / scale
+        keyframe.cam_from_world = pose
+        keyframe.inverse_depth = keyframe.inverse_depth * scale
+        keyframe.prior = keyframe.prior * scale
+        keyframe.information = keyframe.information / scale**2
+
+
+__all__ = ["Closure", "LoopCloser", "LoopConfig"]

@@ -1,0 +1,103 @@
+"""An old keyframe seen again, with no idea of the pose: features, then Lucas-Kanade, then a pose that must fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.camera import matrix
+from mvsgs_core.tracking.bundle_adjustment import Solver
+from mvsgs_core.tracking.features import match_features
+from mvsgs_core.tracking.flow import Matches, spread
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.localization import Localization, localize
+from mvsgs_core.tracking.matcher import Matcher
+
+
+@dataclass(frozen=True)
+class SightingCriteria:
+    """What makes it certain enough to move the map."""
+
+    share: float = 0.12  # of the keyframe's textured points, found
+    count: int = 50  # matches with known depth
+    inliers: float = 0.7  # of these, within 2 pixels of the pose
+    spread: float = 0.1  # of the image area: hull of the inliers
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Keyframe `index` was found in an image."""
+
+    index: int
+    matches: Matches  # of its points
+    localization: Localization  # of the image, in the keyframe's map
+
+
+def sight(
+    graph: KeyframeGraph, matcher: Matcher, index: int, image: TrackingImage, criteria: SightingCriteria
+) -> Sighting | None:
+    """None where the keyframe's points are not found or no pose explains them."""
+    keyframe = graph.keyframes[index]
+    from_keyframe, in_image = match_features(keyframe.image, image, threshold=1.5)
+    if len(from_keyframe) < 15:
+        return None
+    height, width = image.size
+    guess = spread(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * width)
+    matches, share = matcher.match(keyframe.image, image, guess, 0.0)
+    known = matches.alive & keyframe.triangulated
+    if share < criteria.share or known.sum() < criteria.count:
+        return None
+    u, v = keyframe.points[known].T.astype(np.float64)
+    fx, fy, cx, cy = graph.intrinsics
+    depth = 1.0 / keyframe.inverse_depth[known]
+    points = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], axis=1)
+    cv2.setRNGSeed(0)
+    found, rotation, translation, _ = cv2.solvePnPRansac(
+        points,
+        matches.target[known],
+        matrix(graph.intrinsics),
+        np.zeros(4),
+        iterationsCount=200,
+        reprojectionError=3.0,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    if not found:
+        return None
+    relative = np.eye(4)
+    relative[:3, :3], relative[:3, 3] = geometry.so3_exp(rotation.ravel()), translation.ravel()
+    localization = localize(graph, {index: matches}, relative @ keyframe.cam_from_world, Solver(steps=10))
+    if localization.failure or localization.inliers < criteria.inliers or localization.count < criteria.count:
+        return None
+    hull = cv2.convexHull(matches.target[known].astype(np.float32))
+    if cv2.contourArea(hull) < criteria.spread * height * width:
+        return None
+    return Sighting(index, matches, localization)
+
+
+def relative_scale(graph: KeyframeGraph, sighting: Sighting, index: int) -> float | None:
+    """Unit of keyframe `index`'s own depths over the unit of the sighted keyframe's; None where too few compare."""
+    here, seen = graph.keyframes[index], graph.keyframes[sighting.index]
+    usable = sighting.matches.alive & seen.triangulated
+    own = np.flatnonzero(here.triangulated)
+    if usable.sum() < 20 or len(own) < 20:
+        return None
+    relative = sighting.localization.cam_from_world @ graph.world_from_cam(sighting.index)
+    fx, fy, cx, cy = graph.intrinsics
+    u, v = seen.points[usable].T.astype(np.float64)
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)])
+    z = relative[2, :3] @ rays / seen.inverse_depth[usable] + relative[2, 3]
+    at = sighting.matches.target[usable]
+    distance = np.linalg.norm(at[:, None] - here.points[own][None], axis=-1)
+    nearest = np.argmin(distance, axis=1)
+    near = (distance[np.arange(len(at)), nearest] < 8.0) & (z > 0)
+    if near.sum() < 20:
+        return None
+    ratio = (1.0 / here.inverse_depth[own][nearest] / z)[near]
+    return float(np.median(ratio))
+
+
+__all__ = ["Sighting", "SightingCriteria", "relative_scale", "sight"]

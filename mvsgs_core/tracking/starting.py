@@ -1,0 +1,106 @@
+"""Before there is a map: keyframes are collected until they can be solved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mvsgs_core.tracking.flow import Matches, spread
+from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.initialization import StartCriteria, start_up
+from mvsgs_core.tracking.matcher import Matcher
+
+
+@dataclass(frozen=True)
+class StartingConfig:
+    keyframes: int = 6  # before a start is tried
+    limit: int = 10  # keyframes held; the oldest goes first
+    flow: float = 0.035  # of the width: median flow between them; falls to a third while the camera is slow
+    patience: int = 40  # frames without a keyframe over which it falls
+    back: int = 5  # keyframes that each is matched with
+    min_share: float = 0.25  # of the textured points that an edge must have found
+    criteria: StartCriteria = field(default_factory=StartCriteria)
+    forced: StartCriteria = field(
+        default_factory=lambda: StartCriteria(max_cost=1.0, min_turn_error=0.3, min_parallax=1.0, min_baseline=0.01)
+    )  # at the end of the stream
+
+
+class Starter:
+    """The keyframes of a segment that has not started."""
+
+    def __init__(self, graph: KeyframeGraph, matcher: Matcher, config: StartingConfig, threads: int) -> None:
+        self.graph = graph
+        self.matcher = matcher
+        self.config = config
+        self.threads = threads
+        self.waiting: list[int] = []
+        self.attempts = 0
+        self.reason = "too little motion"  # why there is no start yet
+
+    def flow(self, since: int) -> float:
+        """Share of the width that makes a keyframe, so many frames after the last one."""
+        return self.config.flow * max(1.0 / 3.0, 1.0 - since / self.config.patience)
+
+    def add(self, image: TrackingImage, segment: int, matches: Matches | None = None) -> None:
+        """One more keyframe. matches: where the last one's points were found in it."""
+        ones = np.ones(len(image.cells.points))
+        earlier = list(self.waiting)
+        self.graph.add(Keyframe(image, np.eye(4), ones, ones.copy(), 0.0 * ones, segment))
+        self.waiting.append(image.index)
+        if matches is not None and earlier:
+            self._connect(image, earlier, matches)
+
+    def abandon(self) -> None:
+        """Forgets the waiting keyframes."""
+        for index in self.waiting:
+            self.graph.remove(index)
+        self.waiting = []
+
+    def try_start(self, forced: bool = False) -> bool:
+        """Solves the waiting keyframes; True where that succeeded: they are then part of the map."""
+        if len(self.waiting) < (3 if forced else self.config.keyframes):
+            return False
+        self.attempts += 1
+        criteria = self.config.forced if forced else self.config.criteria
+        start = start_up(self.graph, self.waiting, criteria, self.threads)
+        if start.failure:
+            self.reason = start.failure
+            if len(self.waiting) >= self.config.limit:
+                self.graph.remove(self.waiting.pop(0))
+            return False
+        for n, index in enumerate(self.waiting):
+            keyframe = self.graph.keyframes[index]
+            keyframe.cam_from_world, keyframe.inverse_depth = start.cam_from_world[n], start.inverse_depth[n]
+            keyframe.information, keyframe.prior = start.information[n], np.ones_like(start.inverse_depth[n])
+        self.waiting = []
+        return True
+
+    def _connect(self, image: TrackingImage, earlier: list[int], matches: Matches) -> None:
+        """Edges both ways with the keyframes before, the guesses chained from one to the next."""
+        share = self.config.min_share
+        points = image.cells.points.astype(np.float64)
+        newest = earlier[-1]
+        near = self.graph.keyframes[newest].points.astype(np.float64)
+        for index in reversed(earlier[-self.config.back :]):
+            old = self.graph.keyframes[index].image
+            forward = matches
+            if index != newest:
+                link = self.graph.edges.get((index, newest))
+                if link is None:
+                    continue
+                start, seen = old.cells.points.astype(np.float64), link.weight > 0
+                hop = link.target.T[seen].astype(np.float64)
+                there = spread(near[matches.alive], (matches.target - near)[matches.alive], hop)
+                guess = spread(start[seen], there - start[seen], start)
+                forward, _ = self.matcher.match(old, image, guess, share)
+            self.graph.connect(index, image.index, forward, share)
+            if forward.alive.sum() < 30:
+                continue
+            at = forward.target[forward.alive]
+            guess = spread(at, old.cells.points[forward.alive] - at, points)
+            self.graph.connect(image.index, index, self.matcher.match(image, old, guess, share)[0], share)
+
+
+__all__ = ["Starter", "StartingConfig"]
