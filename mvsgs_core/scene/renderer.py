@@ -25,7 +25,12 @@ class SceneRenderer:
     """Triangles, textures and baked light of a list of patches."""
 
     def __init__(self, patches: Sequence[Patch], lighting: Lighting, seed: int = 0, threads: int = 0) -> None:
-        """Bakes the light: a few seconds for a room. threads 0: as many as OpenMP gives."""
+        """Bakes the light: a few seconds for a room. threads 0: as many as OpenMP gives.
+
+        Raises ValueError for points that are not finite and ImportError if the kernels are not built.
+        """
+        if not all(np.isfinite(p.points).all() for p in patches):
+            raise ValueError("a patch has points that are not finite")
         parts = [grids.triangles(p.points) for p in patches]
         sizes = light_sizes(patches, lighting.texel)
         self.lighting = lighting

@@ -90,6 +90,36 @@ def test_depth_is_exact_at_pixel_centers() -> None:
     np.testing.assert_allclose(depth, 3.0 / (1.0 - 0.5 * x + 0.25 * y), rtol=3e-6)
 
 
+def test_nearest_hit_is_that_of_all_triangles_tried_one_by_one() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.uniform((-2, -2, 2), (2, 2, 6), (400, 1, 3))
+    corners = places + rng.normal(0, 0.4, (400, 3, 3))
+    corners[::7] = corners[0]  # coincident ones can't be parted by any plane
+    paper = np.full((4, 4, 3), 128, np.uint8)
+    patches = [Patch(np.stack([[a, b], [c, b + c - a]]), paper) for a, b, c in corners]
+    intrinsics = np.array([40.0, 40.0, 19.5, 14.5])
+    depth = SceneRenderer(patches, LIGHT).render(np.eye(4), intrinsics, (30, 40)).depth
+    u, v = camera.pixel_grid(30, 40)
+    rays = np.stack([(u - 19.5) / 40.0, (v - 14.5) / 40.0, np.ones_like(u)], axis=-1)
+    expected = np.full((30, 40), np.inf)
+    for a, b, c in corners:
+        normal = np.cross(b - a, c - a)
+        z = (a @ normal) / (rays @ normal)
+        along = np.linalg.lstsq(np.stack([b - a, c - a], axis=1), (rays * z[..., None] - a).reshape(-1, 3).T)[0]
+        inside = ((along >= 0) & (along <= 1)).all(axis=0).reshape(30, 40)  # a parallelogram: the patch's two triangles
+        expected = np.where(inside & (z > 0) & (z < expected), z, expected)
+    expected[np.isinf(expected)] = 0.0
+    assert np.mean(np.abs(depth - expected) < 1e-4) > 0.995  # a ray along an edge may fall on either side
+    assert 0.1 < np.mean(expected > 0) <= 1.0
+
+
+def test_corner_that_is_not_finite_is_refused() -> None:
+    points = quad((0, 0, 1), (1, 0, 0), (0, 1, 0))
+    points[0, 0, 0] = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        SceneRenderer([Patch(points, np.zeros((4, 4, 3), np.uint8))], LIGHT)
+
+
 def test_camera_axes_are_right_down_forward() -> None:
     white, dark = np.full((4, 4, 3), 255, np.uint8), np.full((4, 4, 3), 20, np.uint8)
     right_low = Patch(quad((0.2, 0.2, 2), (0.5, 0, 0), (0, 0.5, 0)), white, emission=1.0)

@@ -11,6 +11,8 @@ namespace {
 
 constexpr int BINS = 12;
 constexpr int LEAF = 4;
+constexpr int DEEPEST = 64;  // levels that follow the heuristic; 31 halvings after it reach any leaf
+constexpr int STACK = 128;
 constexpr float EDGE_TOLERANCE = 2e-6f;  // closes the cracks between neighboring triangles
 
 Vec3 minimum(Vec3 a, Vec3 b) { return {std::min(a.x, b.x), std::min(a.y, b.y), std::min(a.z, b.z)}; }
@@ -39,12 +41,12 @@ Bvh::Bvh(std::vector<Corners> triangles) : order_(triangles.size()) {
         high[i] = maximum(a, maximum(b, c));
     }
     nodes_.reserve(triangles.size());
-    build(low, high, 0, static_cast<int>(triangles.size()));
+    build(low, high, 0, static_cast<int>(triangles.size()), 0);
     ordered_.reserve(triangles.size());
     for (const int i : order_) ordered_.push_back(triangles[i]);
 }
 
-int Bvh::build(std::vector<Vec3>& low, std::vector<Vec3>& high, int first, int last) {
+int Bvh::build(const std::vector<Vec3>& low, const std::vector<Vec3>& high, int first, int last, int depth) {
     Bounds bounds, centers;
     for (int i = first; i < last; ++i) {
         const int k = order_[i];
@@ -87,16 +89,16 @@ int Bvh::build(std::vector<Vec3>& low, std::vector<Vec3>& high, int first, int l
             if (n > 0 && n < last - first && cost < best) best = cost, best_axis = axis, best_bin = b;
         }
     }
-    int middle = (first + last) / 2;
-    if (best_axis >= 0) {
+    int middle = (first + last) / 2;  // of triangles in any order, where no plane parts them or the tree gets too deep
+    if (best_axis >= 0 && depth < DEEPEST) {
         middle = static_cast<int>(std::partition(order_.begin() + first, order_.begin() + last,
                                                  [&](int k) { return bin_of(k, best_axis) <= best_bin; }) -
                                   order_.begin());
-    } else if (last - first < std::numeric_limits<uint16_t>::max()) {
+    } else if (best_axis < 0 && last - first < std::numeric_limits<uint16_t>::max()) {
         return index;  // all centers coincide: one leaf
     }
-    build(low, high, first, middle);
-    const int second = build(low, high, middle, last);
+    build(low, high, first, middle, depth + 1);
+    const int second = build(low, high, middle, last, depth + 1);
     nodes_[index].first = second;
     nodes_[index].count = 0;
     nodes_[index].axis = static_cast<uint16_t>(std::max(best_axis, 0));
@@ -136,7 +138,7 @@ void Bvh::nearest(Packet& packet, float t_min) const {
         packet.triangle[l] = -1;
     }
     if (ordered_.empty()) return;
-    int stack[128];
+    int stack[STACK];
     int top = 0;
     stack[top++] = 0;
     while (top > 0) {

@@ -40,7 +40,7 @@ private:
     std::vector<Corners> ordered_;
     std::vector<int> order_;
 
-    int build(std::vector<Vec3>& low, std::vector<Vec3>& high, int first, int last);
+    int build(const std::vector<Vec3>& low, const std::vector<Vec3>& high, int first, int last, int depth);
     static void intersect(Packet& packet, const Corners& triangle, int id, float t_min);
 };
 

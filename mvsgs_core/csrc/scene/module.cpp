@@ -67,6 +67,8 @@ std::unique_ptr<Scene> make(const Corners& corners, const Coordinates& coordinat
         const float *p = corners.data() + 9 * i, *uv = coordinates.data() + 6 * i;
         const int32_t patch = patch_of.data()[i];
         if (patch < 0 || static_cast<size_t>(patch) >= patches) throw std::invalid_argument("patch out of range");
+        for (int k = 0; k < 9; ++k)
+            if (!std::isfinite(p[k])) throw std::invalid_argument("a corner is not finite");
         const scene::Vec3 a = vector_at(p), ab = vector_at(p + 3) - a, ac = vector_at(p + 6) - a;
         const scene::Vec3 normal = cross(ab, ac);
         const float area = length(normal);
