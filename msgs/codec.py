@@ -25,6 +25,7 @@ RELIABLE = b"R"  # first byte of a frame, which readers subscribe to: every mess
 NEWEST = b"N"  # ... or only the newest
 ALIGNMENT = 64  # bytes, of each array from the frame's start
 MAX_MESSAGE_BYTES = 256 * 2**20
+MAX_MAP_BYTES = 4 * 2**30  # a SplatMap: about 16 million splats with all their spherical harmonics
 MAX_HEADER_BYTES = 64 * 2**10
 MAX_END_HEADER_BYTES = 2**20  # End carries the statistics of the whole graph
 MAX_ITEMS = 4096  # entries of one list or map in End.stats
@@ -68,12 +69,13 @@ def encode(
     sequence: int = 0,
     *,
     delivery: bytes = RELIABLE,
-    max_bytes: int = MAX_MESSAGE_BYTES,
+    max_bytes: int | None = None,
     allocate: Callable[[int], np.ndarray] = _allocate,
 ) -> memoryview:
     """The message as one frame, in memory of which `allocate(n)` gives at least n bytes (uint8, contiguous).
 
-    Raises CodecError where a field differs from its annotation or the frame would be larger than `max_bytes`.
+    Raises CodecError where a field differs from its annotation or the frame would be larger than `max_bytes` (None:
+    `max_message_bytes` of its type).
     """
     name = type(message).__name__
     specs = _SPECS.get(name)
@@ -106,6 +108,7 @@ def encode(
     except (ValueError, OverflowError, TypeError) as error:
         raise CodecError(f"{name}: {error}") from error
     limit = _header_limit(name)
+    max_bytes = max_message_bytes(type(message)) if max_bytes is None else max_bytes
     header_at = _PREFIX.size + len(name)
     header_end = header_at + len(header)
     section = _aligned(header_end)
@@ -128,19 +131,20 @@ def encode(
     return frame
 
 
-def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int = MAX_MESSAGE_BYTES) -> Decoded:
+def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int | None = None) -> Decoded:
     """The message of a frame (any bytes-like object). Its arrays are read-only views that keep the frame alive.
 
     `expect` restricts the types that are accepted. Raises CodecError for everything that `encode` would not write.
     """
     view = memoryview(frame)
-    if view.nbytes > max_bytes:
-        raise CodecError(f"a frame of {view.nbytes} bytes, more than the {max_bytes} that a message may have")
     name, header = _split(view)
     allowed = _TYPES if expect is None else expect
     message_type = msgs.TYPES.get(name)
-    if message_type not in allowed:
+    if message_type is None or message_type not in allowed:
         raise CodecError(f"a frame of type {name!r} where {' or '.join(t.__name__ for t in allowed)} is expected")
+    max_bytes = max_message_bytes(message_type) if max_bytes is None else max_bytes
+    if view.nbytes > max_bytes:
+        raise CodecError(f"a frame of {view.nbytes} bytes, more than the {max_bytes} that a {name} may have")
     sequence, scalars, arrays = _unpack_header(header, name)
     specs = _SPECS[name]
     if len(scalars) + len(arrays) != len(specs) or (scalars.keys() | arrays.keys()) != specs.keys():
@@ -171,6 +175,11 @@ def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int
 def type_name(frame: Any) -> str:
     """The message type that a frame says it is, without decoding the rest. Raises CodecError."""
     return _split(memoryview(frame))[0]
+
+
+def max_message_bytes(message_type: type) -> int:
+    """The largest frame of a type unless a topic sets another limit."""
+    return MAX_MAP_BYTES if message_type is msgs.SplatMap else MAX_MESSAGE_BYTES
 
 
 def array_specs(message_type: type) -> dict[str, FieldSpec]:

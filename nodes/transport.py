@@ -26,10 +26,11 @@ from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils.monitor import recv_monitor_message
 
 from msgs import End, Message
-from msgs.codec import MAX_MESSAGE_BYTES, NEWEST, RELIABLE, CodecError, Decoded, decode, encode, type_name
+from msgs.codec import NEWEST, RELIABLE, CodecError, Decoded, decode, encode, max_message_bytes, type_name
 from nodes.addresses import Keys, TransportError, check_address, save_keys
 from nodes.frame_pool import FramePool
 
+MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
 PEER_GRACE = 0.5  # s between a disconnection and its report: whoever failed first should be heard first
 NEWEST_GOODBYE = 5.0  # s that a best-effort reader has to take its End
 
@@ -109,7 +110,7 @@ class Publisher:
         topic: str = "",
         buffer: int = 8,
         keys: Keys | None = None,
-        max_bytes: int = MAX_MESSAGE_BYTES,
+        max_bytes: int | None = None,
     ) -> None:
         check_address(address, bind=True, keys=keys)
         self.topic = topic or address
@@ -122,7 +123,7 @@ class Publisher:
         self._file = Path(address.removeprefix("ipc://")) if address.startswith("ipc") else None
         if keys is not None:
             _guard.enter(keys)
-        self.socket = _open(zmq.XPUB, address, keys, max_bytes)
+        self.socket = _open(zmq.XPUB, address, keys, MAX_SUBSCRIPTION_BYTES)
         self.socket.sndhwm = max(1, buffer)
         self.socket.setsockopt(zmq.XPUB_NODROP, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
@@ -215,7 +216,7 @@ class _Reader:
         topic: str = "",
         buffer: int = 8,
         keys: Keys | None = None,
-        max_bytes: int = MAX_MESSAGE_BYTES,
+        max_bytes: int | None = None,
     ) -> None:
         check_address(address)
         self.topic = topic or address
@@ -223,10 +224,10 @@ class _Reader:
         self.ended = False
         self._type = type
         self._buffer = max(1, buffer)
-        self._max_bytes = max_bytes
+        self._max_bytes = max_message_bytes(type) if max_bytes is None else max_bytes
         self._frames: deque[zmq.Frame] = deque()  # taken over, not asked for yet
         self._lost_at: float | None = None
-        self._socket = _open(zmq.SUB, address, keys, max_bytes)
+        self._socket = _open(zmq.SUB, address, keys, self._max_bytes)
         self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl = 50
         lost = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
@@ -315,7 +316,7 @@ class NewestReader(_Reader):
         topic: str = "",
         late: bool = True,  # what was sent before the first message that it gets is not "skipped"
         keys: Keys | None = None,
-        max_bytes: int = MAX_MESSAGE_BYTES,
+        max_bytes: int | None = None,
     ) -> None:
         super().__init__(address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes)
         self._frames = deque(maxlen=1)  # a newer one takes the older one's place

@@ -1,0 +1,158 @@
+"""A node's parameters from plain values, and what a runner checks and counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from msgs import End, Frame, Keyframe
+from msgs.codec import decode, encode
+from nodes import Node
+from nodes.parameters import make_config
+from nodes.runner import Runner, merge_stats, own_stats, plain
+from tests.sample_nodes import Left, Wrong
+
+
+class Color(Enum):
+    RED = "r"
+    BLUE = "b"
+
+
+@dataclass
+class Inner:
+    weight: float = 0.5
+
+
+class Sample(Node):
+    @dataclass
+    class Config:
+        required: int
+        ratio: float = 1.0
+        name: str | None = None
+        path: Path = Path("x")
+        size: tuple[int, int] | None = None
+        names: list[str] = field(default_factory=list)
+        many: tuple[float, ...] = ()
+        mode: Literal["fast", "slow"] = "fast"
+        color: Color = Color.RED
+        inner: Inner = field(default_factory=Inner)
+        options: dict[str, Any] = field(default_factory=dict)
+        limits: dict[str, float] = field(default_factory=dict)
+        number: int | float = 0
+        flag: bool = False
+
+
+def test_plain_values_become_what_the_annotations_say() -> None:
+    config = make_config(
+        Sample,
+        {
+            "required": 3,
+            "ratio": 2,
+            "name": None,
+            "path": "a/b",
+            "size": [4, 5],
+            "names": ["u"],
+            "many": [1, 2.5],
+            "mode": "slow",
+            "color": "BLUE",
+            "inner": {"weight": 1},
+            "options": {"any": [1, None]},
+            "limits": {"a": 1},
+            "number": 3,
+            "flag": True,
+        },
+    )
+    assert config == Sample.Config(
+        3, 2.0, None, Path("a/b"), (4, 5), ["u"], (1.0, 2.5), "slow", Color.BLUE, Inner(1.0), {"any": [1, None]},
+        {"a": 1.0}, 3, True,
+    )  # fmt: skip
+    assert isinstance(config.number, int)
+    assert isinstance(config.limits["a"], float)
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [
+        ({}, "Sample needs required; its parameters are: required, ratio"),
+        ({"required": 1, "requird": 1}, "has no parameter requird"),
+        ({"required": 1.5}, "Sample.required=1.5: must be int"),
+        ({"required": True}, "Sample.required=True: must be int"),
+        ({"required": 1, "flag": 1}, "Sample.flag=1: must be bool"),
+        ({"required": 1, "size": [1, 2, 3]}, "Sample.size"),
+        ({"required": 1, "size": [1, "a"]}, "Sample.size"),
+        ({"required": 1, "names": "abc"}, "Sample.names"),
+        ({"required": 1, "mode": "medium"}, "Sample.mode='medium': must be"),
+        ({"required": 1, "color": "GREEN"}, "Sample.color"),
+        ({"required": 1, "inner": {"wait": 1}}, "Sample.inner has no parameter wait"),
+        ({"required": 1, "inner": 3}, "Sample.inner=3"),
+        ({"required": 1, "limits": {"a": "b"}}, "Sample.limits.a='b': must be float"),
+    ],
+)
+def test_what_does_not_fit_is_named(given: dict[str, Any], error: str) -> None:
+    with pytest.raises(TypeError) as caught:
+        make_config(Sample, given)
+    assert error in str(caught.value)
+
+
+def frame() -> Frame:
+    return Frame(1, 0.5, np.zeros((4, 4, 3), np.uint8), np.ones(4))
+
+
+def test_a_runner_gives_what_the_hook_yields_and_counts_it() -> None:
+    runner = Runner("left", Left())
+    (keyframe,) = runner.handle(frame())
+    assert isinstance(keyframe, Keyframe)
+    assert runner.sent == {"Keyframe": 1}
+    assert runner.busy_seconds > 0
+    assert list(runner.end()) == []
+    assert runner.idle() is None
+
+
+def test_a_runner_refuses_what_a_node_did_not_declare() -> None:
+    with pytest.raises(TypeError, match="Wrong yields a Frame, but its annotations say Keyframe"):
+        list(Runner("wrong", Wrong()).handle(frame()))
+
+
+def test_ends_of_a_diamond_are_merged_by_node() -> None:
+    runner = Runner("left", Left())
+    for branch in ("b", "c"):
+        news = {"a": {"counts": {"x": 1}}, branch: {"counts": {}}}
+        assert list(runner.handle(End(news))) == []
+    assert runner.node.upstream == {"a": {"counts": {"x": 1}}, "b": {"counts": {}}, "c": {"counts": {}}}
+
+
+def test_any_statistics_can_be_sent() -> None:
+    class Odd(Node):
+        def on_frame(self, message: Frame) -> Iterator[Keyframe]:
+            yield from ()
+
+    node = Odd()
+    node.stats.count("n", np.int64(3))
+    node.stats.values |= {
+        "array": np.arange(3),
+        "nan": float("nan"),
+        "path": Path("a"),
+        "color": Color.RED,
+        "huge": 2**70,
+        "keys": {1: 2},
+        "long": list(range(10_000)),
+        "deep": [[[[[[[[[1]]]]]]]]],
+    }
+    stats = own_stats(node, wall_seconds=np.float32(1.5))
+    decoded = decode(encode(End(merge_stats({}, {"odd": stats})))).message.stats["odd"]
+    assert decoded["counts"] == {"n": 3}
+    assert decoded["wall_seconds"] == 1.5
+    values = decoded["values"]
+    assert values["array"] == [0, 1, 2]
+    assert values["path"] == "a"
+    assert values["keys"] == {"1": 2}
+    assert values["huge"] == float(2**70)
+    assert values["long"] == "(10000 entries left out)"
+    assert "left out" in str(values["deep"])
+    assert plain({"a": (1, {2})}) == {"a": [1, [2]]}
