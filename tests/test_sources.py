@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.server
 import inspect
+import itertools
 import socket
 import subprocess
 import sys
@@ -11,10 +12,12 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import zmq
 from omegaconf import OmegaConf
 
 import nodes.camera
@@ -305,6 +308,39 @@ def test_what_a_robot_should_not_send_is_left_out(address: str) -> None:
     assert "what is no Frame" in text
     assert "another size" in text
     assert "valid intrinsics" in text
+
+
+def test_a_foreign_program_that_follows_the_documented_format(address: str) -> None:
+    """The plain Python of msgs/WIRE.md, on a plain PUB socket that knows nothing of this project."""
+    code = (ROOT / "msgs/WIRE.md").read_text().split("```python\n")[1].split("```")[0]
+    names: dict[str, Any] = {}
+    exec(code, names)
+    stop = threading.Event()
+
+    def work() -> None:
+        with zmq.Context() as context, context.socket(zmq.PUB) as socket:
+            socket.linger = 0
+            socket.bind(address)
+            for number in itertools.count():
+                if stop.wait(0.02):
+                    return
+                rgb = bytes([number % 256, 2, 3]) * (48 * 64)
+                socket.send(names["frame"](number, number, number / 10, 48, 64, rgb, (50.0, 51.0, 31.5, 23.5)))
+
+    sender = threading.Thread(target=work)
+    sender.start()
+    try:
+        robot = Robot(Robot.Config(path=address, stop=5, timeout=10.0))
+        frames = [message for message in robot.run() if isinstance(message, Frame)]
+    finally:
+        stop.set()
+        sender.join()
+    assert len(frames) == 5
+    assert robot.stats.warnings == []
+    for message in frames:
+        assert message.image.shape == (48, 64, 3)
+        assert message.image[7, 9].tolist() == [round(10 * message.timestamp) % 256, 2, 3]
+        np.testing.assert_array_equal(message.intrinsics, [50, 51, 31.5, 23.5])
 
 
 def test_the_example_publishes_a_data_set(address: str, tmp_path: Path) -> None:
