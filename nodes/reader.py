@@ -33,20 +33,26 @@ class Reader(Node):
     def run(self) -> Iterator[Frame | GroundTruth]:
         sequence = self._open()
         self.stats.values["frames_expected"] = len(sequence)
+        self._pass_warnings_on(sequence)  # those that opening gave; the others are counted until the end
         pace = _Pace()
         frames = iter(sequence)
-        while True:
-            with self.stats.time("read"):
-                item = next(frames, None)
-            for warning in sequence.warnings if item is None else ():
-                self.stats.warn(warning)
-            if item is None:
-                return
-            if self.config.realtime:
-                pace.wait(item.timestamp)
-            self.stats.count("frames")
-            yield Frame(item.index, item.timestamp, item.image, item.intrinsics)
-            yield _ground_truth(item)
+        try:
+            while True:
+                with self.stats.time("read"):
+                    item = next(frames, None)
+                if item is None:
+                    return
+                if self.config.realtime:
+                    pace.wait(item.timestamp)
+                self.stats.count("frames")
+                yield Frame(item.index, item.timestamp, item.image, item.intrinsics)
+                yield _ground_truth(item)
+        finally:  # also when the run is interrupted
+            self._pass_warnings_on(sequence)
+
+    def _pass_warnings_on(self, sequence: Sequence) -> None:
+        for warning in sequence.warnings:
+            self.stats.warn(warning)
 
     def _open(self) -> Sequence:
         c = self.config

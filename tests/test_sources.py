@@ -56,6 +56,18 @@ def test_reader_sends_each_frame_and_then_its_truth(tmp_path: Path) -> None:
     assert any("could not be read: 1 (first: 1.png" in w for w in reader.stats.warnings)
 
 
+def test_an_interrupted_reader_still_tells_its_warnings(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr3")
+    (folder / "groundtruth.txt").unlink()
+    truncate(folder / "rgb/0.png")
+    reader = Reader(Reader.Config(name="tum", path=str(folder)))
+    stream = reader.run()
+    next(stream)
+    assert reader.stats.warnings == ["groundtruth.txt is missing: the trajectory is not scored"]
+    stream.close()  # type: ignore[attr-defined]
+    assert any("could not be read: 1 (first: 0.png" in w for w in reader.stats.warnings)
+
+
 def test_reader_passes_options_on(tmp_path: Path) -> None:
     config = Reader.Config(
         name="images", path=str(write_photos(tmp_path)), start=2, stop=8, stride=3, intrinsics=[50, 50, 31.5, 23.5],
