@@ -57,7 +57,7 @@ def write_mesh(
         color_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color)))
         blocks = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1.0, farthest, truncation)
         grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, 1.0, farthest, truncation)
-    mesh = grid.extract_triangle_mesh(weight_threshold=1.0).to_legacy()
+    mesh = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
     mesh.translate(final.origin)
     if not o3d.io.write_triangle_mesh(str(path), mesh):
         raise OSError(f"open3d could not write {path}")

@@ -100,7 +100,7 @@ def step_reference(state: MapState, visible: Tensor, steps: list[Group], decay_s
         taken &= torch.isfinite(gradient.abs().sum(dim=1))
     refused = visible & ~taken
     state.steps += taken.to(torch.int32)
-    age = state.steps.to(torch.float32).clamp(min=1)[:, None]
+    age = state.steps.to(torch.float64).clamp(min=1)[:, None]  # float32 would lose 1 - beta^age
     progress = (age / max(decay_steps, 1)).clamp(max=1.0)
     for group in active:
         parameter: Tensor = getattr(state.splats, group.name)
@@ -114,7 +114,7 @@ def step_reference(state: MapState, visible: Tensor, steps: list[Group], decay_s
         column = torch.arange(value.shape[1], device=value.device)
         rate = rate * torch.where(column < group.lead, 1.0, group.tail)
         update = rate * (m / (1 - BETA_1**age)) / ((v / (1 - BETA_2**age)).sqrt() + EPSILON)
-        stepped = (value - update).clamp(group.low, group.high)
+        stepped = (value - update).clamp(group.low, group.high).to(value.dtype)
         finite = torch.isfinite(stepped.abs().sum(dim=1) + m.abs().sum(dim=1) + v.sum(dim=1))
         refused |= taken & ~finite
         rows = (taken & finite)[:, None]

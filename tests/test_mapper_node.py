@@ -1,0 +1,124 @@
+"""The mapper as a node: messages in and out, idle slices, previews, map.ply, configuration files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nodes
+from msgs import Poses, Preview, SplatMap, View
+from mvsgs_core.splats.export_ply import read_ply
+from nodes.mapper import Mapper, mapper_config
+from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+
+
+def view_message(index: int, t: float, scale: float = 1.0) -> View:
+    view = posed_view(index, pose_on_arc(t), (24, 32))
+    assert view.normals is not None
+    return View(
+        index=index, timestamp=0.1 * index, image=view.image, intrinsics=view.intrinsics,
+        world_from_cam=view.world_from_cam, scale=scale, depth=view.depth, confidence=np.ones_like(view.depth),
+        normals=view.normals, segment=0,
+    )  # fmt: skip
+
+
+def settings(**changes: object) -> Mapper.Config:
+    return Mapper.Config(iterations=4, refinement=3, threads=1, preview_period=0.0, device="cpu", **changes)  # type: ignore[arg-type]
+
+
+def test_inputs_and_outputs_are_declared() -> None:
+    assert nodes.handlers(Mapper) == {View: "on_view", Poses: "on_poses"}
+    assert set(nodes.outputs(Mapper)) == {SplatMap, Preview}
+
+
+def test_two_maps_leave_the_mapper_before_and_after_the_refinement(tmp_path: Path) -> None:
+    node = Mapper(settings(output=str(tmp_path / "run")))
+    for k in range(3):
+        list(node.on_view(view_message(7 * k, k / 2)))
+    while node.on_idle() is not None:
+        pass
+    before, after = list(node.on_end())
+    assert (before.refined, after.refined) == (False, True)
+    assert after.iterations - before.iterations == 3
+    assert before.keyframes.tolist() == [0, 7, 14]
+    assert set(after.anchors.tolist()) <= {0, 7, 14}
+    assert not np.array_equal(before.means, after.means)
+    written = read_ply(tmp_path / "run" / "map.ply")
+    np.testing.assert_allclose(written.splats.means.numpy(), after.means + after.origin, atol=1e-5)
+    assert node.stats.values["splats"] == len(after.means)
+    assert node.stats.seconds["refinement"] > 0
+
+
+def test_without_refinement_both_maps_are_the_same() -> None:
+    node = Mapper(settings())
+    node.config.refinement = 0
+    list(node.on_view(view_message(0, 0.5)))
+    before, after = list(node.on_end())
+    assert np.array_equal(before.means, after.means)
+    assert before.iterations == after.iterations == 4
+
+
+def test_an_idle_slice_ends_soon_and_says_when_there_is_nothing_to_do() -> None:
+    node = Mapper(settings())
+    assert node.on_idle() is None
+    list(node.on_view(view_message(0, 0.5)))
+    assert node.on_idle() == []
+    while node.on_idle() is not None:
+        pass
+    assert node.mapper.iterations == 4
+
+
+def test_poses_move_the_map() -> None:
+    node = Mapper(settings())
+    list(node.on_view(view_message(0, 0.5)))
+    moved = pose_on_arc(0.5)
+    moved[:3, 3] += [1.0, 2.0, 3.0]
+    before = node.mapper.snapshot().splats.means
+    assert list(node.on_poses(Poses(1, np.array([0]), moved[None], np.array([1.0])))) == []
+    after = node.mapper.snapshot()
+    np.testing.assert_allclose((after.splats.means - before).numpy(), [[1.0, 2.0, 3.0]] * len(before), atol=1e-4)
+    np.testing.assert_allclose(after.world_from_cam[0], moved)
+
+
+def test_a_preview_is_capped_and_relative_to_the_origin() -> None:
+    node = Mapper(settings(preview_splats=100))
+    node.config.preview_period = 1e-9
+    (preview,) = list(node.on_view(view_message(0, 0.5)))
+    assert 50 <= len(preview.means) <= 100
+    assert preview.render.shape == preview.image.shape
+    assert np.abs(preview.world_from_cam[:3, 3]).max() == 0.0  # the first keyframe is the origin
+    assert (np.linalg.eigvalsh(preview.covariances) > -1e-9).all()
+
+
+def test_an_empty_stream_still_ends_with_two_empty_maps() -> None:
+    maps = list(Mapper(settings()).on_end())
+    assert [len(m.means) for m in maps] == [0, 0]
+
+
+def test_refusals_reach_the_statistics() -> None:
+    node = Mapper(settings())
+    message = view_message(0, 0.5)
+    message.depth[:3] = np.nan
+    list(node.on_view(message))
+    assert node.stats.counts["refused_depths"] == 96
+    assert len(node.stats.warnings) == 1
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parent.parent / "launch/conf/mapper").glob("*.yaml")))
+def test_launch_files_name_every_parameter(path: Path) -> None:
+    from dataclasses import fields
+
+    from omegaconf import OmegaConf
+
+    given = set(OmegaConf.load(path)) - {"_target_", "reads"}
+    assert given == {f.name for f in fields(Mapper.Config)}
+
+
+def test_the_core_configuration_has_the_nodes_values() -> None:
+    config = mapper_config(settings(voxel=0.5, unexplored_psnr=33.0, density="exact", density_control="none"))
+    assert config.insertion.voxel == 0.5
+    assert config.insertion.unexplored_psnr == 33.0
+    assert config.training.density == "exact"
+    assert config.density_control.mode == "none"
