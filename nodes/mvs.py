@@ -25,7 +25,7 @@ class Mvs(Node):
         lag: int = 2  # keyframes after the reference that are waited for
         window: int = 8  # keyframes before the reference that may be neighbors
         neighbors: int = 4  # views that a reference is matched with
-        best_views: int = 2  # of these, per pixel and hypothesis: the others may be occluded
+        best_views: int = 3  # of these, per pixel and hypothesis: the others may be occluded
         stages: list[dict[str, Any]] = field(default_factory=list)  # of the cascade, empty: the defaults of the core
         paths: int = 8  # directions of the smoothing, 4 or 8
         range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths

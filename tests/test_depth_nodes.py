@@ -62,7 +62,7 @@ def test_every_keyframe_becomes_one_view_in_order_and_is_right() -> None:
     truth = true_depth(view.world_from_cam, view.depth.shape)
     kept = view.depth > 0
     assert kept.mean() > 0.6
-    assert np.mean(np.abs(view.depth - truth)[kept] < 0.02 * truth[kept]) > 0.97
+    assert np.mean(np.abs(view.depth - truth)[kept] < 0.02 * truth[kept]) > 0.95
     assert np.all(view.normals[~kept] == 0)
     np.testing.assert_allclose(np.linalg.norm(view.normals[kept], axis=-1), 1.0, atol=1e-5)
     assert mvs.stats.counts["keyframes"] == 7

@@ -14,17 +14,18 @@ from mvsgs_core import native
 class CostOptions:
     """Windowed ZNCC of a sweep."""
 
-    radius: int = 2  # pixels: a window of 2 radius + 1
-    best: int = 2  # views whose cost counts, of all
+    radius: int = 3  # pixels: a window of 2 radius + 1
+    best: int = 3  # views whose cost counts, of all
     noise: float = 4.0  # gray levels²: added to both variances
+    contrast: float = 14.0  # gray levels: a pixel that differs so from the window's center counts 1 / e
 
 
 @dataclass(frozen=True)
 class SmoothOptions:
-    """Semi-global smoothing, and the softmax that gives depth and probability."""
+    """Semi-global smoothing, and the softmax that gives the probability."""
 
-    small_jump: float = 0.04  # cost of a change by one hypothesis
-    large_jump: float = 0.25  # cost of a larger change
+    small_jump: float = 0.3  # cost of a change by one hypothesis
+    large_jump: float = 2.0  # cost of a larger change
     edge: float = 12.0  # gray levels that halve these
     break_steps: float = 4.0  # hypotheses: a larger jump of the surface ends the path
     temperature: float = 0.02  # of the softmax, in cost
@@ -35,7 +36,7 @@ class SmoothOptions:
 class Choice:
     """What a stage found, each (H, W)."""
 
-    index: np.ndarray  # float32 expected hypothesis
+    index: np.ndarray  # float32 the best hypothesis, between whole ones by a parabola
     probability: np.ndarray  # float32 softmax mass within one hypothesis of the best
     margin: np.ndarray  # float32 how much worse the best other hypothesis is, in cost, at most 1
     best: np.ndarray  # int32 the best hypothesis
@@ -88,7 +89,7 @@ class NativeBackend:
         return np.asarray(
             self._kernels.cost_volume(
                 reference, neighbors, warps, first, step, hypotheses, options.radius, options.best, options.noise,
-                threads=self._threads,
+                options.contrast, threads=self._threads,
             )
         )  # fmt: skip
 
@@ -108,9 +109,10 @@ class NativeBackend:
     ) -> np.ndarray:  # fmt: skip
         return np.asarray(
             self._kernels.view_correlation(
-                reference, neighbors, warps, inverse_depth, options.radius, options.noise, threads=self._threads
+                reference, neighbors, warps, inverse_depth, options.radius, options.noise, options.contrast,
+                threads=self._threads,
             )
-        )
+        )  # fmt: skip
 
 
 def make_backend(device: str, threads: int | None = None) -> Backend:

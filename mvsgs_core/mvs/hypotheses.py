@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core import camera
+from mvsgs_core.mvs.backend import Choice
 from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.mvs.warp import apply_warp, relative_warp
 
@@ -97,3 +98,27 @@ def upsample_surface(inverse_depth: np.ndarray, size: tuple[int, int], largest_g
     jump = cv2.resize(spread, (size[1], size[0]), interpolation=cv2.INTER_NEAREST) > largest_gap
     nearest = cv2.resize(smooth, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.ascontiguousarray(np.where(jump, nearest, linear), dtype=np.float32)
+
+
+def certainty(choice: Choice) -> np.ndarray:
+    """(H, W) float32, 0 where other hypotheses are as good, 1 where the best one is clearly better than all others."""
+    clear = np.clip(choice.margin / 0.1, 0.0, 1.0)
+    return np.asarray((clear * choice.probability) ** 2, dtype=np.float32)
+
+
+def fill_uncertain(
+    inverse_depth: np.ndarray, sure: np.ndarray, gray: np.ndarray, *, least: float = 0.05, stiffness: float = 200.0,
+    edge: float = 10.0,
+) -> np.ndarray:  # fmt: skip
+    """Where `sure` (H, W) is below `least`, inverse depth (H, W) becomes a membrane through the sure pixels around.
+
+    The membrane (a weighted least-squares smoother) may bend at gray-level edges of about `edge`. In inverse depth a
+    plane stays a plane, so it bridges textureless walls and furniture.
+    """
+    guide = np.clip(gray + 128.0, 0.0, 255.0).astype(np.uint8)
+    weight = sure + np.float32(1e-4)
+    smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, stiffness, edge)
+    total = smoother.filter(weight)
+    mixed = smoother.filter(np.ascontiguousarray(weight * inverse_depth, dtype=np.float32))
+    membrane = mixed / np.maximum(total, 1e-9)
+    return np.where(sure < least, membrane, inverse_depth).astype(np.float32)

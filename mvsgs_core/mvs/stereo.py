@@ -9,7 +9,7 @@ import numpy as np
 
 from mvsgs_core.mvs.backend import Backend, Choice, CostOptions, SmoothOptions
 from mvsgs_core.mvs.confidence import Evidence, probability_of_inlier
-from mvsgs_core.mvs.hypotheses import SearchRange, upsample_surface
+from mvsgs_core.mvs.hypotheses import SearchRange, certainty, fill_uncertain, upsample_surface
 from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.mvs.warp import parallax, relative_warp
 
@@ -31,19 +31,20 @@ class StereoConfig:
     """The cascade of one view."""
 
     stages: tuple[Stage, ...] = (
-        Stage(scale=4, step=0.7, hypotheses=96, radius=2, small_jump=0.04, large_jump=0.25),
-        Stage(scale=2, step=0.5, hypotheses=9, radius=2, small_jump=0.04, large_jump=0.25),
-        Stage(scale=1, step=0.5, hypotheses=9, radius=3, small_jump=0.04, large_jump=0.25),
+        Stage(scale=2, step=0.7, hypotheses=128, radius=3, small_jump=0.3, large_jump=2.0),
+        Stage(scale=1, step=0.35, hypotheses=11, radius=3, small_jump=0.05, large_jump=0.4),
     )
-    best_views: int = 2  # of the neighbors, per pixel and hypothesis: the others may be occluded
+    best_views: int = 3  # of the neighbors, per pixel and hypothesis: the others may be occluded
     noise: float = 4.0  # gray levels²
+    contrast: float = 14.0  # gray levels: what differs so from a window's center counts 1 / e in it
     edge: float = 12.0  # gray levels
     break_steps: float = 4.0  # hypotheses
     temperature: float = 0.02  # cost
     paths: int = 8  # 4 or 8
+    fill: bool = True  # between stages, where matching says nothing, from the surroundings
 
     def cost_options(self, stage: Stage) -> CostOptions:
-        return CostOptions(stage.radius, self.best_views, self.noise)
+        return CostOptions(stage.radius, self.best_views, self.noise, self.contrast)
 
     def smooth_options(self, stage: Stage) -> SmoothOptions:
         return SmoothOptions(
@@ -96,10 +97,14 @@ def estimate_depth(
         else:
             count = stage.hypotheses
             previous = interval
+            if config.fill:
+                surface = fill_uncertain(surface, certainty(choice), reference.gray(config.stages[number - 1].scale))
             interval = min(wanted, previous)
             first = upsample_surface(surface, size, 1.5 * previous) - np.float32(interval * (count - 1) / 2)
         step = np.full(size, interval, dtype=np.float32)
-        cost = backend.cost_volume(gray, images, warps.astype(np.float32), first, step, count, config.cost_options(stage))
+        cost = backend.cost_volume(
+            gray, images, warps.astype(np.float32), first, step, count, config.cost_options(stage)
+        )
         choice = backend.semi_global(cost, gray, first, step, config.smooth_options(stage))
         surface = first + choice.index * np.float32(interval)
         counts["hypotheses"] += float(count) * gray.size
@@ -134,10 +139,7 @@ def estimate_depth(
 def _warps(reference: StereoView, neighbors: list[StereoView], scale: int) -> np.ndarray:
     here = reference.intrinsics_at(scale)
     return np.stack(
-        [
-            relative_warp(here, reference.world_from_cam, n.intrinsics_at(scale), n.world_from_cam)
-            for n in neighbors
-        ]
+        [relative_warp(here, reference.world_from_cam, n.intrinsics_at(scale), n.world_from_cam) for n in neighbors]
     )
 
 

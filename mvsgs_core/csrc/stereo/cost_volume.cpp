@@ -1,27 +1,31 @@
-// Matching cost of a plane or surface sweep: warp, windowed ZNCC by separable sums, mean over the best views.
+// Matching cost of a plane or surface sweep: warp, ZNCC in adaptive windows, mean over the best views.
+//
+// A window's pixels count by how similar they are to its center in the reference (Yoon and Kweon 2006): at the edge of
+// an object the window then holds that object's pixels only, which keeps it from growing over what is behind it.
 #include "stereo.hpp"
 
 #include <algorithm>
 #include <cmath>
-#include <cstring>
 
 namespace stereo {
 namespace {
 
-constexpr int kBand = 16;      // rows that a thread handles at once
+constexpr int kBand = 8;  // rows that a thread handles at once: their window weights stay in its cache
 constexpr int kMaxBest = 8;
-constexpr int kTile = 8;       // the side of an `active` tile, pixels
 
-// Rows [begin, end) of the reference, one hypothesis, one neighbor: samples and whether the neighbor sees them.
-void warp_rows(const float* neighbor, int nh, int nw, const Warp& t, int begin, int end, int width, const float* first,
-               const float* step, float k, float* sample, float* seen) {
+int taps_of(int radius) { return (2 * radius + 1) * (2 * radius + 1); }
+
+// Rows [begin, end) of the reference, one hypothesis, one neighbor: samples, in rows padded by `pad` on both sides,
+// and whether the neighbor sees them.
+void warp_rows(const float* neighbor, int nh, int nw, const Warp& t, int begin, int end, int width, int pad,
+               const float* first, const float* step, float k, float* sample, float* seen) {
     const float max_x = static_cast<float>(nw - 1), max_y = static_cast<float>(nh - 1);
     for (int y = begin; y < end; ++y) {
         const float v = static_cast<float>(y);
         const float cx = t.m[1] * v + t.m[2], cy = t.m[4] * v + t.m[5], cz = t.m[7] * v + t.m[8];
         const float* f = first + static_cast<std::size_t>(y) * width;
         const float* s = step + static_cast<std::size_t>(y) * width;
-        float* out = sample + static_cast<std::size_t>(y - begin) * width;
+        float* out = sample + static_cast<std::size_t>(y - begin) * (width + 2 * pad) + pad;
         float* ok = seen + static_cast<std::size_t>(y - begin) * width;
 #pragma omp simd
         for (int x = 0; x < width; ++x) {
@@ -49,150 +53,155 @@ void warp_rows(const float* neighbor, int nh, int nw, const Warp& t, int begin, 
     }
 }
 
-// Sums over the clipped window; in: rows [begin, end) of a map; out: rows [y0, y1).
-void box_sum(const float* in, int begin, int end, int width, int radius, int y0, int y1, int height, float* row,
-             float* out) {
-    for (int y = y0; y < y1; ++y) {
-        const int top = std::max(y - radius, 0), bottom = std::min(y + radius, height - 1);
-        (void)end;
-        const float* line = in + static_cast<std::size_t>(top - begin) * width;
-        std::memcpy(row + radius, line, sizeof(float) * width);
-        for (int yy = top + 1; yy <= bottom; ++yy) {
-            line = in + static_cast<std::size_t>(yy - begin) * width;
-#pragma omp simd
-            for (int x = 0; x < width; ++x) row[radius + x] += line[x];
-        }
-        float* o = out + static_cast<std::size_t>(y - y0) * width;
-        std::memcpy(o, row, sizeof(float) * width);
-        for (int i = 1; i <= 2 * radius; ++i) {
-            const float* shifted = row + i;
-#pragma omp simd
-            for (int x = 0; x < width; ++x) o[x] += shifted[x];
-        }
-    }
-}
+// The windows of rows [y0, y1) of the reference: normalized weights, weights times gray level, mean and variance.
+struct Windows {
+    int radius, width;
+    std::vector<float> weight, weighted;  // [row][tap][x]
+    std::vector<float> mean, variance;    // [row][x]; the variance includes the noise
 
-struct Scratch {
-    std::vector<float> sample, seen, square, product, row, sw, sww, siw, best;
-    Scratch(int width, int radius, int best_views)
-        : sample(static_cast<std::size_t>(width) * (kBand + 2 * radius)),
-          seen(sample.size()), square(sample.size()), product(sample.size()),
-          row(static_cast<std::size_t>(width) + 2 * radius, 0.0f),
-          sw(static_cast<std::size_t>(width) * kBand), sww(sw.size()), siw(sw.size()),
-          best(static_cast<std::size_t>(width) * kBand * best_views) {}
-};
+    Windows(int width_, int radius_)
+        : radius(radius_), width(width_),
+          weight(static_cast<std::size_t>(kBand) * taps_of(radius_) * width_), weighted(weight.size()),
+          mean(static_cast<std::size_t>(kBand) * width_), variance(mean.size()) {}
 
-// What the reference's windows contribute, once for all hypotheses: 1 / pixels, mean, variance + noise.
-struct Reference {
-    std::vector<float> inv_count, mean, variance;
-    Reference(const float* image, int height, int width, int radius, float noise)
-        : inv_count(static_cast<std::size_t>(height) * width), mean(inv_count.size()), variance(inv_count.size()) {
-        const std::size_t n = inv_count.size();
-        std::vector<float> square(n), row(static_cast<std::size_t>(width) + 2 * radius, 0.0f);
-        for (std::size_t i = 0; i < n; ++i) square[i] = image[i] * image[i];
-        box_sum(image, 0, height, width, radius, 0, height, height, row.data(), mean.data());
-        box_sum(square.data(), 0, height, width, radius, 0, height, height, row.data(), variance.data());
-        for (int y = 0; y < height; ++y) {
-            const int ny = std::min(y + radius, height - 1) - std::max(y - radius, 0) + 1;
+    void prepare(const float* image, int height, int y0, int y1, float contrast, float noise) {
+        const int side = 2 * radius + 1, taps = side * side;
+        const float sharpness = -1.0f / contrast;
+        const float spread = -0.5f / static_cast<float>((radius + 1) * (radius + 1));
+        std::vector<float> total(width), square(width);
+        for (int y = y0; y < y1; ++y) {
+            const float* center = image + static_cast<std::size_t>(y) * width;
+            float* g = weight.data() + static_cast<std::size_t>(y - y0) * taps * width;
+            float* gi = weighted.data() + static_cast<std::size_t>(y - y0) * taps * width;
+            float* mu = mean.data() + static_cast<std::size_t>(y - y0) * width;
+            float* var = variance.data() + static_cast<std::size_t>(y - y0) * width;
+            std::fill(total.begin(), total.end(), 0.0f);
+            std::fill(square.begin(), square.end(), 0.0f);
+            std::fill(mu, mu + width, 0.0f);
+            for (int dy = -radius; dy <= radius; ++dy) {
+                for (int dx = -radius; dx <= radius; ++dx) {
+                    float* w = g + static_cast<std::size_t>((dy + radius) * side + dx + radius) * width;
+                    float* wi = gi + static_cast<std::size_t>((dy + radius) * side + dx + radius) * width;
+                    const int yy = y + dy;
+                    std::fill(w, w + width, 0.0f);
+                    std::fill(wi, wi + width, 0.0f);
+                    if (yy < 0 || yy >= height) continue;
+                    const float* other = image + static_cast<std::size_t>(yy) * width + dx;
+                    const float distance = std::exp(spread * static_cast<float>(dx * dx + dy * dy));
+                    const int from = std::max(0, -dx), to = std::min(width, width - dx);
+                    for (int x = from; x < to; ++x) {
+                        const float weight_here = distance * std::exp(sharpness * std::fabs(other[x] - center[x]));
+                        w[x] = weight_here;
+                        wi[x] = weight_here * other[x];
+                        total[x] += weight_here;
+                        mu[x] += weight_here * other[x];
+                        square[x] += weight_here * other[x] * other[x];
+                    }
+                }
+            }
             for (int x = 0; x < width; ++x) {
-                const int nx = std::min(x + radius, width - 1) - std::max(x - radius, 0) + 1;
-                const std::size_t i = static_cast<std::size_t>(y) * width + x;
-                inv_count[i] = 1.0f / static_cast<float>(nx * ny);
-                mean[i] *= inv_count[i];
-                variance[i] = std::max(variance[i] * inv_count[i] - mean[i] * mean[i], 0.0f) + noise;
+                total[x] = 1.0f / total[x];
+                mu[x] *= total[x];
+                var[x] = std::max(square[x] * total[x] - mu[x] * mu[x], 0.0f) + noise;
+            }
+            for (int i = 0; i < taps; ++i) {
+                for (int x = 0; x < width; ++x) {
+                    g[static_cast<std::size_t>(i) * width + x] *= total[x];
+                    gi[static_cast<std::size_t>(i) * width + x] *= total[x];
+                }
             }
         }
     }
 };
 
-// ZNCC of one row from the sums; -2 where the neighbor does not see the pixel.
-void correlate_row(const float* inv, const float* mean_i, const float* var_i, const float* sw, const float* sww,
-                   const float* siw, const float* seen, int width, float noise, float* ncc) {
+struct Scratch {
+    int pad;
+    std::vector<float> sample, seen, sum, square, product, best, value;
+    Scratch(int width, int radius, int best_views)
+        : pad(radius), sample(static_cast<std::size_t>(width + 2 * radius) * (kBand + 2 * radius), 0.0f),
+          seen(static_cast<std::size_t>(width) * (kBand + 2 * radius)), sum(width), square(width), product(width),
+          best(static_cast<std::size_t>(width) * kBand * best_views), value(width) {}
+};
+
+// ZNCC of row y against the samples; -2 where the neighbor does not see the pixel.
+void correlate_row(const Windows& windows, int y, int y0, int begin, int height, float noise, Scratch& s, float* ncc) {
+    const int width = windows.width, radius = windows.radius, side = 2 * radius + 1;
+    const std::size_t row = static_cast<std::size_t>(y - y0);
+    float *sum = s.sum.data(), *square = s.square.data(), *product = s.product.data();
+    std::fill(s.sum.begin(), s.sum.end(), 0.0f);
+    std::fill(s.square.begin(), s.square.end(), 0.0f);
+    std::fill(s.product.begin(), s.product.end(), 0.0f);
+    const int stride = width + 2 * s.pad;
+    for (int dy = std::max(-radius, -y); dy <= std::min(radius, height - 1 - y); ++dy) {
+        const float* line = s.sample.data() + static_cast<std::size_t>(y + dy - begin) * stride + s.pad;
+        for (int dx = -radius; dx <= radius; ++dx) {
+            const std::size_t tap = (row * side * side + static_cast<std::size_t>((dy + radius) * side + dx + radius)) *
+                                    static_cast<std::size_t>(width);
+            const float* w = windows.weight.data() + tap;
+            const float* wi = windows.weighted.data() + tap;
+            const float* v = line + dx;
+#pragma omp simd
+            for (int x = 0; x < width; ++x) {
+                const float weighted = w[x] * v[x];
+                sum[x] += weighted;
+                square[x] += weighted * v[x];
+                product[x] += wi[x] * v[x];
+            }
+        }
+    }
+    const float* mean_i = windows.mean.data() + row * width;
+    const float* var_i = windows.variance.data() + row * width;
+    const float* seen = s.seen.data() + static_cast<std::size_t>(y - begin) * width;
 #pragma omp simd
     for (int x = 0; x < width; ++x) {
-        const float mean_w = sw[x] * inv[x];
-        const float var_w = std::max(sww[x] * inv[x] - mean_w * mean_w, 0.0f) + noise;
-        const float covariance = siw[x] * inv[x] - mean_i[x] * mean_w;
+        const float var_w = std::max(square[x] - sum[x] * sum[x], 0.0f) + noise;
+        const float covariance = product[x] - mean_i[x] * sum[x];
         const float c = covariance / std::sqrt(var_i[x] * var_w);
         ncc[x] = seen[x] > 0.0f ? c : -2.0f;
     }
 }
 
-// One view, one hypothesis, rows [y0, y1): fills sums in scratch. Returns the first row of the halo.
-int sums_of_view(const float* reference, int height, int width, const float* neighbor, int nh, int nw, const Warp& t,
-                 const float* first, const float* step, float k, int radius, int y0, int y1, Scratch& s) {
-    const int begin = std::max(y0 - radius, 0), end = std::min(y1 + radius, height);
-    warp_rows(neighbor, nh, nw, t, begin, end, width, first, step, k, s.sample.data(), s.seen.data());
-    const std::size_t n = static_cast<std::size_t>(end - begin) * width;
-    const float* ref = reference + static_cast<std::size_t>(begin) * width;
-    float *sample = s.sample.data(), *square = s.square.data(), *product = s.product.data();
+// Keeps the `best` smallest costs of each pixel, ascending; slots is [best][width].
+void insert_cost(const float* ncc, int width, int best, float* slots) {
 #pragma omp simd
-    for (std::size_t i = 0; i < n; ++i) {
-        square[i] = sample[i] * sample[i];
-        product[i] = sample[i] * ref[i];
+    for (int x = 0; x < width; ++x) {
+        float c = std::min(std::max(1.0f - ncc[x], 0.0f), 1.0f);
+        for (int j = 0; j < best; ++j) {
+            float& slot = slots[static_cast<std::size_t>(j) * width + x];
+            const float lower = std::min(slot, c);
+            c = std::max(slot, c);
+            slot = lower;
+        }
     }
-    box_sum(sample, begin, end, width, radius, y0, y1, height, s.row.data(), s.sw.data());
-    box_sum(square, begin, end, width, radius, y0, y1, height, s.row.data(), s.sww.data());
-    box_sum(product, begin, end, width, radius, y0, y1, height, s.row.data(), s.siw.data());
-    return begin;
-}
-
-bool any_active(const std::uint8_t* active, int width, int y0, int y1) {
-    if (active == nullptr) return true;
-    const int columns = (width + kTile - 1) / kTile;
-    for (int row = y0 / kTile; row <= (y1 - 1) / kTile; ++row)
-        for (int c = 0; c < columns; ++c)
-            if (active[static_cast<std::size_t>(row) * columns + c]) return true;
-    return false;
 }
 
 }  // namespace
 
 void cost_volume(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
-                 int nh, int nw, const float* first, const float* step, const std::uint8_t* active,
-                 const CostOptions& o, float* cost) {
-    const Reference stats(reference, height, width, o.radius, o.noise);
+                 int nh, int nw, const float* first, const float* step, const CostOptions& o, float* cost) {
     const int best = std::min({o.best, views, kMaxBest});
+    const float share = 1.0f / static_cast<float>(best);
     const int bands = (height + kBand - 1) / kBand;
 #pragma omp parallel num_threads(o.threads)
     {
         Scratch s(width, o.radius, best);
-        std::vector<float> value(width);
+        Windows windows(width, o.radius);
 #pragma omp for schedule(dynamic)
         for (int band = 0; band < bands; ++band) {
             const int y0 = band * kBand, y1 = std::min(y0 + kBand, height);
-            if (!any_active(active, width, y0, y1)) {
-                for (int y = y0; y < y1; ++y)
-                    std::fill_n(cost + static_cast<std::size_t>(y) * o.hypotheses * width,
-                                static_cast<std::size_t>(o.hypotheses) * width, 1.0f);
-                continue;
-            }
+            const int begin = std::max(y0 - o.radius, 0), end = std::min(y1 + o.radius, height);
+            windows.prepare(reference, height, y0, y1, o.contrast, o.noise);
             for (int k = 0; k < o.hypotheses; ++k) {
                 std::fill(s.best.begin(), s.best.end(), 1.0f);
                 for (int n = 0; n < views; ++n) {
-                    const int begin =
-                        sums_of_view(reference, height, width, neighbors + static_cast<std::size_t>(n) * nh * nw, nh,
-                                     nw, warps[n], first, step, static_cast<float>(k), o.radius, y0, y1, s);
+                    warp_rows(neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n], begin, end, width,
+                              o.radius, first, step, static_cast<float>(k), s.sample.data(), s.seen.data());
                     for (int y = y0; y < y1; ++y) {
-                        const std::size_t r = static_cast<std::size_t>(y) * width;
-                        const std::size_t b = static_cast<std::size_t>(y - y0) * width;
-                        correlate_row(&stats.inv_count[r], &stats.mean[r], &stats.variance[r], &s.sw[b], &s.sww[b],
-                                      &s.siw[b], &s.seen[static_cast<std::size_t>(y - begin) * width], width, o.noise,
-                                      value.data());
-                        float* slots = s.best.data() + b * best;  // [best][width] of this row, ascending
-#pragma omp simd
-                        for (int x = 0; x < width; ++x) {
-                            float c = std::min(std::max(1.0f - value[x], 0.0f), 1.0f);
-                            for (int j = 0; j < best; ++j) {
-                                float& slot = slots[static_cast<std::size_t>(j) * width + x];
-                                const float lower = std::min(slot, c);
-                                c = std::max(slot, c);
-                                slot = lower;
-                            }
-                        }
+                        correlate_row(windows, y, y0, begin, height, o.noise, s, s.value.data());
+                        insert_cost(s.value.data(), width, best,
+                                    s.best.data() + static_cast<std::size_t>(y - y0) * width * best);
                     }
                 }
-                const float share = 1.0f / static_cast<float>(best);
                 for (int y = y0; y < y1; ++y) {
                     const float* slots = s.best.data() + static_cast<std::size_t>(y - y0) * width * best;
                     float* out = cost + (static_cast<std::size_t>(y) * o.hypotheses + k) * width;
@@ -209,28 +218,25 @@ void cost_volume(const float* reference, int height, int width, const float* nei
 }
 
 void view_correlation(const float* reference, int height, int width, const float* neighbors, const Warp* warps,
-                      int views, int nh, int nw, const float* inverse_depth, int radius, float noise, int threads,
+                      int views, int nh, int nw, const float* inverse_depth, const CostOptions& o,
                       float* correlation) {
-    const Reference stats(reference, height, width, radius, noise);
     const std::vector<float> step(static_cast<std::size_t>(height) * width, 0.0f);
     const int bands = (height + kBand - 1) / kBand;
-#pragma omp parallel num_threads(threads)
+#pragma omp parallel num_threads(o.threads)
     {
-        Scratch s(width, radius, 1);
+        Scratch s(width, o.radius, 1);
+        Windows windows(width, o.radius);
 #pragma omp for schedule(dynamic)
         for (int band = 0; band < bands; ++band) {
             const int y0 = band * kBand, y1 = std::min(y0 + kBand, height);
+            const int begin = std::max(y0 - o.radius, 0), end = std::min(y1 + o.radius, height);
+            windows.prepare(reference, height, y0, y1, o.contrast, o.noise);
             for (int n = 0; n < views; ++n) {
-                const int begin = sums_of_view(reference, height, width,
-                                               neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n],
-                                               inverse_depth, step.data(), 0.0f, radius, y0, y1, s);
-                for (int y = y0; y < y1; ++y) {
-                    const std::size_t r = static_cast<std::size_t>(y) * width;
-                    const std::size_t b = static_cast<std::size_t>(y - y0) * width;
-                    correlate_row(&stats.inv_count[r], &stats.mean[r], &stats.variance[r], &s.sw[b], &s.sww[b],
-                                  &s.siw[b], &s.seen[static_cast<std::size_t>(y - begin) * width], width, noise,
-                                  correlation + static_cast<std::size_t>(n) * height * width + r);
-                }
+                warp_rows(neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n], begin, end, width,
+                          o.radius, inverse_depth, step.data(), 0.0f, s.sample.data(), s.seen.data());
+                for (int y = y0; y < y1; ++y)
+                    correlate_row(windows, y, y0, begin, height, o.noise, s,
+                                  correlation + (static_cast<std::size_t>(n) * height + y) * width);
             }
         }
     }

@@ -3,7 +3,6 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <omp.h>
 
 #include <stdexcept>
@@ -18,7 +17,6 @@ namespace {
 using Image = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Stack = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Warps = nb::ndarray<const float, nb::shape<-1, 12>, nb::c_contig, nb::device::cpu>;
-using Tiles = nb::ndarray<const std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 int thread_count(int threads) { return threads > 0 ? threads : omp_get_max_threads(); }
 
@@ -41,7 +39,7 @@ nb::ndarray<nb::numpy, T> allocate(const std::size_t (&shape)[N]) {
 
 nb::ndarray<nb::numpy, float> cost_volume(Image reference, Stack neighbors, Warps warps, Image first, Image step,
                                           int hypotheses, int radius, int best, float noise,
-                                          std::optional<Tiles> active, int threads) {
+                                          float contrast, int threads) {
     same_size(reference, first);
     same_size(reference, step);
     require(neighbors.shape(0) == warps.shape(0) && neighbors.shape(0) > 0, "one warp per neighbor, at least one");
@@ -49,31 +47,32 @@ nb::ndarray<nb::numpy, float> cost_volume(Image reference, Stack neighbors, Warp
     require(hypotheses >= 1 && radius >= 0 && radius <= 16 && best >= 1, "bad hypotheses, radius or best");
     const std::size_t h = reference.shape(0), w = reference.shape(1), d = static_cast<std::size_t>(hypotheses);
     auto cost = allocate<float>({h, d, w});
-    const stereo::CostOptions options{hypotheses, radius, best, noise, thread_count(threads)};
+    const stereo::CostOptions options{hypotheses, radius, best, noise, contrast, thread_count(threads)};
     {
         nb::gil_scoped_release release;
         stereo::cost_volume(reference.data(), static_cast<int>(h), static_cast<int>(w), neighbors.data(),
                             reinterpret_cast<const stereo::Warp*>(warps.data()), static_cast<int>(neighbors.shape(0)),
                             static_cast<int>(neighbors.shape(1)), static_cast<int>(neighbors.shape(2)), first.data(),
-                            step.data(), active ? active->data() : nullptr, options, cost.data());
+                            step.data(), options, cost.data());
     }
     return cost;
 }
 
 nb::ndarray<nb::numpy, float> view_correlation(Image reference, Stack neighbors, Warps warps, Image inverse_depth,
-                                               int radius, float noise, int threads) {
+                                               int radius, float noise, float contrast, int threads) {
     same_size(reference, inverse_depth);
     require(neighbors.shape(0) == warps.shape(0) && neighbors.shape(0) > 0, "one warp per neighbor, at least one");
     require(neighbors.shape(1) >= 2 && neighbors.shape(2) >= 2, "neighbor images need at least 2x2 pixels");
     require(radius >= 0 && radius <= 16, "bad radius");
     const std::size_t h = reference.shape(0), w = reference.shape(1), n = neighbors.shape(0);
     auto correlation = allocate<float>({n, h, w});
+    const stereo::CostOptions options{1, radius, 1, noise, contrast, thread_count(threads)};
     {
         nb::gil_scoped_release release;
         stereo::view_correlation(reference.data(), static_cast<int>(h), static_cast<int>(w), neighbors.data(),
                                  reinterpret_cast<const stereo::Warp*>(warps.data()), static_cast<int>(n),
                                  static_cast<int>(neighbors.shape(1)), static_cast<int>(neighbors.shape(2)),
-                                 inverse_depth.data(), radius, noise, thread_count(threads), correlation.data());
+                                 inverse_depth.data(), options, correlation.data());
     }
     return correlation;
 }
@@ -166,9 +165,9 @@ nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack
 MVSGS_EXPAND(MVSGS_MODULE, m) {
     using namespace nb::literals;
     m.def("cost_volume", &cost_volume, "reference"_a, "neighbors"_a, "warps"_a, "first"_a, "step"_a, "hypotheses"_a,
-          "radius"_a, "best"_a, "noise"_a, "active"_a.none() = nb::none(), "threads"_a = 0);
+          "radius"_a, "best"_a, "noise"_a, "contrast"_a, "threads"_a = 0);
     m.def("view_correlation", &view_correlation, "reference"_a, "neighbors"_a, "warps"_a, "inverse_depth"_a,
-          "radius"_a, "noise"_a, "threads"_a = 0);
+          "radius"_a, "noise"_a, "contrast"_a, "threads"_a = 0);
     m.def("semi_global", &semi_global, "cost"_a, "reference"_a, "first"_a, "step"_a, "small_jump"_a, "large_jump"_a,
           "edge"_a, "break_steps"_a, "temperature"_a, "paths"_a, "threads"_a = 0);
     m.def("consistent_views", &consistent_views, "depth"_a, "neighbor_depths"_a, "warps"_a, "back"_a, "relative"_a,

@@ -19,6 +19,7 @@ struct CostOptions {
     int radius;       // window is (2 radius + 1)^2 pixels
     int best;         // number of views, of the best, whose cost is averaged
     float noise;      // variance added to both windows: what has less contrast than this does not correlate
+    float contrast;   // gray levels: a window's pixel that differs this much from its center counts 1 / e
     int threads;
 };
 
@@ -26,12 +27,12 @@ struct CostOptions {
 // Hypothesis k of a pixel is first + k step: the window follows the surface first + k step, so it is as slanted as that.
 void cost_volume(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
                  int neighbor_height, int neighbor_width, const float* first, const float* step,
-                 const std::uint8_t* active, const CostOptions& options, float* cost);
+                 const CostOptions& options, float* cost);
 
-// correlation (N, H, W): ZNCC of each view at one inverse depth per pixel; -1 where the view does not see it.
+// correlation (N, H, W): ZNCC of each view at one inverse depth per pixel; -2 where the view does not see it.
 void view_correlation(const float* reference, int height, int width, const float* neighbors, const Warp* warps,
-                      int views, int neighbor_height, int neighbor_width, const float* inverse_depth, int radius,
-                      float noise, int threads, float* correlation);
+                      int views, int neighbor_height, int neighbor_width, const float* inverse_depth,
+                      const CostOptions& options, float* correlation);
 
 struct SmoothOptions {
     float small_jump;    // penalty for a change by one hypothesis
@@ -43,7 +44,7 @@ struct SmoothOptions {
     int threads;
 };
 
-// index (H, W): expected hypothesis near the best one; probability (H, W): softmax mass within one of it;
+// index (H, W): the best hypothesis, between whole ones by a parabola; probability (H, W): softmax mass within one of it;
 // margin (H, W): cost of the best hypothesis elsewhere minus the best cost; best (H, W): index of the best.
 void semi_global(const float* cost, int height, int hypotheses, int width, const float* reference, const float* first,
                  const float* step, const SmoothOptions& options, float* index, float* probability, float* margin,

@@ -1,0 +1,138 @@
+"""The fusion kernels in PyTorch, for a GPU: the same mathematics as mvsgs_core/csrc/stereo, compared by tests."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvsgs_core.fusion.backend import Fused
+
+
+class TorchFusionBackend:
+    """Runs on `device`, a torch device such as "cuda" or "cpu"; arrays in and out are numpy."""
+
+    def __init__(self, device: str) -> None:
+        self.device = torch.device(device)
+
+    def _on(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
+
+    @torch.no_grad()
+    def consistent_views(
+        self,
+        depth: np.ndarray,
+        neighbor_depths: np.ndarray,
+        warps: np.ndarray,
+        back: np.ndarray,
+        relative: float,
+        pixels: float,
+        round_trip: bool,
+    ) -> np.ndarray:
+        z = self._on(depth)
+        u, v = _pixels(z.shape, self.device)
+        count = torch.zeros(z.shape, dtype=torch.uint8, device=self.device)
+        for map_, there, home in zip(self._on(neighbor_depths), self._on(warps), self._on(back)):
+            x, y, seen_depth, front = _project(there, u, v, z)
+            at, inside = _nearest(x, y, map_.shape)
+            found = map_.reshape(-1)[at]
+            agree = (z > 0) & front & inside & (found > 0)
+            if round_trip:
+                width = map_.shape[1]
+                here_x, here_y, here_depth, ahead = _project(home, (at % width).float(), (at // width).float(), found)
+                near = (here_x - u) ** 2 + (here_y - v) ** 2 < pixels**2
+                agree &= ahead & near & ((here_depth - z).abs() < relative * torch.maximum(here_depth, z))
+            else:
+                agree &= (found - seen_depth).abs() < relative * torch.maximum(found, seen_depth)
+            count += agree.to(torch.uint8)
+        return count.cpu().numpy()
+
+    @torch.no_grad()
+    def splat(
+        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, least_confidence: float,
+        size: tuple[int, int],
+    ) -> np.ndarray:  # fmt: skip
+        result = torch.full((len(depths), size[0] * size[1]), torch.inf, device=self.device)
+        for i, (z, c, warp) in enumerate(zip(self._on(depths), self._on(confidences), self._on(back))):
+            u, v = _pixels(z.shape, self.device)
+            x, y, depth, front = _project(warp, u, v, z)
+            at, inside = _nearest(x, y, size)
+            use = (z > 0) & (c >= least_confidence) & front & inside
+            result[i].scatter_reduce_(0, at[use], depth[use], reduce="amin")
+        result[torch.isinf(result)] = 0.0
+        return result.reshape(len(depths), *size).cpu().numpy()
+
+    @torch.no_grad()
+    def fuse(
+        self,
+        depth: np.ndarray,
+        confidence: np.ndarray,
+        neighbor_depths: np.ndarray,
+        neighbor_confidences: np.ndarray,
+        splatted: np.ndarray,
+        warps: np.ndarray,
+        sigma: float,
+        violation: float,
+        least_confidence: float,
+    ) -> Fused:
+        own_depth = self._on(depth)
+        known = own_depth > 0
+        own_confidence = torch.where(known, self._on(confidence), torch.zeros_like(own_depth))
+        maps, sure, there = self._on(neighbor_depths), self._on(neighbor_confidences), self._on(warps)
+        u, v = _pixels(own_depth.shape, self.device)
+        tolerance, zero = 3.0 * sigma, torch.zeros_like(own_depth)
+        best = {"score": torch.full_like(own_depth, -1e9), "depth": zero, "for": zero, "against": zero, "own": zero}
+        for z in [own_depth, *self._on(splatted)]:
+            valid = z > 0
+            safe = torch.where(valid, z, torch.ones_like(z))
+            difference = (own_depth - safe) / safe
+            agree = torch.exp(-0.5 * (difference / sigma) ** 2)
+            from_own = torch.where(known, own_confidence * agree, zero)
+            against = torch.where(known & (difference.abs() > tolerance), own_confidence, zero)
+            weights = from_own.clone()
+            inverse = torch.where(known, from_own / torch.where(known, own_depth, safe), zero)
+            support = zero.clone()
+            for map_, c_map, warp in zip(maps, sure, there):
+                x, y, expected, front = _project(warp, u, v, safe)
+                at, inside = _nearest(x, y, map_.shape)
+                found, c = map_.reshape(-1)[at], c_map.reshape(-1)[at]
+                use = valid & front & inside & (found > 0) & (c >= least_confidence)
+                off = torch.where(use, (found - expected) / torch.where(use, expected, safe), zero)
+                weight = torch.where(use, c * torch.exp(-0.5 * (off / sigma) ** 2), zero)
+                support += weight
+                weights += weight
+                inverse += torch.where(use, weight / (safe * (1.0 + off)), zero)
+                against += torch.where(use & (off > tolerance), c, zero)
+            score = support + from_own - violation * against
+            better = valid & (score > best["score"])
+            refined = torch.where(inverse > 0, weights / torch.where(inverse > 0, inverse, safe), safe)
+            new = {"score": score, "depth": refined, "for": support, "against": against, "own": from_own}
+            best = {name: torch.where(better, new[name], best[name]) for name in best}
+        return Fused(*(best[name].cpu().numpy() for name in ("depth", "for", "against", "own")))
+
+
+def _pixels(shape: torch.Size, device: torch.device) -> tuple[Tensor, Tensor]:
+    v, u = torch.meshgrid(
+        torch.arange(shape[0], device=device, dtype=torch.float32),
+        torch.arange(shape[1], device=device, dtype=torch.float32),
+        indexing="ij",
+    )
+    return u, v
+
+
+def _project(warp: Tensor, u: Tensor, v: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pixel (x, y) and depth in the other camera, and whether it is in front."""
+    w = 1.0 / torch.where(z > 0, z, torch.ones_like(z))
+    xs, ys, zs = (warp[3 * i] * u + warp[3 * i + 1] * v + warp[3 * i + 2] + w * warp[9 + i] for i in range(3))
+    front = zs > 1e-6
+    inverse = 1.0 / torch.where(front, zs, torch.ones_like(zs))
+    return xs * inverse, ys * inverse, zs * z, front
+
+
+def _nearest(x: Tensor, y: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Flat index of the nearest pixel, clamped, and whether (x, y) lies in the image."""
+    height, width = shape[0], shape[1]
+    inside = (x > -0.5) & (y > -0.5) & (x < width - 0.5) & (y < height - 0.5)
+    ix = (torch.where(inside, x, torch.zeros_like(x)) + 0.5).long().clamp(max=width - 1)
+    iy = (torch.where(inside, y, torch.zeros_like(y)) + 0.5).long().clamp(max=height - 1)
+    return iy * width + ix, inside

@@ -1,0 +1,183 @@
+"""The stereo kernels in PyTorch, for a GPU: the same mathematics as mvsgs_core/csrc/stereo, compared by tests."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvsgs_core.mvs.backend import Choice, CostOptions, SmoothOptions
+
+_MANY = 1e9
+
+
+class TorchBackend:
+    """Runs on `device`, a torch device such as "cuda" or "cpu"; arrays in and out are numpy."""
+
+    def __init__(self, device: str) -> None:
+        self.device = torch.device(device)
+
+    def _on(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
+
+    @torch.no_grad()
+    def cost_volume(
+        self,
+        reference: np.ndarray,
+        neighbors: np.ndarray,
+        warps: np.ndarray,
+        first: np.ndarray,
+        step: np.ndarray,
+        hypotheses: int,
+        options: CostOptions,
+    ) -> np.ndarray:
+        windows = _Windows(self._on(reference), options)
+        images, transforms = self._on(neighbors), self._on(warps)
+        start, interval = self._on(first), self._on(step)
+        best = min(options.best, len(images))
+        cost = torch.empty((first.shape[0], hypotheses, first.shape[1]), device=self.device)
+        for k in range(hypotheses):
+            surface = start + k * interval
+            correlation = torch.stack([windows.correlate(i, t, surface) for i, t in zip(images, transforms)])
+            each = (1.0 - correlation).clamp(0.0, 1.0)
+            cost[:, k] = torch.topk(each, best, dim=0, largest=False).values.mean(dim=0)
+        return cost.cpu().numpy()
+
+    @torch.no_grad()
+    def view_correlation(
+        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,
+        options: CostOptions,
+    ) -> np.ndarray:  # fmt: skip
+        windows = _Windows(self._on(reference), options)
+        surface = self._on(inverse_depth)
+        pairs = zip(self._on(neighbors), self._on(warps))
+        return torch.stack([windows.correlate(image, warp, surface) for image, warp in pairs]).cpu().numpy()
+
+    @torch.no_grad()
+    def semi_global(
+        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
+    ) -> Choice:
+        volume, gray, start, interval = (self._on(a) for a in (cost, reference, first, step))
+        total = torch.zeros_like(volume)
+        sideways = (volume.permute(2, 1, 0), gray.T, start.T, interval.T)
+        shifts = (0, 1, -1) if options.paths == 8 else (0,)
+        for reverse in (False, True):
+            for shift in shifts:
+                total += _path(volume, gray, start, interval, shift, reverse, options)
+            total += _path(*sideways, 0, reverse, options).permute(2, 1, 0)
+        return _select(total / options.paths, options.temperature)
+
+
+class _Windows:
+    """Adaptive windows of a reference (Yoon and Kweon 2006): normalized weights (taps, H, W), mean and variance."""
+
+    def __init__(self, image: Tensor, options: CostOptions) -> None:
+        r = options.radius
+        self.radius, self.noise = r, options.noise
+        offsets = [(dy, dx) for dy in range(-r, r + 1) for dx in range(-r, r + 1)]
+        shifted = self._neighborhood(image)
+        inside = self._neighborhood(torch.ones_like(image))
+        spread = torch.tensor([-0.5 * (dy * dy + dx * dx) / (r + 1) ** 2 for dy, dx in offsets], device=image.device)
+        weight = torch.exp(spread[:, None, None] - (shifted - image).abs() / options.contrast) * inside
+        self.weight = weight / weight.sum(dim=0)
+        self.weighted = self.weight * shifted
+        self.mean = self.weighted.sum(dim=0)
+        square = (self.weighted * shifted).sum(dim=0)
+        self.variance = (square - self.mean**2).clamp(min=0.0) + options.noise
+
+    def _neighborhood(self, image: Tensor) -> Tensor:
+        """(taps, H, W): each pixel's window, 0 outside the image."""
+        side = 2 * self.radius + 1
+        height, width = image.shape
+        columns = torch.nn.functional.unfold(image[None, None], side, padding=self.radius)
+        return columns.reshape(side * side, height, width)
+
+    def correlate(self, neighbor: Tensor, warp: Tensor, inverse_depth: Tensor) -> Tensor:
+        """(H, W) ZNCC against a neighbor (h, w) warped by (12,); -2 where it does not see the pixel."""
+        sample, seen = _sample(neighbor, warp, inverse_depth)
+        shifted = self._neighborhood(sample)
+        total = (self.weight * shifted).sum(dim=0)
+        square = (self.weight * shifted * shifted).sum(dim=0)
+        product = (self.weighted * shifted).sum(dim=0)
+        variance = (square - total**2).clamp(min=0.0) + self.noise
+        correlation = (product - self.mean * total) / torch.sqrt(self.variance * variance)
+        return torch.where(seen, correlation, torch.full_like(correlation, -2.0))
+
+
+def _sample(image: Tensor, warp: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Bilinear samples (H, W) of an image (h, w), border repeated, and whether the pixel lies inside it."""
+    height, width = inverse_depth.shape
+    nh, nw = image.shape
+    v = torch.arange(height, device=image.device, dtype=torch.float32)[:, None]
+    u = torch.arange(width, device=image.device, dtype=torch.float32)[None, :]
+    xs, ys, zs = (
+        warp[3 * i] * u + (warp[3 * i + 1] * v + warp[3 * i + 2]) + inverse_depth * warp[9 + i] for i in range(3)
+    )
+    front = zs > 1e-6
+    inverse = 1.0 / torch.where(front, zs, torch.ones_like(zs))
+    outside = torch.full_like(zs, -1.0)
+    px, py = torch.where(front, xs * inverse, outside), torch.where(front, ys * inverse, outside)
+    seen = (px >= 0) & (px <= nw - 1) & (py >= 0) & (py <= nh - 1) & (inverse_depth > 0)
+    qx, qy = px.clamp(0.0, nw - 1.0), py.clamp(0.0, nh - 1.0)
+    ix, iy = qx.long().clamp(max=nw - 2), qy.long().clamp(max=nh - 2)
+    ax, ay = qx - ix, qy - iy
+    flat, at = image.reshape(-1), iy * nw + ix
+    top = flat[at] + ax * (flat[at + 1] - flat[at])
+    bottom = flat[at + nw] + ax * (flat[at + nw + 1] - flat[at + nw])
+    return top + ay * (bottom - top), seen
+
+
+def _path(
+    cost: Tensor, gray: Tensor, first: Tensor, step: Tensor, shift: int, reverse: bool, options: SmoothOptions
+) -> Tensor:
+    """Path costs (R, D, C) of one direction: row by row, the predecessor `shift` columns to the left."""
+    rows, count, columns = cost.shape
+    result = torch.empty_like(cost)
+    order = range(rows - 1, -1, -1) if reverse else range(rows)
+    previous = torch.zeros((count, columns), device=cost.device)
+    lowest = torch.zeros(columns, device=cost.device)
+    high = torch.full((1, columns), _MANY, device=cost.device)
+    source = torch.arange(columns, device=cost.device) - shift
+    inside, source = (source >= 0) & (source < columns), source.clamp(0, columns - 1)
+    before: int | None = None
+    for y in order:
+        if before is None:
+            value = cost[y].clone()
+        else:
+            contrast = (gray[y] - gray[before][source]).abs() / options.edge
+            jump = (first[y] - first[before][source]).abs()
+            broken = jump > options.break_steps * torch.maximum(step[y], step[before][source])
+            relax = torch.where(broken, torch.zeros_like(contrast), 1.0 / (1.0 + contrast))
+            same = torch.where(inside, previous[:, source], torch.zeros_like(previous))
+            base = torch.where(inside, lowest[source], torch.zeros_like(lowest))
+            # Outside the image all is 0, as at a path's start, but there is no hypothesis beyond the first and last.
+            below, above = torch.cat([high, same[:-1]]), torch.cat([same[1:], high])
+            moved = torch.minimum(
+                torch.minimum(below, above) + options.small_jump * relax, base + options.large_jump * relax
+            )
+            value = cost[y] + torch.minimum(same, moved) - base
+        result[y] = value
+        previous, lowest, before = value, value.min(dim=0).values, y
+    return result
+
+
+def _select(total: Tensor, temperature: float) -> Choice:
+    """The best hypothesis of mean path costs (H, D, W), refined by a parabola, and how sure it is."""
+    count = total.shape[1]
+    lowest, best = total.min(dim=1)
+    gap = total - lowest[:, None]
+    weight = torch.exp(-gap / temperature)
+    distance = (torch.arange(count, device=total.device)[None, :, None] - best[:, None]).abs()
+    near = torch.where(distance <= 1, weight, torch.zeros_like(weight)).sum(dim=1)
+    margin = torch.where(distance >= 2, gap, torch.ones_like(gap)).amin(dim=1).clamp(max=1.0)
+    before = gap.gather(1, (best - 1).clamp(min=0)[:, None])[:, 0]
+    after = gap.gather(1, (best + 1).clamp(max=count - 1)[:, None])[:, 0]
+    both = before + after
+    usable = (best > 0) & (best < count - 1) & (both > 1e-9)
+    offset = torch.where(usable, 0.5 * (before - after) / both.clamp(min=1e-9), torch.zeros_like(both))
+    return Choice(
+        index=(best + offset).cpu().numpy().astype(np.float32),
+        probability=(near / weight.sum(dim=1)).cpu().numpy(),
+        margin=margin.cpu().numpy(),
+        best=best.to(torch.int32).cpu().numpy(),
+    )

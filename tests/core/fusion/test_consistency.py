@@ -1,0 +1,158 @@
+"""Geometric consistency, splatting and fusion: brute force, twins, and what they must reject."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mvsgs_core import camera, geometry
+from mvsgs_core.fusion.backend import NativeFusionBackend
+from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig, fuse
+from mvsgs_core.fusion.normals import normals_of
+from mvsgs_core.fusion.torch_backend import TorchFusionBackend
+from mvsgs_core.fusion.views import DepthView, warps_between
+from tests.core.mvs.plane_scene import intrinsics_of, look, true_depth
+
+SIZE = (40, 56)
+CONFIG = FusionConfig(device="cpu", threads=1, relative=0.01)
+
+
+def view(index: int, x: float, noise: float = 0.0, turn: float = 0.0) -> DepthView:
+    pose = look(x, turn)
+    depth = true_depth(pose, SIZE)
+    rng = np.random.default_rng(index)
+    depth = (depth * np.exp(noise * rng.normal(size=SIZE))).astype(np.float32)
+    confidence = rng.uniform(0.3, 1.0, SIZE).astype(np.float32)
+    return DepthView(index, depth, confidence, intrinsics_of(SIZE), pose, 1.0)
+
+
+def brute_force(
+    reference: DepthView, neighbor: DepthView, relative: float, pixels: float, round_trip: bool
+) -> np.ndarray:
+    """The paper's check, pixel by pixel, in float64 with 4x4 poses."""
+    agree = np.zeros(SIZE, dtype=bool)
+    k, k_inv = camera.matrix(reference.intrinsics), np.linalg.inv(camera.matrix(reference.intrinsics))
+    there = geometry.inverse(neighbor.world_from_cam) @ reference.world_from_cam
+    back = geometry.inverse(there)
+    for v in range(SIZE[0]):
+        for u in range(SIZE[1]):
+            z = float(reference.depth[v, u])
+            if z <= 0:
+                continue
+            point = there[:3, :3] @ (k_inv @ np.array([u, v, 1.0]) * z) + there[:3, 3]
+            if point[2] <= 0:
+                continue
+            x, y, _ = k @ point / point[2]
+            ix, iy = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
+            if not (0 <= ix < SIZE[1] and 0 <= iy < SIZE[0]) or neighbor.depth[iy, ix] <= 0:
+                continue
+            found = float(neighbor.depth[iy, ix])
+            if not round_trip:
+                agree[v, u] = abs(found - point[2]) < relative * max(found, point[2])
+                continue
+            home = back[:3, :3] @ (k_inv @ np.array([ix, iy, 1.0]) * found) + back[:3, 3]
+            bx, by, _ = k @ home / home[2]
+            close = np.hypot(bx - u, by - v) < pixels
+            agree[v, u] = close and abs(home[2] - z) < relative * max(home[2], z)
+    return agree
+
+
+@pytest.mark.parametrize("round_trip", [False, True])
+def test_consistency_equals_brute_force(round_trip: bool) -> None:
+    reference, neighbors = view(0, 0.0, 0.01), [view(1, 0.2, 0.01, 0.05), view(2, -0.3, 0.01)]
+    reference.depth[5:9, 5:9] = 0
+    there, back = warps_between(reference, neighbors)
+    depths = np.stack([n.depth for n in neighbors])
+    expected = sum(brute_force(reference, n, 0.02, 0.7, round_trip).astype(int) for n in neighbors)
+    for backend in (NativeFusionBackend(1), TorchFusionBackend("cpu")):
+        found = backend.consistent_views(reference.depth, depths, there, back, 0.02, 0.7, round_trip)
+        assert np.mean(found != expected) < 0.003  # rounding at half a pixel
+    assert 0.2 < np.mean(np.asarray(expected) > 0) < 1.0
+
+
+def test_fusion_of_both_backends_agrees() -> None:
+    reference, neighbors = view(0, 0.0, 0.03), [view(1, 0.2, 0.01), view(2, -0.3, 0.01), view(3, 0.1, 0.01)]
+    there, back = warps_between(reference, neighbors)
+    depths, confidences = np.stack([n.depth for n in neighbors]), np.stack([n.confidence for n in neighbors])
+    native, twin = NativeFusionBackend(1), TorchFusionBackend("cpu")
+    splats = [b.splat(depths, confidences, back, 0.4, SIZE) for b in (native, twin)]
+    assert np.mean(np.abs(splats[0] - splats[1]) > 1e-3) < 0.003
+    results = [
+        b.fuse(reference.depth, reference.confidence, depths, confidences, splats[0], there, 0.01, 1.0, 0.1)
+        for b in (native, twin)
+    ]
+    for name in ("depth", "support", "violation", "own"):
+        difference = np.abs(getattr(results[0], name) - getattr(results[1], name))
+        assert np.mean(difference > 1e-3) < 0.005, name
+
+
+def test_fusion_replaces_an_outlier_and_fills_a_hole() -> None:
+    reference = view(0, 0.0)
+    reference.depth[10:14, 10:14] *= 0.6
+    reference.depth[20:24, 10:14] = 0
+    truth = true_depth(look(0.0), SIZE)
+    result = fuse(reference, [view(1, 0.05), view(2, -0.05), view(3, 0.1)], CONFIG, NativeFusionBackend(1))
+    for rows in (slice(10, 14), slice(20, 24)):
+        np.testing.assert_allclose(result.unfiltered[rows, 10:14], truth[rows, 10:14], rtol=0.02)
+
+
+def test_a_point_that_others_see_through_is_rejected() -> None:
+    """Something floats in front of the wall in one map only: free-space violation."""
+    reference = view(0, 0.0)
+    reference.depth[4:10, 4:10] = 1.0
+    result = fuse(reference, [view(1, 0.05), view(2, -0.05), view(3, 0.1)], CONFIG, NativeFusionBackend(1))
+    kept = result.depth[4:10, 4:10]
+    truth = true_depth(look(0.0), SIZE)[4:10, 4:10]
+    assert np.all((kept == 0) | (np.abs(kept - truth) < 0.02 * truth))
+
+
+def test_the_wrong_pose_of_one_neighbor_does_not_get_through() -> None:
+    reference, good = view(0, 0.0), [view(1, 0.05), view(2, -0.05), view(3, 0.1)]
+    wrong = view(4, 0.3)
+    shifted = DepthView(4, wrong.depth, wrong.confidence, wrong.intrinsics, look(0.5, 0.1), 1.0)
+    result = fuse(reference, [*good, shifted], CONFIG, NativeFusionBackend(1))
+    truth = true_depth(look(0.0), SIZE)
+    kept = result.depth > 0
+    assert kept.mean() > 0.7
+    assert np.mean(np.abs(result.depth - truth)[kept] > 0.05 * truth[kept]) < 0.02
+
+
+def test_fewer_neighbors_than_asked_for_is_said() -> None:
+    fusion = DepthFusion(CONFIG)
+    assert list(fusion.add(view(0, 0.0))) == []
+    (alone,) = fusion.flush()
+    assert "no neighbor" in alone.problem
+    assert not (alone.depth > 0).any()
+
+
+def test_scale_corrections_scale_stored_depth() -> None:
+    fusion = DepthFusion(CONFIG)
+    for i in range(2):
+        list(fusion.add(view(i, 0.1 * i)))
+    doubled = {i: (look(0.2 * i), 2.0) for i in range(2)}
+    fusion.move(doubled)
+    fusion.move(doubled)  # absolute: a second time changes nothing
+    for found in fusion.flush():
+        np.testing.assert_allclose(found.view.depth, 2.0 * true_depth(look(0.1 * found.view.index), SIZE), rtol=1e-5)
+
+
+def test_normals_of_a_plane_are_exact() -> None:
+    intrinsics = intrinsics_of(SIZE)
+    normal = np.array([0.3, -0.5, -0.8])
+    normal /= np.linalg.norm(normal)
+    u, v = camera.pixel_grid(*SIZE)
+    rays = np.stack([(u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], np.ones(SIZE)], axis=-1)
+    depth = (-2.0 / (rays @ normal)).astype(np.float32)
+    assert depth.min() > 0
+    depth[:4] = 0
+    found = normals_of(depth, intrinsics)
+    assert np.all(found[:4] == 0)
+    np.testing.assert_allclose(found[4:], np.broadcast_to(normal, found[4:].shape), atol=2e-3)
+
+
+def test_normals_do_not_bend_at_a_jump() -> None:
+    depth = np.full(SIZE, 2.0, np.float32)
+    depth[:, 28:] = 4.0
+    np.testing.assert_allclose(
+        normals_of(depth, intrinsics_of(SIZE)), np.broadcast_to([0.0, 0.0, -1.0], (*SIZE, 3)), atol=1e-4
+    )
