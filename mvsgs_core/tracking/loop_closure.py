@@ -10,7 +10,7 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
-from mvsgs_core.tracking.pose_graph import SimilarityEdge, scale_of, solve_pose_graph
+from mvsgs_core.tracking.pose_graph import SimilarityEdges, scale_of, solve_pose_graph
 from mvsgs_core.tracking.retrieval import Retrieval
 from mvsgs_core.tracking.sighting import Sighting, SightingCriteria, relative_scale, sight
 
@@ -103,14 +103,17 @@ class LoopCloser:
         number = {k: n for n, k in enumerate(order)}
         poses = np.stack([self.graph.keyframes[k].cam_from_world for k in order])
         unit = float(np.median([self.graph.keyframes[k].median_depth for k in order]))
-        sigma = (0.01 * unit, 0.005, 0.01)
         pairs = {(min(a, b), max(a, b)) for a, b in self.graph.edges if a in number and b in number}
         pairs |= set(pairwise(order))
-        edges = [
-            SimilarityEdge(number[a], number[b], poses[number[b]] @ geometry.inverse(poses[number[a]]), sigma)
-            for a, b in sorted(pairs)
-        ]
-        edges.append(SimilarityEdge(number[found.index], number[index], self._measured(found, index, scale), sigma))
+        source, to = np.array([(number[a], number[b]) for a, b in sorted(pairs)]).T
+        edges = SimilarityEdges(
+            source=np.append(source, number[found.index]),
+            to=np.append(to, number[index]),
+            relative=np.concatenate(
+                [poses[to] @ geometry.inverse(poses[source]), [self._measured(found, index, scale)]]
+            ),
+            sigma=np.tile([0.01 * unit, 0.005, 0.01], (len(source) + 1, 1)),
+        )
         solution = solve_pose_graph(poses, edges, {0})
         if solution.failure or not np.isfinite(solution.similarities).all():
             return solution.failure or "the pose graph's solution is not finite"

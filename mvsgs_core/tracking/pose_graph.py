@@ -1,4 +1,4 @@
-"""Sim(3) pose graph: closes a loop whose scale has drifted (Strasdat et al. 2010), dense Gauss-Newton in float64.
+"""Sim(3) pose graph: closes a loop whose scale has drifted (Strasdat et al. 2010), Gauss-Newton in float64.
 
 A similarity is a 4x4 matrix [sR t; 0 1]. Tangents are (translation, rotation, log scale); updates are on the left.
 """
@@ -9,17 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvsgs_core import geometry
+from mvsgs_core import geometry, native
 
 
 @dataclass(frozen=True)
-class SimilarityEdge:
-    """What node `to` should be, seen from node `source`: S_to = relative S_source."""
+class SimilarityEdges:
+    """E measurements: S_to = relative S_source."""
 
-    source: int
-    to: int
-    relative: np.ndarray  # (4, 4)
-    sigma: tuple[float, float, float] = (0.01, 0.005, 0.01)  # map units, radians, log scale
+    source: np.ndarray  # (E,) int
+    to: np.ndarray  # (E,) int
+    relative: np.ndarray  # (E, 4, 4)
+    sigma: np.ndarray  # (E, 3): of translations in map units, of rotations in radians, of log scales
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class PoseGraphSolution:
 
 def scale_of(similarity: np.ndarray) -> np.ndarray:
     """Scales (...) of similarities (..., 4, 4)."""
-    return np.cbrt(np.linalg.det(similarity[..., :3, :3]))
+    return np.asarray(np.cbrt(np.linalg.det(similarity[..., :3, :3])))
 
 
 def inverse_similarity(similarity: np.ndarray) -> np.ndarray:
@@ -47,31 +47,27 @@ def inverse_similarity(similarity: np.ndarray) -> np.ndarray:
 
 
 def solve_pose_graph(
-    similarities: np.ndarray, edges: list[SimilarityEdge], fixed: set[int], steps: int = 20, tolerance: float = 1e-6
+    similarities: np.ndarray, edges: SimilarityEdges, fixed: set[int], steps: int = 20, tolerance: float = 1e-6
 ) -> PoseGraphSolution:
     """Similarities (K, 4, 4), camera from world, that agree best with the edges; those in `fixed` stay.
 
-    Every connected part needs a fixed node: else the failure says that the graph has a free gauge.
+    Every connected part needs a fixed node: else the failure says that a part is free.
     """
     current = similarities.astype(np.float64).copy()
+    column = np.full(len(current), -1)
     free = [k for k in range(len(current)) if k not in fixed]
-    column = {k: 7 * n for n, k in enumerate(free)}
+    column[free] = np.arange(len(free))
     initial = cost = _cost(current, edges)
-    lm, taken = 1e-6, 0
+    lm, taken = 1e-8, 0
     for _ in range(steps):
         hessian, gradient = _normal_equations(current, edges, column)
-        step: np.ndarray | None = None
-        better = cost
         for _ in range(8):
             damped = hessian + np.diag(lm * np.diag(hessian))
-            try:
-                np.linalg.cholesky(damped)
-            except np.linalg.LinAlgError:
+            step, pivot = native.load("tracking").solve_positive_definite(damped, -gradient)
+            if pivot <= 1e-12:
                 return PoseGraphSolution(current, initial, cost, taken, "a part of the pose graph has no fixed node")
-            step = np.linalg.solve(damped, -gradient)
             moved = current.copy()
-            for k, at in column.items():
-                moved[k] = _retract(step[at : at + 7], current[k])
+            moved[free] = _retract(step.reshape(-1, 7), current[free])
             better = _cost(moved, edges)
             if better <= cost:
                 break
@@ -85,78 +81,83 @@ def solve_pose_graph(
     return PoseGraphSolution(current, initial, cost, taken)
 
 
-def residual(edge: SimilarityEdge, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(7,) difference between what an edge says and what is, and the similarity E (4, 4) that it is taken from."""
-    error = inverse_similarity(edge.relative) @ similarities[edge.to] @ inverse_similarity(similarities[edge.source])
-    scale = float(scale_of(error))
-    return np.concatenate([error[:3, 3], geometry.so3_log(error[:3, :3] / scale), [np.log(scale)]]), error
+def residuals(similarities: np.ndarray, edges: SimilarityEdges) -> tuple[np.ndarray, np.ndarray]:
+    """(E, 7) difference between what the edges say and what is, and the similarities (E, 4, 4) it is taken from."""
+    error = inverse_similarity(edges.relative) @ similarities[edges.to] @ inverse_similarity(similarities[edges.source])
+    scale = scale_of(error)
+    rotation = geometry.so3_log(error[:, :3, :3] / scale[:, None, None])
+    return np.concatenate([error[:, :3, 3], rotation, np.log(scale)[:, None]], axis=1), error
 
 
 def adjoint(similarity: np.ndarray) -> np.ndarray:
-    """(7, 7): S exp(x) S^-1 = exp(adjoint(S) x)."""
-    result = np.zeros((7, 7))
-    scale = scale_of(similarity)
-    rotation, translation = similarity[:3, :3] / scale, similarity[:3, 3]
-    result[:3, :3] = similarity[:3, :3]
-    result[:3, 3:6] = geometry.skew(translation) @ rotation
-    result[:3, 6] = -translation
-    result[3:6, 3:6] = rotation
-    result[6, 6] = 1.0
+    """(..., 7, 7): S exp(x) S^-1 = exp(adjoint(S) x)."""
+    result = np.zeros((*similarity.shape[:-2], 7, 7))
+    rotation = similarity[..., :3, :3] / scale_of(similarity)[..., None, None]
+    result[..., :3, :3] = similarity[..., :3, :3]
+    result[..., :3, 3:6] = geometry.skew(similarity[..., :3, 3]) @ rotation
+    result[..., :3, 6] = -similarity[..., :3, 3]
+    result[..., 3:6, 3:6] = rotation
+    result[..., 6, 6] = 1.0
     return result
 
 
-def jacobians(edge: SimilarityEdge, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """residual (7,) and its derivatives (7, 7) by left updates of `source` and of `to`."""
-    r, error = residual(edge, similarities)
-    by_error = np.eye(7)
-    by_error[:3, 3:6] = -geometry.skew(error[:3, 3])
-    by_error[:3, 6] = error[:3, 3]
-    omega = r[3:6]
-    angle = float(np.linalg.norm(omega))
+def jacobians(similarities: np.ndarray, edges: SimilarityEdges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals (E, 7) and their derivatives (E, 7, 7) by left updates of `source` and of `to`."""
+    r, error = residuals(similarities, edges)
+    omega = r[:, 3:6]
+    angle = np.linalg.norm(omega, axis=1)[:, None, None]
+    safe = np.where(angle < 1e-4, 1.0, angle)
+    c = np.where(angle < 1e-4, 1.0 / 12.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
     k = geometry.skew(omega)
-    c = 1.0 / 12.0 if angle < 1e-4 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
-    by_error[3:6, 3:6] = np.eye(3) - 0.5 * k + c * (k @ k)
-    return r, -by_error @ adjoint(error), by_error @ adjoint(inverse_similarity(edge.relative))
+    by_error = np.tile(np.eye(7), (len(r), 1, 1))
+    by_error[:, :3, 3:6] = -geometry.skew(error[:, :3, 3])
+    by_error[:, :3, 6] = error[:, :3, 3]
+    by_error[:, 3:6, 3:6] = np.eye(3) - 0.5 * k + c * (k @ k)
+    return r, -by_error @ adjoint(error), by_error @ adjoint(inverse_similarity(edges.relative))
 
 
-def _weights(edge: SimilarityEdge) -> np.ndarray:
-    return 1.0 / np.square(np.repeat(edge.sigma, (3, 3, 1)))
+def _weights(edges: SimilarityEdges) -> np.ndarray:
+    return np.asarray(1.0 / np.square(np.repeat(edges.sigma, (3, 3, 1), axis=1)))
 
 
-def _cost(similarities: np.ndarray, edges: list[SimilarityEdge]) -> float:
-    return float(sum(np.sum(_weights(e) * np.square(residual(e, similarities)[0])) for e in edges))
+def _cost(similarities: np.ndarray, edges: SimilarityEdges) -> float:
+    return float(np.sum(_weights(edges) * np.square(residuals(similarities, edges)[0])))
 
 
 def _normal_equations(
-    similarities: np.ndarray, edges: list[SimilarityEdge], column: dict[int, int]
+    similarities: np.ndarray, edges: SimilarityEdges, column: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    n = 7 * len(column)
-    hessian, gradient = np.zeros((n, n)), np.zeros(n)
-    for edge in edges:
-        r, by_source, by_to = jacobians(edge, similarities)
-        weights = _weights(edge)
-        ends = [(column[k], j) for k, j in ((edge.source, by_source), (edge.to, by_to)) if k in column]
-        for at, j in ends:
-            gradient[at : at + 7] += j.T @ (weights * r)
-            for other, q in ends:
-                hessian[at : at + 7, other : other + 7] += j.T @ (weights[:, None] * q)
-    return hessian, gradient
+    """Hessian (7F, 7F) and gradient (7F,) over the F free similarities, by their column (K,), -1 where fixed."""
+    n = int(column.max()) + 1
+    hessian, gradient = np.zeros((n, n, 7, 7)), np.zeros((n, 7))
+    r, by_source, by_to = jacobians(similarities, edges)
+    weights = _weights(edges)
+    ends = [(column[edges.source], by_source), (column[edges.to], by_to)]
+    for at, j in ends:
+        weighted = np.swapaxes(j, 1, 2) * weights[:, None]
+        used = at >= 0
+        np.add.at(gradient, at[used], (weighted @ r[:, :, None])[used, :, 0])
+        for other, q in ends:
+            both = used & (other >= 0)
+            np.add.at(hessian, (at[both], other[both]), (weighted @ q)[both])
+    return np.ascontiguousarray(hessian.transpose(0, 2, 1, 3)).reshape(7 * n, 7 * n), gradient.ravel()
 
 
-def _retract(x: np.ndarray, similarity: np.ndarray) -> np.ndarray:
-    step = np.eye(4)
-    step[:3, :3] = np.exp(x[6]) * geometry.so3_exp(x[3:6])
-    step[:3, 3] = x[:3]
-    return step @ similarity
+def _retract(x: np.ndarray, similarities: np.ndarray) -> np.ndarray:
+    """Left updates by x (N, 7)."""
+    step = np.tile(np.eye(4), (len(x), 1, 1))
+    step[:, :3, :3] = np.exp(x[:, 6])[:, None, None] * geometry.so3_exp(x[:, 3:6])
+    step[:, :3, 3] = x[:, :3]
+    return np.asarray(step @ similarities)
 
 
 __all__ = [
     "PoseGraphSolution",
-    "SimilarityEdge",
+    "SimilarityEdges",
     "adjoint",
     "inverse_similarity",
     "jacobians",
-    "residual",
+    "residuals",
     "scale_of",
     "solve_pose_graph",
 ]

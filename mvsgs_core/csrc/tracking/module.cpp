@@ -11,6 +11,7 @@
 #include <optional>
 
 #include "bundle_adjustment.hpp"
+#include "cholesky.hpp"
 #include "lucas_kanade.hpp"
 #include "nearest.hpp"
 #include "optimize.hpp"
@@ -146,6 +147,18 @@ static Out<double> median_of_nearest(In<double> points, In<double> values, In<do
     return to_numpy(std::move(out), {static_cast<size_t>(m)});
 }
 
+// Solution (N) of A x = b and the smallest relative pivot: a serial solve, which a busy machine does not slow down.
+static nb::tuple solve_positive_definite(In<double> a, In<double> b) {
+    std::vector<double> matrix(a.data(), a.data() + a.size()), x(b.data(), b.data() + b.size());
+    double pivot;
+    {
+        nb::gil_scoped_release release;
+        pivot = cholesky_solve(matrix, x, static_cast<int>(x.size()));
+    }
+    const size_t n = x.size();
+    return nb::make_tuple(to_numpy(std::move(x), {n}), pivot);
+}
+
 NB_MODULE(MVSGS_MODULE, m) {
     m.def("bundle_adjust", &bundle_adjust, nb::arg("poses"), nb::arg("inverse_depth"), nb::arg("pixels"),
           nb::arg("intrinsics"), nb::arg("source"), nb::arg("to"), nb::arg("target"), nb::arg("information"),
@@ -156,6 +169,7 @@ NB_MODULE(MVSGS_MODULE, m) {
     m.def("lucas_kanade", &lucas_kanade, nb::arg("a"), nb::arg("b"), nb::arg("points"), nb::arg("guess"),
           nb::arg("border"), nb::arg("start_level"), nb::arg("iterations"), nb::arg("window_sigma"),
           nb::arg("min_eigenvalue"), nb::arg("threads"));
+    m.def("solve_positive_definite", &solve_positive_definite, nb::arg("a"), nb::arg("b"));
     m.def("median_of_nearest", &median_of_nearest, nb::arg("points"), nb::arg("values"), nb::arg("queries"),
           nb::arg("count"), nb::arg("radius"));
 }
