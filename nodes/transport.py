@@ -32,7 +32,7 @@ from nodes.frame_pool import FramePool
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
 PEER_GRACE = 0.5  # s between a disconnection and its report: whoever failed first should be heard first
-NEWEST_GOODBYE = 5.0  # s that a best-effort reader has to take its End
+NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
 
 
 class PeerLost(TransportError):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import ENVIRONMENT, Graph, graph
+from tests.processes import ENVIRONMENT, graph
 from tests.shared_data import ROOT
 
 DOWN = 5.0  # s in which a graph must be down after a failure
@@ -221,32 +221,31 @@ def _alive(pid: int) -> bool:
 
 
 def _exercise(rounds: int, count: int) -> None:
-    """`python -m tests.test_node`: the long form of the first test, and nodes killed at random moments."""
+    """`python -m tests.test_node ROUNDS COUNT`: the long form of these tests, at random moments."""
     for i in range(rounds):
-        g = Graph(buffer=2)
-        g.diamond(source={"count": count}, join={"delay": 0.002})
-        codes = g.wait(120)
-        kept = g.joined["received"] == {kind: list(range(count)) for kind in ("Keyframe", "GroundTruth")}
-        print(f"diamond {i + 1}: {'all in order' if kept else 'LOST'}, exit codes {codes}, sockets {g.sockets()}")
-        g.close()
+        with graph(buffer=2) as g:
+            g.diamond(source={"count": count}, join={"delay": 0.002})
+            codes = g.wait(120)
+            kept = g.joined["received"] == {kind: list(range(count)) for kind in ("Keyframe", "GroundTruth")}
+            print(f"diamond {i + 1}: {'all in order' if kept else 'LOST'}, {codes}, sockets {g.sockets()}", flush=True)
     for i in range(4 * rounds):
-        g = Graph(buffer=2)
-        g.diamond(source={"count": 300}, join={"delay": 0.001})
-        for process in g.processes.values():  # before, a launcher would have to stop the others
-            process.wait_for(lambda status: status.get("state") == "running")
-        time.sleep(random.uniform(0.0, 1.0))
-        victim = random.choice(list(g.processes))
-        g.processes[victim].popen.kill()
-        began = time.monotonic()
-        states = {name: process.last["state"] for name, process in g.processes.items()}
-        try:
-            codes = g.wait(DOWN)
-            print(
-                f"kill {i + 1}: {victim}, {states}: down after {time.monotonic() - began:.2f} s, {codes} {g.sockets()}"
-            )
-        except AssertionError as error:
-            print(f"kill {i + 1}: {victim}, {states}: {str(error).splitlines()[0]}")
-        g.close()
+        victim = random.choice(["source", "left", "right", "join"])
+        number = random.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+        with graph(buffer=2) as g:
+            g.diamond(source={"count": 300}, join={"delay": 0.001})
+            if number != signal.SIGINT:  # a node that dies before it has met the others leaves them to the launcher
+                for process in g.processes.values():
+                    process.wait_for(lambda status: status.get("state") == "running")
+            time.sleep(random.uniform(0.0, 1.5))
+            g.processes[victim].popen.send_signal(number)
+            began = time.monotonic()
+            states = [process.last.get("state") for process in g.processes.values()]
+            try:
+                codes = g.wait(DOWN)
+                outcome = f"down after {time.monotonic() - began:.2f} s, {codes}, sockets {g.sockets()}"
+            except AssertionError as error:
+                outcome = f"FAILED: {error}"
+            print(f"{number.name} {i + 1}: {victim} among {states}: {outcome}", flush=True)
 
 
 if __name__ == "__main__":
