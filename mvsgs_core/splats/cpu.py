@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from mvsgs_core import native
 from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import Render, View
+from mvsgs_core.splats.rasterizer import Render, View, screen_points
 
 
 class _Rasterize(torch.autograd.Function):
@@ -88,7 +88,7 @@ def render(splats: Splats, view: View) -> Render:
             "take backend='reference' for float64"
         )
     count = len(splats)
-    screen = torch.zeros(count, 2, requires_grad=torch.is_grad_enabled())
+    screen = screen_points(splats, view)
     extra: dict[str, Any] = {}
     color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), screen, view.pose, view, extra)
     weight_sum = weight_max = None

@@ -82,6 +82,13 @@ def tile_grid(size: tuple[int, int]) -> tuple[int, int]:
     return -(-size[0] // TILE), -(-size[1] // TILE)
 
 
+def screen_points(splats: Splats, view: View) -> Tensor:
+    """Zeros (N, 2) for `Render.screen`; they take a gradient where anything else does."""
+    inputs = [*splats.tensors().values(), view.pose]
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
+    return splats.means.new_zeros(len(splats), 2).requires_grad_(wanted)
+
+
 def se3_exp(twist: Tensor) -> Tensor:
     """(4, 4) rigid transform of a twist (6,) = (translation, rotation), differentiable at 0 as well."""
     rho, omega = twist[:3], twist[3:]

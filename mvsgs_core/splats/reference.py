@@ -138,7 +138,7 @@ def render(splats: Splats, view: View) -> Render:
     """See `rasterizer.rasterize`."""
     dtype, count = splats.means.dtype, len(splats)
     height, width = view.size
-    screen = torch.zeros(count, 2, dtype=dtype, requires_grad=torch.is_grad_enabled())
+    screen = rasterizer.screen_points(splats, view)
     choice = choose(splats, view)
     shown = Splats(*(tensor.index_select(0, choice.order) for tensor in splats.tensors().values()))
     p = project(shown, screen.index_select(0, choice.order), view)

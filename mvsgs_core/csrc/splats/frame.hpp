@@ -19,6 +19,7 @@ constexpr float kBlur = 0.3f;          // px^2 on the diagonal of the image cova
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
 constexpr float kLog2MinAlpha = -7.994353436858858f;  // log2(1 / 255)
+constexpr float kClampMargin = 0.3f;  // of tan(fov)
 constexpr float kMinCompensation = 0.005f;
 constexpr float kMaxVariance = 1e16f;  // px^2
 constexpr float kMinQuaternion = 1e-8f;

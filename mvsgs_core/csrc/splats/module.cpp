@@ -8,6 +8,7 @@
 #include <cmath>
 #include <mutex>
 
+#include "splats/baseline.hpp"
 #include "splats/frame.hpp"
 #include "splats/photometric.hpp"
 
@@ -61,33 +62,40 @@ Parameters parameters(const Frame& frame, In means, In log_scales, In quaternion
 
 int thread_count(int threads) { return std::max(1, threads > 0 ? threads : omp_get_max_threads()); }
 
-std::unique_ptr<Pass> forward(In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas,
-                              Array<const double> pose, std::tuple<float, float, float, float> intrinsics, float near,
-                              std::tuple<float, float, float> background, bool exact, bool antialiased, int degree,
-                              nb::object tile_mask, bool weights, int threads, Out color, Out depth, Out opacity,
-                              Out radii) {
-    auto pass = std::make_unique<Pass>();
-    Frame& frame = *pass->frame;
-    Camera& camera = frame.camera;
+using Intrinsics = std::tuple<float, float, float, float>;
+
+Camera camera_of(Array<const double> pose, Intrinsics intrinsics, float near, int width, int height) {
+    Camera camera;
     for (int i = 0; i < 3; ++i) {
         for (int j = 0; j < 3; ++j) camera.rotation[i][j] = pose.data()[4 * i + j];
         camera.center[i] = pose.data()[4 * i + 3];
     }
     std::tie(camera.fx, camera.fy, camera.cx, camera.cy) = intrinsics;
-    std::tie(frame.background[0], frame.background[1], frame.background[2]) = background;
-    camera.height = int(color.shape(0));
-    camera.width = int(color.shape(1));
+    camera.width = width;
+    camera.height = height;
     camera.near = near;
-    const float margin_x = 0.3f * 0.5f * camera.width / camera.fx, margin_y = 0.3f * 0.5f * camera.height / camera.fy;
+    const float margin_x = kClampMargin * 0.5f * width / camera.fx, margin_y = kClampMargin * 0.5f * height / camera.fy;
     camera.slope_min[0] = -(camera.cx + 0.5f) / camera.fx - margin_x;
-    camera.slope_max[0] = (camera.width - 0.5f - camera.cx) / camera.fx + margin_x;
+    camera.slope_max[0] = (width - 0.5f - camera.cx) / camera.fx + margin_x;
     camera.slope_min[1] = -(camera.cy + 0.5f) / camera.fy - margin_y;
-    camera.slope_max[1] = (camera.height - 0.5f - camera.cy) / camera.fy + margin_y;
+    camera.slope_max[1] = (height - 0.5f - camera.cy) / camera.fy + margin_y;
+    return camera;
+}
+
+std::unique_ptr<Pass> forward(In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas,
+                              Array<const double> pose, Intrinsics intrinsics, float near,
+                              std::tuple<float, float, float> background, bool exact, bool antialiased, int degree,
+                              nb::object tile_mask, bool weights, int threads, Out color, Out depth, Out opacity,
+                              Out radii) {
+    auto pass = std::make_unique<Pass>();
+    Frame& frame = *pass->frame;
+    frame.camera = camera_of(pose, intrinsics, near, int(color.shape(1)), int(color.shape(0)));
+    std::tie(frame.background[0], frame.background[1], frame.background[2]) = background;
     frame.exact = exact;
     frame.antialiased = antialiased;
     frame.degree = degree;
-    frame.tiles_x = (camera.width + kTile - 1) / kTile;
-    frame.tiles_y = (camera.height + kTile - 1) / kTile;
+    frame.tiles_x = (frame.camera.width + kTile - 1) / kTile;
+    frame.tiles_y = (frame.camera.height + kTile - 1) / kTile;
     const Parameters p = parameters(frame, means, log_scales, quaternions, opacity_logits, sh, betas);
     Array<const bool> mask;
     if (!tile_mask.is_none()) mask = nb::cast<Array<const bool>>(tile_mask);
@@ -147,6 +155,20 @@ std::tuple<double, double> image_loss(In image, In target, nb::object pixel_weig
     return {result.l1, result.ssim};
 }
 
+// (forward, backward) seconds of the plain-loop rasterizer.
+std::tuple<double, double> run_baseline(In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas,
+                                        Array<const double> pose, Intrinsics intrinsics, bool exact, int threads,
+                                        Out color, In color_gradient, Out image_gradient) {
+    const Camera camera = camera_of(pose, intrinsics, 1e-3f, int(color.shape(1)), int(color.shape(0)));
+    Frame frame;
+    frame.exact = exact;
+    const Parameters p = parameters(frame, means, log_scales, quaternions, opacity_logits, sh, betas);
+    const nb::gil_scoped_release released;
+    const BaselineSeconds seconds =
+        baseline(camera, p, color.data(), color_gradient.data(), image_gradient.data(), thread_count(threads));
+    return {seconds.forward, seconds.backward};
+}
+
 }  // namespace
 
 #define SPLATS_MODULE(name) NB_MODULE(name, m)
@@ -166,6 +188,10 @@ SPLATS_MODULE(MVSGS_MODULE) {
           nb::arg("on_means"), nb::arg("on_log_scales"), nb::arg("on_quaternions"), nb::arg("on_opacity_logits"),
           nb::arg("on_sh"), nb::arg("on_betas"), nb::arg("on_screen"), nb::arg("on_pose"));
     m.def("weights", &weights);
+    m.def("baseline", &run_baseline);
+    m.def("peak_densities", &peak_densities);
+    m.def("peak_tile_bytes", &peak_tile_bytes);
+    m.def("peak_memory_bytes", &peak_memory_bytes);
     m.def("image_loss", &image_loss, nb::arg("image"), nb::arg("target"), nb::arg("pixel_weight").none(),
           nb::arg("l1_weight"), nb::arg("ssim_weight"), nb::arg("gradient"), nb::arg("threads"));
 }
