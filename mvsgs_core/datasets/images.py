@@ -75,7 +75,11 @@ def _find_images(folder: Path) -> list[Path]:
             return images
     below = [p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
     if not below:
-        raise LAYOUT.missing(f"{folder} has no image")
+        heic = any(p.suffix.lower() in (".heic", ".heif") for p in folder.rglob("*"))
+        hint = (
+            ", only HEIC files: convert them (heif-convert, or the phone's setting `most compatible`)" if heic else ""
+        )
+        raise LAYOUT.missing(f"{folder} has no image{hint}")
     return sorted(below, key=lambda p: natural_order(p.relative_to(folder).as_posix()))
 
 

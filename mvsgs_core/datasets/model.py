@@ -28,14 +28,18 @@ class Model:
     shots: Mapping[str, Shot]
 
     def lookup(self, images: list[Path], folder: Path) -> list[Shot | None]:
-        """The shot of each image, by its path below `folder`, else by its bare name where that is unique."""
+        """The shot of each image: by the longest end of its path below `folder` that is a name, else by its bare name.
+
+        Names of a model start at another folder than ours, and some leave the suffix out.
+        """
         bare = Counter(_bare(name) for name in self.shots)
-        by_bare = {_bare(name): shot for name, shot in self.shots.items() if bare[_bare(name)] == 1}
-        by_path = {_without_suffix(name): shot for name, shot in self.shots.items()}
+        known = {_bare(name): shot for name, shot in self.shots.items() if bare[_bare(name)] == 1}
+        known |= {_without_suffix(name): shot for name, shot in self.shots.items()}
         found = []
         for image in images:
-            relative = _without_suffix(image.relative_to(folder).as_posix())
-            found.append(by_path.get(relative) or by_bare.get(_bare(relative)))
+            parts = _without_suffix(image.relative_to(folder).as_posix()).split("/")
+            ends = ("/".join(parts[i:]) for i in range(len(parts)))
+            found.append(next((known[end] for end in ends if end in known), None))
         return found
 
     @property

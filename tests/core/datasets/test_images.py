@@ -71,6 +71,24 @@ def test_colmap_model(tmp_path: Path, write: Callable[[Path, list[str]], None], 
     ]
 
 
+def test_a_model_of_several_cameras_with_equal_file_names(tmp_path: Path) -> None:
+    names = [f"{camera}/{i}.png" for camera in ("left", "right") for i in range(2)]
+    for i, name in enumerate(names):
+        write_image(tmp_path / "images" / name, 20 + i)
+    colmap_text(tmp_path / "sparse/0", names)
+    for i, item in enumerate(open_dataset("images", path=tmp_path)):
+        assert item.image[0, 0, 0] == 20 + i
+        np.testing.assert_allclose(item.world_from_cam, POSES[i], atol=1e-12)
+
+
+def test_a_folder_without_images_says_so(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="has no image\n"):
+        open_dataset("images", path=tmp_path)
+    (tmp_path / "IMG_1.HEIC").touch()
+    with pytest.raises(FileNotFoundError, match="only HEIC files: convert them"):
+        open_dataset("images", path=tmp_path)
+
+
 def test_damaged_colmap_models(tmp_path: Path) -> None:
     colmap_binary(tmp_path / "a", ["photo0.png"])
     truncate(tmp_path / "a/images.bin", 0.5)
