@@ -109,5 +109,9 @@ class Cascade:
             return CascadeDepth(reference, empty_depth(reference.size), (), search, "no neighbor with a baseline")
         self._previous_range = search
         views = [n.view for n in chosen]
-        result = estimate_depth(reference, views, search, config.stereo, self._backend)
+        result = self._estimate(reference, views, search)
         return CascadeDepth(reference, result, tuple(v.index for v in views), search)
+
+    def _estimate(self, reference: StereoView, neighbors: list[StereoView], search: SearchRange) -> StereoDepth:
+        """The source of depth: a subclass puts a network here and keeps views, neighbors and ranges."""
+        return estimate_depth(reference, neighbors, search, self.config.stereo, self._backend)
