@@ -51,9 +51,9 @@ def write_mesh(
     )
     matrix = o3d.core.Tensor(camera.matrix(intrinsics))
     truncation = 6.0  # voxels, of the distance field
-    for local, depth, color in views:
+    for local, seen_depth, color in views:
         extrinsic = o3d.core.Tensor(np.linalg.inv(local))
-        depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth)))
+        depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(seen_depth)))
         color_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color)))
         blocks = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1.0, farthest, truncation)
         grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, 1.0, farthest, truncation)

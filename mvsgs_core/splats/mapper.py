@@ -236,6 +236,8 @@ class OnlineMapper:
         valid = depth > 0
         if view.confidence is not None and config.min_confidence > 0:
             valid &= view.confidence >= config.min_confidence
+        if added.valid is not None:
+            valid &= camera.resize_image(added.valid[0].cpu().numpy().astype(np.float32), size) > 0.999
         mask = valid
         if config.unexplored and len(self.state):
             level = self._level_of(added, size)
