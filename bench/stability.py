@@ -131,10 +131,10 @@ def box_view(index: int, x: float, size: tuple[int, int] = SIZE, origin: float =
     """A textured plane two units ahead, seen from x."""
     height, width = size
     intrinsics = camera.scale_intrinsics(INTRINSICS, SIZE, size)
-    points = camera.unproject(np.full(size, 2.0), intrinsics) + [x, 0.0, 0.0]
-    waves = (
-        0.5 + 0.2 * np.sin(6.0 * points[..., [0, 1, 0]] + [0.0, 1.0, 2.0]) + 0.2 * np.cos(9.0 * points[..., [1, 0, 1]])
-    )
+    points = camera.unproject(np.full(size, 2.0), intrinsics)
+    points[..., 0] += x
+    phase = np.array([0.0, 1.0, 2.0])
+    waves = 0.5 + 0.2 * np.sin(6.0 * points[..., [0, 1, 0]] + phase) + 0.2 * np.cos(9.0 * points[..., [1, 0, 1]])
     pose = np.eye(4)
     pose[0, 3] = x + origin
     image = np.round(255.0 * np.clip(waves, 0.0, 1.0)).astype(np.uint8)
