@@ -31,7 +31,7 @@ Sample = Frame | GroundTruth
 BUFFER = 8  # messages, of both
 FRESH = 32  # images sent in turns: a source gives each once, so none waits in a cache
 GOAL = 1.5  # times plain pyzmq
-ROUNDS = 3  # of the throughput; the best counts: other work on the machine only ever slows
+ROUNDS = 5  # of the throughput; the best counts: other work on the machine only ever slows
 
 
 def samples() -> dict[str, Callable[[int, float], Sample]]:

@@ -17,6 +17,9 @@ The parameter's type declares the input, the yielded type the output. Hooks:
   None when there is nothing to do until the next message.
 - `on_end(self) -> Iterator[U]`: every input has ended.
 
+Arrays of a message that came from another process are read-only views that keep its whole frame in memory: copy
+what you change, and what is small and kept.
+
 A node imports no socket and knows no topic: it is tested as `list(Tracker(config).on_frame(frame))`.
 """
 

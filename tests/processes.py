@@ -11,7 +11,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,14 +49,21 @@ class Process:
 class Graph:
     """Processes by node name, in a short-named directory of their own."""
 
-    def __init__(self, buffer: int = 2, transport: str = "ipc") -> None:
+    def __init__(self, buffer: int = 2, ports: Sequence[int] = (), keys: Path | None = None) -> None:
+        """Over ipc, or over tcp with one of these ports for each topic."""
         self.directory = Path(tempfile.mkdtemp(prefix="mvsgs-test-"))
         self.processes: dict[str, Process] = {}
         self._buffer = buffer
+        self._ports = list(ports)
+        self._topics: dict[str, str] = {}  # topic -> address
+        self._keys = None if keys is None else str(keys)
         self._listeners: list[threading.Thread] = []
 
     def address(self, topic: str) -> str:
-        return f"ipc://{self.directory}/{topic}"
+        if topic not in self._topics:
+            ports = self._ports
+            self._topics[topic] = f"tcp://127.0.0.1:{ports.pop()}" if ports else f"ipc://{self.directory}/{topic}"
+        return self._topics[topic]
 
     def start(
         self,
@@ -87,6 +94,7 @@ class Graph:
                 for kind, readers in sends.items()
             ],
             "buffer": self._buffer,
+            "keys": self._keys,
             "status_fd": write_end,
         } | spec
         path = self.directory / f"{name}.json"
@@ -148,8 +156,8 @@ class Graph:
 
 
 @contextmanager
-def graph(buffer: int = 2) -> Iterator[Graph]:
-    running = Graph(buffer)
+def graph(buffer: int = 2, ports: Sequence[int] = (), keys: Path | None = None) -> Iterator[Graph]:
+    running = Graph(buffer, ports, keys)
     try:
         yield running
     finally:

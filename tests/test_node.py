@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from nodes.transport import create_keys
 from tests.processes import ENVIRONMENT, graph
 from tests.shared_data import ROOT
 
@@ -25,6 +27,35 @@ def test_a_diamond_with_a_slow_reader_loses_nothing_and_keeps_the_order() -> Non
         assert g.wait(60) == dict.fromkeys(("join", "left", "right", "source"), 0)
         assert g.joined["received"] == {"Keyframe": list(range(count)), "GroundTruth": list(range(count))}
         assert g.sockets() == []
+
+
+def test_a_diamond_over_tcp_with_keys(tmp_path: Path) -> None:
+    create_keys(tmp_path)
+    with graph(ports=free_ports(3), keys=tmp_path) as g:
+        g.diamond(source={"count": 50})
+        assert set(g.wait(30).values()) == {0}
+        assert g.joined["received"] == {"Keyframe": list(range(50)), "GroundTruth": list(range(50))}
+
+
+def test_a_node_with_other_keys_is_not_let_in(tmp_path: Path) -> None:
+    create_keys(tmp_path / "ours")
+    create_keys(tmp_path / "other")
+    with graph(ports=free_ports(1), keys=tmp_path / "ours") as g:
+        here = "tests.sample_nodes"
+        g.start("source", f"{here}.Source", {}, {"Frame": 1})
+        stranger = g.start("left", f"{here}.Left", {"Frame": "source"}, {}, keys=str(tmp_path / "other"))
+        assert stranger.popen.wait(20) == 1
+        assert g.processes["source"].last["state"] == "waiting"
+
+
+def free_ports(count: int) -> list[int]:
+    sockets = [socket.socket() for _ in range(count)]
+    for each in sockets:
+        each.bind(("127.0.0.1", 0))
+    ports = [each.getsockname()[1] for each in sockets]
+    for each in sockets:
+        each.close()
+    return ports
 
 
 def test_statistics_of_all_nodes_reach_the_end_once() -> None:
@@ -204,6 +235,7 @@ def test_no_node_outlives_a_killed_launcher() -> None:
 
 _LAUNCHER = """
 import sys, time
+from nodes.transport import create_keys
 from tests.processes import Graph
 g = Graph()
 p = g.start("left", "tests.sample_nodes.Left", {"Frame": "source"}, {})
