@@ -1,0 +1,119 @@
+"""Multi-view stereo networks in the frame of the cascade: same keyframes, neighbors and ranges, another estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mvsgs_core import camera, geometry, weights
+from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
+from mvsgs_core.mvs.hypotheses import SearchRange
+from mvsgs_core.mvs.stereo import StereoDepth
+from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.networks import checkpoints, itermvs, mvsformer
+
+
+class _Output(Protocol):
+    @property
+    def depth(self) -> Tensor: ...
+
+    @property
+    def confidence(self) -> Tensor: ...
+
+
+class Network(NamedTuple):
+    """How a published network is made and fed."""
+
+    weights: str  # its name in mvsgs_core.weights
+    inside: str  # key of the state dict in its checkpoint
+    multiple: int  # sizes of images that it takes
+
+
+NETWORKS = {
+    "mvsformer": Network("mvsformer", "state_dict", mvsformer.MULTIPLE),
+    "mvsformer_p": Network("mvsformer_p", "state_dict", mvsformer.MULTIPLE),
+    "itermvs": Network("itermvs", "model", itermvs.MULTIPLE),
+}
+RANDOM = "random"
+
+
+@dataclass(frozen=True)
+class LearnedConfig:
+    """A network for the cascade."""
+
+    network: str = "itermvs"  # mvsformer, mvsformer_p or itermvs
+    file: str | None = None  # checkpoint; None: where mvsgs_core.weights finds it; "random": untrained, for tests
+    area: int = 512 * 384  # pixels of the images that the network sees, aspect kept
+    device: str = "cpu"  # "cpu" or "cuda[:N]"
+
+
+def make_network(config: LearnedConfig) -> nn.Module:
+    """The network with its weights. Raises ValueError for an unknown name and what `weights.find` and the checkpoint
+    reader raise, saying what to fetch from where."""
+    if config.network not in NETWORKS:
+        raise ValueError(f"no network {config.network!r}; there are: {', '.join(NETWORKS)}")
+    entry = NETWORKS[config.network]
+    file = None if config.file == RANDOM else weights.find(entry.weights, config.file)
+    if file is None:
+        torch.manual_seed(0)
+    net: nn.Module
+    if config.network == "itermvs":
+        net = itermvs.IterMvs()
+    else:
+        net = mvsformer.MvsFormer("dino" if config.network == "mvsformer_p" else "twins")
+    if file is not None:
+        checkpoints.load(net, checkpoints.read(Path(file), inside=entry.inside), Path(file))
+    return net.eval().requires_grad_(False).to(config.device)
+
+
+class LearnedCascade(Cascade):
+    """`remember` each keyframe's image before `add`ing its view."""
+
+    def __init__(self, config: CascadeConfig, learned: LearnedConfig) -> None:
+        super().__init__(config)
+        self.learned = learned
+        self._net = make_network(learned)
+        self._images: dict[int, np.ndarray] = {}  # (h, w, 3) uint8 at the network's size
+
+    def remember(self, index: int, image: np.ndarray) -> None:
+        """Keeps a keyframe's RGB image (H, W, 3) uint8 at the network's size while it may be needed."""
+        multiple = NETWORKS[self.learned.network].multiple
+        height, width = image.shape[:2]
+        size = camera.fit_size(height, width, self.learned.area, multiple)
+        self._images[index] = camera.resize_image(image, size)
+        for old in sorted(self._images)[: -(self.config.window + self.config.lag + 2)]:
+            del self._images[old]
+
+    def _estimate(self, reference: StereoView, neighbors: list[StereoView], search: SearchRange) -> StereoDepth:
+        views = [reference, *neighbors]
+        size = self._images[reference.index].shape[:2]
+        images = np.stack([self._images[v.index] for v in views])
+        cameras = np.stack([camera.matrix(camera.scale_intrinsics(v.intrinsics, v.size, size)) for v in views])
+        cam_from_world = np.stack([geometry.inverse(v.world_from_cam) for v in views])
+        # around the reference and at unit median depth: in a far or tiny world float32 has no digits to spare
+        cam_from_world = cam_from_world @ reference.world_from_cam
+        unit = float(2.0 / (search.low + search.high))
+        cam_from_world[:, :3, 3] /= unit
+        with torch.inference_mode():
+            output: _Output = self._net(
+                torch.from_numpy(images).permute(0, 3, 1, 2).float().to(self.learned.device),
+                torch.from_numpy(cam_from_world).to(self.learned.device),
+                torch.from_numpy(cameras).to(self.learned.device),
+                (1.0 / (search.high * unit), 1.0 / (search.low * unit)),
+            )
+        return _at_size(output.depth.cpu().numpy() * unit, output.confidence.cpu().numpy(), reference.size)
+
+
+def _at_size(depth: np.ndarray, confidence: np.ndarray, size: tuple[int, int]) -> StereoDepth:
+    """Maps at the cascade's size; depths are not averaged across edges. What is not finite is unknown."""
+    shape = (size[1], size[0])
+    depth = cv2.resize(depth.astype(np.float32), shape, interpolation=cv2.INTER_NEAREST_EXACT)
+    confidence = cv2.resize(confidence.astype(np.float32), shape, interpolation=cv2.INTER_NEAREST_EXACT)
+    good = np.isfinite(depth) & (depth > 0) & np.isfinite(confidence)
+    return StereoDepth(np.where(good, depth, np.float32(0)), np.where(good, confidence, np.float32(0)), None)

@@ -1,0 +1,65 @@
+"""Keyframe -> Depth: multi-view stereo by a published network, in the frame of the weight-free cascade."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from msgs import Depth, Keyframe
+from mvsgs_core.mvs.cascade import CascadeConfig
+from mvsgs_core.mvs.hypotheses import RangeChoice
+from mvsgs_core.mvs.learned import RANDOM, LearnedCascade, LearnedConfig
+from mvsgs_core.mvs.neighbors import NeighborChoice
+from nodes import Node
+from nodes.mvs import Mvs
+
+
+class LearnedMvs(Mvs):
+    """MVSFormer (Cao et al. 2022) or IterMVS (Wang et al. 2022); see mvsgs_core.mvs.learned."""
+
+    @dataclass
+    class Config:
+        network: str = "itermvs"  # mvsformer, mvsformer_p or itermvs
+        weights: str | None = None  # checkpoint; null: where mvsgs_core.weights finds it; random: untrained, for tests
+        network_area: int = 512 * 384  # pixels of the images that the network sees, aspect kept
+        area: int = 320 * 240  # pixels of a depth map, aspect kept
+        lag: int = 2  # keyframes after the reference that are waited for
+        window: int = 8  # keyframes before the reference that may be neighbors
+        neighbors: int = 4  # views that a reference is matched with
+        range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
+        least_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
+        device: str = "auto"  # auto (CUDA if there is one), cpu, cuda
+        threads: int | None = None  # of PyTorch; null: as the launcher sets it
+
+    config: Config  # type: ignore[assignment]
+
+    def __init__(self, config: Any = None) -> None:
+        Node.__init__(self, config)
+        c = self.config
+        device = c.device
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        if c.threads:
+            torch.set_num_threads(c.threads)
+        self._cascade: LearnedCascade = LearnedCascade(
+            CascadeConfig(
+                area=c.area,
+                lag=c.lag,
+                window=c.window,
+                neighbors=NeighborChoice(count=c.neighbors),
+                ranges=RangeChoice(margin=c.range_margin, least_cells=c.least_cells),
+            ),
+            LearnedConfig(network=c.network, file=c.weights, area=c.network_area, device=device),
+        )
+        self._keyframes: dict[int, Keyframe] = {}
+        self._poses: dict[int, tuple[np.ndarray, float]] = {}
+        if c.weights == RANDOM:
+            self.stats.warn(f"{c.network} runs untrained, with random weights: its depth is noise")
+
+    def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
+        self._cascade.remember(keyframe.index, keyframe.image)
+        yield from super().on_keyframe(keyframe)

@@ -1,0 +1,67 @@
+"""Published stereo networks as nodes: real weights where they are, random ones for the path, clear errors without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msgs import Depth, Keyframe
+from mvsgs_core.datasets import Item, open_dataset
+from nodes.learned_mvs import LearnedMvs
+from tests.shared_data import shared
+
+
+def _keyframe(item: Item) -> Keyframe:
+    """A keyframe with true poses and a coarse grid of true depth, as a good tracker would send."""
+    assert item.depth is not None
+    assert item.world_from_cam is not None
+    grid = item.depth[4::8, 4::8]
+    known = grid > 0
+    inverse = np.where(known, 1 / np.where(known, grid, 1), 0).astype(np.float32)
+    return Keyframe(
+        item.index, item.timestamp, item.image, item.intrinsics, item.world_from_cam, 1.0, inverse,
+        known.astype(np.float32), 0,
+    )  # fmt: skip
+
+
+def _depths(config: LearnedMvs.Config, keyframes: list[Keyframe]) -> list[Depth]:
+    node = LearnedMvs(config)
+    return [d for k in keyframes for d in node.on_keyframe(k)] + list(node.on_end())
+
+
+def test_itermvs_with_published_weights_finds_the_room() -> None:
+    weights = str(shared("weights/itermvs_blendedmvs.ckpt"))
+    frames = list(open_dataset("synthetic", frames=25, stride=6))
+    config = LearnedMvs.Config(weights=weights, network_area=320 * 256, area=160 * 120)
+    depths = _depths(config, [_keyframe(f) for f in frames])
+    assert [d.index for d in depths] == [f.index for f in frames]
+    found, frame = depths[2], frames[2]
+    assert frame.depth is not None
+    truth = frame.depth[
+        :: frame.depth.shape[0] // found.depth.shape[0], :: frame.depth.shape[1] // found.depth.shape[1]
+    ]
+    assert np.median(np.abs(found.depth - truth) / truth) < 0.06
+
+
+@pytest.mark.parametrize("network", ["mvsformer", "mvsformer_p"])
+def test_the_papers_network_runs_untrained_and_says_so(network: str) -> None:
+    frames = list(open_dataset("synthetic", frames=13, stride=6, size=(120, 160)))
+    config = LearnedMvs.Config(network=network, weights="random", network_area=128 * 128, area=80 * 60)
+    node = LearnedMvs(config)
+    assert any("its depth is noise" in w for w in node.stats.warnings)
+    depths = [d for f in frames for d in node.on_keyframe(_keyframe(f))] + list(node.on_end())
+    assert len(depths) == len(frames)
+    assert all(np.isfinite(d.depth).all() and (d.confidence >= 0).all() for d in depths)
+
+
+def test_missing_weights_say_what_to_fetch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"no weights of MVSFormer.*OneDrive.*set MVSGS_WEIGHTS"):
+        LearnedMvs(LearnedMvs.Config(network="mvsformer"))
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        LearnedMvs(LearnedMvs.Config(network="itermvs", weights=str(tmp_path / "nothing.pth")))
+    with pytest.raises(ValueError, match=r"no network 'x'; there are: mvsformer"):
+        LearnedMvs(LearnedMvs.Config(network="x"))
