@@ -53,15 +53,17 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_the_room_is_mapped(room: tuple[Path, str]) -> None:
     scores = report(room[0])
-    assert scores["rendering"]["keyframes"]["psnr"] > 20
-    assert scores["rendering"]["held_out"]["psnr"] > 18
+    assert scores["rendering"]["keyframes"]["psnr"] > 24
+    assert scores["rendering"]["held_out"]["psnr"] > 24
     assert scores["rendering"]["held_out"]["count"] >= 3
     assert scores["trajectory"]["frames"] == 60
     assert scores["trajectory"]["frames_tracked"] >= 50
     track = positions(room[0] / "out" / "trajectory.txt")
     assert np.isfinite(track).all()
-    assert scores["trajectory"]["ate_rmse"] < 0.1
-    assert scores["depth"]["inlier_ratio"] > 0.5
+    assert scores["trajectory"]["ate_percent"] < 2  # of the path
+    # At 160x120 over a short path the ratio of depth to motion is weak: a part of each can look like the other.
+    assert scores["depth"]["abs_rel"] < 0.3
+    assert scores["depth"]["completeness"] > 0.2
 
 
 def test_the_report_has_every_figure(room: tuple[Path, str]) -> None:
@@ -119,7 +121,8 @@ def test_a_tracker_from_outside_the_repository(tmp_path: Path) -> None:
 def test_a_missing_sequence_is_explained(tmp_path: Path) -> None:
     failed = run_all(tmp_path, "dataset=tum", "dataset.path=nowhere", expect=1)
     assert "dataset failed: FileNotFoundError" in failed.stderr
-    assert "nowhere" in failed.stderr.rstrip().splitlines()[-1] or "rgb.txt" in failed.stderr
+    assert "nowhere" in failed.stderr
+    assert "rgb.txt" in failed.stderr  # the layout that is expected
 
 
 def test_a_real_sequence_end_to_end(tmp_path: Path) -> None:
