@@ -67,7 +67,7 @@ void sort_by_depth(Frame& frame, size_t count) {
 class TileWalk {
    public:
     TileWalk(Frame& frame, const bool* mask, std::vector<Pair>& pairs, std::vector<uint32_t>& tiles)
-        : frame_(frame), mask_(mask), pairs_(pairs), tiles_(tiles), row_blocks_(frame.tiles_x, 0) {}
+        : frame_(frame), mask_(mask), pairs_(pairs), tiles_(tiles) {}
 
     void visit(uint32_t id) {
         const Camera& camera = frame_.camera;
@@ -77,55 +77,62 @@ class TileWalk {
         const float top = larger(std::ceil(center_y - f.half_height - kMargin), 0.0f);
         const float bottom = smaller(std::floor(center_y + f.half_height + kMargin), float(camera.height - 1));
         if (!(top <= bottom)) return;
-        const int first_row = int(top) / 4, last_row = int(bottom) / 4;
-        for (int row = first_row; row <= last_row; ++row) {
-            const float low = larger(4.0f * row - center_y, -f.half_height);
-            const float high = smaller(4.0f * row + 3.0f - center_y, f.half_height);
-            const float right_y = smaller(larger(f.turn, low), high);
-            const float left_y = smaller(larger(-f.turn, low), high);
-            const float right = center_x + s.shear * right_y + half_span(f, right_y) + kMargin;
-            const float left = center_x + s.shear * left_y - half_span(f, left_y) - kMargin;
-            const float first = larger(std::ceil(left), 0.0f);
-            const float last = smaller(std::floor(right), float(camera.width - 1));
-            if (first <= last) mark(row & 3, int(first) / 4, int(last) / 4);
-            if ((row & 3) == 3 || row == last_row) flush(id, row >> 2);
+        const int first_row = int(top) / 16 * 4, last_row = int(bottom) / 4;  // from the first row of a tile
+        for (int start = first_row; start <= last_row; start += kLanes) {
+            // sixteen rows of blocks at once: how far left and right the ellipse reaches within each
+            const Lanes rows = float(4 * start) + 4.0f * kRows;
+            const Lanes low = rows - center_y, high = low + 3.0f;
+            const Lanes height = all(f.half_height), turn = all(f.turn);
+            const Lanes right_y = within(within(turn, low, high), -height, height);
+            const Lanes left_y = within(within(-turn, low, high), -height, height);
+            Lanes right = center_x + kMargin + s.shear * right_y + half_span(f, right_y);
+            Lanes left = center_x - kMargin + s.shear * left_y - half_span(f, left_y);
+            right = minimum(right, all(float(camera.width - 1)));
+            left = minimum(maximum(left, Lanes{}), all(float(camera.width)));
+            const Ints empty = (low > f.half_height + kMargin) | (high < -f.half_height - kMargin) | (rows < top - 3.0f) |
+                               (rows > bottom) | (right < left);
+            // pixel columns: left is rounded up, right down; neither is negative
+            const Ints cut = __builtin_convertvector(left, Ints);
+            const Ints first = cut - (left > __builtin_convertvector(cut, Lanes));
+            const Ints last = __builtin_convertvector(maximum(right, Lanes{}), Ints);
+            const Ints none = empty | (last < first);
+            const Ints from = none ? Ints{} + kFar : first >> 2, to = none ? Ints{} - 1 : last >> 2;
+            const int end = std::min(kLanes, last_row - start + 1);
+            for (int row = 0; row < end; row += 4) pair(id, (start + row) >> 2, from, to, row);
         }
     }
 
    private:
-    static float half_span(const Footprint& f, float dy) {
-        return std::sqrt(larger(f.reach - f.pitch_v_squared * dy * dy, 0.0f)) * f.inverse_pitch_u;
+    static constexpr int kFar = 1 << 23;  // beyond every column of pixels
+    static constexpr Lanes kRows = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+
+    static Lanes within(Lanes value, Lanes low, Lanes high) { return minimum(maximum(value, low), high); }
+
+    static Lanes half_span(const Footprint& f, Lanes dy) {
+        return root(maximum(f.reach - f.pitch_v_squared * dy * dy, Lanes{})) * f.inverse_pitch_u;
     }
 
-    void mark(int block_row, int first, int last) {
-        const int first_tile = first >> 2, last_tile = last >> 2;
-        for (int tile = first_tile; tile <= last_tile; ++tile) {
-            const int from = tile == first_tile ? first & 3 : 0, to = tile == last_tile ? last & 3 : 3;
-            row_blocks_[tile] |= uint16_t(((2u << (to - from)) - 1u) << (4 * block_row + from));
-        }
-        first_ = std::min(first_, first_tile);
-        last_ = std::max(last_, last_tile);
-    }
-
-    void flush(uint32_t id, int tile_row) {
-        for (int x = first_; x <= last_; ++x) {
-            const uint32_t tile = uint32_t(tile_row * frame_.tiles_x + x);
-            if (row_blocks_[x] && (!mask_ || mask_[tile])) {
-                pairs_.push_back({id, 0, row_blocks_[x]});
-                tiles_.push_back(tile);
+    // The pairs of one row of tiles, from the first and last block columns of its four rows of blocks.
+    void pair(uint32_t id, int tile_row, const Ints& from, const Ints& to, int row) {
+        const int first = std::min(std::min(from[row], from[row + 1]), std::min(from[row + 2], from[row + 3])) >> 2;
+        const int last = std::max(std::max(to[row], to[row + 1]), std::max(to[row + 2], to[row + 3])) >> 2;
+        for (int x = first; x <= last; ++x) {
+            uint32_t blocks = 0;
+            for (int k = 0; k < 4; ++k) {
+                const int begin = std::clamp(from[row + k] - 4 * x, 0, 4), end = std::clamp(to[row + k] - 4 * x + 1, 0, 4);
+                blocks |= uint32_t(std::max(0, (1 << end) - (1 << begin))) << (4 * k);
             }
-            row_blocks_[x] = 0;
+            const uint32_t tile = uint32_t(tile_row * frame_.tiles_x + x);
+            if (!blocks || (mask_ && !mask_[tile])) continue;
+            pairs_.push_back({id, 0, uint16_t(blocks)});
+            tiles_.push_back(tile);
         }
-        first_ = 1 << 30;
-        last_ = -1;
     }
 
     Frame& frame_;
     const bool* mask_;
     std::vector<Pair>& pairs_;
     std::vector<uint32_t>& tiles_;
-    std::vector<uint16_t> row_blocks_;
-    int first_ = 1 << 30, last_ = -1;
 };
 
 // Projects all splats; the depth keys and ids of those seen, in the order of their index, go to `frame`.

@@ -16,13 +16,8 @@ template <bool Exact, bool Weights>
 int64_t blend_tile(Frame& frame, const Tile& tile, Pixels& pixels) {
     uint32_t open = 0;  // blocks with a pixel that is not full
     for (int block = 0; block < 16; ++block) {
-        int row, column;
-        for (int lane = 0; lane < kLanes; ++lane) {
-            const bool inside = tile.pixel(block, lane, row, column);
-            pixels[block].transmittance[lane] = inside ? 1.0f : 0.0f;
-            open |= uint32_t(inside) << block;
-        }
-        pixels[block].red = pixels[block].green = pixels[block].blue = pixels[block].depth = Lanes{};
+        pixels[block] = {BlockSpan(tile, block).inside(), Lanes{}, Lanes{}, Lanes{}, Lanes{}};
+        open |= uint32_t(any(at_least(pixels[block].transmittance, kMinTransmittance))) << block;
     }
     int64_t evaluated = 0;
     uint32_t index = tile.begin;
@@ -39,18 +34,17 @@ int64_t blend_tile(Frame& frame, const Tile& tile, Pixels& pixels) {
             placed.at(s, block, u, v);
             const Lanes exponent = log2_alpha<Exact>(s, u, v, log2_m, power);
             const Lanes before = pixels[block].transmittance;
-            const Ints counted = (exponent >= kLog2MinAlpha) & (before >= kMinTransmittance);
+            const Mask counted = at_least(exponent, kLog2MinAlpha) & at_least(before, kMinTransmittance);
             evaluated += kLanes;
             hit |= uint32_t(any(counted)) << block;
-            Lanes weight = before * minimum(exp2_of_negative(exponent), all(kMaxAlpha));
-            weight = counted ? weight : Lanes{};
+            const Lanes weight = where(counted, before * minimum(exp2_of_negative(exponent), all(kMaxAlpha)));
             const Lanes after = before - weight;
             pixels[block].transmittance = after;
             pixels[block].red += s.red * weight;
             pixels[block].green += s.green * weight;
             pixels[block].blue += s.blue * weight;
             pixels[block].depth += s.depth * weight;
-            if (!any(after >= kMinTransmittance)) [[unlikely]] open &= ~(1u << block);
+            if (!any(at_least(after, kMinTransmittance))) [[unlikely]] open &= ~(1u << block);
             if constexpr (Weights) {
                 weight_sum += weight;
                 weight_max = maximum(weight_max, weight);
@@ -71,18 +65,25 @@ int64_t blend_tile(Frame& frame, const Tile& tile, Pixels& pixels) {
     return evaluated;
 }
 
-void write(const Frame& frame, const Tile& tile, const Pixels& pixels, float* color, float* depth, float* opacity) {
+void write(const Frame& frame, const Tile& tile, Pixels& pixels, float* color, float* depth, float* opacity) {
     for (int block = 0; block < 16; ++block) {
-        for (int lane = 0; lane < kLanes; ++lane) {
-            int row, column;
-            if (!tile.pixel(block, lane, row, column)) continue;
-            const size_t at = size_t(row) * frame.camera.width + column;
-            const float left = pixels[block].transmittance[lane], covered = 1.0f - left;
-            color[3 * at] = pixels[block].red[lane] + left * frame.background[0];
-            color[3 * at + 1] = pixels[block].green[lane] + left * frame.background[1];
-            color[3 * at + 2] = pixels[block].blue[lane] + left * frame.background[2];
-            depth[at] = covered > 0.0f ? pixels[block].depth[lane] / covered : 0.0f;
-            opacity[at] = covered;
+        Block& b = pixels[block];
+        const Lanes left = b.transmittance, covered = 1.0f - left;
+        b.red += left * frame.background[0];
+        b.green += left * frame.background[1];
+        b.blue += left * frame.background[2];
+        b.depth = b.depth / maximum(covered, all(kTiny));  // 0 / tiny where nothing is seen
+        const BlockSpan span(tile, block);
+        for (int dy = 0; dy < span.rows; ++dy) {
+            const size_t first = size_t(span.y + dy) * frame.camera.width + span.x;
+            for (int dx = 0; dx < span.columns; ++dx) {
+                const int lane = 4 * dy + dx;
+                color[3 * (first + dx)] = b.red[lane];
+                color[3 * (first + dx) + 1] = b.green[lane];
+                color[3 * (first + dx) + 2] = b.blue[lane];
+                depth[first + dx] = b.depth[lane];
+                opacity[first + dx] = covered[lane];
+            }
         }
     }
 }

@@ -8,34 +8,47 @@
 namespace splats {
 namespace {
 
-struct Targets {
-    Lanes transmittance[16], behind[16];
-    Lanes red[16], green[16], blue[16], depth[16], covered[16];  // gradients of the sums over weights
+struct Target {
+    Lanes transmittance, behind;
+    Lanes red, green, blue, depth, covered;  // gradients of the sums over weights
 };
+using Targets = Target[16];
 
 struct Images {
     const float *color, *depth, *opacity, *color_gradient, *depth_gradient, *opacity_gradient;
 };
 
+template <bool Depth>
 void load(const Frame& frame, const Tile& tile, const Images& images, Targets& targets) {
     for (int block = 0; block < 16; ++block) {
-        for (int lane = 0; lane < kLanes; ++lane) {
-            int row, column;
-            const bool inside = tile.pixel(block, lane, row, column);
-            const size_t at = inside ? size_t(row) * frame.camera.width + column : 0;
-            const float* c = images.color_gradient + 3 * at;
-            const float covered = images.opacity[at], depth = images.depth[at];
-            const float on_depth = images.depth_gradient && covered > 0.0f ? images.depth_gradient[at] : 0.0f;
-            const float on_opacity = images.opacity_gradient ? images.opacity_gradient[at] : 0.0f;
-            const float scaled = covered > 0.0f ? on_depth / covered : 0.0f;
-            targets.transmittance[block][lane] = inside ? 1.0f : 0.0f;
-            targets.red[block][lane] = c[0];
-            targets.green[block][lane] = c[1];
-            targets.blue[block][lane] = c[2];
-            targets.depth[block][lane] = scaled;
-            targets.covered[block][lane] = on_opacity - scaled * depth;
-            targets.behind[block][lane] = images.color[3 * at] * c[0] + images.color[3 * at + 1] * c[1] +
-                                          images.color[3 * at + 2] * c[2] + covered * on_opacity;
+        const BlockSpan span(tile, block);
+        Target& t = targets[block];
+        t = {span.inside(), Lanes{}, Lanes{}, Lanes{}, Lanes{}, Lanes{}, Lanes{}};
+        Lanes red{}, green{}, blue{}, depth{}, opacity{};
+        for (int dy = 0; dy < span.rows; ++dy) {
+            const size_t first = size_t(span.y + dy) * frame.camera.width + span.x;
+            for (int dx = 0; dx < span.columns; ++dx) {
+                const int lane = 4 * dy + dx;
+                const float *g = images.color_gradient + 3 * (first + dx), *c = images.color + 3 * (first + dx);
+                t.red[lane] = g[0];
+                t.green[lane] = g[1];
+                t.blue[lane] = g[2];
+                red[lane] = c[0];
+                green[lane] = c[1];
+                blue[lane] = c[2];
+                if constexpr (Depth) {
+                    depth[lane] = images.depth[first + dx];
+                    opacity[lane] = images.opacity[first + dx];
+                    if (images.depth_gradient) t.depth[lane] = images.depth_gradient[first + dx];
+                    if (images.opacity_gradient) t.covered[lane] = images.opacity_gradient[first + dx];
+                }
+            }
+        }
+        t.behind = red * t.red + green * t.green + blue * t.blue;
+        if constexpr (Depth) {
+            t.behind += opacity * t.covered;
+            t.depth = opacity > 0.0f ? t.depth / maximum(opacity, all(kTiny)) : Lanes{};
+            t.covered -= t.depth * depth;
         }
     }
 }
@@ -54,33 +67,34 @@ void backward_tile(Frame& frame, const Tile& tile, Targets& targets) {
         Lanes total[16] = {};
         for (uint32_t blocks = pair.blocks; blocks; blocks &= blocks - 1) {
             const int block = __builtin_ctz(blocks);
+            Target& t = targets[block];
             Lanes u, v, log2_m, power;
             placed.at(s, block, u, v);
             const Lanes exponent = log2_alpha<Exact>(s, u, v, log2_m, power);
-            const Lanes before = targets.transmittance[block];
-            const Ints counted = (exponent >= kLog2MinAlpha) & (before >= kMinTransmittance);
+            const Lanes before = t.transmittance;
+            const Mask counted = at_least(exponent, kLog2MinAlpha) & at_least(before, kMinTransmittance);
             const Lanes unclamped = exp2_of_negative(exponent);
-            const Lanes alpha = counted ? minimum(unclamped, all(kMaxAlpha)) : Lanes{};
+            const Lanes alpha = where(counted, minimum(unclamped, all(kMaxAlpha)));
             const Lanes weight = before * alpha;
-            const Lanes red = targets.red[block], green = targets.green[block], blue = targets.blue[block];
+            const Lanes red = t.red, green = t.green, blue = t.blue;
             Lanes q = s.red * red + s.green * green + s.blue * blue;
-            if constexpr (Depth) q += s.depth * targets.depth[block] + targets.covered[block];
-            const Lanes behind = targets.behind[block] - weight * q;
-            targets.behind[block] = behind;
-            targets.transmittance[block] = before - weight;
+            if constexpr (Depth) q += s.depth * t.depth + t.covered;
+            const Lanes behind = t.behind - weight * q;
+            t.behind = behind;
+            t.transmittance = before - weight;
             // dL/dlog(alpha): none where alpha is clamped
-            Lanes on_log = alpha * (before * q - behind / (1.0f - alpha));
-            on_log = (counted & (unclamped <= kMaxAlpha)) ? on_log : Lanes{};
+            const Lanes on_log =
+                where(counted & at_most(unclamped, kMaxAlpha), alpha * (before * q - behind / (1.0f - alpha)));
             total[kRed] += weight * red;
             total[kGreen] += weight * green;
             total[kBlue] += weight * blue;
-            if constexpr (Depth) total[kDepth] += weight * targets.depth[block];
+            if constexpr (Depth) total[kDepth] += weight * t.depth;
             total[kAlpha] += on_log;
             Lanes on_m = on_log;  // times -1/2 in project_backward: dL/dm of the Gaussian
             if constexpr (Exact) {
                 const Lanes m = u * u + v * v;
                 total[kBeta] += on_log * power * log2_m;
-                on_m = m > kCenterM ? on_log * s.half_beta * power / m : Lanes{};
+                on_m = where(at_least(m, kCenterM), on_log * s.half_beta * power / maximum(m, all(kCenterM)));
             }
             const Lanes on_u = on_m * u, on_v = on_m * v;
             total[kU] += on_u;
@@ -101,7 +115,7 @@ void backward_all(Frame& frame, const Images& images, int threads) {
         const Tile tile(frame, index);
         if (tile.begin == tile.end) continue;
         Targets targets;
-        load(frame, tile, images, targets);
+        load<Depth>(frame, tile, images, targets);
         backward_tile<Exact, Depth>(frame, tile, targets);
     }
 }

@@ -1,6 +1,7 @@
 // Sixteen floats side by side in the compiler's own vector type: one AVX-512 register, two AVX2 or four SSE ones.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 #if defined(__AVX512F__) || defined(__AVX2__)
 #include <immintrin.h>
@@ -12,7 +13,7 @@ namespace splats {
 
 constexpr int kLanes = 16;
 typedef float Lanes __attribute__((vector_size(64)));
-typedef int32_t Ints __attribute__((vector_size(64)));  // also masks: -1 true, 0 false
+typedef int32_t Ints __attribute__((vector_size(64)));
 
 #define SPLATS_INLINE static inline __attribute__((always_inline))
 #define SPLATS_INLINE_MEMBER inline __attribute__((always_inline))
@@ -20,13 +21,26 @@ typedef int32_t Ints __attribute__((vector_size(64)));  // also masks: -1 true, 
 SPLATS_INLINE float smaller(float a, float b) { return a < b ? a : b; }  // one instruction; std::fmin is a call
 SPLATS_INLINE float larger(float a, float b) { return a > b ? a : b; }
 SPLATS_INLINE Lanes all(float value) { return Lanes{} + value; }
+
+// Masks live in their own registers on AVX-512 and in vectors elsewhere; there the compiler keeps them where they are.
+#if defined(__AVX512F__)
+using Mask = __mmask16;
+constexpr Mask kAll = 0xffff;  // the unmasked intrinsics of GCC 12 warn about their own innards
+SPLATS_INLINE Lanes minimum(Lanes a, Lanes b) { return (Lanes)_mm512_maskz_min_ps(kAll, (__m512)a, (__m512)b); }
+SPLATS_INLINE Lanes maximum(Lanes a, Lanes b) { return (Lanes)_mm512_maskz_max_ps(kAll, (__m512)a, (__m512)b); }
+SPLATS_INLINE Mask at_least(Lanes a, float b) { return _mm512_cmp_ps_mask((__m512)a, _mm512_set1_ps(b), _CMP_GE_OQ); }
+SPLATS_INLINE Mask at_most(Lanes a, float b) { return _mm512_cmp_ps_mask((__m512)a, _mm512_set1_ps(b), _CMP_LE_OQ); }
+SPLATS_INLINE Lanes where(Mask mask, Lanes a) { return (Lanes)_mm512_maskz_mov_ps(mask, (__m512)a); }  // 0 elsewhere
+SPLATS_INLINE bool any(Mask mask) { return mask != 0; }
+#else
+using Mask = Ints;
 SPLATS_INLINE Lanes minimum(Lanes a, Lanes b) { return a < b ? a : b; }
 SPLATS_INLINE Lanes maximum(Lanes a, Lanes b) { return a > b ? a : b; }
-
-SPLATS_INLINE bool any(Ints mask) {
-#if defined(__AVX512F__)
-    return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask) != 0;
-#elif defined(__AVX2__)
+SPLATS_INLINE Mask at_least(Lanes a, float b) { return a >= b; }
+SPLATS_INLINE Mask at_most(Lanes a, float b) { return a <= b; }
+SPLATS_INLINE Lanes where(Mask mask, Lanes a) { return (Lanes)(mask & (Ints)a); }  // 0 elsewhere
+SPLATS_INLINE bool any(Mask mask) {
+#if defined(__AVX2__)
     const __m256i* halves = reinterpret_cast<const __m256i*>(&mask);
     const __m256i both = _mm256_or_si256(halves[0], halves[1]);
     return !_mm256_testz_si256(both, both);
@@ -34,6 +48,16 @@ SPLATS_INLINE bool any(Ints mask) {
     int32_t joined = 0;
     for (int i = 0; i < kLanes; ++i) joined |= mask[i];
     return joined != 0;
+#endif
+}
+#endif
+
+SPLATS_INLINE Lanes root(Lanes x) {
+#if defined(__AVX512F__)
+    return (Lanes)_mm512_maskz_sqrt_ps(kAll, (__m512)x);
+#else
+    for (int i = 0; i < kLanes; ++i) x[i] = std::sqrt(x[i]);
+    return x;
 #endif
 }
 
@@ -79,25 +103,22 @@ SPLATS_INLINE Lanes log2_of_positive(Lanes x) {
     return p * f + __builtin_convertvector(exponent, Lanes);
 }
 
-#define SPLATS_MERGE(a, b, ...)                                              \
-    (__builtin_shufflevector(a, b, __VA_ARGS__))
-
 // One step of the sums below: halves of width 8, 4, 2, 1 of `a` and `b` are added crosswise.
 SPLATS_INLINE Lanes merge8(Lanes a, Lanes b) {
-    return SPLATS_MERGE(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
-           SPLATS_MERGE(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+    return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+           __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
 }
 SPLATS_INLINE Lanes merge4(Lanes a, Lanes b) {
-    return SPLATS_MERGE(a, b, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27) +
-           SPLATS_MERGE(a, b, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
+    return __builtin_shufflevector(a, b, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27) +
+           __builtin_shufflevector(a, b, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
 }
 SPLATS_INLINE Lanes merge2(Lanes a, Lanes b) {
-    return SPLATS_MERGE(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
-           SPLATS_MERGE(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    return __builtin_shufflevector(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
+           __builtin_shufflevector(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
 }
 SPLATS_INLINE Lanes merge1(Lanes a, Lanes b) {
-    return SPLATS_MERGE(a, b, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30) +
-           SPLATS_MERGE(a, b, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
+    return __builtin_shufflevector(a, b, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30) +
+           __builtin_shufflevector(a, b, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
 }
 
 // The sums over the lanes of sixteen vectors, in one vector: lane kSumLane[i] holds the sum of v[i].

@@ -78,7 +78,7 @@ void splat_backward(const Frame& frame, const Parameters& p, int64_t i, const Im
                     float* sh_gradient) {
     const Camera& camera = frame.camera;
     Projection r;
-    project(camera, p, i, r);
+    if (project(camera, p, i, r) != Fate::kSeen) return;
     out.opacity_logit = g.log_opacity * (1.0f - r.sigmoid);
     out.beta = r.beta_inside ? g.beta : 0.0f;
     out.screen[0] = g.u * 0.5f * camera.width;

@@ -5,6 +5,7 @@
 
 namespace splats {
 
+constexpr float kTiny = 1e-30f;
 constexpr Lanes kLaneX = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 constexpr Lanes kLaneY = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
 
@@ -21,13 +22,19 @@ struct Tile {
         : x(index % frame.tiles_x * kTile), y(index / frame.tiles_x * kTile),
           width(std::min(kTile, frame.camera.width - x)), height(std::min(kTile, frame.camera.height - y)),
           begin(frame.tile_begin[index]), end(frame.tile_begin[index + 1]) {}
+};
 
-    // The image row and column of a lane; false outside of the image.
-    SPLATS_INLINE_MEMBER bool pixel(int block, int lane, int& row, int& column) const {
-        const int dx = 4 * (block & 3) + (lane & 3), dy = 4 * (block >> 2) + (lane >> 2);
-        row = y + dy;
-        column = x + dx;
-        return dx < width && dy < height;
+// The pixels of a block that lie on the image.
+struct BlockSpan {
+    int x, y, columns, rows;
+
+    SPLATS_INLINE_MEMBER BlockSpan(const Tile& tile, int block)
+        : x(tile.x + 4 * (block & 3)), y(tile.y + 4 * (block >> 2)),
+          columns(std::clamp(tile.width - 4 * (block & 3), 0, 4)), rows(std::clamp(tile.height - 4 * (block >> 2), 0, 4)) {}
+
+    // 1 in the lanes on the image, 0 elsewhere.
+    SPLATS_INLINE_MEMBER Lanes inside() const {
+        return where(at_most(kLaneX, float(columns) - 0.5f) & at_most(kLaneY, float(rows) - 0.5f), all(1.0f));
     }
 };
 
