@@ -101,7 +101,7 @@ class LiveScreen(Screen):
         table.add_column("cpu", justify="right")
         table.add_column("memory", justify="right")
         for name, status in self._nodes.items():
-            cpu, memory = self._load(name)
+            cpu, memory = self._load(status)
             table.add_row(
                 name,
                 status.state,
@@ -115,14 +115,15 @@ class LiveScreen(Screen):
             )
         return table
 
-    def _load(self, name: str) -> tuple[str, str]:
-        """CPU since the last look and resident memory, as the system knows them; empty once the process is gone."""
-        process = self._processes.get(name)
+    def _load(self, status: NodeStatus) -> tuple[str, str]:
+        """CPU since the last look and resident memory: the system's figures, the node's last ones once it is gone."""
+        process, memory = self._processes.get(status.name), status.memory
+        cpu = ""
         if process is not None:
             with suppress(psutil.Error):
-                memory = process.memory_info().rss
-                return f"{process.cpu_percent():.0f} %", f"{memory / 2**20:.0f} MB"
-        return "", ""
+                memory = process.memory_info().rss or memory
+                cpu = f"{process.cpu_percent():.0f} %"
+        return cpu, f"{memory / 2**20:.0f} MB" if memory else ""
 
 
 def make_screen(kind: str, console: Console | None = None) -> Screen:
