@@ -15,6 +15,10 @@ class TransportError(RuntimeError):
     """A topic cannot be opened, or a message was lost."""
 
 
+class PeerLost(TransportError):
+    """The other end of a topic is gone before the end: it is the one that failed."""
+
+
 class Keys(NamedTuple):
     """CURVE key pair of a graph, in Z85: every process has it, and nobody without it is let in."""
 

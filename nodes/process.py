@@ -24,13 +24,13 @@ import numpy as np
 import msgs
 from msgs import End, Message
 from nodes import Node, is_source
-from nodes.addresses import load_keys
+from nodes.addresses import PeerLost, load_keys
 from nodes.inbox import Inbox, Reader
 from nodes.parameters import make_config
 from nodes.runner import Runner, merge_stats, own_stats, stats_of
 from nodes.spec import Spec
 from nodes.status import Status, peak_bytes
-from nodes.transport import NewestReader, PeerLost, Publisher, ReliableReader, shut_down
+from nodes.transport import NewestReader, Publisher, ReliableReader, shut_down
 
 POLL = 0.25  # s between looks at signals and lost peers while nothing arrives
 STOP_GRACE = 2.0  # s that a source's current item may take after SIGINT

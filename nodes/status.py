@@ -22,27 +22,25 @@ class Status:
     def __init__(self, fd: int | None, snapshot: Callable[[], dict[str, Any]]) -> None:
         self._fd = fd
         self._snapshot = snapshot
-        self._state = "starting"
+        self._state: dict[str, Any] = {"state": "starting"}  # with its details: the error of a failure
         self._news: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="status", daemon=True)
         if fd is not None:
             self._thread.start()
 
     def set(self, state: str, **details: Any) -> None:
-        self._state = state
+        self._state = {"state": state} | details
         logging.info("%s", " ".join([state, *(str(details[key]) for key in ("error",) if key in details)]))
         if self._fd is not None:
-            self._news.put(self._line(**details))
+            self._news.put(self._line())
 
     def close(self) -> None:
         self._news.put(None)
         if self._fd is not None:
             self._thread.join(LAST_WORDS)
 
-    def _line(self, **details: Any) -> dict[str, Any]:
-        return (
-            {"state": self._state} | self._snapshot() | {"cpu_seconds": time.process_time(), "bytes": rss()} | details
-        )
+    def _line(self) -> dict[str, Any]:
+        return self._state | self._snapshot() | {"cpu_seconds": time.process_time(), "bytes": rss()}
 
     def _write(self) -> None:
         while True:

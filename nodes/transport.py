@@ -27,16 +27,14 @@ from zmq.utils.monitor import recv_monitor_message
 
 from msgs import End, Message
 from msgs.codec import NEWEST, RELIABLE, CodecError, Decoded, decode, encode, max_message_bytes, type_name
-from nodes.addresses import Keys, TransportError, check_address, save_keys
+from nodes.addresses import Keys, PeerLost, TransportError, check_address, save_keys
 from nodes.frame_pool import FramePool
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
+REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+LOST = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
 PEER_GRACE = 0.5  # s between a disconnection and its report: whoever failed first should be heard first
 NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
-
-
-class PeerLost(TransportError):
-    """The other end of a topic is gone before the end: it is the one that failed."""
 
 
 def create_keys(folder: str | Path) -> Keys:
@@ -223,6 +221,7 @@ class _Reader:
         self.received = self.skipped = self.expected = 0
         self.ended = False
         self._type = type
+        self._keys = keys
         self._buffer = max(1, buffer)
         self._max_bytes = max_message_bytes(type) if max_bytes is None else max_bytes
         self._frames: deque[zmq.Frame] = deque()  # taken over, not asked for yet
@@ -230,8 +229,7 @@ class _Reader:
         self._socket = _open(zmq.SUB, address, keys, self._max_bytes)
         self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl = 50
-        lost = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-        self.monitor = self._socket.get_monitor_socket(lost | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
+        self.monitor = self._socket.get_monitor_socket(LOST)
         self._socket.connect(address)
         self._socket.subscribe(self.delivery)
 
@@ -239,7 +237,7 @@ class _Reader:
         """Takes note of a lost connection. Raises TransportError if the publisher refuses this reader's keys."""
         while _readable(self.monitor):
             event = recv_monitor_message(self.monitor)["event"]
-            if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+            if event & REFUSED and self._keys is not None:
                 raise TransportError(f"the publisher of {self.topic} refused the keys: both ends need the same file")
             if event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 raise TransportError(f"the publisher of {self.topic} speaks another protocol: keys on one side only?")
@@ -354,8 +352,9 @@ class NewestReader(_Reader):
     def receive(self, timeout_s: float | None = None) -> Message | None:
         """Waits for a message that was not taken yet: the newest, or End; None when none comes in time.
 
-        Raises CodecError for a frame that is no message; the next call goes on.
+        Raises CodecError for a frame that is no message; the next call goes on. Raises TransportError for wrong keys.
         """
+        self.watch()
         message = self.take()
         if message is None and self.pollable.poll(None if timeout_s is None else round(timeout_s * 1000)):
             message = self.take()

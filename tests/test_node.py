@@ -45,6 +45,9 @@ def test_a_node_with_other_keys_is_not_let_in(tmp_path: Path) -> None:
         g.start("source", f"{here}.Source", {}, {"Frame": 1})
         stranger = g.start("left", f"{here}.Left", {"Frame": "source"}, {}, keys=str(tmp_path / "other"))
         assert stranger.popen.wait(20) == 1
+        g.processes["source"].popen.kill()
+        g.wait(5)
+        assert "refused the keys: both ends need the same" in stranger.last["error"]
         assert g.processes["source"].last["state"] == "waiting"
 
 

@@ -14,9 +14,9 @@ import zmq
 
 from msgs import End, Frame, Keyframe
 from msgs.codec import NEWEST, CodecError, encode
-from nodes.addresses import IPC_PATH_BYTES, TransportError, check_address, load_keys
+from nodes.addresses import IPC_PATH_BYTES, PeerLost, TransportError, check_address, load_keys
 from nodes.inbox import Inbox
-from nodes.transport import NewestReader, PeerLost, Publisher, ReliableReader, create_keys
+from nodes.transport import NewestReader, Publisher, ReliableReader, create_keys
 
 
 def frame(index: int, width: int = 64) -> Frame:
