@@ -32,8 +32,8 @@ class Mapper(Node):
 
     @dataclass
     class Config:
-        iterations: int = 60  # owed for each keyframe, half on the newest, half on all (the paper: 1000)
-        refinement: int = 500  # iterations over all keyframes at the end
+        iterations: int = 30  # owed for each keyframe, half on the newest, half on all (the paper: 1000)
+        refinement: int = 300  # iterations over all keyframes at the end
         window: int = 6  # keyframes of the local half
         realtime: bool = False  # a new keyframe cancels what older ones are owed
         max_pixels: int | None = None  # area of the training images; null: as they come
@@ -42,13 +42,13 @@ class Mapper(Node):
         sh_degree: int = 0  # of the view-dependent color, 0 to 3
         exposure: bool = False  # train a color affine for each keyframe
         unexplored: bool = True  # add splats only where the map does not explain the image
-        unexplored_psnr: float = 20.0  # dB of a pixel; below: unexplored (the paper: 40)
+        unexplored_psnr: float = 25.0  # dB of a pixel; below: unexplored (the paper: 40)
         voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
         density_control: str = "adaptive"  # adaptive, relocate or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls
         skip_tiles: bool = True  # leave out tiles of low error
-        coarse_to_fine: bool = True  # a keyframe's first visits at half resolution
+        coarse_to_fine: bool = False  # a keyframe's first visits at half resolution
         selective: bool = True  # step only the splats that were seen
         preview_period: float = 1.0  # seconds between previews; 0: none
         preview_splats: int = 100000  # at most so many in a preview

@@ -77,8 +77,12 @@ def _adapt(state: MapState, config: DensityConfig, median_depth: float, generato
     large = state.splats.log_scales.max(dim=1).values > math.log(config.split_scale * median_depth)
     clone, split = dense & ~large, dense & large
     old = state.detached()
-    clones, clone_anchors = _select(old, clone), state.anchors[clone]
-    clone_steps = state.steps[clone]
+    _share_opacity(state, clone)
+    clones, clone_anchors, clone_steps = (
+        _clones(_select(old, clone), generator),
+        state.anchors[clone],
+        state.steps[clone],
+    )
     halves = _halves(_select(old, split), generator)
     half_anchors = state.anchors[split].repeat(2)
     keep = ~(prune | split)
@@ -86,6 +90,23 @@ def _adapt(state: MapState, config: DensityConfig, median_depth: float, generato
     state.append(clones, clone_anchors, clone_steps)
     state.append(halves, half_anchors)
     return DensityChange(cloned=int(clone.sum()), split=int(split.sum()), pruned=int(prune.sum()))
+
+
+def _share_opacity(state: MapState, chosen: Tensor) -> None:
+    """Opacity o becomes 1 - sqrt(1 - o), of which two in the same place blend to o: a clone does not change the render
+    (Rota Bulo et al. 2024, section 3.3)."""
+    logits = state.splats.opacity_logits
+    kept = 1.0 - torch.sigmoid(logits[chosen])
+    logits[chosen] = torch.logit((1.0 - kept.sqrt()).clamp(1e-4, 1.0 - 1e-4))
+
+
+def _clones(splats: Splats, generator: torch.Generator) -> Splats:
+    """Copies a little off their place: at the very same one, both would have the same gradients for ever."""
+    deviations = splats.log_scales.exp()
+    drawn = 0.5 * torch.randn((len(deviations), 3), generator=generator).to(deviations.device) * deviations
+    moved = {name: getattr(splats, name) for name in PARAMETERS}
+    moved["means"] = splats.means + (rotation_matrices(splats.quaternions) @ drawn[..., None])[..., 0]
+    return Splats(**moved)
 
 
 def _halves(splats: Splats, generator: torch.Generator) -> Splats:

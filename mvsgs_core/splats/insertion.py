@@ -22,11 +22,11 @@ class InsertionConfig:
     """Where splats are added and what they look like at first."""
 
     unexplored: bool = True  # False: every pixel with depth makes a point
-    unexplored_psnr: float = 20.0  # dB of one pixel over RGB; below: unexplored (the paper: 40)
+    unexplored_psnr: float = 25.0  # dB of one pixel over RGB; below: unexplored (the paper: 40)
     unexplored_opacity: float = 0.5  # rendered opacity below: unexplored, whatever the color
     voxel: float = 0.01  # edge of the voxel filter in median depths; 0: no filter
-    initial_scale: float = 0.6  # standard deviation in spacings of the points
-    flatten: float = 0.3  # thickness along the normal over the width; 1: isotropic
+    initial_scale: float = 0.5  # standard deviation in spacings of the points
+    flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.5  # 0 to 1 (Stereo-GS: 0.1)
     min_confidence: float = 0.0  # of the depth, 0 to 1; views come filtered already
 

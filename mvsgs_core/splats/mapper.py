@@ -39,8 +39,8 @@ from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
 class MapperConfig:
     """The mapper's parameters; lengths are relative to the scene's median depth."""
 
-    iterations: int = 60  # owed for each keyframe, half on the local window, half on all (the paper: 1,000)
-    refinement: int = 500  # iterations over all keyframes after the last
+    iterations: int = 30  # owed for each keyframe, half on the local window, half on all (the paper: 1,000)
+    refinement: int = 300  # iterations over all keyframes after the last
     window: int = 6  # newest keyframes that the local half trains on
     realtime: bool = False  # a new keyframe cancels what older ones are owed
     max_pixels: int | None = None  # area of the training images; None: as they come

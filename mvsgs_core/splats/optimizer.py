@@ -18,13 +18,13 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 class LearningRates:
     """Rates of a splat's parameters. Lengths are in units of the scene's median depth."""
 
-    means: float = 1.0e-3  # median depths a step, for a new splat
+    means: float = 5.0e-4  # median depths a step, for a new splat
     means_final: float = 0.05  # share of `means` that an old splat keeps
     decay_steps: int = 600  # steps of a splat until then, log-linear
-    log_scales: float = 0.01  # natural logarithm a step
-    quaternions: float = 0.003  # a step, of a unit quaternion
+    log_scales: float = 0.02  # natural logarithm a step
+    quaternions: float = 0.01  # a step, of a unit quaternion
     opacity_logits: float = 0.05  # logit a step
-    sh: float = 0.01  # color a step, degree 0; higher degrees a twentieth
+    sh: float = 0.02  # color a step, degree 0; higher degrees a twentieth
     betas: float = 1.0e-3  # shape exponent a step
 
 

@@ -42,8 +42,8 @@ class SkipConfig:
     tiles: bool = True  # tiles of low error are left out
     tiles_error: float = 0.5  # low: below this share of the view's mean error
     tiles_every: int = 4  # every so many visits all tiles are rendered, and their errors measured
-    coarse_to_fine: bool = True  # the first visits of a keyframe are at lower resolution
-    coarse_visits: int = 8  # of these, for each level
+    coarse_to_fine: bool = False  # the first visits of a keyframe are at lower resolution
+    coarse_visits: int = 2  # of these, for each level
     levels: int = 2  # of the image pyramid, full resolution included
     selective: bool = True  # only splats that were seen are stepped
 
