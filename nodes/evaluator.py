@@ -1,4 +1,4 @@
-"""Scores a run and writes the report: report.json, report.html and trajectory.txt."""
+"""Scores a run and writes the report: report.json, report.html, comparison.png and trajectory.txt."""
 
 from __future__ import annotations
 
@@ -116,10 +116,13 @@ class Evaluator(Node):
                 folder / "trajectory.txt", track.timestamp[track.posed], track.world_from_cam[track.posed]
             )
         (folder / "report.json").write_text(json.dumps(self.report, indent=1, default=_plain))
+        comparisons = pictures.comparisons(self.evaluation)
+        if comparisons:
+            pictures.write_sheet(folder / "comparison.png", comparisons)
         document = html.page(
             self.config.title,
             self.report,
-            pictures.comparisons(self.evaluation),
+            comparisons,
             pictures.depth_maps(self.evaluation),
             pictures.plots(self.evaluation, self.report["time"]["stages"]),
         )

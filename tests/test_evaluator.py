@@ -112,7 +112,12 @@ def test_report(evaluator: Evaluator) -> None:
 def test_files(evaluator: Evaluator) -> None:
     _feed(evaluator)
     assert evaluator.folder is not None
-    assert {p.name for p in evaluator.folder.iterdir()} == {"report.json", "report.html", "trajectory.txt"}
+    assert {p.name for p in evaluator.folder.iterdir()} == {
+        "report.json",
+        "report.html",
+        "comparison.png",
+        "trajectory.txt",
+    }
     html = (evaluator.folder / "report.html").read_text()
     assert html.count("data:image/jpeg;base64,") >= 12
     assert "http://" not in html  # nothing is fetched

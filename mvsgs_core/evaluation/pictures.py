@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from mvsgs_core.camera import resize_image
@@ -30,6 +32,13 @@ def comparisons(evaluation: Evaluation) -> list[Row]:
         caption = f"{name} {kind} frame {score.index}: {score.psnr:.2f} dB, SSIM {score.ssim:.3f}"
         rows.append((caption, scoring.comparison(finished.splats, finished.density, views[score.index])))
     return rows
+
+
+def write_sheet(file: Path, rows: list[Row]) -> None:
+    """Writes the pictures of all rows, one below the other, as one PNG file."""
+    sheet = np.vstack([np.hstack(list(pictures.values())) for _, pictures in rows])
+    if not cv2.imwrite(str(file), sheet[..., ::-1]):
+        raise OSError(f"could not write {file}")
 
 
 def depth_maps(evaluation: Evaluation, count: int = 3) -> list[Row]:
