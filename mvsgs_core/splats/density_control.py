@@ -23,7 +23,7 @@ class DensityConfig:
 
     mode: str = "adaptive"  # "adaptive": clone, split, prune; "relocate": as 3DGS-MCMC; "none"
     every: int = 100  # iterations between two rounds
-    gradient: float = 3.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
+    gradient: float = 6.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
     prune_opacity: float = 0.02  # 0 to 1; below: removed
     prune_scale: float = 0.5  # largest standard deviation in median depths; above: removed

@@ -21,10 +21,10 @@ class LearningRates:
     means: float = 5.0e-4  # median depths a step, for a new splat
     means_final: float = 0.05  # share of `means` that an old splat keeps
     decay_steps: int = 600  # steps of a splat until then, log-linear
-    log_scales: float = 0.02  # natural logarithm a step
-    quaternions: float = 0.01  # a step, of a unit quaternion
+    log_scales: float = 0.03  # natural logarithm a step
+    quaternions: float = 0.015  # a step, of a unit quaternion
     opacity_logits: float = 0.05  # logit a step
-    sh: float = 0.02  # color a step, degree 0; higher degrees a twentieth
+    sh: float = 0.03  # color a step, degree 0; higher degrees a twentieth
     betas: float = 1.0e-3  # shape exponent a step
 
 
