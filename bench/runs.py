@@ -1,10 +1,11 @@
-"""Whole runs of the graph for benchmarks: scenes x variants x seeds as one Hydra multirun, and their reports."""
+"""Whole runs of the graph: scenes x variants x settings x seeds as one Hydra multirun, and their reports."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -12,8 +13,34 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from omegaconf import DictConfig, OmegaConf
+
 ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
+SHARED = Path(os.environ.get("MVSGS_SHARED", ROOT.parent / "shared"))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A named set of overrides, such as Setting("area_19200", ("tracker.area=19200", "mvs=coarse"))."""
+
+    name: str
+    overrides: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """The Hydra choice that makes them. Raises ValueError for an override that is not key=value."""
+        choices, values = [], []
+        for override in self.overrides:
+            key, equals, value = override.partition("=")
+            if not equals:
+                raise ValueError(f"{self.name}: {override!r} must look like slot=choice or slot.parameter=value")
+            if "." in key or key == "seed":
+                values.append(override)
+            else:
+                choices.append({f"override /{key}": value})
+        config = OmegaConf.merge({"defaults": [*choices, "_self_"]}, OmegaConf.from_dotlist(values))
+        assert isinstance(config, DictConfig)
+        return f"# @package _global_\n{OmegaConf.to_yaml(config)}"
 
 
 @dataclass(frozen=True)
@@ -25,15 +52,20 @@ class Run:
     seed: int
     folder: Path
     report: dict[str, Any] | None
+    setting: str = ""
 
 
 @dataclass(frozen=True)
 class Matrix:
+    """Everything with everything; `settings` are written beside the runs, as choices of their own."""
+
     scenes: Sequence[str]
     variants: Sequence[str] = ("full",)
     seeds: Sequence[int] = (0,)
     overrides: Sequence[str] = field(default_factory=tuple)
     jobs: int = 1  # at once, by joblib; 1: one after the other, as times need
+    settings: Sequence[Setting] = field(default_factory=tuple)
+    prefix: Sequence[str] = field(default_factory=tuple)  # before the command: ("taskset", "-c", "0")
 
     def check(self) -> None:
         """Raises ValueError, listing what there is, for an unknown scene or variant."""
@@ -42,40 +74,84 @@ class Matrix:
             unknown = [name for name in names if name not in known]
             if unknown:
                 raise ValueError(f"no {kind} {', '.join(unknown)}; there are: {', '.join(known)}")
+        names = [setting.name for setting in self.settings]
+        if len(set(names)) < len(names):
+            raise ValueError(f"two settings of one name: {', '.join(names)}")
 
     def command(self, output: Path) -> list[str]:
         launcher = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={self.jobs}"] if self.jobs > 1 else []
+        search = [f"file://{CONF}"]
+        settings = []
+        if self.settings:
+            search.append(f"file://{_settings_folder(output)}")
+            settings = [f"+setting={','.join(setting.name for setting in self.settings)}"]
         return [
+            *self.prefix,
             sys.executable,
             str(ROOT / "launch" / "run_all.py"),
             "-m",
-            f"hydra.searchpath=[file://{CONF}]",
+            f"hydra.searchpath=[{','.join(search)}]",
             *launcher,
             f"+scene={','.join(self.scenes)}",
             f"+variant={','.join(self.variants)}",
+            *settings,
             f"seed={','.join(str(s) for s in self.seeds)}",
             *self.overrides,
             f"output={output}",
             "screen=plain",
         ]
 
-    def run(self, output: Path) -> list[Run]:
-        """Runs everything; a run that fails leaves a Run without report and the others go on."""
+    def write_settings(self, output: Path) -> None:
+        """What `command` needs on disk."""
+        folder = _settings_folder(output) / "setting"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        for setting in self.settings:
+            (folder / f"{setting.name}.yaml").write_text(setting.text())
+
+    def start(self, output: Path) -> subprocess.Popen[bytes]:
+        """Starts everything; earlier results in `output` are removed. Its screen goes to output/runs.log."""
         self.check()
         output.mkdir(parents=True, exist_ok=True)
+        for number in range(len(self.names())):
+            shutil.rmtree(output / str(number), ignore_errors=True)
+        self.write_settings(output)
         with (output / "runs.log").open("w") as log:
-            subprocess.run(self.command(output), cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, check=False)
+            return subprocess.Popen(
+                self.command(output), cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, env=environment()
+            )
+
+    def run(self, output: Path) -> list[Run]:
+        """Runs everything; a run that fails leaves a Run without report and the others go on."""
+        process = self.start(output)
+        try:
+            process.wait()
+        except BaseException:
+            process.terminate()  # the launcher stops its nodes
+            process.wait()
+            raise
         return self.collect(output)
+
+    def names(self) -> list[tuple[str, str, str, int]]:
+        """Scene, variant, setting and seed of each job: Hydra's order, the last argument fastest."""
+        settings = [setting.name for setting in self.settings] or [""]
+        return list(itertools.product(self.scenes, self.variants, settings, self.seeds))
 
     def collect(self, output: Path) -> list[Run]:
         """Reads the reports of an earlier `run` in the same folder."""
         runs = []
-        # Hydra numbers jobs in the order of the product, the last argument fastest
-        for number, (scene, variant, seed) in enumerate(itertools.product(self.scenes, self.variants, self.seeds)):
+        for number, (scene, variant, setting, seed) in enumerate(self.names()):
             file = output / str(number) / "report.json"
             report = json.loads(file.read_text()) if file.exists() else None
-            runs.append(Run(scene, variant, seed, file.parent, report))
+            runs.append(Run(scene, variant, seed, file.parent, report, setting))
         return runs
+
+
+def environment() -> dict[str, str]:
+    """Environment of the runs: weights for LPIPS from the shared folder, unless MVSGS_WEIGHTS says otherwise."""
+    weights = SHARED / "weights"
+    found = {"MVSGS_WEIGHTS": str(weights)} if weights.is_dir() else {}
+    return {**found, **os.environ}
 
 
 def choices(kind: str) -> list[str]:
@@ -90,14 +166,44 @@ def figure(report: dict[str, Any] | None, path: str) -> float | None:
     return float(value) if isinstance(value, int | float) else None
 
 
+def stage_seconds(report: dict[str, Any] | None, node: str) -> float:
+    """Seconds that a node worked, over all of its stages."""
+    stages = (report or {}).get("time", {}).get("stages", {}).get(node, {})
+    return float(sum(stages.values()))
+
+
+def said(run: Run) -> str:
+    """What the system itself reported of a run: its warnings, or why it failed."""
+    if run.report is None:
+        log = run.folder.parent / "runs.log"
+        lines = log.read_text().splitlines() if log.exists() else []
+        failed = [line for line in lines if " failed: " in line or line.startswith("error")]
+        return failed[-1] if failed else "no report"
+    warned = [f"{node}: {text}" for node, texts in run.report.get("warnings", {}).items() for text in texts]
+    return "; ".join(warned) or "nothing"
+
+
 def machine() -> str:
-    """This machine and commit in one line, for the record."""
+    """This machine in one line, for the record."""
     model = "unknown CPU"
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         model = names[0].split(":", 1)[1].strip() if names else model
-    git = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or "no commit"
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{model}, {cores} cores; commit {commit}"
+    return f"{model}, {cores} cores"
+
+
+def commit() -> str:
+    """The commit that runs, with a plus where files under version control differ from it."""
+    git = ["git", "-C", str(ROOT)]
+    name = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    # the records themselves are not part of what is measured
+    differs = subprocess.run(
+        [*git, "diff", "--quiet", "HEAD", "--", ".", ":!BENCHMARKS.md", ":!bench/recorded"], check=False
+    ).returncode
+    return (name.stdout.strip() or "no commit") + ("+" if name.stdout and differs else "")
+
+
+def _settings_folder(output: Path) -> Path:
+    return output / "settings"

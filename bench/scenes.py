@@ -12,30 +12,31 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.runs import Matrix, Run, choices, figure, machine
+from bench.runs import Matrix, Run, choices, commit, figure, machine
 from bench.table import Row, main
 from mvsgs_core.evaluation import svg
 
+# column: path in the report, digits, unit of the rows
 COLUMNS = {
-    "KF PSNR": ("rendering.keyframes.psnr", 2),
-    "held-out PSNR": ("rendering.held_out.psnr", 2),
-    "all PSNR": ("rendering.all.psnr", 2),
-    "held-out, unrefined": ("rendering_before_refinement.held_out.psnr", 2),
-    "SSIM": ("rendering.held_out.ssim", 3),
-    "LPIPS": ("rendering.held_out.lpips", 3),
-    "ATE": ("trajectory.ate_rmse", 4),
-    "ATE %": ("trajectory.ate_percent", 2),
-    "abs rel": ("depth.abs_rel", 3),
-    "inliers": ("depth.inlier_ratio", 3),
-    "complete": ("depth.completeness", 3),
-    "KFs": ("trajectory.keyframes", 0),
-    "KF/s": ("time.keyframes_per_second", 2),
-    "wall s": ("time.wall", 1),
-    "splats": ("map.splats", 0),
-    "MB": ("map.bytes", 1),
-    "peak MB": ("memory", 0),
+    "KF PSNR": ("rendering.keyframes.psnr", 2, "dB"),
+    "held-out PSNR": ("rendering.held_out.psnr", 2, "dB"),
+    "all PSNR": ("rendering.all.psnr", 2, "dB"),
+    "held-out, unrefined": ("rendering_before_refinement.held_out.psnr", 2, "dB"),
+    "SSIM": ("rendering.held_out.ssim", 3, ""),
+    "LPIPS": ("rendering.held_out.lpips", 3, ""),
+    "ATE": ("trajectory.ate_rmse", 4, ""),
+    "ATE %": ("trajectory.ate_percent", 2, "% of the path"),
+    "abs rel": ("depth.abs_rel", 3, ""),
+    "inliers": ("depth.inlier_ratio", 3, ""),
+    "complete": ("depth.completeness", 3, ""),
+    "KFs": ("trajectory.keyframes", 0, ""),
+    "KF/s": ("time.keyframes_per_second", 2, "1/s"),
+    "wall s": ("time.wall", 1, "s"),
+    "splats": ("map.splats", 0, ""),
+    "MB": ("map.bytes", 1, "MB"),
+    "peak MB": ("memory", 0, "MB"),
 }
-_UNITS = {"MB": 1e-6, "peak MB": 1e-6}
+_FACTORS = {"MB": 1e-6, "peak MB": 1e-6}
 
 # Tables I and II of the paper: PSNR, SSIM, LPIPS as published; which frames were scored is not stated there
 PAPER = {
@@ -60,7 +61,7 @@ def value(run: Run, column: str) -> float | None:
         found = float(sum(peaks.values())) if peaks else None
     else:
         found = figure(run.report, COLUMNS[column][0])
-    return None if found is None else found * _UNITS.get(column, 1.0)
+    return None if found is None else found * _FACTORS.get(column, 1.0)
 
 
 def markdown(runs: list[Run]) -> str:
@@ -107,7 +108,7 @@ def rows(runs: list[Run]) -> list[Row]:
         for column in COLUMNS:
             measured = value(run, column)
             if measured is not None:
-                found.append(Row(f"{name}: {column}", measured))
+                found.append(Row(f"{name}: {column}", measured, COLUMNS[column][2]))
     return found
 
 
@@ -135,7 +136,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     output = options.output.resolve()
     gather: Callable[[Path], list[Run]] = matrix.collect if options.collect else matrix.run
     runs = gather(output)
-    text = f"{markdown(runs)}\n\n{machine()}\n`{' '.join(matrix.command(options.output)[1:])}`\n"
+    text = f"{markdown(runs)}\n\n{machine()}; commit {commit()}\n`{' '.join(matrix.command(options.output)[1:])}`\n"
     (output / "table.md").write_text(text)
     (output / "time_against_error.svg").write_text(time_against_error(runs))
     print(text)

@@ -1,0 +1,165 @@
+"""What got slower or worse than the recorded quick line, by more than the noise.
+
+    python -m bench.compare runs/bench-quick/*.json
+
+Figures are matched by benchmark (the file's name) and row. Each kind of figure has a noise, below which a change says
+nothing, and a bound, beyond which it is a regression and the exit code is 1. Times, rates and memory are compared with
+wide tolerances, and only warn where the machine is another than the recorded one; ratios and errors hold anywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bench.record import RECORDED, Record, read_rows
+from bench.runs import machine
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """`noise` and `bound` are factors (1.3: 30 % worse), or for `absolute` differences in the figure's unit."""
+
+    noise: float
+    bound: float
+    higher_is_better: bool
+    absolute: bool = False
+    machine_bound: bool = False  # says nothing about another machine
+    floor: float = 0.0  # values up to this are all the same: nothing is measured below
+
+
+_UNITS = {
+    "dB": Tolerance(0.3, 1.0, True, absolute=True),
+    "s": Tolerance(1.4, 2.5, False, machine_bound=True, floor=0.05),
+    "ms": Tolerance(1.4, 2.5, False, machine_bound=True, floor=0.05),
+    "ms/keyframe": Tolerance(1.4, 2.5, False, machine_bound=True, floor=0.05),
+    "MB/s": Tolerance(1.4, 2.5, True, machine_bound=True),
+    "1/s": Tolerance(1.4, 2.5, True, machine_bound=True),
+    "MB": Tolerance(1.2, 1.6, False, floor=20.0),
+}
+_RATIO = 1.5, 2.5  # of two times in one run: the machine is out of it, its other work is not
+_WORDS = {  # of a row's name, for figures without a telling unit or goal; the first that occurs decides
+    "psnr": Tolerance(0.3, 1.0, True, absolute=True),
+    "ssim": Tolerance(0.01, 0.04, True, absolute=True),
+    "lpips": Tolerance(0.01, 0.04, False, absolute=True),
+    "inlier": Tolerance(0.03, 0.1, True, absolute=True),
+    "complete": Tolerance(0.03, 0.1, True, absolute=True),
+    "outlier": Tolerance(0.02, 0.1, False, absolute=True),
+    "ate": Tolerance(1.5, 3.0, False, floor=1e-3),
+    "error": Tolerance(1.3, 2.0, False, floor=1e-6),
+    "abs rel": Tolerance(1.3, 2.0, False),
+    "wall": _UNITS["s"],
+    "seconds": _UNITS["s"],
+}
+
+
+@dataclass(frozen=True)
+class Change:
+    """A figure that is worse (or better) by more than the noise."""
+
+    name: str
+    before: str
+    now: str
+    worse: bool
+    regression: bool
+    note: str = ""
+
+
+def tolerance(row: dict[str, Any]) -> Tolerance | None:
+    """How a figure is compared; None where nothing says which way is better."""
+    if row["unit"] in _UNITS:
+        return _UNITS[row["unit"]]
+    words = row["name"].lower()
+    by_name = next((rule for word, rule in _WORDS.items() if re.search(rf"\b{word}", words)), None)
+    if by_name is not None and row["unit"] != "x":
+        return by_name
+    if row["goal"][:2] in ("<=", ">="):
+        return Tolerance(*_RATIO, higher_is_better=row["goal"].startswith(">="))
+    return None
+
+
+def change(row: dict[str, Any], before: dict[str, Any], same_machine: bool) -> Change | None:
+    """None where the figure says nothing, or nothing new."""
+    name, now, then = row["name"], row["value"], before["value"]
+    if row["met"] is False and before["met"] is True and isinstance(now, str):
+        return Change(name, str(then), now, True, True, "goal no longer met")
+    numbers = [v for v in (now, then) if isinstance(v, int | float) and not isinstance(v, bool)]
+    rule = tolerance(row)
+    if rule is None or len(numbers) < 2:
+        return None
+    new, old = (float(v) for v in numbers)
+    if not math.isfinite(new):
+        return None if not math.isfinite(old) else Change(name, _text(then, row), str(now), True, True, "not finite")
+    spread = float(before.get("spread") or 0.0)
+    if rule.absolute:
+        worse_by = (old - new) if rule.higher_is_better else (new - old)
+        noise, bound = rule.noise + 2 * spread, rule.bound + 2 * spread
+        amount = f"{new - old:+.3g}"
+    else:
+        low, high = (new, old) if rule.higher_is_better else (old, new)
+        floor = rule.floor or 1e-12
+        ratio = max(high, floor) / max(low, floor)
+        worse_by = ratio if ratio >= 1 else -1 / ratio
+        widening = 1 + 2 * spread / max(abs(old), floor)
+        noise, bound = rule.noise * widening, rule.bound * widening
+        amount = f"{new / old:.2f} times" if old else ""
+    if abs(worse_by) <= noise:
+        return None
+    regression = worse_by > bound and (same_machine or not rule.machine_bound)
+    return Change(name, _text(then, row), _text(now, row), worse_by > 0, regression, amount)
+
+
+def compare(name: str, rows: list[dict[str, Any]], recorded: Record) -> list[Change]:
+    """Changes of one benchmark; a row that is gone is one, a regression."""
+    same = recorded.machine == machine()
+    before = {row["name"]: row for row in recorded.rows}
+    now = {row["name"]: row for row in rows}
+    found = [change(row, before[key], same) for key, row in now.items() if key in before]
+    changes = [c for c in found if c is not None]
+    changes += [
+        Change(key, _text(row["value"], row), "gone", True, True, "the row is missing")
+        for key, row in before.items()
+        if key not in now
+    ]
+    return changes
+
+
+def _text(value: Any, row: dict[str, Any]) -> str:
+    return f"{value:.4g} {row['unit']}".strip() if isinstance(value, float) else str(value)
+
+
+def run(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="+", type=Path, help="rows of the quick benchmarks, from --json")
+    parser.add_argument("--recorded", type=Path, default=RECORDED / "quick", help="folder of the recorded line")
+    options = parser.parse_args(arguments)
+    regressions = worse = better = compared = 0
+    for file in options.files:
+        known = options.recorded / f"{file.stem}.json"
+        if not known.exists():
+            print(f"{file.stem}: nothing recorded to compare with")
+            continue
+        recorded = Record(**json.loads(known.read_text()))
+        rows = read_rows([file])[0]
+        compared += len(rows)
+        changes = compare(file.stem, rows, recorded)
+        if changes:
+            print(f"{file.stem} (recorded at {recorded.commit}, {recorded.date}, {recorded.machine})")
+        for c in sorted(changes, key=lambda c: (not c.regression, not c.worse)):
+            word = "REGRESSION" if c.regression else "worse" if c.worse else "better"
+            print(f"  {word:10}  {c.name}: {c.before} -> {c.now}  {c.note}")
+        regressions += sum(c.regression for c in changes)
+        worse += sum(c.worse and not c.regression for c in changes)
+        better += sum(not c.worse for c in changes)
+    print(f"{compared} figures: {regressions} regressions, {worse} worse within bounds, {better} better")
+    return 1 if regressions else 0
+
+
+if __name__ == "__main__":
+    sys.exit(run(sys.argv[1:]))
