@@ -48,27 +48,24 @@ class _Guard:
     """Lets in only readers that own a graph's secret key: knowing the public one is not enough."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._users: Counter[Keys] = Counter()
         self._authenticator: ThreadAuthenticator | None = None
 
     def enter(self, keys: Keys) -> None:
-        with self._lock:
-            self._users[keys] += 1
-            if self._authenticator is None:
-                self._authenticator = ThreadAuthenticator(zmq.Context.instance())
-                self._authenticator.start()
-                self._authenticator.configure_curve_callback("*", self)
+        self._users[keys] += 1
+        if self._authenticator is None:
+            self._authenticator = ThreadAuthenticator(zmq.Context.instance())
+            self._authenticator.start()
+            self._authenticator.configure_curve_callback("*", self)
 
     def leave(self, keys: Keys) -> None:
-        with self._lock:
-            self._users[keys] -= 1
-            if self._authenticator is not None and not +self._users:
-                self._authenticator.stop()
-                self._authenticator = None
+        self._users[keys] -= 1
+        if self._authenticator is not None and not +self._users:
+            self._authenticator.stop()
+            self._authenticator = None
 
     def callback(self, domain: str, key: bytes) -> bool:
-        return any(key == keys.public for keys in +self._users)
+        return any(key == keys.public and users > 0 for keys, users in list(self._users.items()))
 
 
 _guard = _Guard()
@@ -143,10 +140,12 @@ class Publisher:
         """Takes note of arrivals and departures. Raises PeerLost."""
         while _readable(self.socket):
             event = self.socket.recv()
-            delivery = RELIABLE if event[1:2] == RELIABLE else NEWEST
+            delivery = event[1:]
+            if delivery not in (RELIABLE, NEWEST):
+                continue  # no reader of ours
             if event[:1] == b"\x01":
                 self.readers[delivery] += 1
-            elif event[:1] == b"\x00":
+            elif self.readers[delivery] > 0:
                 self.readers[delivery] -= 1
                 if delivery == RELIABLE and self._started and not self._ended:
                     raise PeerLost(f"a reader of {self.topic} left before the end")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import resource
+import socket
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +39,8 @@ def address(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 
 def tcp_address() -> str:
-    with zmq.Context() as context, context.socket(zmq.PUSH) as socket:
-        return f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
+    with zmq.Context() as context, context.socket(zmq.PUSH) as probe:
+        return f"tcp://127.0.0.1:{probe.bind_to_random_port('tcp://127.0.0.1')}"
 
 
 @pytest.fixture
@@ -129,29 +132,64 @@ def test_a_lost_message_is_an_error(ipc: str, opened: Callable) -> None:
 
 def test_a_foreign_frame_is_named_and_the_next_one_is_read(ipc: str, opened: Callable) -> None:
     reader = opened(NewestReader(ipc, Frame))
-    with zmq.Context() as context, context.socket(zmq.XPUB) as socket:
-        socket.bind(ipc)
-        assert socket.recv() == b"\x01" + NEWEST
+    with zmq.Context() as context, context.socket(zmq.XPUB) as xpub:
+        xpub.bind(ipc)
+        assert xpub.recv() == b"\x01" + NEWEST
         for bad in (b"Nonsense", bytes(encode(frame(0), delivery=NEWEST))[:-5]):
-            socket.send(bad)
+            xpub.send(bad)
             with pytest.raises(CodecError, match="ipc"):
                 reader.receive(5)
         keyframe = Keyframe(*vars(frame(0)).values(), np.eye(4), 1.0, *[np.ones((2, 2), np.float32)] * 2, 0)
-        socket.send(encode(keyframe, delivery=NEWEST))
+        xpub.send(encode(keyframe, delivery=NEWEST))
         with pytest.raises(CodecError, match="'Keyframe' where Frame or End"):
             reader.receive(5)
-        socket.send(encode(frame(3), 3, delivery=NEWEST))
+        xpub.send(encode(frame(3), 3, delivery=NEWEST))
         assert reader.receive(5).index == 3
 
 
 def test_a_frame_above_the_limit_never_reaches_memory(ipc: str, opened: Callable) -> None:
     reader = opened(NewestReader(ipc, Frame, max_bytes=10_000))
-    with zmq.Context() as context, context.socket(zmq.XPUB) as socket:
-        socket.bind(ipc)
-        socket.recv()
-        socket.send(NEWEST + bytes(20_000))
+    with zmq.Context() as context, context.socket(zmq.XPUB) as xpub:
+        xpub.bind(ipc)
+        xpub.recv()
+        xpub.send(NEWEST + bytes(20_000))
         assert reader.receive(0.3) is None
-        socket.setsockopt(zmq.LINGER, 0)
+        xpub.setsockopt(zmq.LINGER, 0)
+
+
+def test_a_publisher_survives_whoever_knocks(opened: Callable) -> None:
+    address = tcp_address()
+    publisher = opened(Publisher(address))
+    host, port = address.removeprefix("tcp://").split(":")
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01NULL" + bytes(48)  # ZMTP 3.1 of a client
+    ready = b"\x04\x19\x05READY\x0bSocket-Type" + struct.pack(">I", 3) + b"SUB"
+    rng = np.random.default_rng(0)
+    for words in (b"GET / HTTP/1.1\r\n\r\n", rng.bytes(4096), greeting, greeting + ready + rng.bytes(4096),
+                  greeting + ready + b"\x02" + struct.pack(">Q", 2**62)):  # fmt: skip
+        with socket.create_connection((host, int(port))) as knock:
+            knock.sendall(words)
+            time.sleep(0.02)
+    reader = opened(ReliableReader(address, Frame))
+    until(lambda: publisher.ready(1))
+    publisher.send(frame(3))
+    until(lambda: reader.take() is not None)
+
+
+def test_a_reader_refuses_a_message_length_beyond_the_limit(opened: Callable) -> None:
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01NULL" + bytes(48)
+    ready = b"\x04\x1a\x05READY\x0bSocket-Type" + struct.pack(">I", 4) + b"XPUB"
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        reader = opened(NewestReader(f"tcp://127.0.0.1:{server.getsockname()[1]}", Frame))
+        connection, _ = server.accept()
+        with connection:
+            connection.sendall(greeting + ready + b"\x02" + struct.pack(">Q", 2**40) + b"N" * 1000)
+            connection.settimeout(5)
+            with suppress(ConnectionResetError):
+                while connection.recv(4096):  # ends when the reader has closed the connection
+                    pass
+        assert reader.receive(0.1) is None
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50 * 1024
 
 
 def test_a_publisher_that_disappears_is_noticed(address: str, opened: Callable) -> None:
@@ -242,16 +280,16 @@ def test_keys_let_in_only_those_who_have_them(tmp_path: Path, opened: Callable) 
     with pytest.raises(TransportError, match="speaks another protocol"):
         until(lambda: stranger.watch() or False)
     # one who knows the public key, as anybody on the wire's path may, but not the secret one
-    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-        socket.curve_serverkey = keys.public
-        socket.curve_publickey, socket.curve_secretkey = zmq.curve_keypair()
-        socket.subscribe(b"")
-        monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_SUCCEEDED)
-        socket.connect(address)
+    with zmq.Context() as context, context.socket(zmq.SUB) as sub:
+        sub.curve_serverkey = keys.public
+        sub.curve_publickey, sub.curve_secretkey = zmq.curve_keypair()
+        sub.subscribe(b"")
+        monitor = sub.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_SUCCEEDED)
+        sub.connect(address)
         assert monitor.poll(5000)
         event, _ = monitor.recv_multipart()
         assert struct.unpack("=hi", event)[0] == zmq.EVENT_HANDSHAKE_FAILED_AUTH
-        socket.disable_monitor()
+        sub.disable_monitor()
         monitor.close()
     assert publisher.readers.total() == 1
 
