@@ -30,7 +30,7 @@ def _rays(h: int, w: int, intrinsics: Tensor) -> Tensor:
 
 def _move(relative: Tensor, inverse_depth: Tensor, intrinsics: Tensor) -> Tensor:
     """R [x, y, 1] + d t, (E, h, w, 3): the points of E maps, divided by their depth, in another camera."""
-    rays = _rays(*inverse_depth.shape[-2:], intrinsics)
+    rays = _rays(inverse_depth.shape[-2], inverse_depth.shape[-1], intrinsics)
     turned = torch.einsum("eab,hwb->ehwa", relative[:, :3, :3], rays)
     return turned + inverse_depth[..., None] * relative[:, None, None, :3, 3]
 
@@ -52,7 +52,7 @@ def _pixels_moved(points: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     valid = points[..., 2] > _NEAR_DISTANCE
     z = torch.where(valid, points[..., 2], torch.ones_like(points[..., 2]))
     target = points[..., :2] / z[..., None] * intrinsics[:2] + intrinsics[2:]
-    length = (target - cells(*points.shape[1:3], intrinsics)).norm(dim=-1)
+    length = (target - cells(points.shape[1], points.shape[2], intrinsics)).norm(dim=-1)
     return torch.where(valid, length, torch.zeros_like(length)), valid
 
 
@@ -74,7 +74,7 @@ def frame_distance(relative: Tensor, inverse_depth: Tensor, intrinsics: Tensor, 
 
 def world_points(world_from_cam: Tensor, inverse_depth: Tensor, intrinsics: Tensor) -> Tensor:
     """(K, h, w, 3) points of K maps in the world."""
-    points = _rays(*inverse_depth.shape[-2:], intrinsics) / inverse_depth[..., None]
+    points = _rays(inverse_depth.shape[-2], inverse_depth.shape[-1], intrinsics) / inverse_depth[..., None]
     return torch.einsum("kab,khwb->khwa", world_from_cam[:, :3, :3], points) + world_from_cam[:, None, None, :3, 3]
 
 

@@ -1,0 +1,44 @@
+"""The backend: bundle adjustment of the whole video over a graph of its own (DROID-SLAM, section 3.3)."""
+
+from __future__ import annotations
+
+from mvsgs_core.droid.factor_graph import FactorGraph
+from mvsgs_core.droid.networks import Networks
+from mvsgs_core.droid.presets import Preset
+from mvsgs_core.droid.proximity import by_proximity
+from mvsgs_core.droid.video import Video
+from mvsgs_core.tracking.stats import TrackingStats
+
+_FACTORS_PER_KEYFRAME = 16
+_LEAST = 3  # keyframes
+
+
+def adjust_globally(
+    video: Video, networks: Networks, preset: Preset, steps: int, correlation: str, threads: int, stats: TrackingStats
+) -> None:
+    """Normalizes the scale, chooses edges among all keyframes, and updates all of them `steps` times."""
+    if len(video) < _LEAST:
+        return
+    video.normalize()
+    graph = FactorGraph(video, networks, correlation=correlation, transient=True, threads=threads)
+    near = by_proximity(
+        video,
+        first_source=0,
+        first_to=0,
+        existing=[],
+        radius=preset.backend_radius,
+        nms=preset.backend_nms,
+        threshold=preset.backend_threshold,
+        beta=preset.beta,
+        limit=_FACTORS_PER_KEYFRAME * len(video),
+    )
+    stats.count("global edges", graph.add(near))
+    for _ in range(steps):
+        stats.count("edges revised", len(graph.active))
+        solution = graph.update_globally()
+        if solution.failure:
+            stats.count("failed bundle adjustments")
+            stats.warn(f"global bundle adjustment failed: {solution.failure}")
+
+
+__all__ = ["adjust_globally"]

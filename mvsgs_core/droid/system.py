@@ -1,0 +1,219 @@
+"""DROID-SLAM as a tracker: images in; keyframes, corrected poses and the whole path out, as mvsgs_core.tracking does.
+
+What is done with a frame depends on the frames before it alone: the same stream always gives the same poses on a CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+import torch
+
+from mvsgs_core import geometry
+from mvsgs_core.droid.backend import adjust_globally
+from mvsgs_core.droid.confidence import Coarse, coarse_map, consistent_share
+from mvsgs_core.droid.factor_graph import FactorGraph
+from mvsgs_core.droid.framing import Framing
+from mvsgs_core.droid.frontend import Frontend
+from mvsgs_core.droid.motion_filter import MotionFilter
+from mvsgs_core.droid.networks import RANDOM, Networks, load
+from mvsgs_core.droid.presets import AREA, Preset
+from mvsgs_core.droid.trajectory_filler import StoredFrame, fill
+from mvsgs_core.droid.video import Video, VideoFrame
+from mvsgs_core.networks.droid import DroidNet
+from mvsgs_core.tracking.frames import Path, State
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.publish import Publisher
+from mvsgs_core.tracking.stats import TrackingStats
+from mvsgs_core.tracking.tracker import Update
+
+_DEGENERATE = 0.05  # share of cells that agree with a neighbor, below which a keyframe's depth is none
+
+
+@dataclass(frozen=True)
+class DroidConfig:
+    preset: Preset = field(default_factory=Preset)
+    weights: str | None = None  # file; None: found by the registry; "random": noise, to try the machinery
+    area: int = AREA  # pixels of the image that the networks see, aspect kept
+    correlation: str = "volume"  # of the frontend: volume (fast) or on_the_fly (little memory)
+    global_correlation: str = "on_the_fly"  # of the backend; volume: one edge's at a time
+    tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
+    device: str = "cpu"
+    threads: int = 1  # of the bundle adjustment
+
+
+class DroidSlam:
+    def __init__(self, config: DroidConfig | None = None, net: DroidNet | None = None) -> None:
+        """Raises FileNotFoundError or ValueError where the weights are missing or wrong. net: instead of weights."""
+        self.config = config or DroidConfig()
+        self.networks = Networks(load(self.config.weights) if net is None else net, torch.device(self.config.device))
+        self.stats = TrackingStats()
+        if net is None and self.config.weights == RANDOM:
+            self.stats.warn("DROID-SLAM runs on random weights: its poses and depths are noise")
+        self.framing: Framing | None = None
+        self.frames: list[StoredFrame] = []
+        self._states: list[State] = []
+        self._path = _empty_path()
+
+    def add(self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> Update:
+        """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow."""
+        if self.framing is None:
+            self._set_up(image.shape[0], image.shape[1], intrinsics)
+        assert self.framing is not None
+        with self.stats.time("image"):
+            small = self.framing.image(image)
+            self.frames.append(StoredFrame.of(index, timestamp, small))
+        self.stats.count("frames")
+        self._states.append(State.TRACKED if self.frontend.started else State.NOT_STARTED)
+        if (len(self.frames) - 1) % self.config.preset.stride:
+            self.stats.skip("frames between strides")
+            return Update(self._states[-1])
+        with self.stats.time("motion filter"):
+            encoded = self.motion_filter.passes(small)
+        if encoded is None:
+            self.stats.skip("frames that moved too little")
+            return Update(self._states[-1])
+        pose, inverse_depth = self.frontend.start_values()
+        self.video.frames.append(
+            VideoFrame(
+                index,
+                timestamp,
+                pose,
+                np.full(self.framing.grid, inverse_depth),
+                encoded.features,
+                encoded.hidden,
+                encoded.context,
+            )
+        )
+        kept = self.frontend.advance()
+        every = self.config.preset.backend_every
+        if kept and every and self.frontend.started and len(self.video) % every == 0:
+            self._adjust_globally(self.config.preset.backend_steps[-1:])
+        return self._tell(self.frontend.settled)
+
+    @property
+    def pending(self) -> set[int]:
+        """Frames that may still become keyframes that are told: their images are needed until then."""
+        return set() if self.framing is None else set(self.video.keyframes) - self.publisher.told
+
+    def finish(self) -> Iterator[Update]:
+        """The stream has ended: a start by force if there was none, then the global bundle adjustment."""
+        if self.framing is None:
+            return
+        if not self.frontend.started and self.frontend.force_start():
+            self.stats.warn("the start was forced at the end of the stream, on fewer keyframes than the warm-up takes")
+        if not self.frontend.started:
+            self.stats.warn(
+                f"tracking never started: only {len(self.video)} frames moved enough to be keyframes "
+                f"(filter_threshold {self.config.preset.filter_threshold})"
+            )
+            self._path = self._collect(None)
+            yield Update(State.NOT_STARTED)
+            return
+        yield self._tell(len(self.video))
+        self._adjust_globally(self.config.preset.backend_steps)
+        self._path = self._collect(self._fill())
+        if self.networks.not_finite:
+            self.stats.warn(f"{self.networks.not_finite} network outputs were not finite and were ignored")
+        yield Update(State.TRACKED, (), self.publisher.corrections(True))
+
+    def path(self) -> Path:
+        """Every frame's pose, after `finish`."""
+        return self._path
+
+    def keyframe(self, index: int) -> VideoFrame:
+        return self.video.keyframes[index]
+
+    def coarse_map(self, index: int) -> Coarse:
+        """Inverse depth and confidence of a keyframe, for the whole view of its image."""
+        assert self.framing is not None
+        position = [frame.index for frame in self.video.frames].index(index)
+        return coarse_map(self.video, self.graph, position, self.framing)
+
+    def _set_up(self, height: int, width: int, intrinsics: np.ndarray) -> None:
+        config = self.config
+        self.framing = Framing.of(height, width, config.area)
+        self.video = Video(self.framing.intrinsics(intrinsics))
+        self.graph = FactorGraph(
+            self.video,
+            self.networks,
+            correlation=config.correlation,
+            max_factors=config.preset.max_factors,
+            threads=config.threads,
+        )
+        self.motion_filter = MotionFilter(self.networks, config.preset.filter_threshold)
+        self.frontend = Frontend(self.video, self.graph, config.preset, self.stats)
+        # the publisher reads indices, poses, inverse depths: what a video has as well as a tracker's graph
+        self.publisher = Publisher(cast(KeyframeGraph, self.video), config.tolerance)
+
+    def _tell(self, settled: int) -> Update:
+        """Keyframes that have become settled, after corrections of those before."""
+        correction = self.publisher.corrections()
+        new = [frame for frame in self.video.frames[:settled] if frame.index not in self.publisher.told]
+        for frame in new:
+            self.publisher.tell(frame.index)
+        self.stats.count("keyframes", len(new))
+        if self.frontend.started:
+            position = max(0, len(self.video) - 2)
+            flat = consistent_share(self.video, position) < _DEGENERATE
+            self._states[-1] = State.DEGENERATE if flat else State.TRACKED
+            if flat:
+                self.stats.warn("keyframes whose depth agrees with no other: their poses mean little")
+        return Update(self._states[-1], tuple(frame.index for frame in new), correction)
+
+    def _adjust_globally(self, steps: tuple[int, ...]) -> None:
+        with self.stats.time("global bundle adjustment"):
+            for count in steps:
+                adjust_globally(
+                    self.video,
+                    self.networks,
+                    self.config.preset,
+                    count,
+                    self.config.global_correlation,
+                    self.config.threads,
+                    self.stats,
+                )
+
+    def _fill(self) -> dict[int, np.ndarray]:
+        """cam_from_world of every frame."""
+        own = self.video.keyframes
+        others = [frame for frame in self.frames if frame.index not in own]
+        with self.stats.time("frames between keyframes"):
+            found = fill(self.video, self.networks, others, self.config.correlation, self.config.threads, self.stats)
+        poses = {frame.index: pose for frame, pose in zip(others, found)}
+        return poses | {index: frame.cam_from_world for index, frame in own.items()}
+
+    def _collect(self, cam_from_world: dict[int, np.ndarray] | None) -> Path:
+        count = len(self.frames)
+        poses = np.full((count, 4, 4), np.nan)
+        states = np.array(self._states, np.uint8).reshape(count)
+        if cam_from_world is not None:
+            poses = geometry.inverse(np.stack([cam_from_world[frame.index] for frame in self.frames]))
+            states[states == State.NOT_STARTED] = State.TRACKED
+        keyframes = self.video.keyframes if cam_from_world is not None else {}
+        return Path(
+            index=np.array([frame.index for frame in self.frames], np.int64),
+            timestamp=np.array([frame.timestamp for frame in self.frames], np.float64),
+            world_from_cam=poses,
+            keyframe=np.array([frame.index in keyframes for frame in self.frames], bool),
+            state=states,
+            segment=np.full(count, 0 if cam_from_world is not None else -1, np.int32),
+        )
+
+
+def _empty_path() -> Path:
+    none = np.zeros(0)
+    return Path(
+        none.astype(np.int64),
+        none,
+        np.zeros((0, 4, 4)),
+        none.astype(bool),
+        none.astype(np.uint8),
+        none.astype(np.int32),
+    )
+
+
+__all__ = ["DroidConfig", "DroidSlam"]
