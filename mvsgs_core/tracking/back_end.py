@@ -64,7 +64,7 @@ class BackEnd:
         solutions = []
         for scale in self.config.robust_scales:
             solver = Solver(steps=self.config.steps, robust_scale=scale, lm=1e-5, threads=self.threads)
-            solution = self.graph.optimize(members, set(members[1:]), set(members), solver, prior=True)
+            solution = self.graph.optimize(members, set(members[1:]), set(members), solver)
             solutions.append(solution)
         self.graph.rescale(members, self._median_inverse_depth(members) / before)
         return solutions
@@ -74,7 +74,7 @@ class BackEnd:
         members = self.local_map.members(segment)
         before = self._median_inverse_depth(members)
         solver = Solver(steps=1, robust_scale=1.0, lm=1e-5, threads=self.threads)
-        solution = self.graph.optimize(members, set(members[1:]), set(members), solver, prior=True)
+        solution = self.graph.optimize(members, set(members[1:]), set(members), solver)
         self.graph.rescale(members, self._median_inverse_depth(members) / before)
         return solution
 

@@ -73,7 +73,7 @@ class Solution:
     ill_conditioned: bool = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ill_conditioned", bool(self.smallest_pivot < 1e-9))
+        object.__setattr__(self, "ill_conditioned", bool(self.smallest_pivot < 1e-7))
 
 
 def adjust(graph: Graph, solver: Solver) -> Solution:

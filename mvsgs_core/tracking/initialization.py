@@ -44,9 +44,8 @@ class Start:
 def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, threads: int) -> Start:
     """Solves keyframes `order` of the graph, without changing it."""
     everything = set(order)
-    problem = graph.problem(order, everything - {order[0]}, everything, prior=True)
+    problem = graph.problem(order, everything - {order[0]}, everything)
     k, m = problem.inverse_depth.shape
-    problem = replace(problem, prior=np.ones((k, m)), prior_weight=np.full((k, m), 0.05), damping=np.full((k, m), 0.01))
     matched = float(np.sum(problem.information[:, 0] > 0))
     turned = _rotation_error(problem, threads)
     if turned < criteria.min_turn_error:
@@ -59,6 +58,8 @@ def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, th
         attempt: Solution | None = None
         current = replace(problem, cam_from_world=poses, inverse_depth=np.ones((k, m)))
         for scale, steps in ((8.0, 12), (3.0, 8), (1.0, 12)):
+            held = np.full((k, m), 0.05 if scale > 1.0 else 0.0)  # keeps depths from running away at first
+            current = replace(current, prior=np.ones((k, m)), prior_weight=held)
             solver = Solver(steps=steps, robust_scale=scale, lm=1e-3, threads=threads)
             attempt = adjust(current, solver)
             if attempt.failure:
@@ -101,8 +102,6 @@ def _rotation_error(problem: Graph, threads: int) -> float:
         cam_from_world=np.tile(np.eye(4), (k, 1, 1)),
         inverse_depth=np.full((k, m), 1e-9),
         free_depth=np.zeros(k, bool),
-        prior=None,
-        prior_weight=None,
     )
     for scale in (8.0, 2.0):
         solution = adjust(far, Solver(steps=10, ep=1e-3, robust_scale=scale, threads=threads))

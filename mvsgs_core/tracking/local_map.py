@@ -39,9 +39,7 @@ class LocalMap:
     ) -> Keyframe:
         """Adds a keyframe with its pose; `matches`: points of older keyframes, by index, found in it."""
         inverse_depth = self._carry_depth(image, cam_from_world, matches)
-        keyframe = Keyframe(
-            image, cam_from_world, inverse_depth, inverse_depth.copy(), np.zeros(len(inverse_depth)), segment
-        )
+        keyframe = Keyframe(image, cam_from_world, inverse_depth, np.zeros(len(inverse_depth)), segment)
         earlier = self.members(segment)
         self.graph.add(keyframe)
         recent = earlier[-self.config.recent :]

@@ -138,7 +138,6 @@ class LoopCloser:
         pose[:3, :3], pose[:3, 3] = similarity[:3, :3] / scale, similarity[:3, 3] / scale
         keyframe.cam_from_world = pose
         keyframe.inverse_depth = keyframe.inverse_depth * scale
-        keyframe.prior = keyframe.prior * scale
         keyframe.information = keyframe.information / scale**2
 
 

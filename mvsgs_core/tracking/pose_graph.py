@@ -54,6 +54,9 @@ def solve_pose_graph(
     Every connected part needs a fixed node: else the failure says that a part is free.
     """
     current = similarities.astype(np.float64).copy()
+    if not _all_held(len(current), edges, fixed):
+        cost = _cost(current, edges)
+        return PoseGraphSolution(current, cost, cost, 0, "a part of the pose graph has no fixed node")
     column = np.full(len(current), -1)
     free = [k for k in range(len(current)) if k not in fixed]
     column[free] = np.arange(len(free))
@@ -65,7 +68,9 @@ def solve_pose_graph(
             damped = hessian + np.diag(lm * np.diag(hessian))
             step, pivot = native.load("tracking").solve_positive_definite(damped, -gradient)
             if pivot <= 1e-12:
-                return PoseGraphSolution(current, initial, cost, taken, "a part of the pose graph has no fixed node")
+                return PoseGraphSolution(
+                    current, initial, cost, taken, "the normal equations are not positive definite"
+                )
             moved = current.copy()
             moved[free] = _retract(step.reshape(-1, 7), current[free])
             better = _cost(moved, edges)
@@ -114,6 +119,19 @@ def jacobians(similarities: np.ndarray, edges: SimilarityEdges) -> tuple[np.ndar
     by_error[:, :3, 6] = error[:, :3, 3]
     by_error[:, 3:6, 3:6] = np.eye(3) - 0.5 * k + c * (k @ k)
     return r, -by_error @ adjoint(error), by_error @ adjoint(inverse_similarity(edges.relative))
+
+
+def _all_held(count: int, edges: SimilarityEdges, fixed: set[int]) -> bool:
+    """Whether a path of edges leads from every node to a fixed one."""
+    held = np.isin(np.arange(count), list(fixed))
+    for _ in range(count):
+        reached = held.copy()
+        reached[edges.to[held[edges.source]]] = True
+        reached[edges.source[held[edges.to]]] = True
+        if np.array_equal(reached, held):
+            break
+        held = reached
+    return bool(held.all())
 
 
 def _weights(edges: SimilarityEdges) -> np.ndarray:

@@ -94,7 +94,7 @@ class PosedTracker:
     def _first(self, frame: TrackingImage, pose: np.ndarray) -> list[int]:
         assert self.graph is not None
         ones = np.ones(len(frame.cells.points))
-        self.graph.add(Keyframe(frame, pose, ones, ones.copy(), 0.0 * ones, 0))
+        self.graph.add(Keyframe(frame, pose, ones, 0.0 * ones, 0))
         self.front_end.refer_to(frame)
         self.stats.count("keyframes")
         self.pending = [frame.index]
@@ -124,7 +124,6 @@ class PosedTracker:
             error = np.linalg.norm(pixels[0].T - found.target, axis=1)[found.alive]
             best = min(best, (float(np.median(error)), float(ratio / baseline)))
         keyframe.inverse_depth = np.full_like(keyframe.inverse_depth, best[1])
-        keyframe.prior = keyframe.inverse_depth.copy()
 
 
 __all__ = ["PosedConfig", "PosedTracker"]

@@ -47,7 +47,7 @@ class Starter:
         """One more keyframe. matches: where the last one's points were found in it."""
         ones = np.ones(len(image.cells.points))
         earlier = list(self.waiting)
-        self.graph.add(Keyframe(image, np.eye(4), ones, ones.copy(), 0.0 * ones, segment))
+        self.graph.add(Keyframe(image, np.eye(4), ones, 0.0 * ones, segment))
         self.waiting.append(image.index)
         if matches is not None and earlier:
             self._connect(image, earlier, matches)
@@ -73,7 +73,7 @@ class Starter:
         for n, index in enumerate(self.waiting):
             keyframe = self.graph.keyframes[index]
             keyframe.cam_from_world, keyframe.inverse_depth = start.cam_from_world[n], start.inverse_depth[n]
-            keyframe.information, keyframe.prior = start.information[n], np.ones_like(start.inverse_depth[n])
+            keyframe.information = start.information[n]
         self.waiting = []
         return True
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core import geometry
-from mvsgs_core.tracking.bundle_adjustment import DROID_GLOBAL, DROID_LOCAL, Graph, adjust
+from mvsgs_core.tracking.bundle_adjustment import DROID_GLOBAL, DROID_LOCAL, Graph, Solver, adjust, reproject
 from tests.shared_data import shared
 
 CASES = {
@@ -63,3 +63,152 @@ def test_agrees_with_droid_slams_equations(case: str) -> None:
     np.testing.assert_allclose(solution.cam_from_world, matrices(golden[poses]), atol=1e-8)
     if disparities:
         np.testing.assert_allclose(solution.inverse_depth.reshape(k, h, w), golden[disparities], atol=1e-8)
+
+
+def scene(k: int = 4, m: int = 60, seed: int = 0, noise: float = 0.0) -> tuple[Graph, np.ndarray, np.ndarray]:
+    """A graph whose targets are exact (plus noise), its true poses and its true inverse depths."""
+    random = np.random.default_rng(seed)
+    poses = geometry.se3_exp(random.normal(0.0, 0.08, (k, 6)))
+    poses[0] = np.eye(4)
+    inverse_depth = random.uniform(0.4, 1.6, (k, m))
+    pixels = random.uniform([[20.0], [20.0]], [[300.0], [220.0]], (k, 2, m))
+    intrinsics = np.array([260.0, 250.0, 159.5, 119.5])
+    source, to = np.array([(i, j) for i in range(k) for j in range(k) if i != j]).T
+    target, z = reproject(poses, inverse_depth, pixels, intrinsics, source, to)
+    root = random.normal(0.0, 0.7, (len(source), m, 2, 2))
+    tensor = root @ root.swapaxes(-1, -2) + 0.2 * np.eye(2)
+    information = np.stack([tensor[..., 0, 0], tensor[..., 0, 1], tensor[..., 1, 1]], axis=1) * (z > 0.3)[:, None]
+    graph = Graph(
+        cam_from_world=poses.copy(),
+        inverse_depth=inverse_depth.copy(),
+        pixels=pixels,
+        intrinsics=intrinsics,
+        source=source,
+        to=to,
+        target=target + random.normal(0.0, noise, target.shape) if noise else target,
+        information=information,
+        free_pose=np.arange(k) > 0,
+        free_depth=np.ones(k, bool),
+    )
+    return graph, poses, inverse_depth
+
+
+def moved(graph: Graph, seed: int, pose: float, depth: float) -> Graph:
+    random = np.random.default_rng(seed)
+    step = geometry.se3_exp(random.normal(0.0, pose, (len(graph.cam_from_world), 6)) * graph.free_pose[:, None])
+    factor = np.exp(random.normal(0.0, depth, graph.inverse_depth.shape))
+    return replace(graph, cam_from_world=step @ graph.cam_from_world, inverse_depth=graph.inverse_depth * factor)
+
+
+@pytest.mark.parametrize("focal", [False, True])
+def test_a_step_is_the_one_of_numerical_jacobians(focal: bool) -> None:
+    """One undamped step from a dense least-squares problem whose Jacobian is taken by central differences."""
+    exact, *_ = scene(k=3, m=11, noise=0.5)  # 11: not a multiple of the vector width
+    graph = replace(moved(exact, 1, 0.01, 0.05), free_pose=np.array([False, False, True]), free_focal=focal)
+    k, m = graph.inverse_depth.shape
+    a, b, c = graph.information[:, 0], graph.information[:, 1], graph.information[:, 2]
+    root = np.linalg.cholesky(
+        np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2) + 1e-12 * np.eye(2)
+    )  # W = L L'
+
+    def whitened(x: np.ndarray) -> np.ndarray:
+        poses = graph.cam_from_world.copy()
+        poses[2] = geometry.se3_exp(x[:6]) @ poses[2]
+        intrinsics = graph.intrinsics * np.exp([x[6], x[6], 0.0, 0.0])
+        depths = graph.inverse_depth + x[7:].reshape(k, m)
+        pixels, _ = reproject(poses, depths, graph.pixels, intrinsics, graph.source, graph.to)
+        return np.einsum("emji,ejm->emi", root, graph.target - pixels).ravel()
+
+    n = 7 + k * m
+    h = 1e-6
+    jacobian = np.stack([(whitened(h * e) - whitened(-h * e)) / (2 * h) for e in np.eye(n)], axis=1)
+    used = np.arange(n) if focal else np.delete(np.arange(n), 6)
+    expected = np.zeros(n)
+    expected[used] = np.linalg.lstsq(jacobian[:, used], -whitened(np.zeros(n)), rcond=None)[0]
+    solver = Solver(steps=1, adaptive=False, lm=0.0, ep=0.0, robust="none", min_z=0.3)
+    graph = replace(graph, damping=np.full((k, m), 1e-12))
+    solution = adjust(graph, solver)
+    assert not solution.failure
+    pose = solution.cam_from_world[2] @ geometry.inverse(graph.cam_from_world[2])
+    np.testing.assert_allclose(geometry.se3_log(pose), expected[:6], atol=2e-6)
+    np.testing.assert_allclose(solution.inverse_depth - graph.inverse_depth, expected[7:].reshape(k, m), atol=2e-5)
+    np.testing.assert_allclose(np.log(solution.focal_factor), expected[6], atol=2e-6)
+
+
+@pytest.mark.parametrize("robust", ["none", "huber", "cauchy"])
+def test_finds_the_true_scene(robust: str) -> None:
+    graph, poses, inverse_depth = scene(k=5, m=80)
+    start = replace(moved(graph, 2, 0.01, 0.05), free_pose=np.arange(5) > 1)  # two poses: the gauge with its scale
+    start = replace(start, cam_from_world=np.concatenate([poses[:2], start.cam_from_world[2:]]))
+    solution = adjust(start, Solver(steps=40, robust=robust, robust_scale=3.0, tolerance=0.0, min_z=0.3))
+    assert solution.cost < 1e-12 * solution.initial_cost
+    np.testing.assert_allclose(solution.cam_from_world, poses, atol=1e-6)
+    seen = solution.information > 1.0
+    np.testing.assert_allclose(solution.inverse_depth[seen], inverse_depth[seen], atol=1e-5)
+
+
+def test_outliers_do_not_move_a_robust_solution() -> None:
+    graph, poses, _ = scene(k=4, m=100)
+    random = np.random.default_rng(5)
+    wrong = random.random(graph.target[:, 0].shape) < 0.2
+    graph = replace(graph, target=graph.target + 40.0 * wrong[:, None], free_depth=np.zeros(4, bool))
+    graph = replace(graph, free_pose=np.arange(4) == 3)
+    start = replace(graph, cam_from_world=moved(graph, 3, 0.01, 0.0).cam_from_world)
+    errors = {
+        robust: float(np.abs(adjust(start, Solver(steps=30, robust=robust)).cam_from_world - poses).max())
+        for robust in ("none", "cauchy")
+    }
+    assert errors["cauchy"] < 0.01 * errors["none"]
+
+
+def test_pose_only_and_structure_only_leave_the_rest_alone() -> None:
+    graph, poses, inverse_depth = scene()
+    start = moved(graph, 4, 0.01, 0.05)
+    pose_only = replace(start, inverse_depth=inverse_depth, free_depth=np.zeros(4, bool))
+    solution = adjust(pose_only, Solver(steps=20, tolerance=0.0, min_z=0.3))
+    np.testing.assert_array_equal(solution.inverse_depth, inverse_depth)
+    np.testing.assert_allclose(solution.cam_from_world, poses, atol=1e-7)
+    structure_only = replace(start, cam_from_world=poses, free_pose=np.zeros(4, bool))
+    solution = adjust(structure_only, Solver(steps=30, tolerance=0.0, min_z=0.3, robust="none"))
+    np.testing.assert_array_equal(solution.cam_from_world, poses)
+    seen = solution.information > 10.0
+    assert seen.mean() > 0.5
+    np.testing.assert_allclose(solution.inverse_depth[seen], inverse_depth[seen], atol=1e-4)
+
+
+def test_a_singular_system_is_reported_and_changes_nothing() -> None:
+    graph, *_ = scene()
+    nothing = replace(graph, information=np.zeros_like(graph.information))
+    solution = adjust(nothing, Solver(lm=0.0, ep=0.0, adaptive=False))
+    assert "positive definite" in solution.failure
+    assert solution.steps == 0
+    np.testing.assert_array_equal(solution.cam_from_world, graph.cam_from_world)
+
+
+def test_a_free_scale_is_ill_conditioned() -> None:
+    graph, *_ = scene(k=3)
+    free = adjust(graph, Solver(steps=1, adaptive=False, lm=0.0, ep=0.0, robust="none"))
+    held = adjust(
+        replace(graph, free_pose=np.arange(3) > 1), Solver(steps=1, adaptive=False, lm=0.0, ep=0.0, robust="none")
+    )
+    assert free.ill_conditioned or free.failure
+    assert not held.ill_conditioned
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_threads_do_not_change_the_result(threads: int) -> None:
+    graph, *_ = scene(noise=1.0)
+    one = adjust(graph, Solver(threads=1))
+    other = adjust(graph, Solver(threads=threads))
+    np.testing.assert_array_equal(one.cam_from_world, other.cam_from_world)
+    np.testing.assert_array_equal(one.inverse_depth, other.inverse_depth)
+
+
+def test_bad_graphs_are_refused() -> None:
+    graph, *_ = scene()
+    with pytest.raises(ValueError, match=r"Graph\.target"):
+        adjust(replace(graph, target=graph.target[:-1]), Solver())
+    with pytest.raises(ValueError, match="two different keyframes"):
+        adjust(replace(graph, to=graph.source), Solver())
+    with pytest.raises(ValueError, match="not finite"):
+        adjust(replace(graph, information=np.full_like(graph.information, np.nan)), Solver())

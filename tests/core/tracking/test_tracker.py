@@ -1,0 +1,129 @@
+"""The whole tracker on the synthetic room, with what is difficult, and on a real sequence."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.datasets import open_dataset
+from mvsgs_core.tracking.frames import State
+from tests.core.tracking.sequences import ate, synthetic, track
+from tests.shared_data import shared
+
+
+def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:
+    items = synthetic(frames=80)
+    tracker, path, updates = track(items)
+    error, length = ate(path, items)
+    assert error < 0.003 * length
+    assert (path.state == State.TRACKED).all()
+    assert np.isfinite(path.world_from_cam).all()
+    told = [index for update in updates for index in update.keyframes]
+    assert sorted(told) == sorted(set(told)) == path.index[path.keyframe].tolist()
+    assert 8 <= len(told) <= 30
+    assert tracker.stats.warnings == []
+
+
+def test_depths_agree_with_the_truth() -> None:
+    items = synthetic(frames=80)
+    tracker, path, _ = track(items)
+    found, true = path.world_from_cam[:, :3, 3], np.stack([np.asarray(i.world_from_cam)[:3, 3] for i in items])
+    scale, _, _ = geometry.umeyama(found, true)
+    ratios, known = [], []
+    for index in path.index[path.keyframe][2:-2]:
+        keyframe, depth = tracker.keyframe(int(index)), items[int(index)].depth
+        assert depth is not None
+        u, v = keyframe.points.astype(int).T
+        use = keyframe.triangulated & (depth[v, u] > 0)
+        ratios.append(scale / keyframe.inverse_depth[use] / depth[v, u][use])
+        known.append(use.mean())
+    ratio = np.concatenate(ratios)
+    assert np.mean(known) > 0.5
+    assert abs(np.median(ratio) - 1.0) < 0.02
+    assert np.mean(np.abs(ratio - 1.0) < 0.1) > 0.85
+
+
+def test_the_same_frames_give_the_same_path() -> None:
+    items = synthetic(frames=80)[:45]
+    (_, first, _), (_, second, _) = track(items), track(items)
+    np.testing.assert_array_equal(first.world_from_cam, second.world_from_cam)
+
+
+def test_corrections_end_where_the_path_is() -> None:
+    items = synthetic(frames=80)
+    _, path, updates = track(items)
+    last = next(u.correction for u in reversed(updates) if u.correction is not None)
+    keyframes = path.keyframe
+    np.testing.assert_array_equal(last.index, path.index[keyframes])
+    np.testing.assert_array_equal(last.world_from_cam, path.world_from_cam[keyframes])
+    assert np.all((last.scale > 0.8) & (last.scale < 1.25))
+
+
+def test_a_turning_start_waits_for_parallax_and_is_filled_in_later() -> None:
+    items = synthetic(frames=75, pure_rotation=20)
+    _, path, updates = track(items)
+    first = next(n for n, u in enumerate(updates) if u.keyframes)
+    assert first >= 20, "a start was made of nothing but rotation"
+    error, length = ate(path, items)
+    assert error < 0.01 * length
+    assert np.mean(path.state == State.TRACKED) > 0.9
+
+
+def test_a_covered_lens_is_lost_and_found_again() -> None:
+    items = synthetic(frames=90, covered=12, covered_start=50)
+    tracker, path, updates = track(items)
+    assert (path.state[50:62] == State.LOST).all()
+    assert not np.isfinite(path.world_from_cam[50:62]).any()
+    assert (path.state[64:] == State.TRACKED).all()
+    assert len({int(s) for s in path.segment[path.segment >= 0]}) == 1
+    assert not any(update.keyframes for update in updates[50:62])
+    assert any("lost" in warning for warning in tracker.stats.warnings)
+    error, length = ate(path, items)
+    assert error < 0.01 * length
+
+
+def test_a_jump_to_an_unseen_place_starts_a_segment_of_its_own() -> None:
+    room = synthetic(frames=80)
+    elsewhere = synthetic(frames=45, scene="aerial")
+    items = list(room[:45])
+    for item in elsewhere:
+        n = len(items)
+        items.append(type(item)(n, n / 20.0, item.image, item.intrinsics, item.world_from_cam, item.depth))
+    tracker, path, _ = track(items)
+    assert (path.segment[:45] == 0).all()
+    assert (path.segment[52:] == 1).all()
+    for segment in (0, 1):
+        error, length = ate(path, items, path.segment == segment)
+        assert error < 0.02 * length
+    assert any("2 segments" in warning for warning in tracker.stats.warnings)
+
+
+def test_a_room_without_texture_is_not_tracked_and_says_so() -> None:
+    items = [
+        type(item)(item.index, item.timestamp, np.full_like(item.image, 128), item.intrinsics)
+        for item in synthetic(frames=80)[:10]
+    ]
+    tracker, path, updates = track(items)
+    assert (path.state == State.NOT_STARTED).all()
+    assert not any(update.keyframes for update in updates)
+    assert any("never started" in warning for warning in tracker.stats.warnings)
+
+
+def test_a_camera_at_rest_makes_no_keyframes() -> None:
+    items = synthetic(frames=80)
+    still = [type(i)(n, n / 20.0, items[40].image, i.intrinsics) for n, i in zip(range(41, 61), items)]
+    moving = list(items[:41])
+    tracker, path, updates = track(moving + still)
+    assert not any(update.keyframes for update in updates[41:61])
+    assert tracker.stats.skipped["frames that did not move"] >= 19
+    shift = np.linalg.norm(path.world_from_cam[41:, :3, 3] - path.world_from_cam[40, :3, 3], axis=1)
+    assert shift.max() < 1e-3
+
+
+def test_a_real_hand_held_sequence() -> None:
+    items = list(open_dataset("tum", path=shared("data/tum_fr1_xyz"), stop=80))
+    _, path, _ = track(items)
+    known = np.isin(path.index, [i.index for i in items if i.world_from_cam is not None])
+    error, _ = ate(path, items, known)
+    assert error < 0.015, "meters"
+    assert (path.state == State.TRACKED).all()

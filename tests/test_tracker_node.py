@@ -1,0 +1,137 @@
+"""The tracker nodes: messages in, messages out."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+import msgs
+from msgs import Frame, GroundTruth, Keyframe, Poses, TrackingState, Trajectory
+from mvsgs_core.tracking.frames import State
+from nodes import Node, handlers, outputs
+from nodes.posed_tracker import PosedTracker
+from nodes.tracker import Tracker
+from tests.core.tracking.sequences import synthetic
+
+
+def messages(count: int = 60) -> tuple[list[Frame], list[GroundTruth]]:
+    items = synthetic(frames=80)[:count]
+    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in items]
+    truths = [GroundTruth(i.index, i.timestamp, i.image, i.intrinsics, i.world_from_cam, i.depth) for i in items]
+    return frames, truths
+
+
+def of_type(sent: list[msgs.Message], kind: type) -> list:  # type: ignore[type-arg]
+    return [message for message in sent if isinstance(message, kind)]
+
+
+def test_states_are_the_messages_states() -> None:
+    assert {s.name: s.value for s in State} == {s.name: s.value for s in TrackingState}
+
+
+def test_contracts() -> None:
+    assert handlers(Tracker).keys() == {Frame}
+    assert set(outputs(Tracker)) == {Keyframe, Poses, Trajectory}
+    assert handlers(PosedTracker).keys() == {Frame, GroundTruth}
+    assert set(outputs(PosedTracker)) == {Keyframe, Trajectory}
+
+
+def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
+    frames, _ = messages()
+    node = Tracker()
+    sent = [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end())
+    keyframes, poses = of_type(sent, Keyframe), of_type(sent, Poses)
+    assert isinstance(sent[-1], Trajectory)
+    assert isinstance(sent[-2], Poses)
+    assert len(of_type(sent, Trajectory)) == 1
+    indices = [k.index for k in keyframes]
+    assert indices == sorted(set(indices))
+    for keyframe in keyframes:
+        assert keyframe.scale == 1.0
+        assert keyframe.image is frames[keyframe.index].image
+        assert keyframe.inverse_depth.shape == keyframe.inverse_depth_weight.shape == (30, 40)
+        assert keyframe.inverse_depth.dtype == keyframe.inverse_depth_weight.dtype == np.float32
+        known = keyframe.inverse_depth > 0
+        assert known.mean() > 0.3
+        assert keyframe.inverse_depth_weight.min() >= 0
+        assert keyframe.inverse_depth_weight.max() <= 1
+        np.testing.assert_array_equal(known, keyframe.inverse_depth_weight > 0)
+    assert [p.revision for p in poses] == list(range(1, len(poses) + 1))
+    told: set[int] = set()
+    for message in sent:  # nothing is corrected that was not sent before
+        if isinstance(message, Keyframe):
+            told.add(message.index)
+        elif isinstance(message, Poses):
+            assert set(message.index.tolist()) <= told
+            assert np.all(message.scale > 0)
+    path = sent[-1]
+    np.testing.assert_array_equal(path.index, [frame.index for frame in frames])
+    assert path.index[path.keyframe].tolist() == indices
+    np.testing.assert_array_equal(poses[-1].world_from_cam, path.world_from_cam[path.keyframe])
+    assert path.state.dtype == np.uint8
+    assert path.segment.dtype == np.int32
+    assert node.stats.counts["frames"] == len(frames)
+    assert "front end" in node.stats.seconds
+
+
+def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
+    for node in (Tracker(), PosedTracker()):
+        sent = list(node.on_end())
+        assert isinstance(sent[-1], Trajectory)
+        assert sent[-1].world_from_cam.shape == (0, 4, 4)
+
+
+def run_posed(order: list[Frame | GroundTruth]) -> list[msgs.Message]:
+    node = PosedTracker()
+    sent: list[msgs.Message] = []
+    for message in order:
+        sent += node.on_frame(message) if isinstance(message, Frame) else node.on_ground_truth(message)
+    return [*sent, *node.on_end()]
+
+
+def test_true_poses_come_with_depths_in_their_unit() -> None:
+    frames, truths = messages()
+    sent = run_posed([m for pair in zip(frames, truths) for m in pair])
+    keyframes = of_type(sent, Keyframe)
+    assert len(keyframes) >= 6
+    ratios = []
+    for keyframe in keyframes:
+        truth = truths[keyframe.index]
+        np.testing.assert_array_equal(keyframe.world_from_cam, truth.world_from_cam)
+        assert truth.depth is not None
+        depth = truth.depth.reshape(30, 8, 40, 8).transpose(0, 2, 1, 3).reshape(30, 40, 64)
+        sure = keyframe.inverse_depth_weight > 0.5
+        ratios.append((1.0 / keyframe.inverse_depth[sure]) / np.median(depth, axis=-1)[sure])
+    ratio = np.concatenate(ratios)
+    assert len(ratio) > 1000
+    assert abs(np.median(ratio) - 1.0) < 0.02
+    path = sent[-1]
+    assert isinstance(path, Trajectory)
+    np.testing.assert_array_equal(path.world_from_cam, [t.world_from_cam for t in truths])
+    assert path.index[path.keyframe].tolist() == [k.index for k in keyframes]
+
+
+def test_the_order_of_the_two_topics_does_not_matter() -> None:
+    frames, truths = messages(30)
+    truth_first = run_posed([*truths, *frames])
+    frame_first = run_posed([*frames, *truths])
+    assert len(of_type(truth_first, Keyframe)) >= 3
+    for a, b in itertools.zip_longest(of_type(truth_first, Keyframe), of_type(frame_first, Keyframe)):
+        assert a.index == b.index
+        np.testing.assert_array_equal(a.inverse_depth, b.inverse_depth)
+
+
+def test_frames_without_a_true_pose_are_left_out_and_reported() -> None:
+    frames, truths = messages(20)
+    blind = GroundTruth(3, truths[3].timestamp, truths[3].image, truths[3].intrinsics, None, None)
+    node: Node = PosedTracker()
+    assert isinstance(node, PosedTracker)
+    for frame, truth in zip(frames, [*truths[:3], blind, *truths[4:]]):
+        list(node.on_frame(frame))
+        list(node.on_ground_truth(truth))
+    path = list(node.on_end())[-1]
+    assert isinstance(path, Trajectory)
+    assert np.isnan(path.world_from_cam[3]).all()
+    assert path.state[3] == TrackingState.LOST
+    assert any("without a true pose" in warning for warning in node.stats.warnings)
