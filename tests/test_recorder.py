@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from launch.compose import compose
 from msgs import Frame, GroundTruth, Trajectory
 from msgs.codec import decode
 from nodes import handlers, is_source, outputs
@@ -135,3 +136,12 @@ def test_the_contract_of_both_nodes() -> None:
     assert set(outputs(Player)) == {Frame, GroundTruth} == set(handlers(Recorder))
     assert set(handlers(Recorder)) < set(handlers(GraphRecorder))
     assert outputs(GraphRecorder) == ()
+
+
+@pytest.mark.parametrize("choice", ["mcap", "mcap_all"])
+def test_both_recorders_and_the_player_fit_into_the_graph(tmp_path: Path, choice: str) -> None:
+    recorded(tmp_path / "a.mcap", 1)
+    graph = compose(["dataset=player", f"dataset.path={tmp_path / 'a.mcap'}", f"recorder={choice}", "output=/tmp/x"])
+    read = {edge.message for edge in graph.edges if edge.reader == "recorder"}
+    assert {Frame, GroundTruth} <= read
+    assert graph.slots["recorder"].config["path"] == "/tmp/x/recording.mcap"
