@@ -180,6 +180,10 @@ def _backend(name: str, device: torch.device) -> Callable[[Splats, View], Render
         from mvsgs_core.splats import cpu
 
         return cpu.render
+    if name == "triton":
+        from mvsgs_core.splats import triton_backend
+
+        return triton_backend.render
     raise ValueError(f"backend {name!r}: choose one of {', '.join(BACKENDS)}")
 
 

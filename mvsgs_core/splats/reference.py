@@ -47,7 +47,7 @@ def axes_on_image(splats: Splats, points: Tensor, view: View) -> Tensor:
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx * slope_x / z], -1), torch.stack([zero, fy / z, -fy * slope_y / z], -1)], -2
     )
-    cam_from_world = view.pose[:3, :3].T.to(points.dtype)
+    cam_from_world = view.pose[:3, :3].T.to(points)
     axes = rotation_matrices(splats.quaternions) * torch.exp(splats.log_scales)[:, None, :]
     return jacobian @ cam_from_world @ axes
 
@@ -71,12 +71,13 @@ def project(splats: Splats, screen: Tensor, view: View) -> Projected:
     """EWA projection of usable splats in front of the camera; `screen` (N, 2) moves them, unit half the image."""
     fx, fy, cx, cy = view.intrinsics
     height, width = view.size
-    dtype = splats.means.dtype
-    from_camera = splats.means.double() - view.pose[:3, 3]
-    points = (from_camera @ view.pose[:3, :3]).to(dtype)
+    dtype, device = splats.means.dtype, splats.means.device
+    pose = view.pose.to(device)
+    from_camera = splats.means.double() - pose[:3, 3]
+    points = (from_camera @ pose[:3, :3]).to(dtype)
     depths = points[:, 2]
     centers = torch.stack([fx * points[:, 0] / depths + cx, fy * points[:, 1] / depths + cy], dim=-1)
-    centers = centers + screen * torch.tensor([0.5 * width, 0.5 * height], dtype=dtype)
+    centers = centers + screen * torch.tensor([0.5 * width, 0.5 * height], dtype=dtype, device=device)
 
     row_x, row_y = axes_on_image(splats, points, view).unbind(1)
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
@@ -99,7 +100,7 @@ class Choice:
     """Which splats a view shows."""
 
     order: Tensor  # (V,) indices, front to back
-    radii: Tensor  # (V,) px
+    half_sizes: Tensor  # (V, 2) of the box that holds all with alpha >= 1/255, px
     refused: int
 
 
@@ -108,7 +109,8 @@ def choose(splats: Splats, view: View) -> Choice:
     """Leaves out what is not usable, behind the near plane, degenerate on the image, too faint or off the image."""
     height, width = view.size
     keep = usable(splats)
-    z = ((splats.means.double() - view.pose[:3, 3]) @ view.pose[:3, 2]).nan_to_num(0.0)
+    pose = view.pose.to(splats.means.device)
+    z = ((splats.means.double() - pose[:3, 3]) @ pose[:3, 2]).nan_to_num(0.0)
     kept = torch.nonzero(keep & (z > view.near))[:, 0]
     chosen = Splats(*(tensor[kept] for tensor in splats.tensors().values()))
     p = project(chosen, torch.zeros_like(chosen.means[:, :2]), view)
@@ -120,7 +122,7 @@ def choose(splats: Splats, view: View) -> Choice:
     seen = torch.nonzero(sane & on_image & (p.opacity >= densities.MIN_ALPHA))[:, 0]
     seen = seen[torch.argsort(z[kept][seen].float(), stable=True)]
     refused = int((~keep).sum()) + int((~sane).sum())
-    return Choice(kept[seen], torch.maximum(half_x, half_y)[seen], refused)
+    return Choice(kept[seen], torch.stack([half_x, half_y], dim=1)[seen], refused)
 
 
 def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, view: View) -> Tensor:
@@ -136,20 +138,21 @@ def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, view: View) -> Tensor
 
 def render(splats: Splats, view: View) -> Render:
     """See `rasterizer.rasterize`."""
-    dtype, count = splats.means.dtype, len(splats)
+    dtype, device, count = splats.means.dtype, splats.means.device, len(splats)
     height, width = view.size
     screen = rasterizer.screen_points(splats, view)
     choice = choose(splats, view)
     shown = Splats(*(tensor.index_select(0, choice.order) for tensor in splats.tensors().values()))
     p = project(shown, screen.index_select(0, choice.order), view)
-    background = torch.tensor(view.background, dtype=dtype)
-    weight_sum, weight_max = torch.zeros(count, dtype=dtype), torch.zeros(count, dtype=dtype)
+    background = torch.tensor(view.background, dtype=dtype, device=device)
+    weight_sum, weight_max, radii = splats.means.new_zeros(3, count).unbind(0)
 
     rows_at_once = max(1, PAIRS_AT_ONCE // max(1, width * len(choice.order)))
+    columns = torch.arange(width, device=device)
     color, depth, opacity = [], [], []
     for first in range(0, height, rows_at_once):
-        rows = torch.arange(first, min(first + rows_at_once, height))
-        pixel_y, pixel_x = (grid.reshape(-1) for grid in torch.meshgrid(rows, torch.arange(width), indexing="ij"))
+        rows = torch.arange(first, min(first + rows_at_once, height), device=device)
+        pixel_y, pixel_x = (grid.reshape(-1) for grid in torch.meshgrid(rows, columns, indexing="ij"))
         alpha = alphas(p, pixel_x, pixel_y, view)
         before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1.0 - alpha], dim=1), dim=1)[:, :-1]
         before = before[:, : alpha.shape[1]]
@@ -165,8 +168,7 @@ def render(splats: Splats, view: View) -> Render:
             if len(choice.order):
                 weight_max[choice.order] = torch.maximum(weight_max[choice.order], weights.amax(dim=0))
 
-    radii = torch.zeros(count, dtype=dtype)
-    radii[choice.order] = choice.radii
+    radii[choice.order] = choice.half_sizes.amax(dim=1)
     return Render(
         color=torch.cat(color).reshape(height, width, 3),
         depth=torch.cat(depth).reshape(height, width),

@@ -106,9 +106,9 @@ class TileWalk {
     static constexpr int kFar = 1 << 23;  // beyond every column of pixels
     static constexpr Lanes kRows = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
-    static Lanes within(Lanes value, Lanes low, Lanes high) { return minimum(maximum(value, low), high); }
+    SPLATS_INLINE Lanes within(Lanes value, Lanes low, Lanes high) { return minimum(maximum(value, low), high); }
 
-    static Lanes half_span(const Footprint& f, Lanes dy) {
+    SPLATS_INLINE Lanes half_span(const Footprint& f, Lanes dy) {
         return root(maximum(f.reach - f.pitch_v_squared * dy * dy, Lanes{})) * f.inverse_pitch_u;
     }
 

@@ -22,33 +22,34 @@ template <bool Depth>
 void load(const Frame& frame, const Tile& tile, const Images& images, Targets& targets) {
     for (int block = 0; block < 16; ++block) {
         const BlockSpan span(tile, block);
-        Target& t = targets[block];
-        t = {span.inside(), Lanes{}, Lanes{}, Lanes{}, Lanes{}, Lanes{}, Lanes{}};
-        Lanes red{}, green{}, blue{}, depth{}, opacity{};
+        alignas(64) float g[5][kLanes] = {}, image[5][kLanes] = {};  // red, green, blue, depth, opacity
         for (int dy = 0; dy < span.rows; ++dy) {
             const size_t first = size_t(span.y + dy) * frame.camera.width + span.x;
             for (int dx = 0; dx < span.columns; ++dx) {
                 const int lane = 4 * dy + dx;
-                const float *g = images.color_gradient + 3 * (first + dx), *c = images.color + 3 * (first + dx);
-                t.red[lane] = g[0];
-                t.green[lane] = g[1];
-                t.blue[lane] = g[2];
-                red[lane] = c[0];
-                green[lane] = c[1];
-                blue[lane] = c[2];
+                for (int c = 0; c < 3; ++c) {
+                    g[c][lane] = images.color_gradient[3 * (first + dx) + c];
+                    image[c][lane] = images.color[3 * (first + dx) + c];
+                }
                 if constexpr (Depth) {
-                    depth[lane] = images.depth[first + dx];
-                    opacity[lane] = images.opacity[first + dx];
-                    if (images.depth_gradient) t.depth[lane] = images.depth_gradient[first + dx];
-                    if (images.opacity_gradient) t.covered[lane] = images.opacity_gradient[first + dx];
+                    image[3][lane] = images.depth[first + dx];
+                    image[4][lane] = images.opacity[first + dx];
+                    if (images.depth_gradient) g[3][lane] = images.depth_gradient[first + dx];
+                    if (images.opacity_gradient) g[4][lane] = images.opacity_gradient[first + dx];
                 }
             }
         }
-        t.behind = red * t.red + green * t.green + blue * t.blue;
+        Target& t = targets[block];
+        t.transmittance = span.inside();
+        t.red = lanes(g[0]);
+        t.green = lanes(g[1]);
+        t.blue = lanes(g[2]);
+        t.behind = lanes(image[0]) * t.red + lanes(image[1]) * t.green + lanes(image[2]) * t.blue;
         if constexpr (Depth) {
-            t.behind += opacity * t.covered;
-            t.depth = opacity > 0.0f ? t.depth / maximum(opacity, all(kTiny)) : Lanes{};
-            t.covered -= t.depth * depth;
+            const Lanes opacity = lanes(image[4]), on_opacity = lanes(g[4]);
+            t.behind += opacity * on_opacity;
+            t.depth = opacity > 0.0f ? lanes(g[3]) / maximum(opacity, all(kTiny)) : Lanes{};
+            t.covered = on_opacity - t.depth * lanes(image[3]);
         }
     }
 }
@@ -84,7 +85,7 @@ void backward_tile(Frame& frame, const Tile& tile, Targets& targets) {
             t.transmittance = before - weight;
             // dL/dlog(alpha): none where alpha is clamped
             const Lanes on_log =
-                where(counted & at_most(unclamped, kMaxAlpha), alpha * (before * q - behind / (1.0f - alpha)));
+                where(counted & at_most(unclamped, kMaxAlpha), alpha * (before * q - behind * reciprocal(1.0f - alpha)));
             total[kRed] += weight * red;
             total[kGreen] += weight * green;
             total[kBlue] += weight * blue;
@@ -94,7 +95,7 @@ void backward_tile(Frame& frame, const Tile& tile, Targets& targets) {
             if constexpr (Exact) {
                 const Lanes m = u * u + v * v;
                 total[kBeta] += on_log * power * log2_m;
-                on_m = where(at_least(m, kCenterM), on_log * s.half_beta * power / maximum(m, all(kCenterM)));
+                on_m = where(at_least(m, kCenterM), on_log * s.half_beta * power * reciprocal(maximum(m, all(kCenterM))));
             }
             const Lanes on_u = on_m * u, on_v = on_m * v;
             total[kU] += on_u;

@@ -3,6 +3,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #if defined(__AVX512F__) || defined(__AVX2__)
 #include <immintrin.h>
 #endif
@@ -20,6 +21,11 @@ typedef int32_t Ints __attribute__((vector_size(64)));
 
 SPLATS_INLINE float smaller(float a, float b) { return a < b ? a : b; }  // one instruction; std::fmin is a call
 SPLATS_INLINE float larger(float a, float b) { return a > b ? a : b; }
+SPLATS_INLINE Lanes lanes(const float (&values)[kLanes]) {
+    Lanes result;
+    std::memcpy(&result, values, sizeof(result));
+    return result;
+}
 SPLATS_INLINE Lanes all(float value) { return Lanes{} + value; }
 
 // Masks live in their own registers on AVX-512 and in vectors elsewhere; there the compiler keeps them where they are.
@@ -61,6 +67,31 @@ SPLATS_INLINE Lanes root(Lanes x) {
 #endif
 }
 
+// 1 / x of normal x, relative error 1e-7 or better.
+SPLATS_INLINE Lanes reciprocal(Lanes x) {
+#if defined(__AVX512F__)
+    const Lanes r = (Lanes)_mm512_maskz_rcp14_ps(kAll, (__m512)x);
+    return r * (2.0f - x * r);  // one step of Newton's
+#else
+    return 1.0f / x;
+#endif
+}
+
+#if defined(__AVX512F__)
+// 2^x for x <= 126, relative error 8e-8 plus rounding, by a minimax polynomial of degree 5 on [-1/2, 1/2].
+SPLATS_INLINE Lanes exp2_upto_126(Lanes x) {
+    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const Lanes f = x - whole;
+    Lanes p = 1.327647199e-03f * f + 9.675541334e-03f;
+    p = p * f + 5.550713273e-02f;
+    p = p * f + 2.402211972e-01f;
+    p = p * f + 6.931469671e-01f;
+    p = p * f + 1.000000072f;
+    return (Lanes)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)whole);
+}
+SPLATS_INLINE Lanes exp2_of_negative(Lanes x) { return exp2_upto_126(x); }
+SPLATS_INLINE Lanes exp2_limited(Lanes x) { return exp2_upto_126(minimum(x, all(126.0f))); }
+#else
 // 2^x for -126 < x <= 0, relative error 8e-8 plus rounding; other lanes give garbage (the caller masks them).
 // Minimax polynomial of degree 5 on [-1, 0].
 SPLATS_INLINE Lanes exp2_of_negative(Lanes x) {
@@ -86,6 +117,7 @@ SPLATS_INLINE Lanes exp2_limited(Lanes x) {
     p = p * f + 9.999999251e-01f;
     return (Lanes)((Ints)p + (whole << 23));
 }
+#endif
 
 // log2(x) of positive normal x: mantissa in [sqrt(1/2), sqrt(2)), log2(1 + f) = f P(f), P of degree 8.
 SPLATS_INLINE Lanes log2_of_positive(Lanes x) {
