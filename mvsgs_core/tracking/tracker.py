@@ -8,7 +8,8 @@ All of it happens in `add`, in bounded portions: the same frames always give the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -58,10 +59,11 @@ class Update:
 
 
 class Tracker:
-    def __init__(self, config: TrackerConfig | None = None) -> None:
+    def __init__(self, config: TrackerConfig | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
+        """clock: what the stages are timed with, in seconds."""
         self.config = config or TrackerConfig()
         self.records: list[FrameRecord] = []
-        self.stats = TrackingStats()
+        self.stats = TrackingStats(clock=clock)
         self.started = False
         self.segment = 0
         self.graph: KeyframeGraph | None = None

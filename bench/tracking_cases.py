@@ -1,0 +1,59 @@
+"""The sequences of the tracking benchmark: real videos, and the synthetic room with what makes tracking hard."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bench.runs import SHARED
+from mvsgs_core.datasets import Item, open_dataset
+
+
+@dataclass(frozen=True)
+class Case:
+    """`goal`: ATE of the keyframes, in centimeters, or as a share of the path where it ends with %."""
+
+    reader: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    folder: str = ""  # below ../shared/data
+    goal: str = ""
+    hard: bool = False  # what counts is that the loss is reported and nothing wrong goes out
+    quick: bool = False
+
+    @property
+    def path(self) -> Path | None:
+        return SHARED / "data" / self.folder if self.folder else None
+
+    def items(self) -> list[Item]:
+        """The frames; raises FileNotFoundError where the data is not there."""
+        options = dict(self.options)
+        if self.path is not None:
+            options["path"] = self.path
+        return list(open_dataset(self.reader, **options))
+
+
+def _room(**options: Any) -> Mapping[str, Any]:
+    return {"threads": 1, **options}
+
+
+CASES: dict[str, Case] = {
+    "tum_fr1_xyz": Case("tum", folder="tum_fr1_xyz", goal="1.1", quick=True),
+    "redkitchen": Case("seven_scenes", {"registered": False}, "seven_scenes_redkitchen", goal="4.5"),
+    "redkitchen, color camera 525": Case("seven_scenes", {}, "seven_scenes_redkitchen", goal="4.5"),
+    "icl_nuim_of_kt0": Case("icl_nuim", folder="icl_nuim_of_kt0"),
+    "room": Case("synthetic", _room(frames=120), goal="0.3%", quick=True),
+    "room, loop": Case("synthetic", _room(frames=300, loop=True), goal="0.3%"),
+    "room, motion blur": Case("synthetic", _room(frames=120, motion_blur=0.5)),
+    "room, noise and exposure": Case("synthetic", _room(frames=120, noise=6.0, exposure=0.5)),
+    "room, gloss": Case("synthetic", _room(frames=120, gloss=0.5)),
+    "room, moving object": Case("synthetic", _room(frames=120, moving_object=1.5)),
+    "room, bare walls": Case("synthetic", _room(frames=120, textureless=2)),
+    "aerial": Case("synthetic", _room(frames=120, scene="aerial")),
+    "tum_fr3_structure_notexture_far": Case("tum", folder="tum_fr3_structure_notexture_far", hard=True),
+    "room, pure rotation first": Case("synthetic", _room(frames=150, pure_rotation=30), hard=True),
+    "room, lens covered 30 frames": Case("synthetic", _room(frames=180, covered=30), hard=True),
+    "room, jump of 100 frames": Case("synthetic", _room(frames=240, jump=100), hard=True),
+    "room, half of the frames dropped": Case("synthetic", _room(frames=160, drop=0.5), hard=True),
+}
