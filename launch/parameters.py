@@ -37,7 +37,7 @@ def check_parameters(slot: str, owner: str, config: type, given: Mapping[str, An
     for name in given:
         if name not in names:
             raise GraphError(
-                f"{_path(slot, name)}: {owner} has no parameter {name!r}{did_you_mean(name, names)}; it has:\n"
+                f"{_path(slot, name)}: {owner} has no parameter {name!r}{_meant(slot, name, given, names)}; it has:\n"
                 + describe(config)
             )
     values: dict[str, Any] = {}
@@ -52,6 +52,14 @@ def check_parameters(slot: str, owner: str, config: type, given: Mapping[str, An
         else:
             raise GraphError(f"{where} must be given: {owner} has no default for it ({type_name(hints[field.name])})")
     return values
+
+
+def _meant(slot: str, name: str, given: Mapping[str, Any], names: Sequence[str]) -> str:
+    """The parameter that a wrong name is close to; or the one, a mapping, that has such a key."""
+    for parameter, value in given.items():
+        if isinstance(value, Mapping) and name in value:
+            return f" (did you mean {_path(slot, parameter)}.{name}?)"
+    return did_you_mean(name, names)
 
 
 def _path(slot: str, name: str) -> str:

@@ -13,7 +13,7 @@ from launch.graph import Graph
 SHARES: Mapping[str, float] = {"mapper": 4, "mvs": 3, "tracker": 2, "depth_fusion": 1, "dataset": 0.5}
 # Works only when the others have finished: all cores are its own by then.
 LAST = ("evaluator",)
-# The heaviest slot takes most of a whole run's CPU time (the mapper 80 to 85 % of it, measured on the synthetic room
+# The heaviest slot takes most of a whole run's CPU time (the mapper 76 to 94 % of it, measured on the synthetic room
 # and on TUM's freiburg1_xyz): the others often wait for it, and it goes on when they have finished.
 HEAVIEST_SHARE = 0.75
 

@@ -78,6 +78,7 @@ REFUSED = [
     (["transport=udp"], "transport=udp", "'ipc' or 'tcp'"),
     (["device=tpu"], "device=tpu", "auto, cpu, cuda"),
     (["device=cuda:99", "source.device=auto"], "device=cuda:99", "CUDA devices"),
+    (["sink.tint=3"], "did you mean sink.labels.tint?", "labels: dict"),
     (["sink.labels.color=3"], "sink.labels.color", ""),
     (["relay._target_=nowhere.Node"], "no module 'nowhere'", "PYTHONPATH"),
     (["relay._target_=Node"], "relay._target_=Node", "module.Class"),
