@@ -14,6 +14,7 @@ from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.export_ply import write_ply
 from mvsgs_core.splats.insertion import InsertionConfig
 from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.splats.losses import LossConfig
 from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.splats.optimizer import LearningRates
 from mvsgs_core.splats.preview import preview_arrays
@@ -39,6 +40,7 @@ class Mapper(Node):
         max_pixels: int | None = None  # area of the training images; null: as they come
         density: str = "gaussian"  # gaussian, exact or ges_scale
         betas: bool = False  # train the shape (exact, ges_scale)
+        loss: str = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
         sh_degree: int = 0  # of the view-dependent color, 0 to 3
         exposure: bool = False  # train a color affine for each keyframe
         unexplored: bool = True  # add splats only where the map does not explain the image
@@ -47,7 +49,7 @@ class Mapper(Node):
         density_control: str = "adaptive"  # adaptive, relocate or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls
-        skip_tiles: bool = True  # leave out tiles of low error
+        skip_tiles: bool = False  # leave out tiles of low error
         coarse_to_fine: bool = False  # a keyframe's first visits at half resolution
         selective: bool = True  # step only the splats that were seen
         preview_period: float = 1.0  # seconds between previews; 0: none
@@ -134,6 +136,13 @@ class Mapper(Node):
         )  # fmt: skip
 
 
+def _loss(name: str) -> LossConfig:
+    losses = {"ssim": LossConfig(l1=0.8, ssim=0.2, frequency=0.0), "ges": LossConfig(l1=0.3, ssim=0.2, frequency=0.5)}
+    if name not in losses:
+        raise ValueError(f"mapper.loss={name}: choose one of {', '.join(losses)}")
+    return losses[name]
+
+
 def mapper_config(config: Mapper.Config) -> MapperConfig:
     """The core's configuration of the node's parameters; the rest has the core's defaults."""
     device = config.device
@@ -151,7 +160,8 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
         seed=config.seed,
         device=device,
         training=TrainingConfig(
-            density=config.density, betas=config.betas, exposure=config.exposure, threads=config.threads
+            density=config.density, betas=config.betas, exposure=config.exposure, threads=config.threads,
+            loss=_loss(config.loss),
         ),
         skipping=SkipConfig(
             converged=config.skip_converged, tiles=config.skip_tiles, coarse_to_fine=config.coarse_to_fine,
