@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.runs import Matrix, Run, choices, commit, figure, machine
+from bench import plots
+from bench.runs import ROOT, Matrix, Run, choices, commit, figure, machine
 from bench.table import Row, main
 from mvsgs_core.evaluation import svg
 
@@ -136,9 +137,10 @@ def measure(options: argparse.Namespace) -> list[Row]:
     output = options.output.resolve()
     gather: Callable[[Path], list[Run]] = matrix.collect if options.collect else matrix.run
     runs = gather(output)
-    text = f"{markdown(runs)}\n\n{machine()}; commit {commit()}\n`{' '.join(matrix.command(options.output)[1:])}`\n"
+    command = " ".join(["python", *matrix.command(options.output)[1:]]).replace(str(ROOT), "$PWD")
+    text = f"{markdown(runs)}\n\n{machine()}; commit {commit()}; `{command}`\n"
     (output / "table.md").write_text(text)
-    (output / "time_against_error.svg").write_text(time_against_error(runs))
+    plots.write(output / "time_against_error.svg", time_against_error(runs))
     print(text)
     return rows(runs)
 

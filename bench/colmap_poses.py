@@ -1,0 +1,117 @@
+"""Poses and sparse points by COLMAP (Schoenberger and Frahm 2016): SIFT, sequential matching, incremental mapping.
+
+    python -m bench.colmap_poses FOLDER [--threads N]
+
+A process of its own: pycolmap brings libraries of its own, and a failed check inside it ends the process. FOLDER holds
+images/NUMBER.png and camera.json (`size`, `intrinsics`); poses and points go to model.npz, times to seconds.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+import zlib  # noqa: F401  # before pycolmap, which otherwise binds to another libz
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bench.runs import ROOT
+
+
+@dataclass(frozen=True)
+class Model:
+    """What COLMAP found, in its own frame and unit."""
+
+    index: np.ndarray  # (N,) frames that it registered
+    world_from_cam: np.ndarray  # (N, 4, 4)
+    points: np.ndarray  # (M, 3)
+    colors: np.ndarray  # (M, 3) uint8 RGB
+    seconds: dict[str, float]  # by stage
+
+
+def reconstruct(
+    frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: Path, threads: int
+) -> tuple[Model | None, str]:
+    """COLMAP's model of RGB images (H, W, 3) uint8 by frame index, and if there is none, why."""
+    images = folder / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    for old in [*images.glob("*.png"), *(folder / name for name in ("model.npz", "database.db"))]:
+        old.unlink(missing_ok=True)
+    size = (0, 0)
+    for index, image in frames.items():
+        size = image.shape[0], image.shape[1]
+        cv2.imwrite(str(images / f"{index:06d}.png"), image[..., ::-1])
+    (folder / "camera.json").write_text(json.dumps({"size": size, "intrinsics": intrinsics.tolist()}))
+    command = [sys.executable, "-m", "bench.colmap_poses", str(folder), "--threads", str(threads)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    (folder / "colmap.log").write_text(done.stdout + done.stderr)
+    file = folder / "model.npz"
+    if not file.exists():
+        last = (done.stderr.strip().splitlines() or ["nothing said"])[-1]
+        return None, f"COLMAP ended with code {done.returncode}: {last}"
+    arrays = np.load(file)
+    seconds = json.loads((folder / "seconds.json").read_text())
+    return Model(arrays["index"], arrays["world_from_cam"], arrays["points"], arrays["colors"], seconds), ""
+
+
+def run(folder: Path, threads: int) -> None:
+    """Everything from images to model.npz. Raises RuntimeError where no two images could be put together."""
+    import pycolmap
+
+    camera = json.loads((folder / "camera.json").read_text())
+    fx, fy, cx, cy = camera["intrinsics"]
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "PINHOLE"
+    reader.camera_params = f"{fx},{fy},{cx + 0.5},{cy + 0.5}"  # COLMAP's first pixel is centered at 0.5
+    extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
+    mapping = pycolmap.IncrementalPipelineOptions()
+    for options in (extraction, matching, mapping):
+        options.num_threads = threads
+    for name in ("ba_refine_focal_length", "ba_refine_principal_point", "ba_refine_extra_params"):
+        setattr(mapping, name, False)  # the calibration is known, to us as well
+    mapping.random_seed = 0
+    database, images, seconds = folder / "database.db", folder / "images", {}
+    start = time.perf_counter()
+    pycolmap.extract_features(
+        database, images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
+        extraction_options=extraction, device=pycolmap.Device.cpu,
+    )  # fmt: skip
+    seconds["features"] = time.perf_counter() - start
+    start = time.perf_counter()
+    pycolmap.match_sequential(database, matching_options=matching, device=pycolmap.Device.cpu)
+    seconds["matching"] = time.perf_counter() - start
+    start = time.perf_counter()
+    sparse = folder / "sparse"
+    sparse.mkdir(exist_ok=True)
+    models = pycolmap.incremental_mapping(database, images, sparse, options=mapping)
+    seconds["mapping"] = time.perf_counter() - start
+    if not models:
+        raise RuntimeError("no model: no two images could be put together")
+    best = max(models.values(), key=lambda model: model.num_reg_images())
+    registered = [image for image in best.images.values() if image.has_pose]
+    registered.sort(key=lambda image: image.name)
+    poses = np.tile(np.eye(4), (len(registered), 1, 1))
+    for pose, image in zip(poses, registered):
+        pose[:3] = image.cam_from_world().inverse().matrix()
+    points = list(best.points3D.values())
+    (folder / "seconds.json").write_text(json.dumps(seconds))
+    np.savez(
+        folder / "model.npz",
+        index=np.array([int(Path(image.name).stem) for image in registered], dtype=np.int64),
+        world_from_cam=poses,
+        points=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--threads", type=int, default=2)
+    given = parser.parse_args()
+    run(given.folder, given.threads)

@@ -1,0 +1,139 @@
+"""Offline 3D Gaussian splatting from sparse points, by our rasterizer and optimizer: a map without dense depth.
+
+Kerbl et al. 2023: one isotropic splat a point, as large as the mean distance to its three nearest, opacity 0.1; random
+views at full resolution; clone, split and prune. No opacity reset, as in the online mapper, whose thresholds it shares.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from mvsgs_core.splats import density_control, optimizer
+from mvsgs_core.splats.density_control import DensityConfig
+from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
+from mvsgs_core.splats.map_state import MapState
+from mvsgs_core.splats.mapper import MapperLog
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.optimizer import LearningRates
+from mvsgs_core.splats.rasterizer import rasterize
+from mvsgs_core.splats.spherical_harmonics import C0
+from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
+
+
+@dataclass(frozen=True)
+class SparseConfig:
+    """Offline optimization."""
+
+    seconds: float = 60.0  # of optimization
+    settle: float = 0.5  # last share of it in which learning rates fall to a tenth and no splat is added
+    seed: int = 0
+    initial_opacity: float = 0.1
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    rates: LearningRates = field(default_factory=LearningRates)
+    density: DensityConfig = field(default_factory=DensityConfig)
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A photograph (H, W, 3) uint8 with its pose (4, 4), in the frame of the points."""
+
+    index: int
+    image: np.ndarray
+    intrinsics: np.ndarray
+    world_from_cam: np.ndarray
+
+
+class SparseMap:
+    """The map of sparse points. All lengths inside are relative to the median depth of the points."""
+
+    def __init__(self, views: list[Posed], points: np.ndarray, colors: np.ndarray, config: SparseConfig) -> None:
+        """points (M, 3), colors (M, 3) uint8. Raises ValueError without a view, or with fewer than 4 points."""
+        if not views or len(points) < 4:
+            raise ValueError(f"{len(views)} views and {len(points)} points are no start")
+        self.config = config
+        self.origin = views[0].world_from_cam[:3, 3].copy()
+        self.unit = _median_depth(views, points)
+        self.state = MapState(1, torch.device("cpu"))
+        self.log = MapperLog()
+        self.iterations = 0
+        self.seconds = 0.0
+        self._skip = SkipConfig(converged=False, tiles=False, coarse_to_fine=False, levels=1)
+        self._random = np.random.default_rng(config.seed)
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self._views = [self._training(view) for view in views]
+        start = _splats((points - self.origin) / self.unit, colors, config.initial_opacity)
+        self.state.append(start, torch.zeros(len(start), dtype=torch.int64))
+
+    def optimize(self) -> None:
+        """As long as the configuration says."""
+        order: list[int] = []
+        start = time.perf_counter()
+        while (done := (time.perf_counter() - start) / self.config.seconds) < 1.0:
+            order = order or [int(i) for i in self._random.permutation(len(self._views))]
+            self._step(self._views[order.pop()], done)
+        self.seconds += time.perf_counter() - start
+
+    def render(self, view: Posed) -> np.ndarray:
+        """Color (H, W, 3) float32 in 0..1."""
+        with torch.no_grad():
+            color = rasterize(
+                self.state.detached(), self._local(view.world_from_cam), view.intrinsics, view.image.shape[:2],
+                density=self.config.training.density, threads=self.config.training.threads,
+            ).color  # fmt: skip
+        return np.asarray(color.clamp(0, 1).numpy())
+
+    def _step(self, view: TrainingView, done: float) -> None:
+        settling = max(0.0, (done - 1.0 + self.config.settle) / self.config.settle)
+        groups = optimizer.groups(self.config.rates, 1.0, 0.1**settling, False, self.config.training.density)
+        train_once(
+            self.state,
+            view,
+            self.config.training,
+            self._skip,
+            groups,
+            self.config.rates.decay_steps,
+            1.0,
+            True,
+            self.log,
+        )
+        self.iterations += 1
+        if not settling and self.iterations % self.config.density.every == 0:
+            density_control.control(self.state, self.config.density, 1.0, self._generator)
+
+    def _training(self, view: Posed) -> TrainingView:
+        unknown = np.zeros(view.image.shape[:2], dtype=np.float32)
+        posed = PosedView(view.index, view.image, view.intrinsics, view.world_from_cam, unknown)
+        return training_view(posed, self._local(view.world_from_cam), None, 1, self.state.device)
+
+    def _local(self, world_from_cam: np.ndarray) -> np.ndarray:
+        local = world_from_cam.copy()
+        local[:3, 3] = (local[:3, 3] - self.origin) / self.unit
+        return local
+
+
+def _median_depth(views: list[Posed], points: np.ndarray) -> float:
+    depths = [(points - v.world_from_cam[:3, 3]) @ v.world_from_cam[:3, 2] for v in views]
+    seen = np.concatenate(depths)
+    return float(np.median(seen[seen > 0]))
+
+
+def _splats(points: np.ndarray, colors: np.ndarray, opacity: float) -> Splats:
+    """Isotropic splats at points (M, 3), M at least 4."""
+    count = len(points)
+    positions = torch.from_numpy(points)
+    spacing = torch.cat([  # mean squared distance to the three nearest, itself left out
+        torch.cdist(rows, positions).topk(4, largest=False).values[:, 1:].square().mean(dim=1)
+        for rows in positions.split(1024)
+    ]).clamp(min=1e-10).sqrt()  # fmt: skip
+    return Splats(
+        means=positions.float(),
+        log_scales=spacing.log().float()[:, None].repeat(1, 3),
+        quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        opacity_logits=torch.full((count,), float(np.log(opacity / (1 - opacity)))),
+        sh=torch.from_numpy(((colors / 255.0 - 0.5) / C0).astype(np.float32))[:, None, :],
+        betas=torch.full((count,), 2.0),
+    )

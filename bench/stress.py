@@ -1,0 +1,242 @@
+"""Where reconstruction is hard: every stage's error, what the system says itself, and whether a map is kept.
+
+The synthetic room, 120 frames at 240x180, 20 iterations a keyframe and 100 at the end, with one difficulty at a time in
+three strengths; hard real sequences; repeated runs; a long run with the memory of every process; one core; a slow node.
+A run passes where it keeps a map and, if tracking or map are broken, says so itself: warnings or lost frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+from bench.memory import flat_rows, sampled
+from bench.runs import Matrix, Run, Setting, figure, said
+from bench.table import Row, at_most, main
+
+SMALL = (
+    "dataset.size=[180,240]", "tracker.area=43200", "mvs.area=43200", "mapper.iterations=20", "mapper.refinement=100",
+    "evaluator.max_frames=60",
+)  # fmt: skip
+TINY = ("dataset.size=[120,160]", "tracker.area=19200", "mvs.area=19200", "mapper.iterations=4", "mapper.refinement=20")
+DIFFICULTIES: dict[str, tuple[float, float, float]] = {  # mild, hard, breaking: see mvsgs_core/scene/difficulties.py
+    "textureless": (1, 2, 4),
+    "pure_rotation": (10, 20, 40),
+    "motion_blur": (0.25, 0.5, 1.0),
+    "exposure": (0.5, 1.0, 2.0),
+    "noise": (4, 12, 30),
+    "gloss": (0.5, 1.0, 2.0),
+    "moving_object": (0.5, 1.0, 2.0),
+    "drop": (0.25, 0.5, 0.8),
+    "covered": (5, 20, 50),
+    "jump": (5, 15, 60),
+    "origin": (1e2, 1e4, 1e6),
+    "scale": (1e-3, 10.0, 1e3),
+}
+SAME = ("origin", "scale")  # coordinates only: nothing may change
+STARTS = {"pure_rotation": 30, "covered": 40, "jump": 50}  # frame at which it begins
+REAL = ("tum_fr3_notexture", "aerial_caliterra", "fox", "fountain", "herz_jesu")
+GROUPS = ("difficulties", "real", "repeats", "one_core", "slow_node", "long")
+BROKEN_ATE, BROKEN_PSNR = 2.0, 6.0  # % of the path; dB below the easy run
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The figures of a run; None where there is none."""
+
+    ate: float | None  # % of the path
+    inliers: float | None
+    completeness: float | None
+    psnr: float | None  # dB, held out
+    keyframes: float | None
+    tracked: float  # share of the frames
+    segments: float
+    splats: float
+    wall: float | None  # s
+    said: str
+
+    @staticmethod
+    def of(run: Run) -> Outcome:
+        r = run.report
+        frames = figure(r, "trajectory.frames") or 0.0
+        return Outcome(
+            figure(r, "trajectory.ate_percent"), figure(r, "depth.inlier_ratio"), figure(r, "depth.completeness"),
+            figure(r, "rendering.held_out.psnr"), figure(r, "trajectory.keyframes"),
+            (figure(r, "trajectory.frames_tracked") or 0.0) / frames if frames else 0.0,
+            figure(r, "trajectory.segments") or 0.0, figure(r, "map.splats") or 0.0, figure(r, "time.wall"), said(run),
+        )  # fmt: skip
+
+    @property
+    def kept_a_map(self) -> bool:
+        return self.splats > 0 and self.psnr is not None
+
+    def broken(self, easy: Outcome | None, known_poses: bool = True) -> bool:
+        """Poses or map are far from what the easy run gives, or there are none."""
+        lost = self.psnr is None or (known_poses and (self.ate is None or self.ate > BROKEN_ATE))
+        worse = easy is not None and None not in (easy.psnr, self.psnr) and easy.psnr - self.psnr > BROKEN_PSNR  # type: ignore[operator]
+        return lost or worse
+
+    @property
+    def reported(self) -> bool:
+        """The system says by itself that something is wrong."""
+        return self.said != "nothing" or self.tracked < 0.99 or self.segments > 1
+
+
+def rows_of(
+    name: str, outcome: Outcome, easy: Outcome | None, same: bool = False, known_poses: bool = True
+) -> list[Row]:
+    rows = [
+        Row(f"{name}: ATE", outcome.ate, "% of the path"),
+        Row(f"{name}: depth inliers", outcome.inliers),
+        Row(f"{name}: depth completeness", outcome.completeness),
+        Row(f"{name}: held-out PSNR", outcome.psnr, "dB"),
+        Row(f"{name}: frames tracked", outcome.tracked),
+    ]
+    if same and easy is not None:
+        difference = abs((outcome.psnr or 0.0) - (easy.psnr or 0.0))
+        rows.append(at_most(f"{name}: held-out PSNR, difference to the easy run", difference, "dB", 1.0))
+    broken = outcome.broken(easy, known_poses)
+    verdict = ("broken, " if broken else "holds, ") + ("map kept" if outcome.kept_a_map else "no map")
+    passed = (outcome.kept_a_map or outcome.reported) and (not broken or outcome.reported)
+    rows.append(Row(f"{name}: outcome", f"{verdict}; it said: {outcome.said}", "", "holds, or says that not", passed))
+    return rows
+
+
+def setting(difficulty: str, strength: float) -> Setting:
+    given = [f"dataset.options.{difficulty}={strength:g}"]
+    if difficulty in STARTS:
+        given.append(f"dataset.options.{difficulty}_start={STARTS[difficulty]}")
+    return Setting(f"{difficulty}_{strength:g}".replace("+", ""), tuple(given))
+
+
+def difficulties(options: argparse.Namespace, overrides: list[str], easy: Outcome, lines: list[str]) -> list[Row]:
+    chosen = {"covered": (20,), "noise": (12,)} if options.quick else DIFFICULTIES
+    pairs = [(name, strength) for name, strengths in chosen.items() for strength in strengths]
+    matrix = Matrix(["room"], overrides=overrides, settings=[setting(*pair) for pair in pairs])
+    rows = []
+    for (name, strength), run in zip(pairs, _go(matrix, options, "difficulties"), strict=True):
+        outcome = Outcome.of(run)
+        rows += rows_of(f"{name} {strength:g}", outcome, easy, same=name in SAME)
+        lines.append(_line(f"{name} {strength:g}", outcome, rows[-1]))
+    return rows
+
+
+def real(options: argparse.Namespace, lines: list[str]) -> list[Row]:
+    matrix = Matrix(REAL, overrides=SMALL[3:])
+    rows = []
+    for run in _go(matrix, options, "real"):
+        outcome = Outcome.of(run)
+        rows += rows_of(run.scene, outcome, None, known_poses=figure(run.report, "trajectory.path_length") is not None)
+        lines.append(_line(run.scene, outcome, rows[-1]))
+    return rows
+
+
+def repeats(options: argparse.Namespace, overrides: list[str]) -> list[Row]:
+    """Five runs, seeds 0 to 4: mean and half the range."""
+    runs = [Outcome.of(run) for run in _go(Matrix(["room"], seeds=range(5), overrides=overrides), options, "repeats")]
+    rows = []
+    for name, unit, values in (
+        ("held-out PSNR", "dB", [r.psnr for r in runs]),
+        ("ATE", "% of the path", [r.ate for r in runs]),
+        ("depth inliers", "", [r.inliers for r in runs]),
+        ("wall time", "s", [r.wall for r in runs]),
+    ):
+        known = [v for v in values if v is not None]
+        if known:
+            rows.append(Row(f"five runs: {name}, mean", sum(known) / len(known), unit))
+            rows.append(Row(f"five runs: {name}, half the range", (max(known) - min(known)) / 2, unit))
+    finished = sum(r.kept_a_map for r in runs)
+    return [*rows, Row("five runs: finished", f"{finished} of {len(runs)}", "", "all", finished == len(runs))]
+
+
+def one_run(name: str, matrix: Matrix, options: argparse.Namespace, easy: Outcome) -> list[Row]:
+    """A run that may be slow but must give what the easy one gives: nothing is lost on the way."""
+    outcome = Outcome.of(_go(matrix, options, name.replace(" ", "_"))[0])
+    times = (outcome.wall or float("inf")) / (easy.wall or float("nan"))
+    difference = abs((outcome.psnr or 0.0) - (easy.psnr or 0.0))
+    return [
+        Row(f"{name}: wall time, times that of the easy run", times, "x"),
+        at_most(f"{name}: held-out PSNR, difference to the easy run", difference, "dB", 1.0),
+        Row(f"{name}: keyframes", outcome.keyframes, "", f"{easy.keyframes:g}", outcome.keyframes == easy.keyframes),
+    ]
+
+
+def long_run(options: argparse.Namespace) -> list[Row]:
+    """Memory of every process over a long loop through the room."""
+    frames = options.frames
+    loop = (f"dataset.options.frames={frames}", "dataset.options.loop=true", "evaluator.max_frames=50")
+    matrix = Matrix(["room"], overrides=[*TINY, *loop])
+    output = options.output.resolve() / "long"
+    samples = None if options.collect else sampled(matrix, output)
+    outcome = Outcome.of(matrix.collect(output)[0])
+    name = f"{frames} frames"
+    rows = rows_of(name, outcome, None)
+    return rows + flat_rows(name, output, samples)
+
+
+def _go(matrix: Matrix, options: argparse.Namespace, name: str) -> list[Run]:
+    output = options.output.resolve() / name
+    return matrix.collect(output) if options.collect else matrix.run(output)
+
+
+def _line(name: str, outcome: Outcome, verdict: Row) -> str:
+    def cell(value: float | None, digits: int) -> str:
+        return "–" if value is None else f"{value:.{digits}f}"
+
+    cells = [
+        name, cell(outcome.ate, 2), cell(outcome.inliers, 2), cell(outcome.completeness, 2), cell(outcome.psnr, 1),
+        cell(100 * outcome.tracked, 0), "yes" if outcome.kept_a_map else "**no**", "yes" if verdict.met else "**no**",
+        outcome.said.replace("|", "/"),
+    ]  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    groups = ["difficulties"] if options.quick else options.only.split(",")
+    unknown = sorted(set(groups) - set(GROUPS))
+    if unknown:
+        raise SystemExit(f"no group {', '.join(unknown)}; there are: {', '.join(GROUPS)}")
+    overrides = [*SMALL, *options.overrides]
+    if options.quick:
+        overrides += ["dataset.stop=70", "mapper.iterations=10", "mapper.refinement=30"]
+    lines = ["| | ATE % | depth inliers | complete | held-out PSNR | tracked % | map | pass | it said |",
+             "|---|---:|---:|---:|---:|---:|---|---|---|"]  # fmt: skip
+    easy = Outcome.of(_go(Matrix(["room"], overrides=overrides), options, "easy")[0])
+    rows = rows_of("nothing hard", easy, None)
+    lines.append(_line("nothing hard", easy, rows[-1]))
+    if "difficulties" in groups:
+        rows += difficulties(options, overrides, easy, lines)
+    if "real" in groups:
+        rows += real(options, lines)
+    others: list[Row] = []
+    if "repeats" in groups:
+        others += repeats(options, overrides)
+    if "one_core" in groups:
+        pinned = Matrix(["room"], overrides=overrides, prefix=("taskset", "-c", "0"))
+        others += one_run("one core", pinned, options, easy)
+    if "slow_node" in groups:
+        slow = "depth_fusion._target_=bench.slow_fusion.SlowFusion"
+        others += one_run(
+            "depth fusion 10 times as slow", Matrix(["room"], overrides=[*overrides, slow]), options, easy
+        )
+    if "long" in groups:
+        others += long_run(options)
+    lines += ["", "| | value | goal | met |", "|---|---:|---|---|"]
+    for row in others:
+        value = f"{row.value:.3g}" if isinstance(row.value, float) else str(row.value)
+        lines.append(f"| {row.name} | {value} {row.unit} | {row.goal} | {row.met if row.met is not None else ''} |")
+    (options.output / "table.md").write_text("\n".join(lines) + "\n")
+    return rows + others
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--only", default=",".join(GROUPS), help=f"comma separated: {', '.join(GROUPS)}")
+    parser.add_argument("--frames", type=int, default=2000, help="of the long run")
+    parser.add_argument("--output", type=Path, default=Path("runs/bench-stress"), help="folder of the runs")
+    parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
+    parser.add_argument("overrides", nargs="*", help="of every run: mapper.iterations=10")
+
+
+if __name__ == "__main__":
+    main(measure, "Stress", arguments)
