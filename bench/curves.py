@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import plots
-from bench.runs import Matrix, Run, Setting, figure, stage_seconds
+from bench.runs import Matrix, Run, Setting, figure, folder, stage_seconds
 from bench.table import Row, main
 
 # The cascade of the core with one stage more, one less: scale, step, hypotheses, radius, small_jump, large_jump
@@ -141,7 +141,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     matrix = Matrix(
         scenes, seeds=[int(s) for s in options.seeds.split(",")], overrides=overrides, settings=settings(curves)
     )
-    output = options.output.resolve()
+    output = folder(options, "curves")
     runs = matrix.collect(output) if options.collect else matrix.run(output)
     rows, tables = [], []
     for scene in scenes:
@@ -157,7 +157,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", default="room", help="comma separated")
     parser.add_argument("--curves", help=f"comma separated; default all: {', '.join(CURVES)}")
     parser.add_argument("--seeds", default="0", help="comma separated; figures are means over them")
-    parser.add_argument("--output", type=Path, default=Path("runs/bench-curves"), help="folder of the runs")
+    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
     parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
     parser.add_argument("overrides", nargs="*", help="of every run: dataset.stop=60")
 

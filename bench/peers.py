@@ -19,7 +19,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from bench.colmap_poses import Model, reconstruct
-from bench.runs import Matrix, figure, stage_seconds
+from bench.runs import Matrix, figure, folder, stage_seconds
 from bench.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.table import Row, main
 from launch.placement import available_cores
@@ -172,14 +172,14 @@ def map_rows(scene: str, ours: Ours, model: Model, trained: list[Trained]) -> li
 
 
 def compare(scene: str, options: argparse.Namespace, overrides: list[str]) -> list[Row]:
-    folder = options.output.resolve() / scene
-    ours = run_ours(scene, overrides, folder / "ours", options.collect)
+    place = folder(options, "peers") / scene
+    ours = run_ours(scene, overrides, place / "ours", options.collect)
     if ours is None:
-        return [Row(f"{scene}: ours", f"failed: see {folder / 'ours' / 'runs.log'}", "", "a report", False)]
+        return [Row(f"{scene}: ours", f"failed: see {place / 'ours' / 'runs.log'}", "", "a report", False)]
     frames = sorted({*ours.keyframes, *(i for i in ours.frames if i % HELD_OUT_EVERY == 0)})
     threads = options.threads or available_cores()
     images = {i: ours.frames[i].image for i in frames}
-    model, problem = reconstruct(images, ours.frames[frames[0]].intrinsics, folder / "colmap", threads)
+    model, problem = reconstruct(images, ours.frames[frames[0]].intrinsics, place / "colmap", threads)
     if model is None:
         return [Row(f"{scene}: COLMAP", problem)]
     rows = pose_rows(scene, ours, model, frames)
@@ -215,7 +215,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         scenes, options.longest = scenes[:1], 1.0
         overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
     rows = [row for scene in scenes for row in compare(scene, options, overrides)]
-    (options.output / "table.md").write_text(markdown(rows))
+    (folder(options, "peers") / "table.md").write_text(markdown(rows))
     return rows
 
 
@@ -223,7 +223,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", default="room,tum_fr1_xyz,redkitchen", help="comma separated")
     parser.add_argument("--longest", type=float, default=4.0, help="times our optimization's time, for the offline one")
     parser.add_argument("--threads", type=int, help="of COLMAP and of the offline optimization; default: all cores")
-    parser.add_argument("--output", type=Path, default=Path("runs/bench-peers"), help="folder of the runs")
+    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
     parser.add_argument("--collect", action="store_true", help="our runs are in the folder already")
     parser.add_argument("overrides", nargs="*", help="of our runs: dataset.stop=100")
 

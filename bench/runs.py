@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import json
 import os
@@ -156,6 +157,24 @@ def environment() -> dict[str, str]:
 
 def choices(kind: str) -> list[str]:
     return sorted(file.stem for file in (CONF / kind).glob("*.yaml"))
+
+
+def available_scenes() -> list[str]:
+    """The scenes whose data are on this machine."""
+    found = []
+    for name in choices("scene"):
+        config = OmegaConf.load(CONF / "scene" / f"{name}.yaml")
+        path = config.dataset.get("path")
+        if path is None or (ROOT / path).exists():
+            found.append(name)
+    return found
+
+
+def folder(options: argparse.Namespace, name: str) -> Path:
+    """Where a benchmark's runs go: as asked for with --output, or runs/bench/NAME, runs/bench-quick/NAME."""
+    given = options.output or ROOT / "runs" / ("bench-quick" if options.quick else "bench") / name
+    given.mkdir(parents=True, exist_ok=True)
+    return Path(given).resolve()
 
 
 def figure(report: dict[str, Any] | None, path: str) -> float | None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import plots
-from bench.runs import ROOT, Matrix, Run, choices, commit, figure, machine
+from bench.runs import ROOT, Matrix, Run, available_scenes, choices, commit, figure, folder, machine
 from bench.table import Row, main
 from mvsgs_core.evaluation import svg
 
@@ -114,11 +114,12 @@ def rows(runs: list[Run]) -> list[Row]:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", default="room", help=f"comma separated: {', '.join(choices('scene'))}")
+    known = ", ".join(choices("scene"))
+    parser.add_argument("--scenes", help=f"comma separated; default: those whose data are here; known: {known}")
     parser.add_argument("--variants", default="full", help=f"comma separated: {', '.join(choices('variant'))}")
     parser.add_argument("--seeds", default="0", help="comma separated")
     parser.add_argument("--jobs", type=int, default=1, help="runs at once; times mean little above 1")
-    parser.add_argument("--output", type=Path, default=Path("runs/bench-scenes"), help="folder of the runs")
+    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
     parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
     parser.add_argument("overrides", nargs="*", help="of every run: mapper.iterations=30")
 
@@ -128,16 +129,16 @@ def measure(options: argparse.Namespace) -> list[Row]:
     if options.quick:
         overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
     matrix = Matrix(
-        options.scenes.split(","),
+        options.scenes.split(",") if options.scenes else ["room"] if options.quick else available_scenes(),
         options.variants.split(","),
         [int(s) for s in options.seeds.split(",")],
         overrides,
         options.jobs,
     )
-    output = options.output.resolve()
+    output = folder(options, "scenes")
     gather: Callable[[Path], list[Run]] = matrix.collect if options.collect else matrix.run
     runs = gather(output)
-    command = " ".join(["python", *matrix.command(options.output)[1:]]).replace(str(ROOT), "$PWD")
+    command = " ".join(["python", *matrix.command(output)[1:]]).replace(str(ROOT), "$PWD")
     text = f"{markdown(runs)}\n\n{machine()}; commit {commit()}; `{command}`\n"
     (output / "table.md").write_text(text)
     plots.write(output / "time_against_error.svg", time_against_error(runs))

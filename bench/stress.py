@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.memory import flat_rows, sampled
-from bench.runs import Matrix, Run, Setting, figure, said
+from bench.runs import Matrix, Run, Setting, figure, folder, said
 from bench.table import Row, at_most, main
 
 SMALL = (
@@ -167,7 +167,7 @@ def long_run(options: argparse.Namespace) -> list[Row]:
     frames = options.frames
     loop = (f"dataset.options.frames={frames}", "dataset.options.loop=true", "evaluator.max_frames=50")
     matrix = Matrix(["room"], overrides=[*TINY, *loop])
-    output = options.output.resolve() / "long"
+    output = folder(options, "stress") / "long"
     samples = None if options.collect else sampled(matrix, output)
     outcome = Outcome.of(matrix.collect(output)[0])
     name = f"{frames} frames"
@@ -176,7 +176,7 @@ def long_run(options: argparse.Namespace) -> list[Row]:
 
 
 def _go(matrix: Matrix, options: argparse.Namespace, name: str) -> list[Run]:
-    output = options.output.resolve() / name
+    output = folder(options, "stress") / name
     return matrix.collect(output) if options.collect else matrix.run(output)
 
 
@@ -226,14 +226,14 @@ def measure(options: argparse.Namespace) -> list[Row]:
     for row in others:
         value = f"{row.value:.3g}" if isinstance(row.value, float) else str(row.value)
         lines.append(f"| {row.name} | {value} {row.unit} | {row.goal} | {row.met if row.met is not None else ''} |")
-    (options.output / "table.md").write_text("\n".join(lines) + "\n")
+    (folder(options, "stress") / "table.md").write_text("\n".join(lines) + "\n")
     return rows + others
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default=",".join(GROUPS), help=f"comma separated: {', '.join(GROUPS)}")
     parser.add_argument("--frames", type=int, default=2000, help="of the long run")
-    parser.add_argument("--output", type=Path, default=Path("runs/bench-stress"), help="folder of the runs")
+    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
     parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
     parser.add_argument("overrides", nargs="*", help="of every run: mapper.iterations=10")
 

@@ -1,0 +1,125 @@
+"""What each part of the system brings: variants of whole runs against the full system, three seeds, with spread.
+
+A, B, C and D are the paper's Table III (the tracker's coarse depth, + multi-view stereo, + filtering, + the mask of
+unexplored pixels, at the paper's 40 dB); the others switch one thing off or over. A figure is the variant's minus the
+full system's: mean over the seeds, plus or minus half the range. The difference is called real where it is larger than
+the spreads of both.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.runs import Matrix, Run, figure, folder
+from bench.table import Row, main
+
+SCENES = ("room", "tum_fr1_xyz", "redkitchen")
+TABLE_III = ("A", "B", "C", "D")
+SKIPS = ("no_skips", "no_skip_converged", "no_skip_tiles", "no_coarse_to_fine", "no_selective")
+OTHERS = ("no_density_control", "relocate", "exact", "ges_scale", "true_poses")
+FIGURES = {  # path in the report, unit, digits
+    "held-out PSNR": ("rendering.held_out.psnr", "dB", 2),
+    "keyframe PSNR": ("rendering.keyframes.psnr", "dB", 2),
+    "depth inliers": ("depth.inlier_ratio", "", 3),
+    "completeness": ("depth.completeness", "", 3),
+    "splats": ("map.splats", "", 0),
+    "wall time": ("time.wall", "s", 1),
+}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Variant minus full."""
+
+    mean: float
+    spread: float  # half the range of the variant over the seeds
+    noise: float  # the same of the full system
+
+    @property
+    def real(self) -> bool:
+        return abs(self.mean) > self.spread + self.noise
+
+    def text(self, digits: int) -> str:
+        return f"{self.mean:+.{digits}f} ± {self.spread:.{digits}f}"
+
+
+def difference(variant: Sequence[Run], full: Sequence[Run], path: str) -> Difference | None:
+    """None where one of them has no such figure."""
+    values = [v for v in (figure(run.report, path) for run in variant) if v is not None]
+    base = [v for v in (figure(run.report, path) for run in full) if v is not None]
+    if not values or not base:
+        return None
+    return Difference(float(np.mean(values) - np.mean(base)), float(np.ptp(values) / 2), float(np.ptp(base) / 2))
+
+
+def select(runs: list[Run], scene: str, variant: str) -> list[Run]:
+    return [run for run in runs if (run.scene, run.variant) == (scene, variant)]
+
+
+def rows_of(runs: list[Run], scenes: Sequence[str], variants: Sequence[str]) -> list[Row]:
+    rows = []
+    for scene in scenes:
+        full = select(runs, scene, "full")
+        for name, (path, unit, _) in FIGURES.items():
+            base = [v for v in (figure(run.report, path) for run in full) if v is not None]
+            if base:
+                rows.append(Row(f"{scene}: full: {name}", float(np.mean(base)), unit))
+        for variant in variants:
+            for name, (path, unit, digits) in FIGURES.items():
+                found = difference(select(runs, scene, variant), full, path)
+                if found is not None:
+                    real = "" if found.real else " (within the spread)"
+                    rows.append(Row(f"{scene}: {variant}: {name}, change", found.text(digits) + real, unit))
+    return rows
+
+
+def table(runs: list[Run], scenes: Sequence[str], variants: Sequence[str]) -> str:
+    names = list(FIGURES)
+    lines = ["| scene | variant | " + " | ".join(names) + " |", "|---|---|" + "---:|" * len(names)]
+    for scene in scenes:
+        full = select(runs, scene, "full")
+        cells = []
+        for path, _, digits in FIGURES.values():
+            base = [v for v in (figure(run.report, path) for run in full) if v is not None]
+            cells.append(f"{np.mean(base):.{digits}f} ± {np.ptp(base) / 2:.{digits}f}" if base else "–")
+        lines.append(f"| {scene} | **full** | " + " | ".join(cells) + " |")
+        for variant in variants:
+            found = [(difference(select(runs, scene, variant), full, p), digits) for p, _, digits in FIGURES.values()]
+            shown = ["–" if d is None else f"**{d.text(n)}**" if d.real else d.text(n) for d, n in found]
+            lines.append(f"| {scene} | {variant} | " + " | ".join(shown) + " |")
+    return "\n".join([*lines, "", "Changes against the full system; bold: larger than the spreads of both."]) + "\n"
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    scenes, variants = options.scenes.split(","), [v for v in options.variants.split(",") if v != "full"]
+    seeds, overrides = [int(s) for s in options.seeds.split(",")], list(options.overrides)
+    if options.quick:
+        scenes, variants, seeds = scenes[:1], variants[:1], seeds[:1]
+        overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
+    matrix = Matrix(scenes, ["full", *variants], seeds, overrides, options.jobs)
+    output = folder(options, "ablation")
+    runs = matrix.collect(output) if options.collect else matrix.run(output)
+    (output / "table.md").write_text(table(runs, scenes, variants))
+    failed = [
+        Row(f"{r.scene}/{r.variant}/seed {r.seed}", "failed", "", "finished", False) for r in runs if not r.report
+    ]
+    return rows_of(runs, scenes, variants) + failed
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--scenes", default=",".join(SCENES), help="comma separated")
+    parser.add_argument("--variants", default=",".join((*TABLE_III, *SKIPS, *OTHERS)), help="comma separated")
+    parser.add_argument("--seeds", default="0,1,2", help="comma separated")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at once; times mean little above 1")
+    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
+    parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
+    parser.add_argument("overrides", nargs="*", help="of every run: dataset.stop=100")
+
+
+if __name__ == "__main__":
+    main(measure, "Ablation", arguments)
