@@ -14,6 +14,7 @@ rate of the first-level cache, whichever is longer. The sum of both, at rates me
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
 import time
 from dataclasses import dataclass, field
@@ -23,7 +24,8 @@ import torch
 
 from bench.table import Row, at_least, at_most, main
 from mvsgs_core import native
-from mvsgs_core.splats import ssim
+from mvsgs_core.datasets import open_dataset
+from mvsgs_core.splats import densities, spherical_harmonics, ssim
 from mvsgs_core.splats.densities import DENSITIES
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.rasterizer import rasterize
@@ -196,12 +198,54 @@ def similarity() -> list[Row]:
     ]
 
 
+def fit(image: torch.Tensor, camera: np.ndarray, density: str, seconds: float) -> tuple[float, int]:
+    """(PSNR, iterations) of 3,000 splats fitted to one image in `seconds` of one core."""
+    height, width = image.shape[:2]
+    g = torch.Generator().manual_seed(0)
+    pixels = torch.rand(3000, 2, generator=g) * torch.tensor([width, height])
+    z = 2.0 + torch.rand(3000, generator=g)
+    rays = (pixels - torch.from_numpy(camera[2:]).float()) / torch.from_numpy(camera[:2]).float()
+    colors = image[pixels[:, 1].long(), pixels[:, 0].long()]
+    splats = Splats(
+        means=torch.cat([rays, torch.ones(3000, 1)], dim=1) * z[:, None],
+        log_scales=torch.log(3.0 * z / float(camera[0]))[:, None].repeat(1, 3),
+        quaternions=torch.randn(3000, 4, generator=g),
+        opacity_logits=torch.full((3000,), -1.0),
+        sh=spherical_harmonics.from_rgb(colors)[:, None],
+        betas=torch.full((3000,), densities.neutral_beta(density)),
+    )
+    leaves = [tensor.requires_grad_() for tensor in splats.tensors().values()]
+    rates = (2e-3, 5e-3, 1e-3, 5e-2, 1e-2, 1e-2)
+    adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in zip(leaves, rates)], eps=1e-15)
+    start, iterations, render = time.process_time(), 0, None
+    while time.process_time() - start < seconds or render is None:
+        render = rasterize(splats, np.eye(4), camera, (height, width), density=density, threads=1)
+        adam.zero_grad()
+        ssim.image_loss(render.color, image, l1_weight=0.8, ssim_weight=0.2, threads=1).backward()
+        adam.step()
+        iterations += 1
+    error = (render.color.detach().clamp(0.0, 1.0) - image).square().mean()
+    return -10.0 * math.log10(error.item()), iterations
+
+
+def worth(seconds: float) -> list[Row]:
+    """What each density form reaches in the same time: one view of the synthetic room, one core."""
+    rows = []
+    item = next(iter(open_dataset("synthetic", size=(240, 320))))
+    image = torch.from_numpy(item.image.copy()).float() / 255.0
+    for density in densities.DENSITIES:
+        psnr, iterations = fit(image, item.intrinsics, density, seconds)
+        rows.append(Row(f"one view, {seconds:g} s of one core, {density}: PSNR", psnr, "dB"))
+        rows.append(Row(f"one view, {seconds:g} s of one core, {density}: iterations", float(iterations), ""))
+    return rows
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
     threads = options.threads
     rounds = 9 if options.quick else 25
     rows = compare((240, 320), 20_000, threads, rounds)
     rows += compare((480, 640), 50_000, threads, rounds)
-    return rows + beside_reference(threads) + similarity()
+    return rows + beside_reference(threads) + similarity() + worth(2.0 if options.quick else 8.0)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
