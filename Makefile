@@ -48,21 +48,34 @@ demo: setup
 	@echo "report: file://$(abspath $(DEMO_OUTPUT))/report.html"
 
 test: lint
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Every file in bench/ with a main is a benchmark; rows go to runs/bench/NAME.json.
-BENCHMARKS := $(filter-out __init__ table,$(basename $(notdir $(wildcard bench/*.py))))
+# Every file in bench/ that ends with main(measure, ...) is a benchmark. `make bench` takes hours: it runs them all, keeps
+# the rows in bench/recorded/ and writes the tables of BENCHMARKS.md. `make bench-quick` takes minutes and says what got
+# slower or worse than the recorded line (RECORD=1: becomes the line). One of them: make bench BENCHMARKS=transport
+BENCHMARKS ?= $(shell grep -l '^    main(measure' bench/*.py | sed 's|bench/||; s|\.py$$||')
 
-bench bench-quick: setup
+bench: setup
 	@mkdir -p runs/bench
-	@for name in $(BENCHMARKS); do \
-		$(BIN)/python -m bench.$$name --json runs/bench/$$name.json $(if $(filter bench-quick,$@),--quick) || failed="$$failed $$name"; \
+	@for name in $(BENCHMARKS); do echo "$$name"; \
+		$(BIN)/python -m bench.$$name --json runs/bench/$$name.json \
+		&& $(BIN)/python -m bench.record $$name runs/bench/$$name.json --from runs/bench/$$name || failed="$$failed $$name"; \
 	done; test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
+	@$(MAKE) bench-quick RECORD=1
+
+bench-quick: setup
+	@mkdir -p runs/bench-quick && rm -f runs/bench-quick/*.json
+	@for name in $(BENCHMARKS); do echo "$$name"; \
+		$(BIN)/python -m bench.$$name --quick --json runs/bench-quick/$$name.json > runs/bench-quick/$$name.txt 2>&1 \
+		&& { test -z "$(RECORD)" || $(BIN)/python -m bench.record quick/$$name runs/bench-quick/$$name.json; } \
+		|| failed="$$failed $$name"; \
+	done; test -z "$$failed" || { echo "failed (see runs/bench-quick/NAME.txt):$$failed"; exit 1; }
+	@test -n "$(RECORD)" || $(BIN)/python -m bench.compare runs/bench-quick/*.json
 
 clean:
 	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
