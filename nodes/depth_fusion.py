@@ -26,7 +26,7 @@ class DepthFusion(Node):
         refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
         sigma: float = 0.01  # relative depth: width of the support
         check: bool = True  # geometric consistency
-        relative: float = 0.01  # relative depth difference that still agrees
+        relative: float = 0.02  # relative depth difference that still agrees
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
         least_views: int = 3  # views that must agree, the reference counted
         confidence: float = 0.7  # least confidence of a kept pixel

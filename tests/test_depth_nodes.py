@@ -105,9 +105,7 @@ def test_without_coarse_depth_the_neighbors_give_the_range() -> None:
     mvs = stereo()
     nothing = np.zeros((15, 20), dtype=np.float32)
     depths = [
-        d
-        for i in range(5)
-        for d in mvs.on_keyframe(keyframe(i, inverse_depth=nothing) if i == 2 else keyframe(i))
+        d for i in range(5) for d in mvs.on_keyframe(keyframe(i, inverse_depth=nothing) if i == 2 else keyframe(i))
     ]
     depth = next(d for d in depths if d.index == 2).depth
     truth = true_depth(look(0.16), depth.shape)

@@ -2,23 +2,40 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from mvsgs_core.fusion.backend import Fused
 
-# Logistic regression on `features`.
-WEIGHTS = np.array([-2.0, 3.0, 1.5, -1.5, 0.5])
+# Logistic regression on `features_of`, by `python -m bench.depth_calibration`.
+WEIGHTS = np.array([-0.981, 1.16, 1.546, -0.759, -0.123, 1.309, 0.074, -1.097, -1.354])
 
 
-def features(fused: Fused, consistent: np.ndarray) -> np.ndarray:
-    """(F, H, W) float32, the first all ones."""
+def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray) -> np.ndarray:
+    """(F, H, W) float32, the first all ones. `confidence` (H, W): stereo's; `consistent` (H, W): neighbors that agree."""
+    around = cv2.blur(confidence, (9, 9))  # errors come in patches
+    agreeing = cv2.blur((consistent >= 2).astype(np.float32), (5, 5))
+    # Windows make a near surface grow over what lies behind it: its rim, close to something farther, is doubtful.
+    inverse = np.where(fused.depth > 0, 1.0 / np.maximum(fused.depth, 1e-9), 0.0).astype(np.float32)
+    kernel = np.ones((7, 7), np.uint8)
+    rim = np.clip(1.0 - cv2.erode(inverse, kernel) / np.maximum(inverse, 1e-9), 0.0, 0.25)
+    behind = np.clip(cv2.dilate(inverse, kernel) / np.maximum(inverse, 1e-9) - 1.0, 0.0, 0.25)
     return np.stack(
-        [np.ones_like(fused.own), fused.own, np.sqrt(fused.support), fused.violation, consistent.astype(np.float32)]
+        [
+            np.ones_like(fused.own),
+            fused.own,
+            np.sqrt(fused.support),
+            fused.violation,
+            consistent.astype(np.float32),
+            around,
+            agreeing,
+            4.0 * rim,
+            4.0 * behind,
+        ]
     ).astype(np.float32)
 
 
-def probability_of_inlier(fused: Fused, consistent: np.ndarray) -> np.ndarray:
-    """(H, W) float32 in [0, 1], 0 where there is no depth. `consistent` (H, W): neighbors that agree."""
-    logit = np.tensordot(WEIGHTS.astype(np.float32), features(fused, consistent), axes=1)
-    probability = 1.0 / (1.0 + np.exp(-logit))
-    return np.where(fused.depth > 0, probability, 0.0).astype(np.float32)
+def probability_of_inlier(features: np.ndarray) -> np.ndarray:
+    """(H, W) float32 in [0, 1] from `features_of`."""
+    logit = np.tensordot(WEIGHTS.astype(np.float32), features, axes=1)
+    return np.asarray(1.0 / (1.0 + np.exp(-logit)), dtype=np.float32)

@@ -9,7 +9,7 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.fusion.backend import FusionBackend, make_fusion_backend
-from mvsgs_core.fusion.confidence import probability_of_inlier
+from mvsgs_core.fusion.confidence import features_of, probability_of_inlier
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.views import DepthView, warps_between
 
@@ -26,7 +26,7 @@ class FusionConfig:
     violation: float = 1.0  # weight of free-space violations against support
     least_confidence: float = 0.1  # a neighbor's pixel below takes no part in the refinement
     check: bool = True  # geometric consistency
-    relative: float = 0.01  # relative depth difference that still agrees
+    relative: float = 0.02  # relative depth difference that still agrees
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
     least_views: int = 3  # views that must agree, the reference counted
@@ -46,6 +46,7 @@ class FusedDepth:
     normals: np.ndarray  # (H, W, 3) float32 camera frame, 0 where depth is 0
     consistent: np.ndarray  # (H, W) uint8 neighbors that agree
     counts: dict[str, float] = field(default_factory=dict)  # pixels kept, and rejected by each filter
+    evidence: np.ndarray | None = None  # (F, H, W) float32 what the confidence was computed from
     problem: str = ""  # a limit that had to be relaxed, or why nothing is kept
 
 
@@ -114,14 +115,13 @@ def nearest_views(reference: DepthView, others: list[DepthView], count: int) -> 
     return [entry[3] for entry in sorted(scored, key=lambda entry: entry[:3])[:count]]
 
 
-def fuse(
-    reference: DepthView, neighbors: list[DepthView], config: FusionConfig, backend: FusionBackend
-) -> FusedDepth:
+def fuse(reference: DepthView, neighbors: list[DepthView], config: FusionConfig, backend: FusionBackend) -> FusedDepth:
     """Refines and filters one map with its neighbors', all of one size."""
     known = reference.depth > 0
     depth, confidence = reference.depth, reference.confidence
     consistent = np.zeros(reference.size, dtype=np.uint8)
     problem = ""
+    evidence: np.ndarray | None = None
     counts: dict[str, float] = {"pixels": float(depth.size), "known": float(known.sum())}
     if neighbors:
         there, back = warps_between(reference, neighbors)
@@ -138,7 +138,8 @@ def fuse(
             depth, depths, there, back, config.relative, config.pixels, config.round_trip
         )
         if config.refine:
-            confidence = probability_of_inlier(fused, consistent)
+            evidence = features_of(fused, confidence, consistent)
+            confidence = np.where(depth > 0, probability_of_inlier(evidence), 0.0).astype(np.float32)
     keep = depth > 0
     sure = confidence >= config.confidence
     counts["rejected: confidence"] = float((keep & ~sure).sum())
@@ -154,4 +155,4 @@ def fuse(
     counts["kept"] = float(keep.sum())
     filtered = np.where(keep, depth, 0.0).astype(np.float32)
     normals = normals_of(filtered, reference.intrinsics)
-    return FusedDepth(reference, filtered, depth, confidence, normals, consistent, counts, problem)
+    return FusedDepth(reference, filtered, depth, confidence, normals, consistent, counts, evidence, problem)

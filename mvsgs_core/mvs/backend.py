@@ -16,8 +16,8 @@ class CostOptions:
 
     radius: int = 3  # pixels: a window of 2 radius + 1
     best: int = 3  # views whose cost counts, of all
-    noise: float = 4.0  # gray levels²: added to both variances
-    contrast: float = 14.0  # gray levels: a pixel that differs so from the window's center counts 1 / e
+    noise: float = 1.5  # gray levels²: added to both variances
+    contrast: float = 11.0  # gray levels: a pixel that differs so from the window's center counts 1 / e
 
 
 @dataclass(frozen=True)

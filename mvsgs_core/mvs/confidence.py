@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-# Logistic regression on `Evidence.features`.
-WEIGHTS = np.array([-3.0, 2.0, 1.5, 1.5, 1.0, -1.0, 0.3])
+# Logistic regression on `Evidence.features`, by `python -m bench.depth_calibration`.
+WEIGHTS = np.array([-0.982, 1.114, 0.517, 1.908, 0.099, -0.241, -0.016, 3.149, -1.666])
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,8 @@ class Evidence:
     first_probability: np.ndarray  # of the first stage's
     relative_pixel: np.ndarray  # relative change of depth that moves the point by one pixel
     texture: np.ndarray  # gray levels: local contrast of the reference
+    margin: np.ndarray  # of the last stage: how much worse other hypotheses are
+    bend: np.ndarray  # relative change of inverse depth to the median around: high at jumps and where depth is noise
 
     @staticmethod
     def of(
@@ -29,11 +32,9 @@ class Evidence:
         first_probability: np.ndarray,
         relative_pixel: np.ndarray,
         gray: np.ndarray,
+        inverse_depth: np.ndarray,
     ) -> Evidence:
         """From ZNCC of each view (N, H, W), -2 where not seen, and maps (H, W)."""
-        import cv2
-
-        del margin
         ordered = np.sort(np.clip(correlation, 0.0, 1.0), axis=0)[::-1]
         best = ordered[: min(2, len(ordered))].mean(axis=0)
         mean = cv2.blur(gray, (5, 5))
@@ -45,6 +46,8 @@ class Evidence:
             first_probability=first_probability,
             relative_pixel=np.asarray(relative_pixel, dtype=np.float32),
             texture=np.sqrt(variance),
+            margin=margin,
+            bend=np.abs(cv2.medianBlur(inverse_depth, 5) / np.maximum(inverse_depth, 1e-9) - 1.0),
         )
 
     def features(self) -> np.ndarray:
@@ -58,6 +61,8 @@ class Evidence:
                 self.first_probability,
                 np.log(np.clip(self.relative_pixel, 1e-4, 1.0) / 0.01),
                 np.log(1.0 + self.texture),
+                np.clip(self.margin, 0.0, 0.5),
+                np.clip(cv2.blur(self.bend, (5, 5)) / 0.02, 0.0, 2.0),
             ]
         ).astype(np.float32)
 

@@ -35,8 +35,8 @@ class StereoConfig:
         Stage(scale=1, step=0.35, hypotheses=11, radius=3, small_jump=0.05, large_jump=0.4),
     )
     best_views: int = 3  # of the neighbors, per pixel and hypothesis: the others may be occluded
-    noise: float = 4.0  # gray levels²
-    contrast: float = 14.0  # gray levels: what differs so from a window's center counts 1 / e in it
+    noise: float = 1.5  # gray levels²
+    contrast: float = 11.0  # gray levels: what differs so from a window's center counts 1 / e in it
     edge: float = 12.0  # gray levels
     break_steps: float = 4.0  # hypotheses
     temperature: float = 0.02  # cost
@@ -128,6 +128,7 @@ def estimate_depth(
         first_probability=_enlarge(first_probability, size),
         relative_pixel=1.0 / np.maximum(moved * surface, 1e-9),
         gray=gray,
+        inverse_depth=surface,
     )
     known = _enlarge(in_range.astype(np.float32), size) > 0.5
     known &= np.isfinite(surface) & (surface > 0.5 * search.low)

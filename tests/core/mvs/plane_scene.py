@@ -61,7 +61,9 @@ def _texture(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
     return np.clip(0.5 + value / 3.0, 0.0, 1.0)
 
 
-def render(pose: np.ndarray, size: tuple[int, int], gain: float = 1.0, bias: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def render(
+    pose: np.ndarray, size: tuple[int, int], gain: float = 1.0, bias: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Image (H, W, 3) uint8 and its intrinsics (4,); exposure by gain and bias in gray levels."""
     _, points, surface = _hits(pose, size)
     gray = np.clip(30.0 + 190.0 * _texture(points, surface), 0, 255) * gain + bias

@@ -1,0 +1,103 @@
+"""Fits and checks the confidences: `python -m bench.depth_calibration`.
+
+Prints the constants of mvsgs_core/mvs/confidence.py and mvsgs_core/fusion/confidence.py, by logistic regression of
+"within 5 % of the truth" on synthetic scenes, and how well they hold on scenes that took no part.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from bench.depth_data import Scene, load_scene
+from bench.depth_run import run
+from bench.depth_tracked import load_tracked
+from mvsgs_core.fusion import confidence as fused_confidence
+from mvsgs_core.fusion.fusion import FusionConfig
+from mvsgs_core.mvs import confidence as stereo_confidence
+from mvsgs_core.mvs.cascade import CascadeConfig
+
+INLIER = 0.05  # relative error
+FIT = ("room", "aerial", "replica", "fr1_xyz tracked")
+CHECK = ("room_b", "icl_nuim", "redkitchen tracked")
+
+
+def load(name: str, area: int) -> Scene:
+    """`tracked`: with the tracker's poses, because those of the real sets do not fit their images to a pixel."""
+    sequence, _, how = name.partition(" ")
+    return load_tracked(sequence, area) if how else load_scene(sequence, area)
+
+
+def samples(scene: Scene, area: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Features (N, F) and inlier labels (N,) of "stereo" and "fusion", of pixels with depth and truth."""
+    found = run(scene.views, CascadeConfig(area=area), FusionConfig())
+    rows: dict[str, list[np.ndarray]] = {"stereo": [], "fusion": []}
+    labels: dict[str, list[np.ndarray]] = {"stereo": [], "fusion": []}
+    for stereo, fused, truth in zip(found.stereo, found.fused, scene.truths, strict=True):
+        if truth is None or stereo.result.evidence is None or fused.evidence is None:
+            continue
+        for name, depth, features in (
+            ("stereo", stereo.result.depth, stereo.result.evidence.features()),
+            ("fusion", fused.unfiltered, fused.evidence),
+        ):
+            use = (truth > 0) & (depth > 0)
+            if scene.name.endswith("tracked"):
+                depth = depth * np.median(truth[use] / depth[use])
+            rows[name].append(features[:, use].T[::7])
+            labels[name].append((np.abs(depth[use] - truth[use]) < INLIER * truth[use])[::7])
+    return {name: (np.concatenate(rows[name]), np.concatenate(labels[name])) for name in rows}
+
+
+def fit(features: np.ndarray, labels: np.ndarray, ridge: float = 1e-3) -> np.ndarray:
+    """Logistic regression (F,) by Newton's method."""
+    weights = np.zeros(features.shape[1])
+    x = features.astype(np.float64)
+    for _ in range(30):
+        probability = 1.0 / (1.0 + np.exp(-x @ weights))
+        gradient = x.T @ (labels - probability) / len(x) - ridge * weights
+        hessian = (x * (probability * (1 - probability))[:, None]).T @ x / len(x) + ridge * np.eye(len(weights))
+        step = np.linalg.solve(hessian, gradient)
+        weights += step
+        if np.abs(step).max() < 1e-8:
+            break
+    return weights
+
+
+def reliability(
+    probability: np.ndarray, labels: np.ndarray, bins: int = 10
+) -> tuple[float, list[tuple[float, float, float]]]:
+    """Expected calibration error, and (mean confidence, inliers, share of pixels) of each bin."""
+    curve = []
+    error = 0.0
+    which = np.minimum((probability * bins).astype(int), bins - 1)
+    for b in range(bins):
+        inside = which == b
+        if inside.any():
+            share = float(inside.mean())
+            curve.append((float(probability[inside].mean()), float(labels[inside].mean()), share))
+            error += share * abs(curve[-1][0] - curve[-1][1])
+    return error, curve
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--area", type=int, default=320 * 240)
+    options = parser.parse_args()
+    data = {name: samples(load(name, options.area), options.area) for name in (*FIT, *CHECK)}
+    for kind, module in (("stereo", stereo_confidence), ("fusion", fused_confidence)):
+        x = np.concatenate([data[name][kind][0] for name in FIT])
+        y = np.concatenate([data[name][kind][1] for name in FIT])
+        weights = fit(x, y)
+        print(f"{kind}: WEIGHTS = np.array({np.round(weights, 3).tolist()})")
+        for name in data:
+            features, labels = data[name][kind]
+            for tag, w in (("fitted now", weights), ("in the code", module.WEIGHTS)):
+                probability = 1.0 / (1.0 + np.exp(-features @ w))
+                error, curve = reliability(probability, labels)
+                text = " ".join(f"{c:.2f}:{i:.2f}({s:.2f})" for c, i, s in curve)
+                print(f"  {name:12s} {tag:12s} calibration error {error:.3f}  confidence:inliers(share) {text}")
+
+
+if __name__ == "__main__":
+    main()

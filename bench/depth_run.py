@@ -1,0 +1,101 @@
+"""Runs stereo and fusion over a scene's keyframes, and scores depth maps."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.depth_data import Scene
+from mvsgs_core.fusion.fusion import DepthFusion, FusedDepth, FusionConfig
+from mvsgs_core.fusion.views import DepthView
+from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth
+from mvsgs_core.mvs.views import StereoView
+
+
+@dataclass(frozen=True)
+class Run:
+    """What came out, keyframe by keyframe, and the median time of each stage."""
+
+    stereo: list[CascadeDepth]
+    fused: list[FusedDepth]
+    stereo_seconds: float
+    fusion_seconds: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of the pixels with true depth."""
+
+    inliers: float  # part of the kept ones within the tolerance
+    completeness: float  # part that is kept
+    outliers: float  # part of the kept ones beyond 3 times the tolerance
+    relative_error: float  # mean absolute, of the kept ones
+
+
+def run(views: list[StereoView], cascade: CascadeConfig, fusion: FusionConfig) -> Run:
+    """Stereo and fusion of views in stream order."""
+    stereo_node, fusion_node = Cascade(cascade), DepthFusion(fusion)
+    stereo: list[CascadeDepth] = []
+    fused: list[FusedDepth] = []
+    stereo_times: list[float] = []
+    fusion_times: list[float] = []
+
+    def keep(found: list[CascadeDepth]) -> None:
+        stereo.extend(found)
+        for one in found:
+            start = time.perf_counter()
+            out = list(fusion_node.add(depth_view(one)))
+            if out:
+                fusion_times.append((time.perf_counter() - start) / len(out))
+            fused.extend(out)
+
+    for view in views:
+        start = time.perf_counter()
+        found = list(stereo_node.add(view))
+        if found:
+            stereo_times.append((time.perf_counter() - start) / len(found))
+        keep(found)
+    keep(list(stereo_node.flush()))
+    fused.extend(fusion_node.flush())
+    median = [float(np.median(t)) if t else 0.0 for t in (stereo_times, fusion_times)]
+    return Run(stereo, fused, median[0], median[1])
+
+
+def depth_view(found: CascadeDepth) -> DepthView:
+    view = found.view
+    return DepthView(
+        view.index, found.result.depth, found.result.confidence, view.intrinsics, view.world_from_cam, view.scale,
+        view.segment,
+    )  # fmt: skip
+
+
+def score(depths: list[np.ndarray], scene: Scene, align: bool = False) -> Score:
+    """Pooled over keyframes with truth, in stream order. `align`: each map's median ratio to the truth is divided out."""
+    errors, total = [], 0
+    for depth, truth in zip(depths, scene.truths, strict=True):
+        if truth is None:
+            continue
+        known = truth > 0
+        total += int(known.sum())
+        kept = known & (depth > 0)
+        if not kept.any():
+            continue
+        factor = float(np.median(truth[kept] / depth[kept])) if align else 1.0
+        errors.append(np.abs(depth[kept] * factor - truth[kept]) / truth[kept])
+    if not errors or total == 0:
+        return Score(float("nan"), 0.0, float("nan"), float("nan"))
+    error = np.concatenate(errors)
+    return Score(
+        inliers=float(np.mean(error < scene.tolerance)),
+        completeness=len(error) / total,
+        outliers=float(np.mean(error > 3 * scene.tolerance)),
+        relative_error=float(error.mean()),
+    )
+
+
+def with_poses(scene: Scene, world_from_cam: list[np.ndarray]) -> Scene:
+    """The same scene seen through other poses."""
+    views = [replace(v, world_from_cam=p) for v, p in zip(scene.views, world_from_cam, strict=True)]
+    return replace(scene, views=views)

@@ -1,0 +1,72 @@
+"""Keyframes as the tracker gives them: its poses, its coarse depth, its scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from bench.depth_data import SHARED, SOURCES, Scene, register
+from msgs import Frame, Keyframe, Poses
+from mvsgs_core.datasets import Item, open_dataset
+from mvsgs_core.mvs.views import prepare_view
+from nodes.tracker import Tracker
+
+
+def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scene:
+    """The sequence's keyframes with the tracker's final poses, scaled to the truth by the median over all keyframes.
+
+    Raises FileNotFoundError where the data is missing and ValueError where the tracker gave no keyframe.
+    """
+    source = SOURCES[name]
+    options = dict(source.options)
+    if source.dataset != "synthetic":
+        options["path"] = SHARED / source.folder
+    items: dict[int, Item] = {}
+    keyframes: dict[int, Keyframe] = {}
+    latest: dict[int, tuple[np.ndarray, float]] = {}
+    tracker = Tracker()
+
+    def take(messages: object) -> None:
+        for message in messages:  # type: ignore[attr-defined]
+            if isinstance(message, Keyframe):
+                keyframes[message.index] = message
+            elif isinstance(message, Poses):
+                for i, pose, scale in zip(message.index, message.world_from_cam, message.scale, strict=True):
+                    latest[int(i)] = (pose, float(scale))
+
+    for item in open_dataset(source.dataset, **options):
+        item = register(item) if source.dataset == "seven_scenes" else item
+        items[item.index] = item
+        take(tracker.on_frame(Frame(item.index, item.timestamp, item.image, item.intrinsics)))
+        if item.depth is None and item.index not in keyframes:
+            items[item.index] = replace(item, image=np.empty((0, 0, 3), np.uint8))
+    take(tracker.on_end())
+    if not keyframes:
+        raise ValueError(f"{name}: the tracker gave no keyframe")
+    views, truths, ratios = [], [], []
+    for index, keyframe in sorted(keyframes.items()):
+        view = prepare_view(
+            index, keyframe.image, keyframe.intrinsics, keyframe.world_from_cam, area=area, scales=scales,
+            inverse_depth=keyframe.inverse_depth, weight=keyframe.inverse_depth_weight, scale=keyframe.scale,
+            segment=keyframe.segment,
+        )  # fmt: skip
+        if index in latest:
+            view = view.moved(*latest[index])
+        truth = items[index].depth
+        if truth is not None:
+            cells = cv2.resize(truth, view.inverse_depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            both = (cells > 0) & (view.inverse_depth > 0)
+            ratios.append(cells[both] * view.inverse_depth[both])
+            truth = cv2.resize(truth, view.size[::-1], interpolation=cv2.INTER_NEAREST)
+        views.append(view)
+        truths.append(truth)
+    factor = float(np.median(np.concatenate(ratios)))
+    scaled = []
+    for view in views:
+        pose = view.world_from_cam.copy()
+        pose[:3, 3] *= factor
+        scaled.append(view.moved(pose, view.scale * factor))
+    kept = [items[view.index] for view in views]
+    return Scene(f"{name}, tracked", kept, scaled, truths, source.tolerance)
