@@ -29,6 +29,9 @@ class Mapper(Node):
 
     Without `realtime` every keyframe gets all its iterations before the next is added, whatever the timing: a slow
     mapper holds the senders back, and the result is the same in one process as in many.
+
+    Parts of the stream between which tracking was lost share no frame of reference: each gets a map of its own, and
+    the one with the most keyframes is refined and sent.
     """
 
     @dataclass
@@ -63,13 +66,16 @@ class Mapper(Node):
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
-        self.mapper = OnlineMapper(mapper_config(self.config))
-        log = self.mapper.log  # one set of counters: what the core counts is what the node reports
-        self.stats.counts, self.stats.skipped = log.counts, log.skipped
-        self.stats.seconds, self.stats.warnings = log.seconds, log.warnings
+        self._core_config = mapper_config(self.config)
+        self.mapper = OnlineMapper(self._core_config)
+        self._log = self.mapper.log  # one set of counters: what the core counts is what the node reports
+        self.stats.counts, self.stats.skipped = self._log.counts, self._log.skipped
+        self.stats.seconds, self.stats.warnings = self._log.seconds, self._log.warnings
+        self._by_segment: dict[int, OnlineMapper] = {}
         self._last_preview = 0.0
 
     def on_view(self, view: View) -> Iterator[Preview]:
+        self._enter(view.segment)
         self.mapper.add_view(
             PosedView(
                 index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
@@ -80,7 +86,8 @@ class Mapper(Node):
         yield from self._preview()
 
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
-        self.mapper.correct(poses.index, poses.world_from_cam, poses.scale)
+        for mapper in self._by_segment.values() or [self.mapper]:
+            mapper.correct(poses.index, poses.world_from_cam, poses.scale)
         yield from ()
 
     def on_idle(self) -> list[Preview] | None:
@@ -95,6 +102,7 @@ class Mapper(Node):
     def on_end(self) -> Iterator[SplatMap]:
         while self.mapper.step():
             pass
+        self._choose_largest()
         yield self._map(refined=False)
         for done in range(self.config.refinement):
             self.mapper.refine(done, self.config.refinement)
@@ -105,6 +113,27 @@ class Mapper(Node):
             write_ply(path, self.mapper.snapshot())
             self.stats.values["map_bytes"] = path.stat().st_size
         yield self._map(refined=True)
+
+    def _enter(self, segment: int) -> None:
+        """Goes on with the map of this part of the stream, or begins it."""
+        if not self._by_segment:
+            self._by_segment[segment] = self.mapper
+        if segment not in self._by_segment:
+            while self.mapper.step():  # what the part before is owed
+                pass
+            self._by_segment[segment] = OnlineMapper(self._core_config, self._log)
+        self.mapper = self._by_segment[segment]
+
+    def _choose_largest(self) -> None:
+        parts = list(self._by_segment.values())
+        if len(parts) < 2:
+            return
+        self.mapper = max(parts, key=lambda mapper: len(mapper.views))
+        total = sum(len(mapper.views) for mapper in parts)
+        self.stats.warn(
+            f"tracking was lost: the map shows the largest of {len(parts)} parts, "
+            f"{len(self.mapper.views)} of {total} keyframes"
+        )
 
     def _report(self) -> None:
         self.stats.values["splats"] = len(self.mapper.state)

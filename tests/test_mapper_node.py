@@ -14,13 +14,13 @@ from nodes.mapper import Mapper, mapper_config
 from tests.core.splats.tiny_scene import pose_on_arc, posed_view
 
 
-def view_message(index: int, t: float, scale: float = 1.0) -> View:
+def view_message(index: int, t: float, scale: float = 1.0, segment: int = 0) -> View:
     view = posed_view(index, pose_on_arc(t), (24, 32))
     assert view.normals is not None
     return View(
         index=index, timestamp=0.1 * index, image=view.image, intrinsics=view.intrinsics,
         world_from_cam=view.world_from_cam, scale=scale, depth=view.depth, confidence=np.ones_like(view.depth),
-        normals=view.normals, segment=0,
+        normals=view.normals, segment=segment,
     )  # fmt: skip
 
 
@@ -80,6 +80,17 @@ def test_poses_move_the_map() -> None:
     after = node.mapper.snapshot()
     np.testing.assert_allclose((after.splats.means - before).numpy(), [[1.0, 2.0, 3.0]] * len(before), atol=1e-4)
     np.testing.assert_allclose(after.world_from_cam[0], moved)
+
+
+def test_parts_between_which_tracking_was_lost_do_not_mix_and_the_largest_is_sent() -> None:
+    node = Mapper(settings())
+    for index, segment in [(0, 0), (1, 1), (2, 1), (3, 0), (4, 1)]:
+        list(node.on_view(view_message(index, index / 5, segment=segment)))
+    before, after = list(node.on_end())
+    assert before.keyframes.tolist() == after.keyframes.tolist() == [1, 2, 4]
+    assert set(after.anchors.tolist()) <= {1, 2, 4}
+    assert node.stats.warnings == ["tracking was lost: the map shows the largest of 2 parts, 3 of 5 keyframes"]
+    assert node.stats.counts["views"] == 5
 
 
 def test_a_preview_is_capped_and_relative_to_the_origin() -> None:

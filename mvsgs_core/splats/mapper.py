@@ -87,12 +87,12 @@ class MapperLog:
 class OnlineMapper:
     """Builds the map: `add_view`, then `step` while there is something owed, `correct` at any time, `refine` last."""
 
-    def __init__(self, config: MapperConfig | None = None) -> None:
+    def __init__(self, config: MapperConfig | None = None, log: MapperLog | None = None) -> None:
         self.config = config or MapperConfig()
         self.state = MapState((self.config.sh_degree + 1) ** 2, torch.device(self.config.device))
         self.views: list[TrainingView] = []
         self.schedule = Schedule(self.config.window, self.config.seed)
-        self.log = MapperLog()
+        self.log = log or MapperLog()
         self.iterations = 0
         self.origin: np.ndarray | None = None  # (3,) float64 world position of the first keyframe
         self.unit: float | None = None  # median depth of the first keyframe that has depth, world units
