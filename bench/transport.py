@@ -31,7 +31,7 @@ Sample = Frame | GroundTruth
 BUFFER = 8  # messages, of both
 FRESH = 32  # images sent in turns: a source gives each once, so none waits in a cache
 GOAL = 1.5  # times plain pyzmq
-ROUNDS = 5  # of the throughput; the best counts: other work on the machine only ever slows
+ROUNDS = 20  # of the throughput, short ones; the best counts: other work on the machine only ever slows
 
 
 def samples() -> dict[str, Callable[[int, float], Sample]]:
@@ -180,7 +180,7 @@ def measure_pair(
 
 def measure(options: argparse.Namespace) -> list[Row]:
     rows: list[Row] = []
-    counts = (60, 60) if options.quick else (500, 300)
+    counts = (60, 60) if options.quick else (500, 100)
     for transport in ("ipc", "tcp"):
         for name, sample in samples().items():
             with tempfile.TemporaryDirectory(prefix="mvsgs-") as folder:
