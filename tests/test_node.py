@@ -63,7 +63,7 @@ def free_ports(count: int) -> list[int]:
 
 def test_statistics_of_all_nodes_reach_the_end_once() -> None:
     with graph() as g:
-        g.diamond(source={"count": 5}, join={"slices": 3})
+        g.diamond(source={"count": 5, "delay": 0.1}, join={"slices": 3})
         g.wait(20)
         upstream = g.joined["upstream"]
         assert set(upstream) == {"source", "left", "right"}
