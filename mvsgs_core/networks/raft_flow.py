@@ -1,0 +1,101 @@
+"""RAFT-small as a flow of the tracker (mvsgs_core.tracking.flow): `flow: mvsgs_core.networks.raft_flow:RaftFlow`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+import torch
+
+from mvsgs_core import weights
+from mvsgs_core.networks import checkpoints
+from mvsgs_core.networks.raft_small import STRIDE, RaftSmall
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.image import TrackingImage
+
+
+@dataclass
+class RaftFlow:
+    """Dense flow there and back, begun from the guess; the weight falls with the distance from where it came.
+
+    Raises FileNotFoundError at the first match where the weights are missing, saying what to fetch from where.
+    """
+
+    weights: str | None = None  # file; None: found by the registry
+    iterations: int = 8  # of the recurrent update
+    guided: bool = True  # the search begins at the guess that the tracker has
+    distance_sigma: float = 0.7  # pixels there and back at which the weight has fallen to 0.6
+    max_distance: float = 2.0  # pixels there and back
+    device: str = "cpu"
+    needs_color: bool = True
+    calls: int = field(default=0, repr=False)  # pairs of images
+
+    @cached_property
+    def _net(self) -> RaftSmall:
+        file = weights.find("raft_small", self.weights)
+        net = RaftSmall()
+        checkpoints.load(net, checkpoints.read(file), file)
+        return net.to(self.device)
+
+    def field(self, a: TrackingImage, b: TrackingImage, start: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Flows (2, H, W) float32 in pixels from a to b and from b to a.
+
+        start: (2, H / 8, W / 8) flow from a to b to begin with, in pixels of the 1/8 map.
+        """
+        self.calls += 1
+        images = torch.from_numpy(np.stack([_color(a), _color(b)])).permute(0, 3, 1, 2).float().to(self.device)
+        begin = None
+        if start is not None:
+            # on the way back the same motion, at nearly the same place: a start, no more
+            begin = torch.from_numpy(np.stack([start, -start]).astype(np.float32)).to(self.device)
+        flows = self._net(images, images.flip(0), self.iterations, begin).cpu().numpy()
+        return flows[0], flows[1]
+
+    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
+        """Points of a (N, 2) in b; a point is lost where the way back leads elsewhere or it leaves the image."""
+        height, width = b.size
+        start = None
+        if self.guided:
+            start = _coarse_field(points, guess - points, (height // STRIDE, width // STRIDE))
+        there, back = self.field(a, b, start)
+        at = np.asarray(points, dtype=np.float64)
+        target = at + _sample(there, at)
+        inside = np.all((target >= 0) & (target <= [width - 1, height - 1]), axis=1) & np.isfinite(target).all(axis=1)
+        landing = np.where(inside[:, None], target, 0.0)
+        distance = np.linalg.norm(landing + _sample(back, landing) - at, axis=1)
+        alive = inside & (distance < self.max_distance)
+        weight = np.where(alive, np.exp(-0.5 * np.square(np.where(alive, distance, 0.0) / self.distance_sigma)), 0.0)
+        return Matches(np.where(alive[:, None], target, np.nan), weight)
+
+
+def _color(image: TrackingImage) -> np.ndarray:
+    if image.color is None:
+        raise ValueError(f"frame {image.index} has no color: RAFT needs it (TrackingImage.of(..., color=True))")
+    return image.color
+
+
+def _sample(flow: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, 2) of a flow (2, H, W) at points, bilinear."""
+    at = points.astype(np.float32).reshape(-1, 1, 2)
+    found = [cv2.remap(part, at, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for part in flow]
+    return np.stack([np.asarray(part).reshape(-1) for part in found], axis=1).astype(np.float64)
+
+
+def _coarse_field(points: np.ndarray, moved: np.ndarray, grid: tuple[int, int]) -> np.ndarray | None:
+    """The mean motion of the points in each 1/8 cell, the median of all where there are none; None without any."""
+    known = np.isfinite(moved).all(axis=1)
+    if not known.any():
+        return None
+    rows, columns = grid
+    cell = np.clip((points[known] / STRIDE).astype(int), 0, [columns - 1, rows - 1])
+    number = cell[:, 1] * columns + cell[:, 0]
+    count = np.bincount(number, minlength=rows * columns)
+    sums = [np.bincount(number, moved[known, n], minlength=rows * columns) for n in (0, 1)]
+    median = np.median(moved[known], axis=0)
+    means = [np.where(count > 0, s / np.maximum(count, 1), m) for s, m in zip(sums, median)]
+    return np.stack(means).reshape(2, rows, columns) / STRIDE
+
+
+__all__ = ["RaftFlow"]
