@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -102,6 +103,7 @@ def _run_inline(graph: Graph, screen: Screen) -> None:
         status.skipped, status.warnings = node.stats.skipped, node.stats.warnings
         screen.refresh()
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C shows where it was
     try:
         run_inline(graph, observe)
     finally:

@@ -6,6 +6,7 @@ From any directory. `--help` lists slots, choices and parameters; `-m` sweeps; `
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,9 @@ ROOT = Path(__file__).resolve().parent.parent
 # The workspace first (`launch`, `nodes` and `msgs` are generic names), then the user's directory with their own nodes.
 _FIRST = [str(ROOT), str(Path.cwd())]
 sys.path[:] = _FIRST + [path for path in sys.path if path not in (*_FIRST, str(ROOT / "launch"))]
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # before a run there is nothing to finish: no traceback of an import
 
 import hydra  # noqa: E402
 from hydra.core.hydra_config import HydraConfig  # noqa: E402

@@ -60,16 +60,18 @@ class Supervisor:
 
     def run(self) -> Outcome:
         """Runs to the end. Whatever happens, no process, socket file or temporary directory is left."""
-        directory = RunDirectory.create(self._graph)
         try:
             with self._signal_handlers():
+                directory = RunDirectory.create(self._graph)
                 try:
                     self._start(directory)
                     return self._watch()
                 finally:
-                    self._stop_all()
+                    try:
+                        self._stop_all()
+                    finally:
+                        directory.remove()
         finally:
-            directory.remove()
             self._close()
 
     def _start(self, directory: RunDirectory) -> None:
