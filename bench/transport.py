@@ -181,7 +181,7 @@ def measure_pair(
 
 def measure(options: argparse.Namespace) -> list[Row]:
     rows: list[Row] = []
-    counts = (60, 60) if options.quick else (500, 100)
+    counts = (50, 30) if options.quick else (500, 100)
     for transport in ("ipc", "tcp"):
         for name, sample in samples().items():
             with tempfile.TemporaryDirectory(prefix="mvsgs-") as folder:
