@@ -20,8 +20,8 @@ from bench.table import Row, main
 
 SCENES = ("room", "tum_fr1_xyz", "redkitchen")
 TABLE_III = ("A", "B", "C", "D")
-SKIPS = ("no_skips", "no_skip_converged", "no_skip_tiles", "no_coarse_to_fine", "no_selective")
-OTHERS = ("no_density_control", "relocate", "exact", "ges_scale", "true_poses")
+SKIPS = ("no_skips", "all_skips", "no_skip_converged", "skip_tiles", "coarse_to_fine", "no_selective", "every_frame")
+OTHERS = ("no_voxel", "no_density_control", "relocate", "exact", "ges_scale", "ges_loss", "true_poses")
 FIGURES = {  # path in the report, unit, digits
     "held-out PSNR": ("rendering.held_out.psnr", "dB", 2),
     "keyframe PSNR": ("rendering.keyframes.psnr", "dB", 2),

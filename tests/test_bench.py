@@ -1,0 +1,362 @@
+"""The benchmarks' own logic on small figures, and that all scenes and variants compose."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bench import ablation, compare, curves, memory, plots, record, scenes, stress
+from bench.runs import CONF, Matrix, Run, Setting, choices, figure, said
+from bench.sparse_splats import Posed, SparseConfig, SparseMap
+from bench.table import Row, at_least, at_most
+from launch.compose import compose
+from launch.parameters import GraphError
+from mvsgs_core.datasets import open_dataset
+from mvsgs_core.splats.training import TrainingConfig
+from tests.shared_data import ROOT
+
+SEARCH = f"hydra.searchpath=[file://{CONF}]"
+MAINS = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if "\n    main(measure" in p.read_text())
+
+
+def row(name: str, value: Any, unit: str = "", goal: str = "", met: bool | None = None) -> dict[str, Any]:
+    return {"name": name, "value": value, "unit": unit, "goal": goal, "met": met}
+
+
+def report(psnr: float = 25.0, wall: float = 10.0, **more: Any) -> dict[str, Any]:
+    return {
+        "rendering": {"held_out": {"psnr": psnr, "ssim": 0.8}},
+        "trajectory": {"ate_percent": 0.5, "frames": 100, "frames_tracked": 100, "keyframes": 20, "segments": 1},
+        "depth": {"inlier_ratio": 0.9, "completeness": 0.6},
+        "map": {"splats": 1000, "bytes": 2_000_000},
+        "time": {"wall": wall, "stages": {"mapper": {"insertion": 1.0, "optimization": 2.0}}},
+        "memory": {"peak_bytes": {"mapper": 3e8, "tracker": 1e8}},
+        "warnings": {},
+        **more,
+    }
+
+
+def a_run(scene: str = "room", variant: str = "full", seed: int = 0, **figures: Any) -> Run:
+    return Run(scene, variant, seed, Path("nowhere"), report(**figures), figures.get("setting", ""))
+
+
+def test_rows_know_whether_they_meet_their_goal() -> None:
+    assert at_most("a", 2.0, "s", 2.0).met
+    assert not at_most("a", 2.1, "s", 2.0).met
+    assert at_least("a", 2.0, "s", 2.0).met
+    assert at_least("a", 1.9, "s", 2.0) == Row("a", 1.9, "s", ">= 2", False)
+
+
+@pytest.mark.parametrize("names", [choices("scene")[k::4] for k in range(4)])
+def test_every_scene_composes(names: Sequence[str]) -> None:
+    for name in names:
+        graph = compose([SEARCH, f"+scene={name}"])
+        assert "dataset" in graph.sources, name
+
+
+@pytest.mark.parametrize("names", [choices("variant")[k::4] for k in range(4)])
+def test_every_variant_composes_and_changes_something_or_is_the_full_system(names: Sequence[str]) -> None:
+    plain = compose([SEARCH, "+scene=room", "output=same"]).resolved
+    for name in names:
+        graph = compose([SEARCH, "+scene=room", f"+variant={name}", "output=same"])
+        assert (graph.resolved == plain) == (name == "full"), name
+
+
+def test_variants_and_curves_name_what_there_is(tmp_path: Path) -> None:
+    assert set(ablation.TABLE_III + ablation.SKIPS + ablation.OTHERS) <= set(choices("variant"))
+    assert {*ablation.SCENES, *stress.REAL} <= set(choices("scene"))
+    given = curves.settings(curves.CURVES) + [stress.setting(n, s) for n, w in stress.DIFFICULTIES.items() for s in w]
+    matrix = Matrix(["room"], settings=given)
+    matrix.check()
+    matrix.write_settings(tmp_path)
+    plain = compose([SEARCH, "+scene=room", "output=same"]).resolved
+    search = f"hydra.searchpath=[file://{CONF},file://{tmp_path}/settings]"
+    for setting in given[:: max(1, len(given) // 16)] + [s for s in given if "stages" in s.name]:
+        graph = compose([search, "+scene=room", f"+setting={setting.name}", "output=same"])
+        assert (graph.resolved == plain) == (not setting.overrides), setting.name
+
+
+def test_settings_override_choices_and_parameters(tmp_path: Path) -> None:
+    setting = Setting("coarse", ("mvs=coarse", "mapper.iterations=7", "mapper.max_pixels=9600"))
+    matrix = Matrix(["room"], settings=[setting])
+    matrix.write_settings(tmp_path)
+    graph = compose([f"hydra.searchpath=[file://{CONF},file://{tmp_path}/settings]", "+scene=room", "+setting=coarse"])
+    assert graph.slots["mvs"].target == "nodes.coarse_depth.CoarseDepth"
+    assert graph.slots["mapper"].config["iterations"] == 7
+    assert graph.slots["mapper"].config["max_pixels"] == 9600
+    with pytest.raises(ValueError, match="slot=choice"):
+        Setting("bad", ("mapper",)).text()
+
+
+def test_a_slow_node_and_the_track_recorder_stand_in_the_graph() -> None:
+    graph = compose([SEARCH, "+scene=room", "depth_fusion._target_=bench.slow_fusion.SlowFusion"])
+    assert graph.slots["depth_fusion"].config["factor"] == 10.0
+    with pytest.raises(GraphError, match="recorder has no choice"):
+        compose(["recorder=track"])
+    graph = compose([SEARCH, "+scene=room", "++recorder._target_=bench.track_recorder.TrackRecorder",
+                     "++recorder.reads.Trajectory=tracker"])  # fmt: skip
+    assert any(edge.reader == "recorder" for edge in graph.edges)
+
+
+def test_the_command_names_everything_and_jobs_are_in_its_order(tmp_path: Path) -> None:
+    matrix = Matrix(["room", "fox"], ["full", "A"], [0, 3], ["mapper.iterations=2"], 2, [Setting("x"), Setting("y")])
+    command = matrix.command(tmp_path)
+    for text in ("-m", "+scene=room,fox", "+variant=full,A", "+setting=x,y", "seed=0,3", "mapper.iterations=2"):
+        assert text in command
+    assert "hydra/launcher=joblib" in command
+    for number, name in enumerate(matrix.names()):
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "report.json").write_text(json.dumps({"name": name}))
+    runs = matrix.collect(tmp_path)
+    assert [(r.scene, r.variant, r.setting, r.seed) for r in runs] == [tuple(r.report["name"]) for r in runs]  # type: ignore[index]
+    assert len(runs) == 16
+    assert (runs[1].scene, runs[1].variant, runs[1].setting, runs[1].seed) == ("room", "full", "x", 3)
+
+
+def test_unknown_names_are_refused_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match=r"no scene rom; there are: .*room"):
+        Matrix(["rom"]).check()
+    with pytest.raises(ValueError, match=r"no variant Z; there are: A, B"):
+        Matrix(["room"], ["Z"]).check()
+    with pytest.raises(ValueError, match="two settings of one name"):
+        Matrix(["room"], settings=[Setting("a"), Setting("a")]).check()
+
+
+def test_figures_of_a_report() -> None:
+    assert figure(report(), "rendering.held_out.psnr") == 25.0
+    assert figure(report(), "rendering.nothing.psnr") is None
+    assert figure(None, "time.wall") is None
+
+
+def test_what_a_run_said(tmp_path: Path) -> None:
+    assert said(a_run()) == "nothing"
+    lost = Run("room", "full", 0, tmp_path / "0", report(warnings={"tracker": ["lost"], "mvs": ["no depth"]}))
+    assert said(lost) == "tracker: lost; mvs: no depth"
+    (tmp_path / "runs.log").write_text("job 0\ntracker failed: ValueError: no image\nlog: x\n")
+    assert said(Run("room", "full", 0, tmp_path / "0", None)) == "tracker failed: ValueError: no image"
+
+
+def test_scene_table_has_means_spreads_the_paper_and_failures() -> None:
+    runs = [a_run(seed=0, psnr=24.0), a_run(seed=1, psnr=26.0), a_run("tum_desk"), Run("fox", "A", 0, Path("x"), None)]
+    lines = scenes.markdown(runs).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert "25.00 ±1.00" in lines[2]
+    assert "*20.67*" in lines[4]
+    assert "0 of 1" in lines[5]
+    assert any(r.name.startswith("fox/A") and r.met is False for r in scenes.rows(runs))
+    assert scenes.time_against_error(runs[:3]).startswith("<svg")
+
+
+def test_ablation_says_sign_size_and_what_is_within_the_spread() -> None:
+    runs = [a_run(variant=v, seed=s, psnr=p + 0.1 * s) for v, p in (("full", 25.0), ("A", 22.0), ("B", 25.05))
+            for s in range(3)]  # fmt: skip
+    found = ablation.difference(ablation.select(runs, "room", "A"), runs[:3], "rendering.held_out.psnr")
+    assert found is not None
+    assert found.real
+    assert found.mean == pytest.approx(-3.0)
+    assert found.spread == pytest.approx(0.1)
+    text = ablation.table(runs, ["room"], ["A", "B"])
+    assert "**-3.00 ± 0.10**" in text
+    assert "| +0.05 ± 0.10 |" in text
+
+
+def test_pareto_front_and_its_plot(tmp_path: Path) -> None:
+    assert plots.pareto([3.0, 1.0, 2.0, 4.0, np.nan], [9.0, 1.0, 0.5, 9.0, 99.0]) == [1, 0]
+    svg = plots.front_plot({"area": [("a & b", 1.0, 2.0), ("c", 2.0, 3.0)]}, (2.0, 3.0), "s", "dB")
+    plots.write(tmp_path / "plot.svg", svg)
+    text = (tmp_path / "plot.svg").read_text()
+    assert text.count("xmlns=") == 1
+    assert "a &amp; b" in text
+    assert "stroke-dasharray" in text
+
+
+def test_curves_average_seeds_and_mark_the_front() -> None:
+    chosen = {"mapper.iterations": {"15": ("mapper.iterations=15",), "90": ("mapper.iterations=90",)}}
+    names = [setting.name for setting in curves.settings(chosen)]
+    assert names == ["default", "mapper_iterations_15", "mapper_iterations_90"]
+    runs = [
+        Run("room", "full", s, Path("x"), report(p, w), n)
+        for n, p, w in zip(names, (25.0, 24.0, 24.5), (10.0, 5.0, 20.0))
+        for s in (0, 1)
+    ]
+    default, others = curves.points_of(runs, chosen)
+    front = {r.name: r.value for r in curves.rows_of("room", default, others) if "front" in r.name}
+    assert list(front.values()) == ["yes", "yes", "no"]
+    assert "**default**" in curves.table("room", default, others)
+    assert curves.picture(default, others).startswith("<svg")
+
+
+def test_stress_passes_what_holds_or_says_that_it_does_not() -> None:
+    easy = stress.Outcome.of(a_run())
+    assert stress.rows_of("x", easy, None)[-1].met
+
+    def verdict(**trajectory: Any) -> Row:
+        path = {**report()["trajectory"], **trajectory}
+        return stress.rows_of("x", stress.Outcome.of(a_run(trajectory=path)), easy)[-1]
+
+    assert not verdict(ate_percent=30.0).met  # broken, and not a word
+    assert verdict(ate_percent=30.0, frames_tracked=50).met
+    nothing = stress.Outcome.of(Run("room", "full", 0, Path("x"), None))
+    assert stress.rows_of("x", nothing, easy)[-1].met  # "no report" is said
+    assert "no map" in str(stress.rows_of("x", nothing, easy)[-1].value)
+
+
+def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
+    flat = [(float(t), 100.0 if t > 5 else 10.0) for t in range(100)]
+    grows = [(float(t), 100.0 + t) for t in range(100)]
+    assert memory.growth(flat) == 1.0
+    assert memory.growth(grows) > 1.4
+
+
+def test_repeated_runs_are_merged_with_their_spread() -> None:
+    merged = record.merge([
+        [row("a", 1.0, "s", "<= 2", True), row("only", "word")], [row("a", 2.0, "s", "<= 2", True)],
+        [row("a", 3.0, "s", "<= 2", False)],
+    ])  # fmt: skip
+    assert merged[0]["value"] == 2.0
+    assert merged[0]["spread"] == 1.0
+    assert merged[0]["met"] is False
+    assert merged[1] == {**row("only", "word"), "spread": None}
+
+
+def test_records_are_rendered_between_their_markers_only(tmp_path: Path) -> None:
+    files = []
+    for k, value in enumerate((1.0, 2.0)):
+        files.append(tmp_path / f"{k}.json")
+        files[-1].write_text(json.dumps([row("latency | 99 %", value, "ms", "<= 3", True)]))
+    made = record.record("quick/transport", files, "python -m bench.transport", folder=tmp_path)
+    assert record.Record.load("quick/transport", tmp_path) == made
+    block = "<!-- bench:{0} -->\n{1}<!-- /bench:{0} -->\n"
+    text = "before\n" + block.format("quick/transport", "old\n") + "after\n" + block.format("x", "")
+    once = record.render(text, tmp_path)
+    assert once.startswith("before\n<!-- bench:quick/transport -->\n\n`python -m bench.transport`, 2 runs; commit ")
+    assert "| latency \\| 99 % | 1.5 ± 0.5 ms | &lt;= 3 | yes |" in once
+    assert "old" not in once
+    assert "\nafter\n" in once
+    assert "Not recorded yet" in once
+    assert record.render(once, tmp_path) == once
+
+
+def test_a_benchmarks_own_table_and_plots_are_kept(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "table.md").write_text("| own |\n")
+    (run / "room.svg").write_text("<svg/>")
+    (tmp_path / "rows.json").write_text(json.dumps([row("a", 1.0)]))
+    made = record.record("curves", [tmp_path / "rows.json"], "c", run, tmp_path / "kept")
+    assert "| own |" in made.markdown()
+    assert "curves_room.svg" in made.markdown()
+    assert (tmp_path / "kept" / "curves_room.svg").read_text() == "<svg/>"
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "expected"),
+    [
+        (row("psnr", 25.0, "dB"), row("psnr", 24.8, "dB"), None),  # noise
+        (row("psnr", 25.0, "dB"), row("psnr", 24.5, "dB"), "worse"),
+        (row("psnr", 25.0, "dB"), row("psnr", 23.5, "dB"), "regression"),
+        (row("psnr", 25.0, "dB"), row("psnr", 26.0, "dB"), "better"),
+        (row("psnr", 25.0, "dB"), row("psnr", float("nan"), "dB"), "regression"),
+        (row("latency", 10.0, "ms"), row("latency", 13.0, "ms"), None),
+        (row("latency", 10.0, "ms"), row("latency", 30.0, "ms"), "regression"),
+        (row("throughput", 1000.0, "MB/s"), row("throughput", 300.0, "MB/s"), "regression"),
+        (row("room/full: ATE %", 0.4, "% of the path"), row("room/full: ATE %", 0.5, "% of the path"), None),
+        (row("room/full: ATE %", 0.4, "% of the path"), row("room/full: ATE %", 2.0, "% of the path"), "regression"),
+        (row("depth inliers", 0.9), row("depth inliers", 0.7), "regression"),
+        (row("ratio", 1.0, "x", "<= 2", True), row("ratio", 1.3, "x", "<= 2", True), None),
+        (row("ratio", 1.0, "x", "<= 2", True), row("ratio", 3.0, "x", "<= 2", False), "regression"),
+        (row("speedup", 5.0, "x", ">= 4", True), row("speedup", 3.0, "x", ">= 4", False), "worse"),
+        (row("splats", 1000), row("splats", 5000), None),  # neither is better
+        (row("map finite", "all", "", "finite", True), row("map finite", "NaN", "", "finite", False), "regression"),
+    ],
+)
+def test_comparison_tells_noise_from_regressions(
+    before: dict[str, Any], now: dict[str, Any], expected: str | None
+) -> None:
+    found = compare.change(now, before, same_machine=True)
+    if expected is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert ("regression" if found.regression else "worse" if found.worse else "better") == expected
+
+
+def test_times_of_another_machine_warn_only_and_the_recorded_spread_counts() -> None:
+    slow = compare.change(row("latency", 90.0, "ms"), row("latency", 10.0, "ms"), same_machine=False)
+    assert slow is not None
+    assert slow.worse
+    assert not slow.regression
+    assert compare.change(row("psnr", 24.0, "dB"), {**row("psnr", 25.0, "dB"), "spread": 0.5}, True) is None
+
+
+def test_compare_exits_with_one_for_regressions_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line, now = tmp_path / "line", tmp_path / "mapping.json"
+    now.write_text(json.dumps([row("psnr", 25.0, "dB"), row("other", 1.0)]))
+    record.record("mapping", [now], "c", folder=line)
+    assert compare.run([str(now), "--recorded", str(line)]) == 0
+    now.write_text(json.dumps([row("psnr", 20.0, "dB")]))
+    assert compare.run([str(now), "--recorded", str(line)]) == 1
+    printed = capsys.readouterr().out
+    assert "REGRESSION  psnr: 25 dB -> 20 dB" in printed
+    assert "the row is missing" in printed
+    assert compare.run([str(now), "--recorded", str(tmp_path / "empty")]) == 0
+
+
+def test_offline_splatting_of_sparse_points_gets_better() -> None:
+    items = list(open_dataset("synthetic", scene="room", frames=12, size=(48, 64), threads=1))
+    views = [
+        Posed(i.index, i.image, i.intrinsics, i.world_from_cam) for i in items[::4] if i.world_from_cam is not None
+    ]
+    points, colors = [], []
+    for item in items[::4]:
+        assert item.depth is not None
+        assert item.world_from_cam is not None
+        v, u = np.mgrid[2:48:3, 2:64:3].reshape(2, -1)
+        fx, fy, cx, cy = item.intrinsics
+        z = item.depth[v, u].astype(np.float64)
+        seen = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
+        points.append(seen @ item.world_from_cam[:3, :3].T + item.world_from_cam[:3, 3])
+        colors.append(item.image[v, u])
+    config = SparseConfig(seconds=2.0, training=TrainingConfig(threads=1))
+    fitted = SparseMap(views, np.concatenate(points), np.concatenate(colors), config)
+
+    def error() -> float:
+        return float(np.mean([(fitted.render(v) - v.image / 255.0) ** 2 for v in views]))
+
+    before = error()
+    fitted.optimize()
+    assert fitted.iterations > 10
+    assert error() < 0.5 * before
+    with pytest.raises(ValueError, match="no start"):
+        SparseMap(views, np.zeros((2, 3)), np.zeros((2, 3), np.uint8), config)
+
+
+def test_each_benchmark_explains_itself() -> None:
+    """All in one process: most of the time goes into imports."""
+    code = (
+        "import runpy, sys\n"
+        "for name in sys.argv[1:]:\n"
+        "    sys.argv = [name, '--help']\n"
+        "    try: runpy.run_module('bench.' + name, run_name='__main__')\n"
+        "    except SystemExit as ended: assert ended.code == 0, name\n"
+    )
+    names = [*MAINS, "record", "compare", "colmap_poses"]
+    assert {"scenes", "peers", "stress", "curves", "ablation"} <= set(names)
+    done = subprocess.run([sys.executable, "-c", code, *names], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.count("usage:") == len(names)
+    assert done.stdout.count("--quick") >= len(MAINS)
+
+
+def test_the_document_has_a_place_for_every_benchmark() -> None:
+    text = (ROOT / "BENCHMARKS.md").read_text()
+    for name in MAINS:
+        assert f"<!-- bench:{name} -->" in text, name
+        assert f"<!-- /bench:{name} -->" in text, name
+    assert record.render(text) == text, "tables differ from what is recorded: python -m bench.record"
