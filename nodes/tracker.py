@@ -35,6 +35,7 @@ class Tracker(Node):
         proximity: int = 3  # older keyframes that it is matched with
         steps: int = 5  # of the local bundle adjustment
         global_edges: int = 6  # of each keyframe in the global bundle adjustment
+        readout: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
         loops: bool = True  # old keyframes are looked for by appearance
         saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
         tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
@@ -57,6 +58,7 @@ class Tracker(Node):
                 local_map=LocalMapConfig(window=c.window, recent=c.recent, proximity=c.proximity, steps=c.steps),
                 back_end=BackEndConfig(edges=c.global_edges),
                 starting=StartingConfig(keyframes=c.start_keyframes),
+                readout=c.readout,
                 loops=c.loops,
                 saturation=c.saturation,
             )
@@ -117,5 +119,6 @@ class Tracker(Node):
         self.stats.counts.update(core_stats.counts)
         self.stats.seconds.update(core_stats.seconds)
         self.stats.skipped.update(core_stats.skipped)
+        self.stats.values.update(core_stats.values)
         for warning in core_stats.warnings:
             self.stats.warn(warning)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.flow import DenseInverseSearch, Matches, sample_field, spread
 from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.image import CELL, TrackingImage
 from mvsgs_core.tracking.localization import Localization, localize
 from mvsgs_core.tracking.matcher import Matcher
 
@@ -77,6 +78,7 @@ class FrontEnd:
             return Step(
                 self.step.matches, self.step.share, self.step.flow, True, self.step.localization if started else None
             )
+        self._set_velocity(image, field)
         guess = self.carried + sample_field(field, self.carried)
         matches, share = self.matcher.match(self.reference, image, guess, self.config.feature_share)
         alive = matches.alive
@@ -89,7 +91,9 @@ class FrontEnd:
             found = localize(self.graph, {self.reference.index: matches}, start, self.solver)
             guess, _ = self.graph.predict_pose(self.reference.index, found.cam_from_world)
         step = Step(matches, share, flow, False, found)
-        if not self.is_lost(step):
+        if self.is_lost(step):
+            image.velocity = None
+        else:
             self.carried = np.where(alive[:, None], matches.target, np.nan_to_num(guess, nan=-1e3))
             self.last = image
             self.pose = found.cam_from_world if found else None
@@ -115,6 +119,20 @@ class FrontEnd:
         return step.localization.cam_from_world @ geometry.inverse(
             self.graph.keyframes[self.reference.index].cam_from_world
         )
+
+    def _set_velocity(self, image: TrackingImage, field: np.ndarray) -> None:
+        """Image velocity from the flow since the last frame, for the rolling shutter."""
+        assert self.last is not None
+        seconds = image.timestamp - self.last.timestamp
+        if not 0.0 < abs(seconds) < 0.25:
+            return
+        height, width = image.size
+        cells = cv2.resize(field, (width // CELL, height // CELL), interpolation=cv2.INTER_AREA)
+        velocity = np.asarray(cells / seconds, dtype=np.float32)
+        for frame in (image, self.last):
+            if frame.velocity is None:
+                frame.velocity = velocity
+                frame.__dict__.pop("cell_shutter", None)
 
     def _same(self, image: TrackingImage) -> bool:
         """Whether the last image still explains this one: a covered lens does not move either."""

@@ -53,6 +53,7 @@ class Edge:
 
     target: np.ndarray  # (2, M) float32, 0 where lost
     weight: np.ndarray  # (M,) float32, 0 to 1
+    shift: np.ndarray  # (2, M) float32 pixels by which a second of readout moves the target
     share: float  # of the textured points that were found
 
 
@@ -61,6 +62,7 @@ class KeyframeGraph:
 
     def __init__(self, intrinsics: np.ndarray) -> None:
         self.intrinsics = np.asarray(intrinsics, dtype=np.float64)  # (4,) at the tracker's size
+        self.readout = 0.0  # seconds that the camera needs for an image, from the first row to the last
         self.keyframes: dict[int, Keyframe] = {}  # by frame index
         self.edges: dict[tuple[int, int], Edge] = {}  # by frame indices
 
@@ -79,22 +81,25 @@ class KeyframeGraph:
         if share < min_share or matches.alive.sum() < 30:
             return False
         target = np.nan_to_num(matches.target.T).astype(np.float32)
-        self.edges[source, to] = Edge(target, matches.weight.astype(np.float32), share)
+        shift = np.zeros_like(target) if matches.shift is None else matches.shift.T.astype(np.float32)
+        self.edges[source, to] = Edge(target, matches.weight.astype(np.float32), shift, share)
         return True
 
     def neighbors(self, index: int) -> set[int]:
         return {b if a == index else a for a, b in self.edges if index in (a, b)}
 
     def predict(self, source: int, to: int) -> tuple[np.ndarray, np.ndarray]:
-        """Where the points of `source` should be in `to`: (M, 2), NaN behind the camera; and inside the image (M,)."""
-        return self.predict_pose(source, self.keyframes[to].cam_from_world)
+        """Where the points of `source` should be seen in `to`: (M, 2), NaN behind it; and inside the image (M,)."""
+        at, inside = self.predict_pose(source, self.keyframes[to].cam_from_world)
+        return at + self.readout * self.keyframes[to].image.shutter(at), inside
 
     def predict_pose(self, source: int, cam_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same for a camera (4, 4) without a rolling shutter."""
         keyframe = self.keyframes[source]
         pixels, z = reproject(
             np.stack([keyframe.cam_from_world, cam_from_world]),
             keyframe.inverse_depth[None],
-            keyframe.points.T[None],
+            self.pixels(source)[None],
             self.intrinsics,
             np.array([0]),
             np.array([1]),
@@ -104,6 +109,11 @@ class KeyframeGraph:
         with np.errstate(invalid="ignore"):
             inside = np.all((at >= 0) & (at <= [width - 1, height - 1]), axis=1)
         return at, inside
+
+    def pixels(self, index: int) -> np.ndarray:
+        """Where a global shutter would have seen the points of a keyframe: (2, M) float64."""
+        image = self.keyframes[index].image
+        return np.asarray((image.cells.points - self.readout * image.cell_shutter).T)
 
     def problem(self, indices: Iterable[int], free_poses: set[int], free_depths: set[int]) -> Graph:
         """The bundle adjustment of these keyframes and every edge among them that has something free at an end."""
@@ -120,13 +130,13 @@ class KeyframeGraph:
         target = np.empty((len(pairs), 2, cells))
         for n, (a, b) in enumerate(pairs):
             edge = self.edges[a, b]
-            target[n] = edge.target
+            target[n] = edge.target - self.readout * edge.shift
             information[n] = self.keyframes[a].image.cells.information.T * edge.weight
         inverse_depth = np.stack([k.inverse_depth for k in frames])
         return Graph(
             cam_from_world=np.stack([k.cam_from_world for k in frames]),
             inverse_depth=inverse_depth,
-            pixels=np.stack([k.points.T for k in frames]).astype(np.float64),
+            pixels=np.stack([self.pixels(index) for index in order]),
             intrinsics=self.intrinsics,
             source=np.array([number[a] for a, _ in pairs], np.int32),
             to=np.array([number[b] for _, b in pairs], np.int32),

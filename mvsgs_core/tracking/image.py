@@ -32,6 +32,7 @@ class TrackingImage:
     timestamp: float  # seconds
     gray: np.ndarray
     color: np.ndarray | None = None  # (H, W, 3) uint8 RGB: only for a flow that wants it
+    velocity: np.ndarray | None = None  # (H / 8, W / 8, 2) float32 pixels a second, where it is known
     _features: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
@@ -69,6 +70,21 @@ class TrackingImage:
     @cached_property
     def cells(self) -> Cells:
         return find_cells(self.gray)
+
+    def shutter(self, points: np.ndarray) -> np.ndarray:
+        """(N, 2) pixels by which a second of readout moves what is seen at points (N, 2): see rolling_shutter.py."""
+        if self.velocity is None:
+            return np.zeros(points.shape)
+        at = np.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0)
+        rows, columns = self.velocity.shape[:2]
+        v = np.clip(at[:, 1] / CELL, 0, rows - 1).astype(int)
+        u = np.clip(at[:, 0] / CELL, 0, columns - 1).astype(int)
+        return np.asarray(self.velocity[v, u] * (at[:, 1:] / self.size[0] - 0.5))
+
+    @cached_property
+    def cell_shutter(self) -> np.ndarray:
+        """`shutter` of the cells' points (M, 2)."""
+        return self.shutter(self.cells.points)
 
     def features(self, count: int = 800) -> tuple[np.ndarray, np.ndarray]:
         """ORB keypoints (N, 2) float32 and descriptors (N, 32) uint8."""

@@ -40,12 +40,12 @@ def localize(
     weights = np.stack([np.where(f.triangulated, matches[i].weight, 0.0) for i, f in zip(order, frames)])
     if (weights > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
         weights = np.stack([matches[i].weight for i in order])
-    target = np.stack([np.nan_to_num(matches[i].target.T) for i in order])
+    target = np.stack([np.nan_to_num(_unrolled(matches[i], graph.readout).T) for i in order])
     information = np.stack([f.image.cells.information.T for f in frames]) * weights[:, None]
     problem = Graph(
         cam_from_world=np.stack([*(f.cam_from_world for f in frames), start]),
         inverse_depth=np.stack([*(f.inverse_depth for f in frames), np.ones(cells)]),
-        pixels=np.stack([*(f.points.T for f in frames), np.zeros((2, cells))]).astype(np.float64),
+        pixels=np.stack([*(graph.pixels(i) for i in order), np.zeros((2, cells))]),
         intrinsics=graph.intrinsics,
         source=np.arange(k, dtype=np.int32),
         to=np.full(k, k, np.int32),
@@ -66,6 +66,11 @@ def localize(
     return Localization(
         pose, float(np.mean(error < inlier_pixels)), len(error), float(np.median(error)), solution.failure
     )
+
+
+def _unrolled(matches: Matches, readout: float) -> np.ndarray:
+    """Targets (M, 2) as a global shutter would have seen them."""
+    return matches.target if matches.shift is None else matches.target - readout * matches.shift
 
 
 __all__ = ["Localization", "localize"]

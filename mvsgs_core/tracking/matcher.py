@@ -45,7 +45,7 @@ class Matcher:
             found = self.flow.match(a, b, cells.points[wanted], guess[wanted])
             target[wanted], weight[wanted] = found.target, found.weight
         share = float((weight > 0).sum() / max(1, cells.textured.sum()))
-        return Matches(target, weight), share
+        return Matches(target, weight, b.shutter(target)), share
 
 
 __all__ = ["Matcher"]

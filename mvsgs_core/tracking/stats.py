@@ -13,6 +13,7 @@ class TrackingStats:
     counts: dict[str, float] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     skipped: dict[str, float] = field(default_factory=dict)  # work that the scene did not need
+    values: dict[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     clock: Callable[[], float] = time.perf_counter  # seconds; time.process_time where other processes disturb
 

@@ -27,6 +27,7 @@ from mvsgs_core.tracking.loop_closure import LoopCloser, LoopConfig
 from mvsgs_core.tracking.matcher import Matcher
 from mvsgs_core.tracking.publish import Correction, Publisher
 from mvsgs_core.tracking.recovery import Recovery, RecoveryConfig
+from mvsgs_core.tracking.rolling_shutter import estimate_readout
 from mvsgs_core.tracking.sighting import Sighting
 from mvsgs_core.tracking.starting import Starter, StartingConfig
 from mvsgs_core.tracking.stats import TrackingStats
@@ -38,6 +39,7 @@ class TrackerConfig:
     flow: str = "lucas_kanade"  # mvsgs_core.tracking.flow.FLOWS, or module:Class
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
     loops: bool = True  # look for old keyframes by appearance
+    readout: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated
     saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
     texture: float = 0.05  # share of the cells that must be textured for an image to be of any use
     threads: int = 1
@@ -108,6 +110,8 @@ class Tracker:
             return
         if not self.started:
             yield from self._force_start()
+        if self.started:
+            self._estimate_readout(40)
         with self.stats.time("global bundle adjustment"):
             for segment in sorted({k.segment for k in self.graph.keyframes.values()}):
                 self._adjust_globally(segment)
@@ -130,6 +134,7 @@ class Tracker:
         config = self.config
         self.size = fit_size(height, width, config.area)
         self.graph = KeyframeGraph(scale_intrinsics(intrinsics, (height, width), self.size))
+        self.graph.readout = config.readout or 0.0
         self.flow = make_flow(config.flow)
         self.matcher = Matcher(self.flow)
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, config.threads)
@@ -176,6 +181,7 @@ class Tracker:
     def _started(self, waiting: list[int], record: FrameRecord) -> Update:
         assert self.graph is not None
         self.started = True
+        self._estimate_readout()
         self.local_map.adjust_window(waiting[-1])
         self.front_end.pose = self.graph.keyframes[waiting[-1]].cam_from_world
         for index in waiting:
@@ -213,6 +219,8 @@ class Tracker:
             self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
         self.stats.count("keyframes")
         self._since = 0
+        if len(self.graph.keyframes) in (10, 20, 40):
+            self._estimate_readout()
         self._close_loops(frame.index)
         for index in self.local_map.members(self.segment)[: -self.config.local_map.window]:
             self.graph.keyframes[index].image.release()
@@ -221,6 +229,16 @@ class Tracker:
         correction = self.publisher.corrections()
         self.publisher.tell(frame.index)
         return Update(record.state, (frame.index,), correction)
+
+    def _estimate_readout(self, keyframes: int = 12) -> None:
+        """From the newest keyframes: once for a camera would do, but the first ones say little."""
+        assert self.graph is not None
+        if self.config.readout is not None:
+            return
+        with self.stats.time("rolling shutter"):
+            members = self.local_map.members(self.segment)[-keyframes:]
+            self.graph.readout = estimate_readout(self.graph, members, self.config.threads)
+        self.stats.values["rolling shutter"] = f"{1e3 * self.graph.readout:.1f} ms"
 
     def _known_here(self, frame: TrackingImage, pose: np.ndarray) -> bool:
         """Enough keyframes already see this from here: the nearest becomes the reference again."""

@@ -1,0 +1,77 @@
+"""The readout time of a rolling shutter is found in the matches; a global shutter stays one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mvsgs_core import geometry
+from mvsgs_core.tracking.bundle_adjustment import Solver, reproject
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.rolling_shutter import estimate_readout
+from tests.core.tracking.sequences import synthetic, track
+
+SIZE = (120, 160)
+
+
+def graph_of(readout: float, count: int = 7, noise: float = 0.1) -> tuple[KeyframeGraph, np.ndarray]:
+    """Keyframes of a shaking camera whose rows are read within `readout` seconds, and their true poses."""
+    random = np.random.default_rng(0)
+    graph = KeyframeGraph(np.array([130.0, 130.0, 79.5, 59.5]))
+    poses = geometry.se3_exp(random.normal(0.0, [0.1, 0.1, 0.03, 0.03, 0.03, 0.03], (count, 6)))
+    for index in range(count):
+        gray = random.integers(0, 255, SIZE, dtype=np.uint8)
+        image = TrackingImage(index, index / 10.0, gray)
+        image.velocity = np.tile(random.normal(0.0, 200.0, 2), (15, 20, 1)).astype(np.float32)
+        depths = random.uniform(0.5, 1.5, 300)
+        graph.add(Keyframe(image, poses[index], depths, np.full(300, 100.0), 0))
+    graph.readout = readout
+    for a in range(count):
+        for b in range(count):
+            if a == b:
+                continue
+            keyframe, other = graph.keyframes[a], graph.keyframes[b].image
+            pixels, _ = reproject(
+                poses[[a, b]],
+                keyframe.inverse_depth[None],
+                graph.pixels(a)[None],
+                graph.intrinsics,
+                np.array([0]),
+                np.array([1]),
+            )
+            target = pixels[0].T
+            for _ in range(3):  # where it is seen depends on the row where it is seen
+                target = pixels[0].T + readout * other.shutter(target)
+            target = target + random.normal(0.0, noise, target.shape)
+            inside = np.all((target > 0) & (target < [159, 119]), axis=1)
+            graph.connect(a, b, Matches(target, inside.astype(np.float64), other.shutter(target)), 0.0)
+    graph.readout = 0.0
+    return graph, poses
+
+
+@pytest.mark.parametrize("readout", [0.0, 0.01, 0.025])
+def test_readout_is_found(readout: float) -> None:
+    graph, _ = graph_of(readout)
+    assert len(graph.edges) > 20
+    assert estimate_readout(graph, graph.keyframes, threads=1) == pytest.approx(readout, abs=0.002)
+    assert graph.readout == 0.0, "only the caller changes the graph"
+
+
+def test_poses_are_right_once_it_is_taken_out() -> None:
+    errors = {}
+    for readout in (0.0, 0.025):
+        graph, poses = graph_of(0.025)
+        graph.readout = readout
+        indices = set(graph.keyframes)
+        solver = Solver(steps=20, tolerance=0.0)
+        assert not graph.optimize(indices, indices - {0, 1}, indices, solver).failure
+        errors[readout] = max(np.abs(graph.keyframes[n].cam_from_world - poses[n]).max() for n in indices)
+    assert errors[0.025] < 0.2 * errors[0.0]
+
+
+def test_the_synthetic_camera_has_a_global_shutter() -> None:
+    tracker, _, _ = track(synthetic(frames=80)[:50])
+    assert tracker.graph is not None
+    assert tracker.graph.readout == 0.0
