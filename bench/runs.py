@@ -28,18 +28,20 @@ class Setting:
     name: str
     overrides: tuple[str, ...] = ()
 
-    def text(self) -> str:
-        """The Hydra choice that makes them. Raises ValueError for an override that is not key=value."""
-        choices, values = [], []
-        for override in self.overrides:
+    def text(self, first: Sequence[str] = ()) -> str:
+        """The Hydra choice that makes them, after those in `first`. Raises ValueError for what is not key=value."""
+        choices: dict[str, str] = {}
+        values = []
+        for override in (*first, *self.overrides):
             key, equals, value = override.partition("=")
             if not equals:
                 raise ValueError(f"{self.name}: {override!r} must look like slot=choice or slot.parameter=value")
             if "." in key or key == "seed":
                 values.append(override)
             else:
-                choices.append({f"override /{key}": value})
-        config = OmegaConf.merge({"defaults": [*choices, "_self_"]}, OmegaConf.from_dotlist(values))
+                choices[f"override /{key}"] = value
+        defaults = [*({key: value} for key, value in choices.items()), "_self_"]
+        config = OmegaConf.merge({"defaults": defaults}, OmegaConf.from_dotlist(values))
         assert isinstance(config, DictConfig)
         return f"# @package _global_\n{OmegaConf.to_yaml(config)}"
 
@@ -58,7 +60,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Everything with everything; `settings` are written beside the runs, as choices of their own."""
+    """Everything with everything; `settings` are written beside the runs, as choices of their own.
+
+    Stronger from left to right: the scene, the variant, `overrides`, the setting.
+    """
 
     scenes: Sequence[str]
     variants: Sequence[str] = ("full",)
@@ -97,7 +102,7 @@ class Matrix:
             f"+variant={','.join(self.variants)}",
             *settings,
             f"seed={','.join(str(s) for s in self.seeds)}",
-            *self.overrides,
+            *([] if self.settings else self.overrides),  # on the command line they would be stronger than a setting
             f"output={output}",
             "screen=plain",
         ]
@@ -108,7 +113,7 @@ class Matrix:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         for setting in self.settings:
-            (folder / f"{setting.name}.yaml").write_text(setting.text())
+            (folder / f"{setting.name}.yaml").write_text(setting.text(self.overrides))
 
     def start(self, output: Path) -> subprocess.Popen[bytes]:
         """Starts everything; earlier results in `output` are removed. Its screen goes to output/runs.log."""

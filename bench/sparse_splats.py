@@ -29,6 +29,7 @@ class SparseConfig:
     """Offline optimization."""
 
     seconds: float = 60.0  # of optimization
+    iterations: int | None = None  # of optimization, whatever the time; None: as many as the seconds allow
     settle: float = 0.5  # last share of it in which learning rates fall to a tenth and no splat is added
     seed: int = 0
     initial_opacity: float = 0.1
@@ -72,7 +73,7 @@ class SparseMap:
         """As long as the configuration says."""
         order: list[int] = []
         start = time.perf_counter()
-        while (done := (time.perf_counter() - start) / self.config.seconds) < 1.0:
+        while (done := self._done(time.perf_counter() - start)) < 1.0:
             order = order or [int(i) for i in self._random.permutation(len(self._views))]
             self._step(self._views[order.pop()], done)
         self.seconds += time.perf_counter() - start
@@ -85,6 +86,11 @@ class SparseMap:
                 density=self.config.training.density, threads=self.config.training.threads,
             ).color  # fmt: skip
         return np.asarray(color.clamp(0, 1).numpy())
+
+    def _done(self, seconds: float) -> float:
+        """Share of the work."""
+        wanted = self.config.iterations
+        return seconds / self.config.seconds if wanted is None else self.iterations / wanted
 
     def _step(self, view: TrainingView, done: float) -> None:
         settling = max(0.0, (done - 1.0 + self.config.settle) / self.config.settle)
