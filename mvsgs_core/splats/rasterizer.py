@@ -128,7 +128,7 @@ def rasterize(
     tile_mask: (rows, columns) of `tile_grid`, False leaves a tile out: background there, and no gradient from it.
     near: splats with z <= near are left out, map units: relate it to the scene's depth.
     degree: highest degree of the spherical harmonics used; None = all that `splats.sh` has.
-    weights: fill `Render.weight_sum` and `weight_max` (adds some 10 % to the forward pass).
+    weights: fill `Render.weight_sum` and `weight_max` (adds about a quarter to the forward pass).
     threads: of the "cpu" back end; None = all. The result is the same for every number.
     backend: "auto" takes "triton" on a GPU and "cpu" otherwise.
 

@@ -78,8 +78,8 @@ SPLATS_INLINE Lanes reciprocal(Lanes x) {
 }
 
 #if defined(__AVX512F__)
-// 2^x for x <= 126, relative error 8e-8 plus rounding, by a minimax polynomial of degree 5 on [-1/2, 1/2].
-SPLATS_INLINE Lanes exp2_upto_126(Lanes x) {
+// 2^x for x <= 0, relative error 8e-8 plus rounding, by a minimax polynomial of degree 5 on [-1/2, 1/2].
+SPLATS_INLINE Lanes exp2_of_negative(Lanes x) {
     const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
     const Lanes f = x - whole;
     Lanes p = 1.327647199e-03f * f + 9.675541334e-03f;
@@ -89,8 +89,17 @@ SPLATS_INLINE Lanes exp2_upto_126(Lanes x) {
     p = p * f + 1.000000072f;
     return (Lanes)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)whole);
 }
-SPLATS_INLINE Lanes exp2_of_negative(Lanes x) { return exp2_upto_126(x); }
-SPLATS_INLINE Lanes exp2_limited(Lanes x) { return exp2_upto_126(minimum(x, all(126.0f))); }
+// 2^x with x limited to 126 from above, relative error 3e-6, by a polynomial of degree 4: for an exponent, as above.
+SPLATS_INLINE Lanes exp2_limited(Lanes x) {
+    x = minimum(x, all(126.0f));
+    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const Lanes f = x - whole;
+    Lanes p = 9.570101911e-03f * f + 5.591786032e-02f;
+    p = p * f + 2.402474483e-01f;
+    p = p * f + 6.931218147e-01f;
+    p = p * f + 9.999992614e-01f;
+    return (Lanes)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)whole);
+}
 #else
 // 2^x for -126 < x <= 0, relative error 8e-8 plus rounding; other lanes give garbage (the caller masks them).
 // Minimax polynomial of degree 5 on [-1, 0].
@@ -119,19 +128,18 @@ SPLATS_INLINE Lanes exp2_limited(Lanes x) {
 }
 #endif
 
-// log2(x) of positive normal x: mantissa in [sqrt(1/2), sqrt(2)), log2(1 + f) = f P(f), P of degree 8.
+// log2(x) of positive normal x: mantissa in [sqrt(1/2), sqrt(2)), log2(1 + f) = f P(f), P of degree 6 with a
+// relative error of 1e-6: enough for an exponent, where it changes alpha by less than 1e-6.
 SPLATS_INLINE Lanes log2_of_positive(Lanes x) {
     const Ints bits = (Ints)x;
     const Ints exponent = (bits - 0x3f3504f3) >> 23;
     const Lanes f = (Lanes)(bits - (exponent << 23)) - 1.0f;
-    Lanes p = 1.258370513e-01f * f - 2.072697619e-01f;
-    p = p * f + 2.157156012e-01f;
-    p = p * f - 2.389448187e-01f;
-    p = p * f + 2.879162483e-01f;
-    p = p * f - 3.607036829e-01f;
-    p = p * f + 4.809106429e-01f;
-    p = p * f - 7.213473468e-01f;
-    p = p * f + 1.442695004e+00f;
+    Lanes p = 1.716245617e-01f * f - 2.693202167e-01f;
+    p = p * f + 2.956995207e-01f;
+    p = p * f - 3.593716436e-01f;
+    p = p * f + 4.806267683e-01f;
+    p = p * f - 7.213635760e-01f;
+    p = p * f + 1.442696447e+00f;
     return p * f + __builtin_convertvector(exponent, Lanes);
 }
 
@@ -164,15 +172,30 @@ SPLATS_INLINE Lanes sums(const Lanes (&v)[16]) {
 // Vector i = (8-bit, 4-bit, 2-bit, 1-bit merges): bit 0 of i chose the half of 8 lanes, bit 3 the single lane.
 constexpr int kSumLane[16] = {0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15};
 
+// Every lane with the one 8, 4, 2 or 1 lanes on, so that four steps join them all.
+SPLATS_INLINE Lanes turned8(Lanes v) {
+    return __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7);
+}
+SPLATS_INLINE Lanes turned4(Lanes v) {
+    return __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3, 12, 13, 14, 15, 8, 9, 10, 11);
+}
+SPLATS_INLINE Lanes turned2(Lanes v) {
+    return __builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+}
+SPLATS_INLINE Lanes turned1(Lanes v) {
+    return __builtin_shufflevector(v, v, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
+}
 SPLATS_INLINE float sum(Lanes v) {
-    float total = 0.0f;
-    for (int i = 0; i < kLanes; ++i) total += v[i];
-    return total;
+    v += turned8(v);
+    v += turned4(v);
+    v += turned2(v);
+    return (v + turned1(v))[0];
 }
 SPLATS_INLINE float largest(Lanes v) {
-    float best = v[0];
-    for (int i = 1; i < kLanes; ++i) best = v[i] > best ? v[i] : best;
-    return best;
+    v = maximum(v, turned8(v));
+    v = maximum(v, turned4(v));
+    v = maximum(v, turned2(v));
+    return maximum(v, turned1(v))[0];
 }
 
 }  // namespace splats
