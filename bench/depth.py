@@ -75,11 +75,14 @@ def _inliers(name: str, value: Score) -> Row:
 def peer_rows(scene: Scene, found: Run) -> list[Row]:
     """Outliers at equal completeness against a plain plane sweep; both figures against SGBM."""
     by_index = {v.index: v for v in scene.views}
-    plain, unsure, pair = [], [], []
+    plain: list[np.ndarray] = []
+    unsure: list[np.ndarray] = []
+    pair: list[np.ndarray] = []
     for one in found.stereo:
         if one.search is None or not one.neighbors:
             empty = np.zeros(one.view.size, np.float32)
-            plain.append(empty), unsure.append(empty), pair.append(empty)
+            for maps in (plain, unsure, pair):
+                maps.append(empty)
             continue
         neighbors = [by_index[i] for i in one.neighbors]
         depth, confidence = plane_sweep(one.view, neighbors, one.search, hypotheses=96)

@@ -58,7 +58,10 @@ class Scene:
 def load_scene(
     name: str, area: int, count: int | None = None, scales: tuple[int, ...] = (1, 2), **changes: Any
 ) -> Scene:
-    """Keyframes at a fixed parallax, at most `count`; `changes` to the reader's options. Raises FileNotFoundError where the data is missing."""
+    """Keyframes at a fixed parallax, at most `count`; `changes` to the reader's options.
+
+    Raises FileNotFoundError where the data is missing.
+    """
     source = SOURCES[name]
     options = source.options | changes
     if source.dataset == "synthetic":

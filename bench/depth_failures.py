@@ -16,7 +16,7 @@ from mvsgs_core.mvs.cascade import CascadeConfig
 
 
 def wrong_pose(scene: Scene) -> Scene:
-    """One keyframe in the middle stands 15 % of the scene's median depth beside its place and is turned by 2 degrees."""
+    """One keyframe in the middle stands 15 % of the median depth beside its place and is turned by 2 degrees."""
     middle = len(scene.views) // 2
     truth = scene.truths[middle]
     assert truth is not None

@@ -52,7 +52,7 @@ def sgbm(reference: StereoView, neighbor: StereoView, search: SearchRange) -> np
     relative = geometry.inverse(neighbor.world_from_cam) @ reference.world_from_cam
     ours, theirs = camera.matrix(reference.intrinsics), camera.matrix(neighbor.intrinsics)
     no_distortion = np.zeros(5)
-    r1, r2, p1, p2, q, _, _ = cv2.stereoRectify(
+    r1, r2, p1, p2, *_ = cv2.stereoRectify(
         ours, no_distortion, theirs, no_distortion, (width, height), relative[:3, :3], relative[:3, 3:], alpha=0
     )
     maps = [
@@ -71,7 +71,7 @@ def sgbm(reference: StereoView, neighbor: StereoView, search: SearchRange) -> np
         images = [np.ascontiguousarray(i[:, ::-1]) for i in images]
     least = max(0, int(abs(shift) * search.low) - 1)
     count = int(np.ceil((abs(shift) * search.high - least + 2) / 16)) * 16
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         minDisparity=least, numDisparities=max(16, count), blockSize=5, P1=8 * 25, P2=32 * 25, disp12MaxDiff=1,
         uniquenessRatio=10, speckleWindowSize=50, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip

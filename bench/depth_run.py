@@ -72,7 +72,7 @@ def depth_view(found: CascadeDepth) -> DepthView:
 
 
 def score(depths: list[np.ndarray], scene: Scene, align: bool = False) -> Score:
-    """Pooled over keyframes with truth, in stream order. `align`: each map's median ratio to the truth is divided out."""
+    """Pooled over keyframes with truth. `align`: each map's median ratio to the truth is divided out."""
     errors, total = [], 0
     for depth, truth in zip(depths, scene.truths, strict=True):
         if truth is None:

@@ -1,4 +1,4 @@
-"""Keyframe -> Depth: the tracker's own coarse depth, enlarged. The paper's ablation A, and a way to run without stereo."""
+"""Keyframe -> Depth: the tracker's own coarse depth, enlarged. The paper's ablation A."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CoarseDepth(Node):
     config: Config
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
-        size = camera.fit_size(*keyframe.image.shape[:2], self.config.area)
+        size = camera.fit_size(keyframe.image.shape[0], keyframe.image.shape[1], self.config.area)
         with self.stats.time("enlarge"):
             depth, confidence = enlarge_inverse_depth(keyframe.inverse_depth, keyframe.inverse_depth_weight, size)
         self.stats.count("keyframes")

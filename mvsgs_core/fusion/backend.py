@@ -115,7 +115,7 @@ class NativeFusionBackend:
 
 
 def make_fusion_backend(device: str, threads: int | None = None) -> FusionBackend:
-    """`device` "auto" (CUDA if there is one), "cpu" (C++), "torch" (PyTorch on the CPU) or a torch device like "cuda"."""
+    """`device`: "auto" (CUDA if there is one), "cpu" (C++), "torch" (PyTorch, CPU) or a torch device like "cuda"."""
     if device == "auto":
         import torch
 

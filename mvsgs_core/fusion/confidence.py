@@ -12,7 +12,7 @@ WEIGHTS = np.array([-0.981, 1.16, 1.546, -0.759, -0.123, 1.309, 0.074, -1.097, -
 
 
 def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray) -> np.ndarray:
-    """(F, H, W) float32, the first all ones. `confidence` (H, W): stereo's; `consistent` (H, W): neighbors that agree."""
+    """(F, H, W) float32, the first all ones, of stereo's confidence and the number of agreeing neighbors (H, W)."""
     around = cv2.blur(confidence, (9, 9))  # errors come in patches
     agreeing = cv2.blur((consistent >= 2).astype(np.float32), (5, 5))
     # Windows make a near surface grow over what lies behind it: its rim, close to something farther, is doubtful.

@@ -33,13 +33,11 @@ class DepthView:
 
 
 def warps_between(reference: DepthView, neighbors: list[DepthView]) -> tuple[np.ndarray, np.ndarray]:
-    """(there (N, 12), back (N, 12)) float32: from the reference into each neighbor, and from each into the reference."""
+    """(there (N, 12), back (N, 12)) float32: from the reference into each neighbor, and back."""
     there = [
-        relative_warp(reference.intrinsics, reference.world_from_cam, n.intrinsics, n.world_from_cam)
-        for n in neighbors
+        relative_warp(reference.intrinsics, reference.world_from_cam, n.intrinsics, n.world_from_cam) for n in neighbors
     ]
     back = [
-        relative_warp(n.intrinsics, n.world_from_cam, reference.intrinsics, reference.world_from_cam)
-        for n in neighbors
+        relative_warp(n.intrinsics, n.world_from_cam, reference.intrinsics, reference.world_from_cam) for n in neighbors
     ]
     return np.array(there, dtype=np.float32), np.array(back, dtype=np.float32)

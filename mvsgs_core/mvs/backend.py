@@ -116,7 +116,7 @@ class NativeBackend:
 
 
 def make_backend(device: str, threads: int | None = None) -> Backend:
-    """`device` "auto" (CUDA if there is one), "cpu" (C++), "torch" (PyTorch on the CPU) or a torch device like "cuda"."""
+    """`device`: "auto" (CUDA if there is one), "cpu" (C++), "torch" (PyTorch, CPU) or a torch device like "cuda"."""
     if device == "auto":
         import torch
 

@@ -41,7 +41,7 @@ class Evidence:
         variance = np.maximum(cv2.blur(gray * gray, (5, 5)) - mean * mean, 0.0)
         return Evidence(
             correlation=best,
-            support=np.mean(correlation > 0.6, axis=0, dtype=np.float32),
+            support=np.asarray(np.mean(correlation > 0.6, axis=0, dtype=np.float32)),
             probability=probability,
             first_probability=first_probability,
             relative_pixel=np.asarray(relative_pixel, dtype=np.float32),

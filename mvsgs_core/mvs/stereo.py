@@ -92,15 +92,16 @@ def estimate_depth(
             needed = int(np.ceil((search.high - search.low) / wanted)) + 1
             count = int(np.clip(needed, 8, stage.hypotheses))
             interval = (search.high - search.low) / (count - 1)
-            first = np.full(size, search.low, dtype=np.float32)
+            first: np.ndarray = np.full(size, search.low, dtype=np.float32)
             counts["hypotheses_pruned"] += float(stage.hypotheses - count) * gray.size
         else:
             count = stage.hypotheses
             previous = interval
-            if config.fill:
+            if config.fill and choice is not None:
                 surface = fill_uncertain(surface, certainty(choice), reference.gray(config.stages[number - 1].scale))
             interval = min(wanted, previous)
-            first = upsample_surface(surface, size, 1.5 * previous) - np.float32(interval * (count - 1) / 2)
+            centers = upsample_surface(surface, size, 1.5 * previous)
+            first = centers - np.float32(interval * (count - 1) / 2)
         step = np.full(size, interval, dtype=np.float32)
         cost = backend.cost_volume(
             gray, images, warps.astype(np.float32), first, step, count, config.cost_options(stage)
@@ -145,9 +146,8 @@ def _warps(reference: StereoView, neighbors: list[StereoView], scale: int) -> np
 
 
 def _stack(neighbors: list[StereoView], scale: int) -> np.ndarray:
-    """(N, h, w) images of one size: smaller ones are padded by their border, which no warp reaches."""
-    images = [n.gray(scale) for n in neighbors]
-    return np.ascontiguousarray(np.stack(images))
+    """(N, h, w) images, all of one size (a change of size starts a new window in Cascade)."""
+    return np.ascontiguousarray(np.stack([n.gray(scale) for n in neighbors]))
 
 
 def _enlarge(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:

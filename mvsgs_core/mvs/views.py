@@ -1,4 +1,4 @@
-"""What multi-view stereo keeps of a keyframe: gray images at the sizes of the stages, pose, the tracker's coarse depth."""
+"""What multi-view stereo keeps of a keyframe: gray images at the stages' sizes, pose, the tracker's coarse depth."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def prepare_view(
     if not (np.isfinite(world_from_cam).all() and np.isfinite(intrinsics).all()):
         raise ValueError(f"keyframe {index}: pose or intrinsics are not finite")
     coarsest = max(scales)
-    size = camera.fit_size(*image.shape[:2], area, multiple=max(8, coarsest))
+    size = camera.fit_size(image.shape[0], image.shape[1], area, multiple=max(8, coarsest))
     gray = cv2.cvtColor(camera.resize_image(image, size), cv2.COLOR_RGB2GRAY).astype(np.float32) - 128.0
     pyramid = tuple(
         np.ascontiguousarray(gray if s == 1 else camera.resize_image(gray, (size[0] // s, size[1] // s)))

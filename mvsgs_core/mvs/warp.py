@@ -27,7 +27,7 @@ def relative_warp(
 def apply_warp(
     warp: np.ndarray, u: np.ndarray, v: np.ndarray, inverse_depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (x, y) in the neighbor and Z (depth there times inverse depth here); only where Z > 0 are they in front."""
+    """Pixels (x, y) in the neighbor and Z, the depth there times the inverse depth here; Z > 0 is in front."""
     m, b = warp[:9].reshape(3, 3), warp[9:]
     xs, ys, zs = (m[i, 0] * u + m[i, 1] * v + m[i, 2] + b[i] * inverse_depth for i in range(3))
     safe = np.where(zs > 1e-9, zs, 1.0)
