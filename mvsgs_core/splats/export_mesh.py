@@ -20,7 +20,7 @@ def write_mesh(
     intrinsics: np.ndarray,
     size: tuple[int, int],
     voxel: float = 0.01,
-    min_opacity: float = 0.8,
+    min_opacity: float = 0.5,
 ) -> tuple[int, int]:
     """Renders depth from poses (K, 4, 4) with intrinsics (4,) at `size`, fuses it and writes a .ply, .obj or .glb mesh.
 

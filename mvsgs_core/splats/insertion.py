@@ -27,7 +27,7 @@ class InsertionConfig:
     voxel: float = 0.01  # edge of the voxel filter in median depths; 0: no filter
     initial_scale: float = 0.5  # standard deviation in spacings of the points
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
-    initial_opacity: float = 0.5  # 0 to 1 (Stereo-GS: 0.1)
+    initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
     min_confidence: float = 0.0  # of the depth, 0 to 1; views come filtered already
 
 

@@ -59,8 +59,8 @@ class TrainingView:
         if self.visits_full == 1:
             self.loss_fast = self.loss_slow = loss
             return
-        self.loss_fast += 0.5 * (loss - self.loss_fast)
-        self.loss_slow += 0.15 * (loss - self.loss_slow)
+        self.loss_fast += 0.2 * (loss - self.loss_fast)
+        self.loss_slow += 0.05 * (loss - self.loss_slow)
 
     def converged(self, min_visits: int, improvement: float) -> bool:
         """After `min_visits` the loss no longer falls by the share `improvement` between slow and fast mean."""

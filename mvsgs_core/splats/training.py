@@ -36,9 +36,9 @@ class SkipConfig:
     """What the optimization leaves out, each with its switch."""
 
     converged: bool = True  # keyframes whose loss no longer falls are mostly passed over
-    converged_visits: int = 12  # full-resolution visits before a keyframe can count as converged
-    converged_improvement: float = 0.03  # share by which the loss must still fall
-    converged_keep: float = 0.3  # share of the visits that a converged keyframe still gets
+    converged_visits: int = 30  # full-resolution visits before a keyframe can count as converged
+    converged_improvement: float = 0.02  # share by which the loss must still fall
+    converged_keep: float = 0.5  # share of the visits that a converged keyframe still gets
     tiles: bool = False  # tiles of low error are left out
     tiles_error: float = 0.5  # low: below this share of the view's mean error
     tiles_every: int = 4  # every so many visits all tiles are rendered, and their errors measured
