@@ -113,7 +113,7 @@ def setting(difficulty: str, strength: float) -> Setting:
 def difficulties(options: argparse.Namespace, overrides: list[str], easy: Outcome, lines: list[str]) -> list[Row]:
     chosen = {"covered": (20,), "noise": (12,)} if options.quick else DIFFICULTIES
     pairs = [(name, strength) for name, strengths in chosen.items() for strength in strengths]
-    matrix = Matrix(["room"], overrides=overrides, settings=[setting(*pair) for pair in pairs])
+    matrix = Matrix(["room"], overrides=overrides, jobs=options.jobs, settings=[setting(*pair) for pair in pairs])
     rows = []
     for (name, strength), run in zip(pairs, _go(matrix, options, "difficulties"), strict=True):
         outcome = Outcome.of(run)
@@ -123,7 +123,7 @@ def difficulties(options: argparse.Namespace, overrides: list[str], easy: Outcom
 
 
 def real(options: argparse.Namespace, lines: list[str]) -> list[Row]:
-    matrix = Matrix(REAL, overrides=SMALL[3:])
+    matrix = Matrix(REAL, overrides=SMALL[3:], jobs=options.jobs)
     rows = []
     for run in _go(matrix, options, "real"):
         outcome = Outcome.of(run)
@@ -232,6 +232,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default=",".join(GROUPS), help=f"comma separated: {', '.join(GROUPS)}")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="difficulties and real sequences at once; times mean little"
+    )
     parser.add_argument("--frames", type=int, default=2000, help="of the long run")
     parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
     parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
