@@ -15,7 +15,7 @@ from nodes.tracker import Tracker
 from tests.core.tracking.sequences import synthetic
 
 
-def messages(count: int = 60) -> tuple[list[Frame], list[GroundTruth]]:
+def messages(count: int = 45) -> tuple[list[Frame], list[GroundTruth]]:
     items = synthetic(frames=80)[:count]
     frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in items]
     truths = [GroundTruth(i.index, i.timestamp, i.image, i.intrinsics, i.world_from_cam, i.depth) for i in items]

@@ -32,6 +32,12 @@ def track(items: Sequence[Item], config: TrackerConfig | None = None) -> tuple[T
     return tracker, tracker.path(), updates
 
 
+@functools.cache
+def tracked_room() -> tuple[Tracker, Path, list[Update]]:
+    """The easy case, tracked once: 80 frames of the room."""
+    return track(synthetic(frames=80))
+
+
 def ate(path: Path, items: Sequence[Item], chosen: np.ndarray | None = None) -> tuple[float, float]:
     """RMS position error after Sim(3) alignment over all frames with a pose, and the length of the true path."""
     truth = {i.index: i.world_from_cam for i in items}

@@ -11,7 +11,7 @@ from mvsgs_core.tracking.flow import Matches
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.rolling_shutter import estimate_readout
-from tests.core.tracking.sequences import synthetic, track
+from tests.core.tracking.sequences import tracked_room
 
 SIZE = (120, 160)
 
@@ -72,6 +72,6 @@ def test_poses_are_right_once_it_is_taken_out() -> None:
 
 
 def test_the_synthetic_camera_has_a_global_shutter() -> None:
-    tracker, _, _ = track(synthetic(frames=80)[:50])
+    tracker, _, _ = tracked_room()
     assert tracker.graph is not None
     assert tracker.graph.readout == 0.0
