@@ -67,6 +67,13 @@ def test_ply_has_the_3dgs_layout_by_plyfile(tmp_path: Path, bases: int) -> None:
         np.testing.assert_array_equal(vertex[f"f_rest_{bases - 1}"], final.splats.sh[:, 1, 1].numpy())
 
 
+def test_an_empty_map_is_a_file_too(tmp_path: Path) -> None:
+    full = final_map(1)
+    none = Splats(*(value[:0] for value in vars(full.splats).values()))
+    write_ply(tmp_path / "map.ply", replace(full, splats=none, anchors=full.anchors[:0]))
+    assert len(PlyData.read(str(tmp_path / "map.ply"))["vertex"].data) == 0
+
+
 @pytest.mark.parametrize("density", ["gaussian", "exact", "ges_scale"])
 def test_a_saved_map_is_read_back(tmp_path: Path, density: str) -> None:
     final = final_map(4, density)
