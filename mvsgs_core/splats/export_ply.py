@@ -27,7 +27,8 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     origin = relative_origin(final)
     means = splats.means.numpy().astype(np.float64) + (final.origin - origin)
     harmonics = splats.sh.numpy()
-    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), 3 * (harmonics.shape[1] - 1))  # all of red, then green, then blue
+    # all of red, then green, then blue
+    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), 3 * (harmonics.shape[1] - 1))
     columns = {"x": means[:, 0], "y": means[:, 1], "z": means[:, 2]}
     columns |= {name: np.zeros(len(splats)) for name in ("nx", "ny", "nz")}
     columns |= {f"f_dc_{k}": harmonics[:, 0, k] for k in range(3)}
