@@ -1,4 +1,4 @@
-"""Compact files for web viewers, which know only Gaussians: .splat (32 bytes a splat) and .spz (compressed)."""
+"""Compact files for web viewers: .splat (32 bytes a splat), .spz (compressed, by open3d). Both know only Gaussians."""
 
 from __future__ import annotations
 

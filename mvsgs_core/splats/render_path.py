@@ -1,4 +1,4 @@
-"""A saved map along a path, as a video: `python -m mvsgs_core.splats.render_path MAP.ply TRAJECTORY.txt OUT.mp4`."""
+"""A saved map along a path as a video: `python -m mvsgs_core.splats.render_path MAP.ply TRAJECTORY.txt OUT.mp4`."""
 
 from __future__ import annotations
 
