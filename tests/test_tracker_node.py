@@ -75,6 +75,18 @@ def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
     assert "front end" in node.stats.seconds
 
 
+def test_a_stream_too_short_for_a_start_is_forced_to_one_and_says_so() -> None:
+    frames, _ = messages(16)
+    node = Tracker()
+    sent = [m for frame in frames for m in node.on_frame(frame)]
+    assert sent == []
+    sent = list(node.on_end())
+    keyframes = of_type(sent, Keyframe)
+    assert len(keyframes) >= 3
+    assert all(k.image is frames[k.index].image for k in keyframes)
+    assert any("forced" in warning for warning in node.stats.warnings)
+
+
 def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
     for node in (Tracker(), PosedTracker()):
         sent = list(node.on_end())

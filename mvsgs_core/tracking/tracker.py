@@ -102,7 +102,10 @@ class Tracker:
     @property
     def pending(self) -> set[int]:
         """Frames that may still become keyframes that are told: their images are needed until then."""
-        return set(self.starter.waiting) if self.graph is not None else set()
+        if self.graph is None:
+            return set()
+        last = self.front_end.last  # the end of the stream may force a start with it
+        return set(self.starter.waiting) | ({last.index} if last is not None and not self.started else set())
 
     def finish(self) -> Iterator[Update]:
         """The stream has ended: a start by force if there was none, and the global bundle adjustment."""

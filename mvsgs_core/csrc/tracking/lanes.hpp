@@ -3,6 +3,9 @@
 
 #include <cstring>
 
+// Vectors wider than the instruction set's registers are passed in memory: only inline functions here, so it's no ABI.
+#pragma GCC diagnostic ignored "-Wpsabi"
+
 namespace mvsgs {
 
 constexpr int kLanes = 8;
