@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +69,9 @@ def load_scene(
         options["size"] = (240, 320) if area <= 320 * 240 else (384, 512)
     else:
         options |= {"path": SHARED / source.folder, "stride": source.stride}
-    items = list(keyframes(open_dataset(source.dataset, **options), source.parallax))
+    items = list(islice(keyframes(open_dataset(source.dataset, **options), source.parallax), count))
     if source.dataset == "seven_scenes":
         items = [register(item) for item in items]
-    items = items[:count]
     known = [i.depth for i in items if i.depth is not None]
     views, truths = [], []
     for number, item in enumerate(items):

@@ -52,7 +52,8 @@ FAILURES: dict[str, Callable[[Scene], Scene]] = {
 
 def failure_rows(area: int, count: int | None) -> list[Row]:
     """Outliers (beyond 5 %) among the kept pixels, and how much each filter rejected."""
-    scenes = {name: change(load_scene("room", area, count)) for name, change in FAILURES.items()}
+    room = load_scene("room", area, count)
+    scenes = {name: change(room) for name, change in FAILURES.items()}
     scenes["moving object"] = load_scene("room", area, count, moving_object=1.0)
     scenes["bare walls"] = load_scene("room", area, count, textureless=4)
     rows = []

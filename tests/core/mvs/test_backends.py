@@ -33,7 +33,7 @@ def problem(seed: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("radius", [0, 1, 3])
+@pytest.mark.parametrize("radius", [1, 2, 3])
 def test_cost_volumes_of_both_backends_agree(radius: int) -> None:
     p = problem()
     options = replace(COST, radius=radius)
@@ -44,7 +44,7 @@ def test_cost_volumes_of_both_backends_agree(radius: int) -> None:
     assert native.max() <= 1
     # Rounding decides on which side of the border a sample falls: a few pixels may differ by more.
     assert np.mean(np.abs(native - twin) > 1e-3) < 2e-3
-    assert native.std() > (0 if radius == 0 else 0.05)
+    assert native.std() > 0.05
 
 
 def test_correlations_agree_and_mark_what_is_not_seen() -> None:
