@@ -39,6 +39,7 @@ def load(file: str | None) -> DroidNet:
 
 def random_net(seed: int = 0) -> DroidNet:
     """Weights that keep activations at their size (He et al. 2015), so that every part of the system is exercised."""
+    gain_of_revision = 3.0  # of the last layer: revisions of several cells, which pass the motion filter
     generator = torch.Generator().manual_seed(seed)
     net = DroidNet().eval().requires_grad_(False)
     for layer in net.modules():
@@ -47,6 +48,9 @@ def random_net(seed: int = 0) -> DroidNet:
             layer.weight.copy_(torch.randn(layer.weight.shape, generator=generator) * (2.0 / fan_in) ** 0.5)
             assert layer.bias is not None
             layer.bias.zero_()
+    revision = net.update.delta[2]
+    assert isinstance(revision, nn.Conv2d)
+    revision.weight.mul_(gain_of_revision)
     return net
 
 
