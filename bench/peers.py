@@ -139,8 +139,9 @@ def pose_rows(scene: str, ours: Ours, model: Model, frames: list[int]) -> list[R
         posed = sum(i in poses for i in frames)
         rows.append(Row(f"{scene}: poses, {name}: frames posed", f"{posed} of {len(frames)}"))
         rows.append(Row(f"{scene}: poses, {name}: ATE, frames that COLMAP has", ate_percent(poses, ours, common), "%"))
-    rows.insert(2, Row(f"{scene}: poses, ours: seconds of the tracker", stage_seconds(ours.report, "tracker"), "s"))
+    rows.insert(2, Row(f"{scene}: poses, ours: seconds", stage_seconds(ours.report, "tracker"), "s"))
     rows.append(Row(f"{scene}: poses, COLMAP: seconds", sum(model.seconds.values()), "s"))
+    rows.append(Row(f"{scene}: poses, COLMAP: sparse points", len(model.points)))
     return rows
 
 
@@ -149,10 +150,9 @@ def map_rows(scene: str, ours: Ours, model: Model, trained: list[Trained]) -> li
         Row(f"{scene}: map, ours: held-out PSNR", figure(ours.report, "rendering.held_out.psnr"), "dB"),
         Row(f"{scene}: map, ours: held-out SSIM", figure(ours.report, "rendering.held_out.ssim")),
         Row(f"{scene}: map, ours: seconds of optimization", ours.optimization, "s"),
-        Row(f"{scene}: map, ours: seconds, video to map", figure(ours.report, "time.wall"), "s"),
+        Row(f"{scene}: map, ours: seconds, frames to map", figure(ours.report, "time.wall"), "s"),
         Row(f"{scene}: map, ours: splats", figure(ours.report, "map.splats")),
         Row(f"{scene}: map, ours: iterations", figure(ours.report, "map.iterations")),
-        Row(f"{scene}: map, COLMAP: points", len(model.points)),
     ]
     for result in trained:
         times = round(result.seconds / ours.optimization)
@@ -191,21 +191,25 @@ def compare(scene: str, options: argparse.Namespace, overrides: list[str]) -> li
 
 
 def markdown(rows: list[Row]) -> str:
-    """One line a scene and method, from rows named "scene: poses or map, method: figure"."""
-    lines: dict[tuple[str, str, str], dict[str, str]] = {}
+    """A table of poses and one of maps, a line each scene and method, from rows named "scene: kind, method: figure"."""
+    tables: dict[str, dict[tuple[str, str], dict[str, str]]] = {"poses": {}, "map": {}}
+    failures = []
     for row in rows:
-        scene, method, *rest = row.name.split(": ", 2)
+        scene, method, *figure_name = row.name.split(": ", 2)
         kind, _, method = method.partition(", ")
         shown = "–" if row.value is None else f"{row.value:.4g}" if isinstance(row.value, float) else str(row.value)
-        if rest:
-            lines.setdefault((scene, kind, method), {})[rest[0]] = f"{shown} {row.unit}".strip()
+        if kind in tables and figure_name:
+            tables[kind].setdefault((scene, method), {})[figure_name[0]] = f"{shown} {row.unit}".strip()
         else:
-            lines.setdefault((scene, kind, method), {})["failed"] = shown
-    text = ["| scene | what | method | figures |", "|---|---|---|---|"]
-    for (scene, kind, method), figures in lines.items():
-        cells = "; ".join(f"{name} {shown}" for name, shown in figures.items())
-        text.append(f"| {scene} | {kind} | {method} | {cells} |")
-    return "\n".join(text) + "\n"
+            failures.append(f"{row.name}: {shown}")
+    text = []
+    for kind, lines in tables.items():
+        names = list(dict.fromkeys(name for figures in lines.values() for name in figures))
+        text += [f"| scene | {kind} | " + " | ".join(names) + " |", "|---|---|" + "---:|" * len(names)]
+        for (scene, method), figures in lines.items():
+            text.append(f"| {scene} | {method} | " + " | ".join(figures.get(name, "") for name in names) + " |")
+        text.append("")
+    return "\n".join([*text, *failures]) + "\n"
 
 
 def measure(options: argparse.Namespace) -> list[Row]:

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench import ablation, compare, curves, memory, plots, record, scenes, stress
+from bench import ablation, compare, curves, memory, peers, plots, record, scenes, stress
 from bench.runs import CONF, Matrix, Run, Setting, choices, figure, said
 from bench.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.table import Row, at_least, at_most
 from launch.compose import compose
 from launch.parameters import GraphError
+from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.splats.training import TrainingConfig
 from tests.shared_data import ROOT
@@ -170,6 +171,38 @@ def test_ablation_says_sign_size_and_what_is_within_the_spread() -> None:
     text = ablation.table(runs, ["room"], ["A", "B"])
     assert "**-3.00 ± 0.10**" in text
     assert "| +0.05 ± 0.10 |" in text
+
+
+def test_peers_stand_in_one_table_of_poses_and_one_of_maps() -> None:
+    rows = [
+        Row("room: poses, ours: ATE", 0.5, "%"), Row("room: poses, COLMAP: ATE", None, "%"),
+        Row("room: map, ours: held-out PSNR", 30.0, "dB"),
+        Row("room: map, COLMAP, equal time: held-out PSNR", 20.0, "dB"),
+        Row("room: map, ours: splats", 9), Row("fox: COLMAP", "no model"),
+    ]  # fmt: skip
+    text = peers.markdown(rows)
+    assert "| room | poses, ours |" not in text
+    assert "| room | COLMAP | – % |" in text
+    assert "| room | ours | 30 dB | 9 |\n| room | COLMAP, equal time | 20 dB |  |" in text
+    assert text.endswith("fox: COLMAP: no model\n")
+
+
+def test_the_error_of_other_poses_is_taken_over_common_frames_after_alignment() -> None:
+    truth = {i: np.eye(4) for i in range(6)}
+    for i, pose in truth.items():
+        pose[:3, 3] = (i, i % 2, 0.1 * i)
+    frames = {i: GroundTruth(i, 0.0, np.zeros((2, 2, 3), np.uint8), np.ones(4), p, None) for i, p in truth.items()}
+    ours = peers.Ours(report(), {"index": [0, 5, 3], "keyframe": [True, False, True], "world_from_cam": []}, frames)
+    theirs = {i: pose.copy() for i, pose in truth.items() if i != 2}
+    for pose in theirs.values():
+        pose[:3, 3] = 3.0 * pose[:3, 3] + 7.0
+    assert peers.ate_percent(theirs, ours, list(range(6))) == pytest.approx(0.0, abs=1e-9)
+    theirs[4][:3, 3] += 1.0
+    worse = peers.ate_percent(theirs, ours, list(range(6)))
+    assert worse is not None
+    assert worse > 1.0
+    assert peers.ate_percent(theirs, ours, [0, 2]) is None
+    assert (ours.keyframes, ours.held_out, ours.optimization) == ([0, 3], [5], 3.0)
 
 
 def test_pareto_front_and_its_plot(tmp_path: Path) -> None:
