@@ -63,11 +63,6 @@ class TrackingImage:
         return np.asarray(cv2.resize(self.gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
     @cached_property
-    def sharpness(self) -> float:
-        """Mean squared Laplacian: falls with motion blur."""
-        return float(np.mean(np.square(cv2.Laplacian(self.gray, cv2.CV_32F))))
-
-    @cached_property
     def cells(self) -> Cells:
         return find_cells(self.gray)
 

@@ -40,7 +40,6 @@ class LoopCloser:
         self.local_map = local_map
         self.config = config
         self.retrieval = Retrieval()
-        self.tried = 0
 
     def add(self, index: int) -> None:
         """A keyframe that may be found again."""
@@ -57,7 +56,6 @@ class LoopCloser:
         descriptors = keyframe.image.features()[1]
         usual = set(order[max(0, place - 2) : place])
         for candidate in self.retrieval.query(descriptors, self.config.candidates, near, usual):
-            self.tried += 1
             found = sight(self.graph, self.local_map.matcher, candidate, keyframe.image, self.config.criteria)
             if found is None:
                 continue

@@ -76,6 +76,9 @@ class Tracker:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow."""
         if self.graph is None:
             self._set_up(image.shape[0], image.shape[1], intrinsics)
+        here = scale_intrinsics(intrinsics, (image.shape[0], image.shape[1]), self.size)
+        if not np.allclose(here, self.intrinsics, rtol=1e-3):
+            self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
         with self.stats.time("image"):
             frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color)
         self.stats.count("frames")
@@ -136,7 +139,8 @@ class Tracker:
     def _set_up(self, height: int, width: int, intrinsics: np.ndarray) -> None:
         config = self.config
         self.size = fit_size(height, width, config.area)
-        self.graph = KeyframeGraph(scale_intrinsics(intrinsics, (height, width), self.size))
+        self.intrinsics = scale_intrinsics(intrinsics, (height, width), self.size)
+        self.graph = KeyframeGraph(self.intrinsics)
         self.graph.readout = config.readout or 0.0
         self.flow = make_flow(config.flow)
         self.matcher = Matcher(self.flow)
@@ -346,6 +350,8 @@ class Tracker:
                 self.stats.warn(f"global bundle adjustment failed: {solution.failure}")
 
     def _warn_at_end(self) -> None:
+        self.stats.counts["matches"] = self.matcher.calls
+        self.stats.counts["matches that needed features"] = self.matcher.feature_calls
         segments = {k.segment for k in self._keyframes()}
         if not segments:
             self.stats.warn(f"tracking never started: {self.starter.reason}")
