@@ -154,7 +154,7 @@ def map_rows(scene: str, ours: Ours, model: Model, trained: list[Trained]) -> li
         Row(f"{scene}: map, ours: splats", figure(ours.report, "map.splats")),
         Row(f"{scene}: map, ours: iterations", figure(ours.report, "map.iterations")),
     ]
-    for result in trained:
+    for before, result in zip([None, *trained], trained):
         times = round(result.seconds / ours.optimization)
         name = f"{scene}: map, COLMAP + splatting, " + ("equal time" if times == 1 else f"{times} times as long")
         rows += [
@@ -165,9 +165,8 @@ def map_rows(scene: str, ours: Ours, model: Model, trained: list[Trained]) -> li
             Row(f"{name}: splats", result.splats),
             Row(f"{name}: iterations", result.iterations),
         ]
-    if len(trained) > 1:
-        gain = trained[-1].psnr - trained[-2].psnr
-        rows.append(Row(f"{scene}: map, COLMAP + splatting: gain of the last doubling", gain, "dB"))
+        if before is not None:
+            rows.append(Row(f"{name}: gain by twice the time", result.psnr - before.psnr, "dB"))
     return rows
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench import ablation, compare, curves, memory, peers, plots, record, scenes, stress
+from bench import ablation, curves, memory, peers, plots, record, scenes, stress
 from bench.runs import CONF, Matrix, Run, Setting, choices, figure, said
 from bench.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.table import Row, at_least, at_most
@@ -25,10 +25,6 @@ from tests.shared_data import ROOT
 
 SEARCH = f"hydra.searchpath=[file://{CONF}]"
 MAINS = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if "\n    main(measure" in p.read_text())
-
-
-def row(name: str, value: Any, unit: str = "", goal: str = "", met: bool | None = None) -> dict[str, Any]:
-    return {"name": name, "value": value, "unit": unit, "goal": goal, "met": met}
 
 
 def report(psnr: float = 25.0, wall: float = 10.0, **more: Any) -> dict[str, Any]:
@@ -251,100 +247,6 @@ def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
     grows = [(float(t), 100.0 + t) for t in range(100)]
     assert memory.growth(flat) == 1.0
     assert memory.growth(grows) > 1.4
-
-
-def test_repeated_runs_are_merged_with_their_spread() -> None:
-    merged = record.merge([
-        [row("a", 1.0, "s", "<= 2", True), row("only", "word")], [row("a", 2.0, "s", "<= 2", True)],
-        [row("a", 3.0, "s", "<= 2", False)],
-    ])  # fmt: skip
-    assert merged[0]["value"] == 2.0
-    assert merged[0]["spread"] == 1.0
-    assert merged[0]["met"] is False
-    assert merged[1] == {**row("only", "word"), "spread": None}
-
-
-def test_records_are_rendered_between_their_markers_only(tmp_path: Path) -> None:
-    files = []
-    for k, value in enumerate((1.0, 2.0)):
-        files.append(tmp_path / f"{k}.json")
-        files[-1].write_text(json.dumps([row("latency | 99 %", value, "ms", "<= 3", True)]))
-    made = record.record("quick/transport", files, "python -m bench.transport", folder=tmp_path)
-    assert record.Record.load("quick/transport", tmp_path) == made
-    block = "<!-- bench:{0} -->\n{1}<!-- /bench:{0} -->\n"
-    text = "before\n" + block.format("quick/transport", "old\n") + "after\n" + block.format("x", "")
-    once = record.render(text, tmp_path)
-    assert once.startswith("before\n<!-- bench:quick/transport -->\n\n`python -m bench.transport`, 2 runs; commit ")
-    assert "| latency \\| 99 % | 1.5 ± 0.5 ms | &lt;= 3 | yes |" in once
-    assert "old" not in once
-    assert "\nafter\n" in once
-    assert "Not recorded yet" in once
-    assert record.render(once, tmp_path) == once
-
-
-def test_a_benchmarks_own_table_and_plots_are_kept(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "table.md").write_text("| own |\n")
-    (run / "room.svg").write_text("<svg/>")
-    (tmp_path / "rows.json").write_text(json.dumps([row("a", 1.0)]))
-    made = record.record("curves", [tmp_path / "rows.json"], "c", run, tmp_path / "kept")
-    assert "| own |" in made.markdown()
-    assert "curves_room.svg" in made.markdown()
-    assert (tmp_path / "kept" / "curves_room.svg").read_text() == "<svg/>"
-
-
-@pytest.mark.parametrize(
-    ("before", "now", "expected"),
-    [
-        (row("psnr", 25.0, "dB"), row("psnr", 24.8, "dB"), None),  # noise
-        (row("psnr", 25.0, "dB"), row("psnr", 24.5, "dB"), "worse"),
-        (row("psnr", 25.0, "dB"), row("psnr", 23.5, "dB"), "regression"),
-        (row("psnr", 25.0, "dB"), row("psnr", 26.0, "dB"), "better"),
-        (row("psnr", 25.0, "dB"), row("psnr", float("nan"), "dB"), "regression"),
-        (row("latency", 10.0, "ms"), row("latency", 13.0, "ms"), None),
-        (row("latency", 10.0, "ms"), row("latency", 30.0, "ms"), "regression"),
-        (row("throughput", 1000.0, "MB/s"), row("throughput", 300.0, "MB/s"), "regression"),
-        (row("room/full: ATE %", 0.4, "% of the path"), row("room/full: ATE %", 0.5, "% of the path"), None),
-        (row("room/full: ATE %", 0.4, "% of the path"), row("room/full: ATE %", 2.0, "% of the path"), "regression"),
-        (row("depth inliers", 0.9), row("depth inliers", 0.7), "regression"),
-        (row("ratio", 1.0, "x", "<= 2", True), row("ratio", 1.3, "x", "<= 2", True), None),
-        (row("ratio", 1.0, "x", "<= 2", True), row("ratio", 3.0, "x", "<= 2", False), "regression"),
-        (row("speedup", 5.0, "x", ">= 4", True), row("speedup", 3.0, "x", ">= 4", False), "worse"),
-        (row("splats", 1000), row("splats", 5000), None),  # neither is better
-        (row("map finite", "all", "", "finite", True), row("map finite", "NaN", "", "finite", False), "regression"),
-    ],
-)
-def test_comparison_tells_noise_from_regressions(
-    before: dict[str, Any], now: dict[str, Any], expected: str | None
-) -> None:
-    found = compare.change(now, before, same_machine=True)
-    if expected is None:
-        assert found is None
-    else:
-        assert found is not None
-        assert ("regression" if found.regression else "worse" if found.worse else "better") == expected
-
-
-def test_times_of_another_machine_warn_only_and_the_recorded_spread_counts() -> None:
-    slow = compare.change(row("latency", 90.0, "ms"), row("latency", 10.0, "ms"), same_machine=False)
-    assert slow is not None
-    assert slow.worse
-    assert not slow.regression
-    assert compare.change(row("psnr", 24.0, "dB"), {**row("psnr", 25.0, "dB"), "spread": 0.5}, True) is None
-
-
-def test_compare_exits_with_one_for_regressions_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line, now = tmp_path / "line", tmp_path / "mapping.json"
-    now.write_text(json.dumps([row("psnr", 25.0, "dB"), row("other", 1.0)]))
-    record.record("mapping", [now], "c", folder=line)
-    assert compare.run([str(now), "--recorded", str(line)]) == 0
-    now.write_text(json.dumps([row("psnr", 20.0, "dB")]))
-    assert compare.run([str(now), "--recorded", str(line)]) == 1
-    printed = capsys.readouterr().out
-    assert "REGRESSION  psnr: 25 dB -> 20 dB" in printed
-    assert "the row is missing" in printed
-    assert compare.run([str(now), "--recorded", str(tmp_path / "empty")]) == 0
 
 
 def test_offline_splatting_of_sparse_points_gets_better() -> None:
