@@ -111,8 +111,8 @@ def estimate_depth(
         counts["hypotheses"] += float(count) * gray.size
         if number == 0:
             first_probability = choice.probability
-            # The best hypothesis near an end of the range: the scene may well lie outside.
-            in_range = (choice.best > 1) & (choice.best < count - 2)
+            # The best hypothesis at an end of the range: the scene may well lie outside.
+            in_range = (choice.best > 0) & (choice.best < count - 1)
     assert choice is not None
     last = config.stages[-1]
     size = (surface.shape[0], surface.shape[1])
