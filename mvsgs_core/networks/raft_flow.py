@@ -1,4 +1,8 @@
-"""RAFT-small as a flow of the tracker (mvsgs_core.tracking.flow): `flow: mvsgs_core.networks.raft_flow:RaftFlow`."""
+"""RAFT-small as a flow of the tracker (mvsgs_core.tracking.flow), by itself or refined to subpixels.
+
+`flow: mvsgs_core.networks.raft_flow:RefinedRaftFlow`. RAFT alone solves at 1/8 and interpolates: its matches are some
+tenths of a pixel off, which costs accuracy; it is there for motion and blur that Lucas-Kanade does not follow.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ import torch
 from mvsgs_core import weights
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.raft_small import STRIDE, RaftSmall
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.flow import LucasKanade, Matches
 from mvsgs_core.tracking.image import TrackingImage
 
 
@@ -39,27 +43,33 @@ class RaftFlow:
         checkpoints.load(net, checkpoints.read(file), file)
         return net.to(self.device)
 
-    def field(self, a: TrackingImage, b: TrackingImage, start: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Flows (2, H, W) float32 in pixels from a to b and from b to a.
+    def field(self, a: TrackingImage, b: TrackingImage, start: np.ndarray | None, back: bool) -> np.ndarray:
+        """Flow (1, 2, H, W) float32 in pixels from a to b; with `back` (2, 2, H, W), the second from b to a.
 
         start: (2, H / 8, W / 8) flow from a to b to begin with, in pixels of the 1/8 map.
         """
         self.calls += 1
-        images = torch.from_numpy(np.stack([_color(a), _color(b)])).permute(0, 3, 1, 2).float().to(self.device)
+        first = torch.from_numpy(np.stack([_color(a), _color(b)])).permute(0, 3, 1, 2).float().to(self.device)
+        second = first.flip(0)
         begin = None
         if start is not None:
             # on the way back the same motion, at nearly the same place: a start, no more
             begin = torch.from_numpy(np.stack([start, -start]).astype(np.float32)).to(self.device)
-        flows = self._net(images, images.flip(0), self.iterations, begin).cpu().numpy()
-        return flows[0], flows[1]
+        if not back:
+            first, second, begin = first[:1], second[:1], None if begin is None else begin[:1]
+        flow: np.ndarray = self._net(first, second, self.iterations, begin).cpu().numpy()
+        return flow
+
+    def start(self, a: TrackingImage, points: np.ndarray, guess: np.ndarray) -> np.ndarray | None:
+        """What the search begins with, (2, H / 8, W / 8); None: nothing."""
+        if not self.guided:
+            return None
+        return _coarse_field(points, guess - points, (a.size[0] // STRIDE, a.size[1] // STRIDE))
 
     def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
         """Points of a (N, 2) in b; a point is lost where the way back leads elsewhere or it leaves the image."""
         height, width = b.size
-        start = None
-        if self.guided:
-            start = _coarse_field(points, guess - points, (height // STRIDE, width // STRIDE))
-        there, back = self.field(a, b, start)
+        there, back = self.field(a, b, self.start(a, points, guess), back=True)
         at = np.asarray(points, dtype=np.float64)
         target = at + _sample(there, at)
         inside = np.all((target >= 0) & (target <= [width - 1, height - 1]), axis=1) & np.isfinite(target).all(axis=1)
@@ -68,6 +78,23 @@ class RaftFlow:
         alive = inside & (distance < self.max_distance)
         weight = np.where(alive, np.exp(-0.5 * np.square(np.where(alive, distance, 0.0) / self.distance_sigma)), 0.0)
         return Matches(np.where(alive[:, None], target, np.nan), weight)
+
+
+@dataclass
+class RefinedRaftFlow(RaftFlow):
+    """RAFT one way finds the points, Lucas-Kanade at full size refines and verifies them."""
+
+    threads: int = 1  # of the refinement
+
+    @cached_property
+    def _refinement(self) -> LucasKanade:
+        return LucasKanade(start_level=0, threads=self.threads)
+
+    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
+        """Points of a (N, 2) in b; a point is lost where Lucas-Kanade does not confirm it."""
+        (flow,) = self.field(a, b, self.start(a, points, guess), back=False)
+        at = np.asarray(points, dtype=np.float64)
+        return self._refinement.match(a, b, points, at + _sample(flow, at))
 
 
 def _color(image: TrackingImage) -> np.ndarray:
@@ -98,4 +125,4 @@ def _coarse_field(points: np.ndarray, moved: np.ndarray, grid: tuple[int, int]) 
     return np.stack(means).reshape(2, rows, columns) / STRIDE
 
 
-__all__ = ["RaftFlow"]
+__all__ = ["RaftFlow", "RefinedRaftFlow"]

@@ -1,0 +1,56 @@
+"""RAFT-small behind the tracker's flow interface, with its published weights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mvsgs_core.networks.raft_flow import RaftFlow, RefinedRaftFlow
+from mvsgs_core.tracking.flow import make_flow
+from mvsgs_core.tracking.image import TrackingImage
+from tests.shared_data import shared
+
+SHIFT = np.array([21.0, -13.0])
+
+
+def pair() -> tuple[TrackingImage, TrackingImage]:
+    """A texture and the same texture, moved by SHIFT."""
+    coarse = np.random.default_rng(0).integers(0, 255, (40, 50, 3), dtype=np.uint8)
+    texture = np.kron(coarse, np.ones((6, 6, 1), np.uint8))
+    x, y = SHIFT.astype(int)
+    first, second = texture[30:158, 40:232], texture[30 - y : 158 - y, 40 - x : 232 - x]
+    return tuple(TrackingImage.of(n, 0.0, i.copy(), (128, 192), True) for n, i in enumerate((first, second)))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(("kind", "allowed"), [(RaftFlow, 0.6), (RefinedRaftFlow, 0.05)])
+def test_finds_a_large_motion_without_a_guess(kind: type[RaftFlow], allowed: float) -> None:
+    flow = kind(weights=str(shared("weights/raft-small.pth")))
+    assert flow.needs_color
+    a, b = pair()
+    v, u = np.mgrid[24:110:9, 8:160:9]
+    points = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
+    matches = flow.match(a, b, points, points.astype(float))
+    assert matches.alive.mean() > 0.8
+    errors = np.linalg.norm(matches.target - points - SHIFT, axis=1)[matches.alive]
+    assert np.median(errors) < allowed
+    assert np.isnan(matches.target[~matches.alive]).all()
+
+
+def test_a_point_that_leaves_the_image_is_lost() -> None:
+    flow = RaftFlow(weights=str(shared("weights/raft-small.pth")))
+    a, b = pair()
+    points = np.array([[185.0, 60.0], [90.0, 3.0], [90.0, 60.0]])
+    guess = points + SHIFT
+    guess[2] = np.nan  # no guess: the others' motion
+    assert flow.match(a, b, points, guess).alive.tolist() == [False, False, True]
+
+
+def test_missing_weights_and_missing_color_say_what_to_do() -> None:
+    flow = make_flow("mvsgs_core.networks.raft_flow:RaftFlow", weights="nowhere.pth")
+    gray = [TrackingImage.of(n, 0.0, np.zeros((64, 64, 3), np.uint8), (64, 64), False) for n in range(2)]
+    points = np.full((1, 2), 30.0)
+    with pytest.raises(ValueError, match="color"):
+        flow.match(gray[0], gray[1], points, points)
+    color = [TrackingImage.of(n, 0.0, np.zeros((64, 64, 3), np.uint8), (64, 64), True) for n in range(2)]
+    with pytest.raises(FileNotFoundError, match="RAFT"):
+        flow.match(color[0], color[1], points, points)

@@ -1,0 +1,89 @@
+"""The DROID node: its messages, with noise for weights; and what it says without weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import msgs
+from msgs import Frame, Keyframe, Poses, TrackingState, Trajectory
+from nodes import handlers, outputs
+from nodes.droid_tracker import DroidTracker
+from tests.core.tracking.sequences import synthetic
+
+COUNT = 12
+# the least size that the networks take, so that noise costs little
+TRIAL = DroidTracker.Config(weights="random", area=64 * 86, stride=1, warmup=5)
+
+
+def run(config: DroidTracker.Config, count: int = COUNT) -> tuple[DroidTracker, list[msgs.Message], list[Frame]]:
+    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in synthetic(frames=80)[:count]]
+    node = DroidTracker(config)
+    return node, [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end()), frames
+
+
+def test_contract() -> None:
+    assert handlers(DroidTracker).keys() == {Frame}
+    assert set(outputs(DroidTracker)) == {Keyframe, Poses, Trajectory}
+
+
+def test_noise_gives_honest_finite_messages() -> None:
+    node, sent, frames = run(TRIAL)
+    assert any("noise" in warning for warning in node.stats.warnings)
+    keyframes = [m for m in sent if isinstance(m, Keyframe)]
+    poses = [m for m in sent if isinstance(m, Poses)]
+    path = sent[-1]
+    assert isinstance(path, Trajectory)
+    assert len(keyframes) >= 5
+    told: set[int] = set()
+    for message in sent[:-1]:
+        if isinstance(message, Keyframe):
+            assert message.image is frames[message.index].image
+            assert message.scale == 1.0
+            assert np.isfinite(message.world_from_cam).all()
+            assert np.isfinite(message.inverse_depth).all()
+            assert message.inverse_depth.dtype == message.inverse_depth_weight.dtype == np.float32
+            assert message.inverse_depth.shape == message.inverse_depth_weight.shape == (8, 11)
+            np.testing.assert_array_equal(message.inverse_depth > 0, message.inverse_depth_weight > 0)
+            assert message.inverse_depth_weight.max() <= 1
+            told.add(message.index)
+        elif isinstance(message, Poses):
+            assert set(message.index.tolist()) <= told
+            assert np.isfinite(message.world_from_cam).all()
+            assert np.all(message.scale > 0)
+    assert [p.revision for p in poses] == list(range(1, len(poses) + 1))
+    assert path.index.tolist() == list(range(COUNT))
+    assert path.index[path.keyframe].tolist() == [k.index for k in keyframes]
+    np.testing.assert_array_equal(poses[-1].world_from_cam, path.world_from_cam[path.keyframe])
+    assert np.isfinite(path.world_from_cam).all()
+    assert set(path.state.tolist()) <= {TrackingState.TRACKED, TrackingState.DEGENERATE}
+    assert node.stats.counts["keyframes"] == len(keyframes)
+
+
+def test_too_few_frames_are_not_started() -> None:
+    node, sent, _ = run(TRIAL, count=3)
+    (path,) = sent
+    assert isinstance(path, Trajectory)
+    assert np.isnan(path.world_from_cam).all()
+    assert set(path.state.tolist()) == {TrackingState.NOT_STARTED}
+    assert any("never started" in warning for warning in node.stats.warnings)
+
+
+def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
+    (path,) = list(DroidTracker(TRIAL).on_end())
+    assert isinstance(path, Trajectory)
+    assert len(path.index) == 0
+
+
+def test_missing_weights_are_said_before_anything_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"droid\.pth.*MVSGS_WEIGHTS"):
+        DroidTracker()
+    (tmp_path / "droid.pth").write_bytes(b"half a downl")
+    with pytest.raises(ValueError, match="truncated"):
+        DroidTracker()
+    with pytest.raises(ValueError, match="demo, tum, replica"):
+        DroidTracker(DroidTracker.Config(weights="random", preset="kitti"))
