@@ -14,7 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
 
 ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
@@ -30,19 +32,22 @@ class Setting:
 
     def text(self, first: Sequence[str] = ()) -> str:
         """The Hydra choice that makes them, after those in `first`. Raises ValueError for what is not key=value."""
-        choices: dict[str, str] = {}
-        values = []
+        parser = OverridesParser.create()  # values as on the command line: "off" is no boolean there, in YAML it is
+        choices: dict[str, Any] = {}
+        config = OmegaConf.create()
         for override in (*first, *self.overrides):
-            key, equals, value = override.partition("=")
-            if not equals:
-                raise ValueError(f"{self.name}: {override!r} must look like slot=choice or slot.parameter=value")
+            try:
+                parsed = parser.parse_override(override)
+            except HydraException as error:
+                raise ValueError(
+                    f"{self.name}: {override!r} must look like slot=choice or slot.parameter=value"
+                ) from error
+            key = parsed.key_or_group
             if "." in key or key == "seed":
-                values.append(override)
+                OmegaConf.update(config, key, parsed.value(), force_add=True)
             else:
-                choices[f"override /{key}"] = value
-        defaults = [*({key: value} for key, value in choices.items()), "_self_"]
-        config = OmegaConf.merge({"defaults": defaults}, OmegaConf.from_dotlist(values))
-        assert isinstance(config, DictConfig)
+                choices[f"override /{key}"] = parsed.value()
+        config.defaults = [*({key: value} for key, value in choices.items()), "_self_"]
         return f"# @package _global_\n{OmegaConf.to_yaml(config)}"
 
 
