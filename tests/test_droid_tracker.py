@@ -13,7 +13,7 @@ from nodes import handlers, outputs
 from nodes.droid_tracker import DroidTracker
 from tests.core.tracking.sequences import synthetic
 
-COUNT = 12
+COUNT = 9
 # the least size that the networks take, so that noise costs little
 TRIAL = DroidTracker.Config(weights="random", area=64 * 86, stride=1, warmup=5)
 
@@ -45,7 +45,7 @@ def test_noise_gives_honest_finite_messages() -> None:
             assert np.isfinite(message.world_from_cam).all()
             assert np.isfinite(message.inverse_depth).all()
             assert message.inverse_depth.dtype == message.inverse_depth_weight.dtype == np.float32
-            assert message.inverse_depth.shape == message.inverse_depth_weight.shape == (8, 11)
+            assert message.inverse_depth.shape == message.inverse_depth_weight.shape == (8, 10)
             np.testing.assert_array_equal(message.inverse_depth > 0, message.inverse_depth_weight > 0)
             assert message.inverse_depth_weight.max() <= 1
             told.add(message.index)
