@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ SHARED = Path(os.environ.get("MVSGS_SHARED", Path(__file__).resolve().parents[2]
 COARSE = (30, 40)  # cells of the simulated tracker grid
 # 7-Scenes: the color camera's focal length, by the overlap of depth edges with image edges and by epipolar errors of
 # tracked points; the published 585 is the depth camera's.
-SEVEN_SCENES_COLOR_FOCAL = 525.0
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,6 @@ def load_scene(
     else:
         options |= {"path": SHARED / source.folder, "stride": source.stride}
     items = list(islice(keyframes(open_dataset(source.dataset, **options), source.parallax), count))
-    if source.dataset == "seven_scenes":
-        items = [register(item) for item in items]
     known = [i.depth for i in items if i.depth is not None]
     views, truths = [], []
     for number, item in enumerate(items):
@@ -120,17 +117,6 @@ def keyframes(frames: Iterable[Item], parallax: float) -> Iterable[Item]:
                 continue
         last = pose
         yield frame
-
-
-def register(item: Item) -> Item:
-    """7-Scenes: color intrinsics, and depth resampled from the depth camera's view to the color camera's."""
-    ratio = SEVEN_SCENES_COLOR_FOCAL / item.intrinsics[0]
-    cx, cy = item.intrinsics[2:]
-    depth = item.depth
-    if depth is not None:
-        matrix = np.array([[ratio, 0.0, cx * (1 - ratio)], [0.0, ratio, cy * (1 - ratio)]])
-        depth = cv2.warpAffine(depth, matrix, (depth.shape[1], depth.shape[0]), flags=cv2.INTER_NEAREST)
-    return replace(item, intrinsics=item.intrinsics * np.array([ratio, ratio, 1.0, 1.0]), depth=depth)
 
 
 def coarse_grid(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from bench.depth_data import SHARED, SOURCES, Scene, register
+from bench.depth_data import SHARED, SOURCES, Scene
 from msgs import Frame, Keyframe, Poses
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.mvs.views import prepare_view
@@ -37,7 +37,6 @@ def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scen
                     latest[int(i)] = (pose, float(scale))
 
     for item in open_dataset(source.dataset, **options):
-        item = register(item) if source.dataset == "seven_scenes" else item
         items[item.index] = item
         take(tracker.on_frame(Frame(item.index, item.timestamp, item.image, item.intrinsics)))
         if item.depth is None and item.index not in keyframes:

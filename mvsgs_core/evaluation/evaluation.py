@@ -15,6 +15,7 @@ from mvsgs_core.evaluation.frame_store import FrameStore
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.splats.model import Splats
 
+NEAR = 0.01  # of the typical depth: splats nearer to a camera are not drawn
 TRACKED = 0  # state of a frame whose pose is good; other states are lost, not started, degenerate
 
 
@@ -29,6 +30,14 @@ class FinishedMap:
     keyframe_poses: dict[int, np.ndarray]
     scale: dict[int, float]  # of each keyframe's depths, see msgs.Poses
     bytes: int
+
+    def typical_depth(self) -> float:
+        """Median distance of the splats from the middle of the keyframes, map units; the world's scale is arbitrary."""
+        positions = [pose[:3, 3] - self.origin for pose in self.keyframe_poses.values()]
+        if not positions or not len(self.splats.means):
+            return 1.0
+        center = np.median(positions, axis=0)
+        return float(np.median(np.linalg.norm(self.splats.means.numpy() - center, axis=1)))
 
 
 @dataclass(frozen=True)
@@ -122,6 +131,7 @@ class Evaluation:
         assert self.track is not None
         views = []
         main = _largest_segment(self.track)
+        near = NEAR * finished.typical_depth()
         from_world = np.eye(4)
         from_world[:3, 3] = -finished.origin
         for k in np.flatnonzero(main & np.isin(self.track.index, list(self._intrinsics))):
@@ -133,6 +143,7 @@ class Evaluation:
                     from_world @ finished.keyframe_poses.get(index, self.track.world_from_cam[k]),
                     self._intrinsics[index],
                     lambda index=index: self.photograph(index),  # type: ignore[misc]
+                    near,
                 )
             )
         return views

@@ -27,6 +27,7 @@ class View:
     world_from_cam: np.ndarray  # (4, 4) in the map's frame
     intrinsics: np.ndarray  # (4,)
     photograph: Callable[[], np.ndarray]  # (H, W, 3) uint8, read when needed
+    near: float  # nothing nearer is drawn, map units
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Score:
 def render_view(splats: Splats, density: str, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Color (H, W, 3) float32 in 0..1 and depth (H, W) float32 of the map seen from a view."""
     with torch.inference_mode():
-        render = rasterize(splats, view.world_from_cam, view.intrinsics, size, density=density)
+        render = rasterize(splats, view.world_from_cam, view.intrinsics, size, density=density, near=view.near)
     return render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
 
 
