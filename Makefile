@@ -57,16 +57,19 @@ lint: setup
 
 # Every file in bench/ that ends with main(measure, ...) is a benchmark. `make bench` takes hours: it runs them all, keeps
 # the rows in bench/recorded/ and writes the tables of BENCHMARKS.md. `make bench-quick` takes minutes and says what got
-# slower or worse than the recorded line (RECORD=1: becomes the line). One of them: make bench BENCHMARKS=transport
-BENCHMARKS ?= $(shell grep -l '^    main(measure' bench/*.py | sed 's|bench/||; s|\.py$$||')
+# slower or worse than the recorded line (RECORD=1: becomes the line; `make bench` does that at the end). Some of them,
+# with arguments: make bench BENCHMARKS="curves" ARGS="--scenes room,aerial"
+BENCHMARKS ?= $(shell grep -l '^    main.measure' bench/*.py | sed 's|bench/||; s|\.py$$||')
+ARGS ?=
 
 bench: setup
 	@mkdir -p runs/bench
 	@for name in $(BENCHMARKS); do echo "$$name"; \
-		$(BIN)/python -m bench.$$name --json runs/bench/$$name.json \
-		&& $(BIN)/python -m bench.record $$name runs/bench/$$name.json --from runs/bench/$$name || failed="$$failed $$name"; \
+		$(BIN)/python -m bench.$$name --json runs/bench/$$name.json $(ARGS) \
+		&& $(BIN)/python -m bench.record $$name runs/bench/$$name.json --from runs/bench/$$name \
+			--command "python -m bench.$$name $(ARGS)" || failed="$$failed $$name"; \
 	done; test -z "$$failed" || { echo "failed:$$failed"; exit 1; }
-	@$(MAKE) bench-quick RECORD=1
+	$(if $(filter file,$(origin BENCHMARKS)),@$(MAKE) bench-quick RECORD=1)
 
 bench-quick: setup
 	@mkdir -p runs/bench-quick && rm -f runs/bench-quick/*.json

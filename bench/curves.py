@@ -22,7 +22,7 @@ _COARSE = "{scale: 2, step: 0.7, hypotheses: 128, radius: 3, small_jump: 0.3, la
 _COARSEST = "{scale: 4, step: 0.7, hypotheses: 64, radius: 3, small_jump: 0.3, large_jump: 2.0}"
 _MIDDLE = "{scale: 2, step: 0.5, hypotheses: 15, radius: 3, small_jump: 0.1, large_jump: 0.8}"
 _FINE = "{scale: 1, step: 0.35, hypotheses: 11, radius: 3, small_jump: 0.05, large_jump: 0.4}"
-CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point and its overrides, defaults left out
+CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point and its overrides
     "tracker.area": {f"{a // 1000}k": (f"tracker.area={a}",) for a in (19200, 38400, 153600)},
     "tracker.window": {str(n): (f"tracker.window={n}",) for n in (6, 20)},
     "mvs.area": {f"{a // 1000}k": (f"mvs.area={a}",) for a in (19200, 38400, 153600)},
@@ -31,7 +31,7 @@ CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point 
         "1 stage": (f"mvs.stages=[{_COARSE}]",),
         "3 stages": (f"mvs.stages=[{_COARSEST},{_MIDDLE},{_FINE}]",),
     },
-    "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 30, 120, 240)},
+    "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 30, 60, 120, 240)},
     "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200, 38400)},
     "mapper.max_splats": {f"{n // 1000}k": (f"mapper.max_splats={n}",) for n in (10000, 20000, 40000)},
 }

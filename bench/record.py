@@ -169,7 +169,7 @@ def run(arguments: list[str]) -> int:
             parser.error(f"{options.name}: which files?")
         stem, quick = options.name.rpartition("/")[2], options.name.startswith("quick/")
         command = options.command or f"python -m bench.{stem}" + (" --quick" if quick else "")
-        record(options.name, options.files, command, options.made_in)
+        record(options.name, options.files, command.strip(), options.made_in)
     if DOCUMENT.exists():
         DOCUMENT.write_text(render(DOCUMENT.read_text()))
     return 0
