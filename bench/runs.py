@@ -206,8 +206,9 @@ def said(run: Run) -> str:
     if run.report is None:
         log = run.folder.parent / "runs.log"
         lines = log.read_text().splitlines() if log.exists() else []
-        failed = [line for line in lines if " failed: " in line or line.startswith("error")]
-        return failed[-1] if failed else "no report"
+        own = [line for line, after in zip(lines, lines[1:]) if " failed: " in line and f"{run.folder}/logs" in after]
+        refused = [line for line in lines if line.startswith("error: ")]  # before a run starts: no folder is named
+        return (own or refused or ["no report"])[-1]
     warned = [f"{node}: {text}" for node, texts in run.report.get("warnings", {}).items() for text in texts]
     return "; ".join(warned) or "nothing"
 

@@ -141,7 +141,9 @@ def test_what_a_run_said(tmp_path: Path) -> None:
     assert said(a_run()) == "nothing"
     lost = Run("room", "full", 0, tmp_path / "0", report(warnings={"tracker": ["lost"], "mvs": ["no depth"]}))
     assert said(lost) == "tracker: lost; mvs: no depth"
-    (tmp_path / "runs.log").write_text("job 0\ntracker failed: ValueError: no image\nlog: x\n")
+    log = "job 0\ntracker failed: ValueError: no image\nlog: {0}/0/logs/tracker.log\n"
+    log += "job 1\nmapper failed: MemoryError\nlog: {0}/1/logs/mapper.log\n"
+    (tmp_path / "runs.log").write_text(log.format(tmp_path))
     assert said(Run("room", "full", 0, tmp_path / "0", None)) == "tracker failed: ValueError: no image"
 
 
