@@ -59,7 +59,7 @@ lint: setup
 # the rows in bench/recorded/ and writes the tables of BENCHMARKS.md. `make bench-quick` takes minutes and says what got
 # slower or worse than the recorded line (RECORD=1: becomes the line; `make bench` does that at the end). Some of them,
 # with arguments: make bench BENCHMARKS="curves" ARGS="--scenes room,aerial"
-BENCHMARKS ?= $(shell grep -l '^    main.measure' bench/*.py | sed 's|bench/||; s|\.py$$||')
+BENCHMARKS ?= $(shell grep -lE '^ +main.measure' bench/*.py | sed 's|bench/||; s|\.py$$||')
 ARGS ?=
 
 bench: setup

@@ -206,7 +206,8 @@ def said(run: Run) -> str:
     if run.report is None:
         log = run.folder.parent / "runs.log"
         lines = log.read_text().splitlines() if log.exists() else []
-        own = [line for line, after in zip(lines, lines[1:]) if " failed: " in line and f"{run.folder}/logs" in after]
+        pairs = itertools.pairwise(lines)
+        own = [line for line, after in pairs if " failed: " in line and f"{run.folder}/logs" in after]
         refused = [line for line in lines if line.startswith("error: ")]  # before a run starts: no folder is named
         return (own or refused or ["no report"])[-1]
     warned = [f"{node}: {text}" for node, texts in run.report.get("warnings", {}).items() for text in texts]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ from mvsgs_core.splats.training import TrainingConfig
 from tests.shared_data import ROOT
 
 SEARCH = f"hydra.searchpath=[file://{CONF}]"
-MAINS = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if "\n    main(measure" in p.read_text())
+MAINS = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if re.search(r"^ +main\(measure", p.read_text(), re.M))
 
 
 def report(psnr: float = 25.0, wall: float = 10.0, **more: Any) -> dict[str, Any]:
