@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import plots
-from bench.runs import ROOT, Matrix, Run, available_scenes, choices, commit, figure, folder, machine
+from bench.runs import ROOT, Matrix, Run, available_scenes, choices, commit, figure, folder, machine, said
 from bench.table import Row, main
 from mvsgs_core.evaluation import svg
 
@@ -104,7 +104,7 @@ def rows(runs: list[Run]) -> list[Row]:
     for run in runs:
         name = f"{run.scene}/{run.variant}/seed {run.seed}"
         if run.report is None:
-            found.append(Row(f"{name}: finished", "no", "", "yes", False))
+            found.append(Row(f"{name}: finished", said(run), "", "a report", False))
             continue
         for column in COLUMNS:
             measured = value(run, column)
