@@ -4,7 +4,8 @@
 
 Random weights where none are needed to build a network: cost does not depend on them. Each network runs in a process
 of its own, on one thread, so that its peak memory is its own. Multiply-adds are those of convolutions and matrix
-products; sampling and activations are not counted, and a figure of zero is left out. Seconds are of the processor, of the second run.
+products; sampling and activations are not counted, and a figure of zero is left out. Seconds are of the processor,
+of the second run.
 """
 
 from __future__ import annotations

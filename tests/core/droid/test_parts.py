@@ -170,6 +170,30 @@ def test_both_correlations_lead_the_graph_to_the_same() -> None:
     np.testing.assert_allclose(*found, atol=1e-3)
 
 
+def test_half_precision_passes_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU's autocast, as far as a CPU can stand in for it: the same mixture of types, in bfloat16."""
+    exact, rough = (Networks(random_net(), torch.device("cpu")) for _ in range(2))
+    monkeypatch.setattr(rough, "_precision", lambda: torch.autocast("cpu", dtype=torch.bfloat16))
+    image = np.random.default_rng(0).integers(0, 255, (64, 80, 3), dtype=np.uint8)
+    results = []
+    for nets in (exact, rough):
+        features, (hidden, context) = nets.features([image, image[:, ::-1]]), nets.context(image)
+        for kind in ("volume", "on_the_fly"):
+            made = video([0.0, 0.1])
+            for n, frame in enumerate(made.frames):
+                frame.features, frame.hidden, frame.context = features[n], hidden, context
+            g = FactorGraph(made, nets, correlation=kind)
+            g.add([(0, 1), (1, 0)])
+            assert not g.update(1).failure
+            assert not g.update(1).failure
+            assert g.active[0].target.dtype == np.float32
+            results.append(g.active[0].target)
+    assert features.dtype == hidden.dtype == torch.bfloat16
+    assert not exact.not_finite + rough.not_finite
+    step = np.abs(results[0] - results[2]).mean() / np.abs(results[0]).mean()
+    assert 0 < step < 0.2
+
+
 def test_the_motion_filter_keeps_the_first_frame_and_those_that_moved() -> None:
     nets = Networks(random_net(), torch.device("cpu"))
     image = np.random.default_rng(0).integers(0, 255, (64, 80, 3), dtype=np.uint8)
