@@ -17,8 +17,6 @@ from mvsgs_core.mvs.views import StereoView, prepare_view
 
 SHARED = Path(os.environ.get("MVSGS_SHARED", Path(__file__).resolve().parents[2] / "shared")) / "data"
 COARSE = (30, 40)  # cells of the simulated tracker grid
-# 7-Scenes: the color camera's focal length, by the overlap of depth edges with image edges and by epipolar errors of
-# tracked points; the published 585 is the depth camera's.
 
 
 @dataclass(frozen=True)

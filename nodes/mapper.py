@@ -49,6 +49,7 @@ class Mapper(Node):
         unexplored: bool = True  # add splats only where the map does not explain the image
         unexplored_psnr: float = 25.0  # dB of a pixel; below: unexplored (the paper: 40)
         voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
+        map_voxel: float = 0.02  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
         density_control: str = "adaptive"  # adaptive, relocate or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls
@@ -198,7 +199,8 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
         ),
         rates=LearningRates(),
         insertion=InsertionConfig(
-            unexplored=config.unexplored, unexplored_psnr=config.unexplored_psnr, voxel=config.voxel
+            unexplored=config.unexplored, unexplored_psnr=config.unexplored_psnr, voxel=config.voxel,
+            map_voxel=config.map_voxel,
         ),
         density_control=DensityConfig(mode=config.density_control, max_splats=config.max_splats),
     )  # fmt: skip

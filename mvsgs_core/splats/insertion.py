@@ -25,6 +25,7 @@ class InsertionConfig:
     unexplored_psnr: float = 25.0  # dB of one pixel over RGB; below: unexplored (the paper: 40)
     unexplored_opacity: float = 0.5  # rendered opacity below: unexplored, whatever the color
     voxel: float = 0.01  # edge of the voxel filter in median depths; 0: no filter
+    map_voxel: float = 0.02  # edge in median depths of the voxels in which one splat of the map is enough; 0: any number
     initial_scale: float = 0.5  # standard deviation in spacings of the points
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
@@ -45,7 +46,11 @@ class Points:
 
     def first(self, count: int) -> Points:
         """The first `count` of them."""
-        return Points(self.positions[:count], self.normals[:count], self.colors[:count], self.spacing[:count])
+        return self.where(np.arange(len(self)) < count)
+
+    def where(self, mask: np.ndarray) -> Points:
+        """Those of a mask (N,) bool."""
+        return Points(self.positions[mask], self.normals[mask], self.colors[mask], self.spacing[mask])
 
 
 def unexplored_mask(
@@ -102,6 +107,26 @@ def voxel_filter(points: Points, edge: float) -> Points:
         mean(points.colors),
         np.sqrt(area),
     )
+
+
+def unoccupied(positions: np.ndarray, means: np.ndarray, edge: float) -> np.ndarray:
+    """Positions (N, 3) whose voxel of side `edge` holds none of the map's means (M, 3): (N,) bool.
+
+    The surface there is in the map already, and what its color lacks is the optimization's to find. Without this a
+    noisy or blurred keyframe, which nothing explains to the decibel, lays a second skin over what is mapped.
+    """
+    if len(positions) == 0 or len(means) == 0:
+        return np.ones(len(positions), dtype=bool)
+    low = positions.min(axis=0)
+    cells = np.floor((positions - low) / edge).astype(np.int64)
+    count = cells.max(axis=0) + 1
+    others = np.floor((means - low) / edge)
+    others = others[((others >= 0) & (others < count)).all(axis=1)].astype(np.int64)
+
+    def key(cell: np.ndarray) -> np.ndarray:
+        return (cell[:, 0] * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
+
+    return ~np.isin(key(cells), key(others))
 
 
 def splats_from_points(

@@ -24,6 +24,7 @@ from mvsgs_core.splats.insertion import (
     points_from_depth,
     splats_from_points,
     unexplored_mask,
+    unoccupied,
     voxel_filter,
 )  # fmt: skip
 from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
@@ -256,6 +257,12 @@ class OnlineMapper:
             before = len(points)
             points = voxel_filter(points, config.voxel * self.median_depth)
             self.log.skip("points_voxel_filter", before - len(points))
+        if config.map_voxel > 0 and len(self.state):
+            pose = added.local_from_cam
+            positions = points.positions @ pose[:3, :3].T + pose[:3, 3]
+            free = unoccupied(positions, self.state.splats.means.detach().cpu().numpy(), config.map_voxel * self.median_depth)
+            self.log.skip("points_occupied", int((~free).sum()))
+            points = points.where(free)
         room = self.config.density_control.max_splats - len(self.state)
         if len(points) > room:
             self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
