@@ -24,7 +24,7 @@ from mvsgs_core.tracking.image import TrackingImage
 class RaftFlow:
     """Dense flow there and back, begun from the guess; the weight falls with the distance from where it came.
 
-    Raises FileNotFoundError at the first match where the weights are missing, saying what to fetch from where.
+    Raises FileNotFoundError where the weights are missing, saying what to fetch from where.
     """
 
     weights: str | None = None  # file; None: found by the registry
@@ -36,9 +36,12 @@ class RaftFlow:
     needs_color: bool = True
     calls: int = field(default=0, repr=False)  # pairs of images
 
+    def __post_init__(self) -> None:
+        self._file = weights.find("raft_small", self.weights)
+
     @cached_property
     def _net(self) -> RaftSmall:
-        file = weights.find("raft_small", self.weights)
+        file = self._file
         net = RaftSmall()
         checkpoints.load(net, checkpoints.read(file), file)
         return net.to(self.device)
