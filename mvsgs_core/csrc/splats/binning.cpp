@@ -92,11 +92,13 @@ class TileWalk {
             const Ints empty = (low > f.half_height + kMargin) | (high < -f.half_height - kMargin) | (rows < top - 3.0f) |
                                (rows > bottom) | (right < left);
             // pixel columns: left is rounded up, right down; neither is negative
-            const Ints cut = __builtin_convertvector(left, Ints);
-            const Ints first = cut - (left > __builtin_convertvector(cut, Lanes));
-            const Ints last = __builtin_convertvector(maximum(right, Lanes{}), Ints);
+            const Ints cut = toward_zero(left);
+            const Ints first = cut - (left > to_floats(cut));
+            const Ints last = toward_zero(maximum(right, Lanes{}));
             const Ints none = empty | (last < first);
-            const Ints from = none ? Ints{} + kFar : first >> 2, to = none ? Ints{} - 1 : last >> 2;
+            alignas(64) int32_t from[kLanes], to[kLanes];
+            store(choose(none, Ints{} + kFar, first >> 2), from);
+            store(choose(none, Ints{} - 1, last >> 2), to);
             const int end = std::min(kLanes, last_row - start + 1);
             for (int row = 0; row < end; row += 4) pair(id, (start + row) >> 2, from, to, row);
         }
@@ -113,7 +115,7 @@ class TileWalk {
     }
 
     // The pairs of one row of tiles, from the first and last block columns of its four rows of blocks.
-    void pair(uint32_t id, int tile_row, const Ints& from, const Ints& to, int row) {
+    void pair(uint32_t id, int tile_row, const int32_t (&from)[kLanes], const int32_t (&to)[kLanes], int row) {
         const int first = std::min(std::min(from[row], from[row + 1]), std::min(from[row + 2], from[row + 3])) >> 2;
         const int last = std::max(std::max(to[row], to[row + 1]), std::max(to[row + 2], to[row + 3])) >> 2;
         for (int x = first; x <= last; ++x) {

@@ -73,16 +73,20 @@ void write(const Frame& frame, const Tile& tile, Pixels& pixels, float* color, f
         b.green += left * frame.background[1];
         b.blue += left * frame.background[2];
         b.depth = b.depth / maximum(covered, all(kTiny));  // 0 / tiny where nothing is seen
+        alignas(64) float sums[5][kLanes];
+        store(b.red, sums[0]);
+        store(b.green, sums[1]);
+        store(b.blue, sums[2]);
+        store(b.depth, sums[3]);
+        store(covered, sums[4]);
         const BlockSpan span(tile, block);
         for (int dy = 0; dy < span.rows; ++dy) {
             const size_t first = size_t(span.y + dy) * frame.camera.width + span.x;
             for (int dx = 0; dx < span.columns; ++dx) {
                 const int lane = 4 * dy + dx;
-                color[3 * (first + dx)] = b.red[lane];
-                color[3 * (first + dx) + 1] = b.green[lane];
-                color[3 * (first + dx) + 2] = b.blue[lane];
-                depth[first + dx] = b.depth[lane];
-                opacity[first + dx] = covered[lane];
+                for (int c = 0; c < 3; ++c) color[3 * (first + dx) + c] = sums[c][lane];
+                depth[first + dx] = sums[3][lane];
+                opacity[first + dx] = sums[4][lane];
             }
         }
     }

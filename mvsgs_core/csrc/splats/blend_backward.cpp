@@ -48,7 +48,7 @@ void load(const Frame& frame, const Tile& tile, const Images& images, Targets& t
         if constexpr (Depth) {
             const Lanes opacity = lanes(image[4]), on_opacity = lanes(g[4]);
             t.behind += opacity * on_opacity;
-            t.depth = opacity > 0.0f ? lanes(g[3]) / maximum(opacity, all(kTiny)) : Lanes{};
+            t.depth = where(at_least(opacity, kTiny), lanes(g[3]) / maximum(opacity, all(kTiny)));
             t.covered = on_opacity - t.depth * lanes(image[3]);
         }
     }

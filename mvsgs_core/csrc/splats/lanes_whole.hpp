@@ -1,0 +1,103 @@
+// Sixteen floats in one AVX-512 register.
+#pragma once
+
+#include <immintrin.h>
+
+#include <cstdint>
+
+#include "splats/inlining.hpp"
+
+namespace splats {
+
+typedef float Lanes __attribute__((vector_size(64)));
+typedef int32_t Ints __attribute__((vector_size(64)));
+using Mask = __mmask16;
+constexpr Mask kAll = 0xffff;  // the unmasked intrinsics of GCC 12 warn about their own innards
+
+SPLATS_INLINE Ints as_bits(Lanes a) { return (Ints)a; }
+SPLATS_INLINE Lanes as_floats(Ints a) { return (Lanes)a; }
+SPLATS_INLINE Lanes to_floats(Ints a) { return __builtin_convertvector(a, Lanes); }
+SPLATS_INLINE Ints toward_zero(Lanes a) { return __builtin_convertvector(a, Ints); }
+
+SPLATS_INLINE Lanes minimum(Lanes a, Lanes b) { return (Lanes)_mm512_maskz_min_ps(kAll, (__m512)a, (__m512)b); }
+SPLATS_INLINE Lanes maximum(Lanes a, Lanes b) { return (Lanes)_mm512_maskz_max_ps(kAll, (__m512)a, (__m512)b); }
+SPLATS_INLINE Lanes root(Lanes x) { return (Lanes)_mm512_maskz_sqrt_ps(kAll, (__m512)x); }
+SPLATS_INLINE Mask at_least(Lanes a, float b) { return _mm512_cmp_ps_mask((__m512)a, _mm512_set1_ps(b), _CMP_GE_OQ); }
+SPLATS_INLINE Mask at_most(Lanes a, float b) { return _mm512_cmp_ps_mask((__m512)a, _mm512_set1_ps(b), _CMP_LE_OQ); }
+SPLATS_INLINE Lanes where(Mask mask, Lanes a) { return (Lanes)_mm512_maskz_mov_ps(mask, (__m512)a); }  // 0 elsewhere
+SPLATS_INLINE Ints choose(Ints mask, Ints a, Ints b) { return mask ? a : b; }
+SPLATS_INLINE bool any(Mask mask) { return mask != 0; }
+
+// 1 / x of normal x, relative error 1e-7 or better.
+SPLATS_INLINE Lanes reciprocal(Lanes x) {
+    const Lanes r = (Lanes)_mm512_maskz_rcp14_ps(kAll, (__m512)x);
+    return r * (2.0f - x * r);  // one step of Newton's
+}
+
+// 2^x for x <= 0, relative error 8e-8 plus rounding, by a minimax polynomial of degree 5 on [-1/2, 1/2].
+SPLATS_INLINE Lanes exp2_of_negative(Lanes x) {
+    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const Lanes f = x - whole;
+    Lanes p = 1.327647199e-03f * f + 9.675541334e-03f;
+    p = p * f + 5.550713273e-02f;
+    p = p * f + 2.402211972e-01f;
+    p = p * f + 6.931469671e-01f;
+    p = p * f + 1.000000072f;
+    return (Lanes)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)whole);
+}
+
+// 2^x with x limited to 126 from above, relative error 3e-6, by a polynomial of degree 4: for an exponent, as above.
+SPLATS_INLINE Lanes exp2_limited(Lanes x) {
+    x = minimum(x, Lanes{} + 126.0f);
+    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const Lanes f = x - whole;
+    Lanes p = 9.570101911e-03f * f + 5.591786032e-02f;
+    p = p * f + 2.402474483e-01f;
+    p = p * f + 6.931218147e-01f;
+    p = p * f + 9.999992614e-01f;
+    return (Lanes)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)whole);
+}
+
+// Neighboring runs of `Width` lanes of `a` and of `b` are added; the runs of `a` and `b` then alternate.
+template <int Width>
+SPLATS_INLINE Lanes merge(Lanes a, Lanes b) {
+    if constexpr (Width == 8)
+        return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+               __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+    else if constexpr (Width == 4)
+        return __builtin_shufflevector(a, b, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27) +
+               __builtin_shufflevector(a, b, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
+    else if constexpr (Width == 2)
+        return __builtin_shufflevector(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
+               __builtin_shufflevector(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    else
+        return __builtin_shufflevector(a, b, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30) +
+               __builtin_shufflevector(a, b, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
+}
+
+// Every lane with the one `Width` lanes on.
+template <int Width>
+SPLATS_INLINE Lanes turned(Lanes v) {
+    if constexpr (Width == 8)
+        return __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7);
+    else if constexpr (Width == 4)
+        return __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3, 12, 13, 14, 15, 8, 9, 10, 11);
+    else if constexpr (Width == 2)
+        return __builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+    else
+        return __builtin_shufflevector(v, v, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
+}
+SPLATS_INLINE float sum(Lanes v) {
+    v += turned<8>(v);
+    v += turned<4>(v);
+    v += turned<2>(v);
+    return (v + turned<1>(v))[0];
+}
+SPLATS_INLINE float largest(Lanes v) {
+    v = maximum(v, turned<8>(v));
+    v = maximum(v, turned<4>(v));
+    v = maximum(v, turned<2>(v));
+    return maximum(v, turned<1>(v))[0];
+}
+
+}  // namespace splats
