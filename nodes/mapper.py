@@ -49,7 +49,7 @@ class Mapper(Node):
         unexplored: bool = True  # add splats only where the map does not explain the image
         unexplored_psnr: float = 25.0  # dB of a pixel; below: unexplored (the paper: 40)
         voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
-        map_voxel: float = 0.02  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
+        map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
         density_control: str = "adaptive"  # adaptive, relocate or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls

@@ -1,10 +1,8 @@
-"""The source nodes: recorded, live and remote; and their choices in the launch configuration."""
+"""The source nodes: recorded, live and remote."""
 
 from __future__ import annotations
 
-import dataclasses
 import http.server
-import inspect
 import itertools
 import socket
 import subprocess
@@ -19,18 +17,9 @@ import cv2
 import numpy as np
 import pytest
 import zmq
-from omegaconf import OmegaConf
 
 import nodes.camera
-from launch.compose import compose
 from msgs import Depth, Frame, GroundTruth
-from mvsgs_core.datasets.bag import Bag
-from mvsgs_core.datasets.images import Images
-from mvsgs_core.datasets.seven_scenes import SevenScenes
-from mvsgs_core.datasets.synthetic import Synthetic
-from mvsgs_core.datasets.tum import Tum
-from mvsgs_core.datasets.video import Video
-from mvsgs_core.scene.difficulties import Difficulties
 from nodes.camera import Camera, CameraError
 from nodes.reader import Reader
 from nodes.robot import Robot
@@ -370,38 +359,3 @@ def test_the_example_publishes_a_data_set(address: str, tmp_path: Path) -> None:
     assert numbers == sorted(set(numbers))
     assert "6 frames sent" in output
     assert "warning: frames without a depth map" in errors
-
-
-# ---------------------------------------------------------------- launch configuration
-
-
-@pytest.mark.parametrize(
-    "choice", ["synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "camera", "robot"]
-)
-def test_every_dataset_choice_composes(choice: str) -> None:
-    graph = compose([f"dataset={choice}"])
-    live = choice in ("camera", "robot")
-    frames = [edge for edge in graph.out_of("dataset") if edge.message is Frame]
-    assert frames
-    assert all(edge.best_effort == live for edge in frames)
-    assert all(not edge.best_effort for edge in graph.out_of("dataset") if edge.message is GroundTruth)
-
-
-def test_options_of_a_choice_reach_the_reader(tmp_path: Path) -> None:
-    folder = write_photos(tmp_path)
-    graph = compose(
-        ["dataset=images", f"dataset.path={folder}", "dataset.intrinsics=[50,50,31.5,23.5]", "dataset.options.rate=5"]
-    )
-    reader = Reader(Reader.Config(**graph.slots["dataset"].config))
-    assert [m.timestamp for m in reader.run() if isinstance(m, Frame)][:2] == pytest.approx([0.0, 0.2])
-
-
-def test_every_choice_lists_all_options_of_its_format() -> None:
-    own = {"path", "start", "stop", "stride", "size", "intrinsics", "distortion"}
-    for name, reader in {"tum": Tum, "seven_scenes": SevenScenes, "images": Images, "video": Video, "bag": Bag}.items():
-        parameters = set(inspect.signature(reader).parameters)
-        listed = set(OmegaConf.load(ROOT / f"launch/conf/dataset/{name}.yaml").options)
-        assert listed == parameters - own
-    synthetic = set(OmegaConf.load(ROOT / "launch/conf/dataset/synthetic.yaml").options)
-    explicit = {p.name for p in inspect.signature(Synthetic).parameters.values() if p.kind is not p.VAR_KEYWORD}
-    assert synthetic == (explicit | {f.name for f in dataclasses.fields(Difficulties)}) - own

@@ -25,7 +25,7 @@ class InsertionConfig:
     unexplored_psnr: float = 25.0  # dB of one pixel over RGB; below: unexplored (the paper: 40)
     unexplored_opacity: float = 0.5  # rendered opacity below: unexplored, whatever the color
     voxel: float = 0.01  # edge of the voxel filter in median depths; 0: no filter
-    map_voxel: float = 0.02  # edge in median depths of the voxels in which one splat of the map is enough; 0: any number
+    map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
     initial_scale: float = 0.5  # standard deviation in spacings of the points
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)

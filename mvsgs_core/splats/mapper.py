@@ -260,7 +260,8 @@ class OnlineMapper:
         if config.map_voxel > 0 and len(self.state):
             pose = added.local_from_cam
             positions = points.positions @ pose[:3, :3].T + pose[:3, 3]
-            free = unoccupied(positions, self.state.splats.means.detach().cpu().numpy(), config.map_voxel * self.median_depth)
+            means = self.state.splats.means.detach().cpu().numpy()
+            free = unoccupied(positions, means, config.map_voxel * self.median_depth)
             self.log.skip("points_occupied", int((~free).sum()))
             points = points.where(free)
         room = self.config.density_control.max_splats - len(self.state)

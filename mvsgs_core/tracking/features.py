@@ -36,7 +36,10 @@ def match_features(a: TrackingImage, b: TrackingImage, threshold: float = 1.0) -
         return none, none
     from_a, in_b = points_a[pairs[:, 0]], points_b[pairs[:, 1]]
     cv2.setRNGSeed(0)
-    matrix, mask = cv2.findFundamentalMat(from_a, in_b, cv2.USAC_MAGSAC, threshold, 0.999, 2000)
+    try:
+        matrix, mask = cv2.findFundamentalMat(from_a, in_b, cv2.USAC_MAGSAC, threshold, 0.999, 2000)
+    except cv2.error:  # OpenCV throws where it finds no model at all, as between images with hardly any texture
+        return none, none
     if matrix is None or mask is None or int(mask.sum()) < 15:
         return none, none
     keep = mask.ravel() > 0

@@ -145,6 +145,7 @@ FLOWS = {
     "lucas_kanade": "mvsgs_core.tracking.flow:LucasKanade",
     "dis": "mvsgs_core.tracking.flow:DenseInverseSearch",
     "features": "mvsgs_core.tracking.flow:FeatureFlow",
+    "raft_small": "mvsgs_core.networks.raft_flow:RefinedRaftFlow",
 }
 
 

@@ -13,6 +13,7 @@ from mvsgs_core.splats.insertion import (
     rotation_to,
     splats_from_points,
     unexplored_mask,
+    unoccupied,
     voxel_filter,
 )
 from mvsgs_core.splats.reference import rotation_matrices
@@ -112,3 +113,15 @@ def test_rotation_to_every_direction_even_straight_back() -> None:
     normals = np.vstack([random_points(100).normals, [[0, 0, 1.0], [0, 0, -1.0]]])
     turned = rotation_matrices(torch.from_numpy(rotation_to(normals)))[:, :, 2].numpy()
     np.testing.assert_allclose(turned, normals, atol=1e-9)
+
+
+def test_a_voxel_that_holds_a_splat_needs_no_second() -> None:
+    random = np.random.default_rng(1)
+    positions, means = random.uniform(-1, 1, (300, 3)), random.uniform(-3, 3, (2000, 3))
+    edge, low = 0.3, positions.min(axis=0)
+    taken = {tuple(c) for c in np.floor((means - low) / edge).astype(int)}
+    expected = [tuple(c) not in taken for c in np.floor((positions - low) / edge).astype(int)]
+    assert unoccupied(positions, means, edge).tolist() == expected
+    assert 0 < sum(expected) < len(expected)
+    assert unoccupied(positions, means[:0], edge).all()
+    assert unoccupied(positions[:0], means, edge).shape == (0,)

@@ -1,0 +1,55 @@
+"""The choices of the slot dataset: they compose, and list what their readers take."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from launch.compose import compose
+from msgs import Frame, GroundTruth
+from mvsgs_core.datasets.bag import Bag
+from mvsgs_core.datasets.images import Images
+from mvsgs_core.datasets.seven_scenes import SevenScenes
+from mvsgs_core.datasets.synthetic import Synthetic
+from mvsgs_core.datasets.tum import Tum
+from mvsgs_core.datasets.video import Video
+from mvsgs_core.scene.difficulties import Difficulties
+from nodes.reader import Reader
+from tests.core.datasets.folders import write_photos
+from tests.shared_data import ROOT
+
+
+@pytest.mark.parametrize(
+    "choice", ["synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "camera", "robot"]
+)
+def test_every_dataset_choice_composes(choice: str) -> None:
+    graph = compose([f"dataset={choice}"])
+    live = choice in ("camera", "robot")
+    frames = [edge for edge in graph.out_of("dataset") if edge.message is Frame]
+    assert frames
+    assert all(edge.best_effort == live for edge in frames)
+    assert all(not edge.best_effort for edge in graph.out_of("dataset") if edge.message is GroundTruth)
+
+
+def test_options_of_a_choice_reach_the_reader(tmp_path: Path) -> None:
+    folder = write_photos(tmp_path)
+    graph = compose(
+        ["dataset=images", f"dataset.path={folder}", "dataset.intrinsics=[50,50,31.5,23.5]", "dataset.options.rate=5"]
+    )
+    reader = Reader(Reader.Config(**graph.slots["dataset"].config))
+    assert [m.timestamp for m in reader.run() if isinstance(m, Frame)][:2] == pytest.approx([0.0, 0.2])
+
+
+def test_every_choice_lists_all_options_of_its_format() -> None:
+    own = {"path", "start", "stop", "stride", "size", "intrinsics", "distortion"}
+    for name, reader in {"tum": Tum, "seven_scenes": SevenScenes, "images": Images, "video": Video, "bag": Bag}.items():
+        parameters = set(inspect.signature(reader).parameters)
+        listed = set(OmegaConf.load(ROOT / f"launch/conf/dataset/{name}.yaml").options)
+        assert listed == parameters - own
+    synthetic = set(OmegaConf.load(ROOT / "launch/conf/dataset/synthetic.yaml").options)
+    explicit = {p.name for p in inspect.signature(Synthetic).parameters.values() if p.kind is not p.VAR_KEYWORD}
+    assert synthetic == (explicit | {f.name for f in dataclasses.fields(Difficulties)}) - own
