@@ -89,8 +89,8 @@ class TileWalk {
             Lanes left = center_x - kMargin + s.shear * left_y - half_span(f, left_y);
             right = minimum(right, all(float(camera.width - 1)));
             left = minimum(maximum(left, Lanes{}), all(float(camera.width)));
-            const Ints empty = (low > f.half_height + kMargin) | (high < -f.half_height - kMargin) | (rows < top - 3.0f) |
-                               (rows > bottom) | (right < left);
+            const Ints empty = (low > f.half_height + kMargin) | (high < -f.half_height - kMargin) |
+                               (rows < top - 3.0f) | (rows > bottom) | (right < left);
             // pixel columns: left is rounded up, right down; neither is negative
             const Ints cut = toward_zero(left);
             const Ints first = cut - (left > to_floats(cut));
@@ -121,7 +121,8 @@ class TileWalk {
         for (int x = first; x <= last; ++x) {
             uint32_t blocks = 0;
             for (int k = 0; k < 4; ++k) {
-                const int begin = std::clamp(from[row + k] - 4 * x, 0, 4), end = std::clamp(to[row + k] - 4 * x + 1, 0, 4);
+                const int begin = std::clamp(from[row + k] - 4 * x, 0, 4);
+                const int end = std::clamp(to[row + k] - 4 * x + 1, 0, 4);
                 blocks |= uint32_t(std::max(0, (1 << end) - (1 << begin))) << (4 * k);
             }
             const uint32_t tile = uint32_t(tile_row * frame_.tiles_x + x);

@@ -1,6 +1,6 @@
 // Gradients of the image, tile by tile, front to back again: with q = dL/dweight of a splat at a pixel and R the sum of
-// weight * q of all that lies behind, background included, dL/dalpha = T q - R / (1 - alpha). R starts as the whole sum,
-// known from the image itself, so the transmittance is the forward pass's own product and no division undoes it.
+// weight * q of all that lies behind, background included, dL/dalpha = T q - R / (1 - alpha). R starts as the whole
+// sum, known from the image itself, so the transmittance is the forward pass's own product and no division undoes it.
 #include <omp.h>
 
 #include "splats/tile.hpp"
@@ -65,7 +65,7 @@ void backward_tile(Frame& frame, const Tile& tile, Targets& targets) {
         }
         const ScreenSplat& s = frame.splats[pair.splat];
         const Placed placed(s, tile);
-        Lanes total[16] = {};
+        Total total[16] = {};
         for (uint32_t blocks = pair.blocks; blocks; blocks &= blocks - 1) {
             const int block = __builtin_ctz(blocks);
             Target& t = targets[block];
@@ -84,25 +84,26 @@ void backward_tile(Frame& frame, const Tile& tile, Targets& targets) {
             t.behind = behind;
             t.transmittance = before - weight;
             // dL/dlog(alpha): none where alpha is clamped
-            const Lanes on_log =
-                where(counted & at_most(unclamped, kMaxAlpha), alpha * (before * q - behind * reciprocal(1.0f - alpha)));
-            total[kRed] += weight * red;
-            total[kGreen] += weight * green;
-            total[kBlue] += weight * blue;
-            if constexpr (Depth) total[kDepth] += weight * t.depth;
-            total[kAlpha] += on_log;
+            const Mask moves = counted & at_most(unclamped, kMaxAlpha);
+            const Lanes on_log = where(moves, alpha * (before * q - behind * reciprocal(1.0f - alpha)));
+            add_product(total[kRed], weight, red);
+            add_product(total[kGreen], weight, green);
+            add_product(total[kBlue], weight, blue);
+            if constexpr (Depth) add_product(total[kDepth], weight, t.depth);
+            add(total[kAlpha], on_log);
             Lanes on_m = on_log;  // times -1/2 in project_backward: dL/dm of the Gaussian
             if constexpr (Exact) {
                 const Lanes m = u * u + v * v;
-                total[kBeta] += on_log * power * log2_m;
-                on_m = where(at_least(m, kCenterM), on_log * s.half_beta * power * reciprocal(maximum(m, all(kCenterM))));
+                add_product(total[kBeta], on_log * power, log2_m);
+                const Lanes slope = s.half_beta * power * reciprocal(maximum(m, all(kCenterM)));
+                on_m = where(at_least(m, kCenterM), on_log * slope);
             }
             const Lanes on_u = on_m * u, on_v = on_m * v;
-            total[kU] += on_u;
-            total[kV] += on_v;
-            total[kUU] += on_u * u;
-            total[kUV] += on_u * v;
-            total[kVV] += on_v * v;
+            add(total[kU], on_u);
+            add(total[kV], on_v);
+            add_product(total[kUU], on_u, u);
+            add_product(total[kUV], on_u, v);
+            add_product(total[kVV], on_v, v);
         }
         frame.slots[pair.slot] = sums(total);
     }

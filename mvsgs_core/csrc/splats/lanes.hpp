@@ -45,11 +45,11 @@ SPLATS_INLINE Lanes log2_of_positive(Lanes x) {
     return p * f + to_floats(exponent);
 }
 
-// The sums over the lanes of sixteen vectors, in one vector: lane kSumLane[i] holds the sum of v[i].
-SPLATS_INLINE Lanes sums(const Lanes (&v)[16]) {
-    const Lanes a0 = merge<8>(v[0], v[1]), a1 = merge<8>(v[2], v[3]), a2 = merge<8>(v[4], v[5]);
-    const Lanes a3 = merge<8>(v[6], v[7]), a4 = merge<8>(v[8], v[9]), a5 = merge<8>(v[10], v[11]);
-    const Lanes a6 = merge<8>(v[12], v[13]), a7 = merge<8>(v[14], v[15]);
+// The sums over the lanes of sixteen totals, in one vector: lane kSumLane[i] holds the sum of v[i].
+SPLATS_INLINE Lanes sums(const Total (&v)[16]) {
+    const Lanes a0 = both(v[0], v[1]), a1 = both(v[2], v[3]), a2 = both(v[4], v[5]);
+    const Lanes a3 = both(v[6], v[7]), a4 = both(v[8], v[9]), a5 = both(v[10], v[11]);
+    const Lanes a6 = both(v[12], v[13]), a7 = both(v[14], v[15]);
     const Lanes b0 = merge<4>(a0, a1), b1 = merge<4>(a2, a3), b2 = merge<4>(a4, a5), b3 = merge<4>(a6, a7);
     return merge<1>(merge<2>(b0, b1), merge<2>(b2, b3));
 }

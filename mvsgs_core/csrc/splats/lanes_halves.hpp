@@ -140,6 +140,16 @@ SPLATS_INLINE Halves<Half> merge(const Halves<Half>& a, const Halves<Half>& b) {
     else
         return {merge<Width>(a.low, b.low), merge<Width>(a.high, b.high)};
 }
+
+// Sums over blocks: both halves go to one, for all sums of a splat do not fit into the registers otherwise.
+using Total = decltype(Lanes::low);
+SPLATS_INLINE void add(Total& total, const Lanes& a) { total += a.low + a.high; }
+SPLATS_INLINE void add_product(Total& total, const Lanes& a, const Lanes& b) {
+    total += a.low * b.low;
+    total += a.high * b.high;
+}
+SPLATS_INLINE Lanes both(const Total& a, const Total& b) { return {a, b}; }
+
 template <class Half>
 SPLATS_INLINE float sum(const Halves<Half>& v) {
     return sum(v.low + v.high);

@@ -13,6 +13,7 @@ typedef float Lanes __attribute__((vector_size(64)));
 typedef int32_t Ints __attribute__((vector_size(64)));
 using Mask = __mmask16;
 constexpr Mask kAll = 0xffff;  // the unmasked intrinsics of GCC 12 warn about their own innards
+constexpr int kNearest = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
 
 SPLATS_INLINE Ints as_bits(Lanes a) { return (Ints)a; }
 SPLATS_INLINE Lanes as_floats(Ints a) { return (Lanes)a; }
@@ -36,7 +37,7 @@ SPLATS_INLINE Lanes reciprocal(Lanes x) {
 
 // 2^x for x <= 0, relative error 8e-8 plus rounding, by a minimax polynomial of degree 5 on [-1/2, 1/2].
 SPLATS_INLINE Lanes exp2_of_negative(Lanes x) {
-    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, kNearest);
     const Lanes f = x - whole;
     Lanes p = 1.327647199e-03f * f + 9.675541334e-03f;
     p = p * f + 5.550713273e-02f;
@@ -49,7 +50,7 @@ SPLATS_INLINE Lanes exp2_of_negative(Lanes x) {
 // 2^x with x limited to 126 from above, relative error 3e-6, by a polynomial of degree 4: for an exponent, as above.
 SPLATS_INLINE Lanes exp2_limited(Lanes x) {
     x = minimum(x, Lanes{} + 126.0f);
-    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, kNearest);
     const Lanes f = x - whole;
     Lanes p = 9.570101911e-03f * f + 5.591786032e-02f;
     p = p * f + 2.402474483e-01f;
@@ -74,6 +75,12 @@ SPLATS_INLINE Lanes merge(Lanes a, Lanes b) {
         return __builtin_shufflevector(a, b, 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30) +
                __builtin_shufflevector(a, b, 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
 }
+
+// Sums over blocks: lane by lane, one register each.
+using Total = Lanes;
+SPLATS_INLINE void add(Total& total, Lanes a) { total += a; }
+SPLATS_INLINE void add_product(Total& total, Lanes a, Lanes b) { total += a * b; }
+SPLATS_INLINE Lanes both(Total a, Total b) { return merge<8>(a, b); }
 
 // Every lane with the one `Width` lanes on.
 template <int Width>
