@@ -35,7 +35,7 @@ $(PACKAGES): constraints.txt | check-system
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -r constraints.txt
 	@touch $@
 
-# The package itself, with its C++ kernels: in place, so that an edit of Python needs no reinstallation.
+# The package itself, with its C++ kernels: editable, so that an edit of Python needs no reinstallation.
 $(STAMP): $(PACKAGES) pyproject.toml CMakeLists.txt $(KERNELS)
 	@echo "building the C++ kernels"
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip install --quiet --disable-pip-version-check \
