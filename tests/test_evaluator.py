@@ -100,7 +100,12 @@ def test_report(evaluator: Evaluator) -> None:
     assert report["trajectory"]["ate_rmse"] == pytest.approx(0, abs=1e-6)
     assert report["trajectory"]["scale"] == pytest.approx(1 / SCALE)
     assert report["trajectory"]["frames_tracked"] == report["trajectory"]["frames"] == N
-    assert report["depth"] == {"abs_rel": pytest.approx(0, abs=1e-6), "inlier_ratio": 1.0, "completeness": 1.0}
+    assert report["depth"] == {
+        "abs_rel": pytest.approx(0, abs=1e-6),
+        "inlier_ratio": 1.0,
+        "completeness": 1.0,
+        "scale_ratio": pytest.approx(1.0),
+    }
     assert report["map"]["splats"] == 1200
     assert report["time"]["stages"]["tracker"] == {"flow": 1.5}
     assert report["time"]["wall"] > 0

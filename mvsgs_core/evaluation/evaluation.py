@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core.evaluation import scoring, trajectory
-from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, score_depth
+from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.frame_store import FrameStore
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.splats.model import Splats
@@ -226,17 +226,22 @@ class Evaluation:
         }
 
     def _score_depths(self, alignment: trajectory.Alignment | None, notes: list[str]) -> dict[str, float | None]:
+        """After one scale for the whole run, the median ratio of true to estimated depth, as is usual for monocular
+        depth; `scale_ratio` is that over the trajectory's scale, 1 where poses and depth maps of the truth agree."""
         finished = self.maps.get(True) or self.maps.get(False)
-        total = NO_DEPTH
+        maps = []
         for index, scale in self._depth_scale.items():
             truth, depth = self._store.get("depth", index), self._store.get("filtered", index)
-            if truth is None or depth is None or alignment is None:
-                continue
-            corrected = finished.scale.get(index, scale) / scale if finished else 1.0
-            total = total + score_depth(depth, truth, alignment.scale * corrected)
-        if total.known == 0:
-            notes.append("no depth error: no keyframe with true depth and aligned poses")
-        return total.summary()
+            if truth is not None and depth is not None:
+                maps.append((depth * (finished.scale.get(index, scale) / scale if finished else 1.0), truth))
+        ratios = [depth_ratios(depth, truth) for depth, truth in maps]
+        known = np.concatenate(ratios) if ratios else np.empty(0)
+        if not len(known):
+            notes.append("no depth error: no keyframe has both filtered and true depth")
+            return {**NO_DEPTH.summary(), "scale_ratio": None}
+        scale = float(np.median(known))
+        total = sum((score_depth(depth, truth, scale) for depth, truth in maps), NO_DEPTH)
+        return {**total.summary(), "scale_ratio": scale / alignment.scale if alignment else None}
 
     def close(self) -> None:
         self._store.close()

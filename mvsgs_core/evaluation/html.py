@@ -76,6 +76,7 @@ def page(
         "filtered depth: absolute relative error": number(depth["abs_rel"], 4),
         "filtered depth: inliers within 5 %": number(depth["inlier_ratio"]),
         "filtered depth: completeness": number(depth["completeness"]),
+        "scale of the depth maps over that of the trajectory": number(depth["scale_ratio"]),
         "splats": f"{splats['splats']:,}",
         "map size": f"{splats['bytes'] / 1e6:.1f} MB",
         "optimization steps": f"{splats['iterations']:,}",

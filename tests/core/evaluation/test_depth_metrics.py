@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, score_depth
+from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 
 
 def test_counts_only_what_both_know() -> None:
@@ -41,3 +41,14 @@ def test_values_that_are_not_finite_are_no_estimate() -> None:
     depth = np.ones((4, 4), np.float32)
     depth[0, 0], depth[0, 1] = np.nan, np.inf
     assert score_depth(depth, truth, 1.0).estimated == 14
+
+
+def test_ratios_are_of_pixels_that_have_both() -> None:
+    truth = np.full((20, 30), 3.0, np.float32)
+    truth[:10] = 0
+    depth = np.full((20, 30), 2.0, np.float32)
+    depth[:, :5] = np.nan
+    ratios = depth_ratios(depth, truth, every=1)
+    assert len(ratios) == 10 * 25
+    assert np.allclose(ratios, 1.5)
+    assert len(depth_ratios(depth * 0, truth)) == 0
