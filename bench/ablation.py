@@ -39,13 +39,14 @@ class Difference:
     mean: float
     spread: float  # half the range of the variant over the seeds
     noise: float  # the same of the full system
+    runs: int  # of the one that has fewer; a single run has no known spread
 
     @property
     def real(self) -> bool:
-        return abs(self.mean) > self.spread + self.noise
+        return self.runs > 1 and abs(self.mean) > self.spread + self.noise
 
     def text(self, digits: int) -> str:
-        return f"{self.mean:+.{digits}f} ± {self.spread:.{digits}f}"
+        return f"{self.mean:+.{digits}f}" + (f" ± {self.spread:.{digits}f}" if self.runs > 1 else "")
 
 
 def difference(variant: Sequence[Run], full: Sequence[Run], path: str) -> Difference | None:
@@ -54,7 +55,12 @@ def difference(variant: Sequence[Run], full: Sequence[Run], path: str) -> Differ
     base = [v for v in (figure(run.report, path) for run in full) if v is not None]
     if not values or not base:
         return None
-    return Difference(float(np.mean(values) - np.mean(base)), float(np.ptp(values) / 2), float(np.ptp(base) / 2))
+    return Difference(
+        float(np.mean(values) - np.mean(base)),
+        float(np.ptp(values) / 2),
+        float(np.ptp(base) / 2),
+        min(len(values), len(base)),
+    )
 
 
 def select(runs: list[Run], scene: str, variant: str) -> list[Run]:
@@ -73,7 +79,7 @@ def rows_of(runs: list[Run], scenes: Sequence[str], variants: Sequence[str]) -> 
             for name, (path, unit, digits) in FIGURES.items():
                 found = difference(select(runs, scene, variant), full, path)
                 if found is not None:
-                    real = "" if found.real else " (within the spread)"
+                    real = "" if found.real else " (within the spread)" if found.runs > 1 else " (one run)"
                     rows.append(Row(f"{scene}: {variant}: {name}, change", found.text(digits) + real, unit))
     return rows
 
@@ -86,13 +92,24 @@ def table(runs: list[Run], scenes: Sequence[str], variants: Sequence[str]) -> st
         cells = []
         for path, _, digits in FIGURES.values():
             base = [v for v in (figure(run.report, path) for run in full) if v is not None]
-            cells.append(f"{np.mean(base):.{digits}f} ± {np.ptp(base) / 2:.{digits}f}" if base else "–")
+            cells.append(
+                f"{np.mean(base):.{digits}f} ± {np.ptp(base) / 2:.{digits}f}"
+                if len(base) > 1
+                else f"{base[0]:.{digits}f}"
+                if base
+                else "–"
+            )
         lines.append(f"| {scene} | **full** | " + " | ".join(cells) + " |")
         for variant in variants:
             found = [(difference(select(runs, scene, variant), full, p), digits) for p, _, digits in FIGURES.values()]
             shown = ["–" if d is None else f"**{d.text(n)}**" if d.real else d.text(n) for d, n in found]
             lines.append(f"| {scene} | {variant} | " + " | ".join(shown) + " |")
-    return "\n".join([*lines, "", "Changes against the full system; bold: larger than the spreads of both."]) + "\n"
+    return (
+        "\n".join(
+            [*lines, "", "Changes against the full system; bold: larger than the spreads of both, of two runs or more."]
+        )
+        + "\n"
+    )
 
 
 def measure(options: argparse.Namespace) -> list[Row]:

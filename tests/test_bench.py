@@ -172,6 +172,16 @@ def test_ablation_says_sign_size_and_what_is_within_the_spread() -> None:
     assert "| +0.05 ± 0.10 |" in text
 
 
+def test_an_ablation_of_one_run_calls_nothing_real() -> None:
+    runs = [a_run(variant="full", psnr=25.0), a_run(variant="A", psnr=22.0)]
+    found = ablation.difference(runs[1:], runs[:1], "rendering.held_out.psnr")
+    assert found is not None
+    assert not found.real
+    text = ablation.table(runs, ["room"], ["A"])
+    assert "| -3.00 |" in text
+    assert "±" not in text
+
+
 def test_peers_stand_in_one_table_of_poses_and_one_of_maps() -> None:
     rows = [
         Row("room: poses, ours: ATE", 0.5, "%"), Row("room: poses, COLMAP: ATE", None, "%"),
