@@ -9,6 +9,8 @@ import numpy as np
 
 from mvsgs_core import native
 
+TILE = (8, 16)  # (rows, columns) of the tiles that a sweep can leave out
+
 
 @dataclass(frozen=True)
 class CostOptions:
@@ -57,7 +59,9 @@ class Backend(Protocol):
         step: np.ndarray,
         hypotheses: int,
         options: CostOptions,
-    ) -> np.ndarray: ...
+        needed: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """`needed` (tile rows, D, tile columns) uint8, tiles of TILE pixels: elsewhere the cost is 1, uncomputed."""
 
     def semi_global(
         self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
@@ -85,11 +89,12 @@ class NativeBackend:
         step: np.ndarray,
         hypotheses: int,
         options: CostOptions,
+        needed: np.ndarray | None = None,
     ) -> np.ndarray:
         return np.asarray(
             self._kernels.cost_volume(
                 reference, neighbors, warps, first, step, hypotheses, options.radius, options.best, options.noise,
-                options.contrast, threads=self._threads,
+                options.contrast, threads=self._threads, needed=needed,
             )
         )  # fmt: skip
 

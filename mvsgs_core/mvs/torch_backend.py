@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.mvs.backend import Choice, CostOptions, SmoothOptions
+from mvsgs_core.mvs.backend import TILE, Choice, CostOptions, SmoothOptions
 
 _MANY = 1e9
 
@@ -30,6 +30,7 @@ class TorchBackend:
         step: np.ndarray,
         hypotheses: int,
         options: CostOptions,
+        needed: np.ndarray | None = None,
     ) -> np.ndarray:
         windows = _Windows(self._on(reference), options)
         images, transforms = self._on(neighbors), self._on(warps)
@@ -41,6 +42,9 @@ class TorchBackend:
             correlation = torch.stack([windows.correlate(i, t, surface) for i, t in zip(images, transforms)])
             each = (1.0 - correlation).clamp(0.0, 1.0)
             cost[:, k] = torch.topk(each, best, dim=0, largest=False).values.mean(dim=0)
+        if needed is not None:
+            tiles = torch.from_numpy(needed).to(self.device).repeat_interleave(TILE[0], 0).repeat_interleave(TILE[1], 2)
+            cost[tiles[: cost.shape[0], :, : cost.shape[2]] == 0] = 1.0
         return cost.cpu().numpy()
 
     @torch.no_grad()

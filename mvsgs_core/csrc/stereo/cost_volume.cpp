@@ -10,15 +10,21 @@
 namespace stereo {
 namespace {
 
-constexpr int kBand = 8;  // rows that a thread handles at once: their window weights stay in its cache
+constexpr int kBand = kTileRows;  // rows that a thread handles at once: their window weights stay in its cache
 constexpr int kMaxBest = 8;
 
 int taps_of(int radius) { return (2 * radius + 1) * (2 * radius + 1); }
 
+// Columns [from, to) of some rows.
+struct Columns {
+    int from, to;
+    Columns wider(int by, int width) const { return {std::max(from - by, 0), std::min(to + by, width)}; }
+};
+
 // Rows [begin, end) of the reference, one hypothesis, one neighbor: samples, in rows padded by `pad` on both sides,
 // and whether the neighbor sees them.
-void warp_rows(const float* neighbor, int nh, int nw, const Warp& t, int begin, int end, int width, int pad,
-               const float* first, const float* step, float k, float* sample, float* seen) {
+void warp_rows(const float* neighbor, int nh, int nw, const Warp& t, int begin, int end, int width, Columns columns,
+               int pad, const float* first, const float* step, float k, float* sample, float* seen) {
     const float max_x = static_cast<float>(nw - 1), max_y = static_cast<float>(nh - 1);
     for (int y = begin; y < end; ++y) {
         const float v = static_cast<float>(y);
@@ -28,7 +34,7 @@ void warp_rows(const float* neighbor, int nh, int nw, const Warp& t, int begin, 
         float* out = sample + static_cast<std::size_t>(y - begin) * (width + 2 * pad) + pad;
         float* ok = seen + static_cast<std::size_t>(y - begin) * width;
 #pragma omp simd
-        for (int x = 0; x < width; ++x) {
+        for (int x = columns.from; x < columns.to; ++x) {
             const float u = static_cast<float>(x);
             const float w = f[x] + k * s[x];
             const float xs = t.m[0] * u + cx + w * t.b[0];
@@ -124,13 +130,15 @@ struct Scratch {
 };
 
 // ZNCC of row y against the samples; -2 where the neighbor does not see the pixel.
-void correlate_row(const Windows& windows, int y, int y0, int begin, int height, float noise, Scratch& s, float* ncc) {
+void correlate_row(const Windows& windows, int y, int y0, int begin, int height, Columns columns, float noise,
+                   Scratch& s, float* ncc) {
     const int width = windows.width, radius = windows.radius, side = 2 * radius + 1;
+    const int from = columns.from, to = columns.to;
     const std::size_t row = static_cast<std::size_t>(y - y0);
     float *sum = s.sum.data(), *square = s.square.data(), *product = s.product.data();
-    std::fill(s.sum.begin(), s.sum.end(), 0.0f);
-    std::fill(s.square.begin(), s.square.end(), 0.0f);
-    std::fill(s.product.begin(), s.product.end(), 0.0f);
+    std::fill(sum + from, sum + to, 0.0f);
+    std::fill(square + from, square + to, 0.0f);
+    std::fill(product + from, product + to, 0.0f);
     const int stride = width + 2 * s.pad;
     for (int dy = std::max(-radius, -y); dy <= std::min(radius, height - 1 - y); ++dy) {
         const float* line = s.sample.data() + static_cast<std::size_t>(y + dy - begin) * stride + s.pad;
@@ -141,7 +149,7 @@ void correlate_row(const Windows& windows, int y, int y0, int begin, int height,
             const float* wi = windows.weighted.data() + tap;
             const float* v = line + dx;
 #pragma omp simd
-            for (int x = 0; x < width; ++x) {
+            for (int x = from; x < to; ++x) {
                 const float weighted = w[x] * v[x];
                 sum[x] += weighted;
                 square[x] += weighted * v[x];
@@ -153,7 +161,7 @@ void correlate_row(const Windows& windows, int y, int y0, int begin, int height,
     const float* var_i = windows.variance.data() + row * width;
     const float* seen = s.seen.data() + static_cast<std::size_t>(y - begin) * width;
 #pragma omp simd
-    for (int x = 0; x < width; ++x) {
+    for (int x = from; x < to; ++x) {
         const float var_w = std::max(square[x] - sum[x] * sum[x], 0.0f) + noise;
         const float covariance = product[x] - mean_i[x] * sum[x];
         const float c = covariance / std::sqrt(var_i[x] * var_w);
@@ -162,9 +170,9 @@ void correlate_row(const Windows& windows, int y, int y0, int begin, int height,
 }
 
 // Keeps the `best` smallest costs of each pixel, ascending; slots is [best][width].
-void insert_cost(const float* ncc, int width, int best, float* slots) {
+void insert_cost(const float* ncc, int width, Columns columns, int best, float* slots) {
 #pragma omp simd
-    for (int x = 0; x < width; ++x) {
+    for (int x = columns.from; x < columns.to; ++x) {
         float c = std::min(std::max(1.0f - ncc[x], 0.0f), 1.0f);
         for (int j = 0; j < best; ++j) {
             float& slot = slots[static_cast<std::size_t>(j) * width + x];
@@ -175,41 +183,70 @@ void insert_cost(const float* ncc, int width, int best, float* slots) {
     }
 }
 
+// Runs of needed tiles of one band and hypothesis; all columns where nothing says otherwise.
+void runs_of(const std::uint8_t* needed, int tiles, int width, std::vector<Columns>& runs) {
+    runs.clear();
+    if (needed == nullptr) {
+        runs.push_back({0, width});
+        return;
+    }
+    for (int t = 0; t < tiles; ++t) {
+        if (!needed[t]) continue;
+        const int from = t * kTileColumns, to = std::min(from + kTileColumns, width);
+        if (!runs.empty() && runs.back().to == from)
+            runs.back().to = to;
+        else
+            runs.push_back({from, to});
+    }
+}
+
 }  // namespace
 
 void cost_volume(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
-                 int nh, int nw, const float* first, const float* step, const CostOptions& o, float* cost) {
+                 int nh, int nw, const float* first, const float* step, const std::uint8_t* needed,
+                 const CostOptions& o, float* cost) {
     const int best = std::min({o.best, views, kMaxBest});
     const float share = 1.0f / static_cast<float>(best);
-    const int bands = (height + kBand - 1) / kBand;
+    const int bands = (height + kBand - 1) / kBand, tiles = (width + kTileColumns - 1) / kTileColumns;
 #pragma omp parallel num_threads(o.threads)
     {
         Scratch s(width, o.radius, best);
         Windows windows(width, o.radius);
+        std::vector<Columns> runs;
 #pragma omp for schedule(dynamic)
         for (int band = 0; band < bands; ++band) {
             const int y0 = band * kBand, y1 = std::min(y0 + kBand, height);
             const int begin = std::max(y0 - o.radius, 0), end = std::min(y1 + o.radius, height);
             windows.prepare(reference, height, y0, y1, o.contrast, o.noise);
             for (int k = 0; k < o.hypotheses; ++k) {
-                std::fill(s.best.begin(), s.best.end(), 1.0f);
-                for (int n = 0; n < views; ++n) {
-                    warp_rows(neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n], begin, end, width,
-                              o.radius, first, step, static_cast<float>(k), s.sample.data(), s.seen.data());
+                const std::size_t at = (static_cast<std::size_t>(band) * o.hypotheses + k) * tiles;
+                runs_of(needed == nullptr ? nullptr : needed + at, tiles, width, runs);
+                if (needed != nullptr)
                     for (int y = y0; y < y1; ++y) {
-                        correlate_row(windows, y, y0, begin, height, o.noise, s, s.value.data());
-                        insert_cost(s.value.data(), width, best,
-                                    s.best.data() + static_cast<std::size_t>(y - y0) * width * best);
+                        float* out = cost + (static_cast<std::size_t>(y) * o.hypotheses + k) * width;
+                        std::fill(out, out + width, 1.0f);
                     }
-                }
-                for (int y = y0; y < y1; ++y) {
-                    const float* slots = s.best.data() + static_cast<std::size_t>(y - y0) * width * best;
-                    float* out = cost + (static_cast<std::size_t>(y) * o.hypotheses + k) * width;
+                for (const Columns& run : runs) {
+                    std::fill(s.best.begin(), s.best.end(), 1.0f);
+                    for (int n = 0; n < views; ++n) {
+                        warp_rows(neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n], begin, end,
+                                  width, run.wider(o.radius, width), o.radius, first, step, static_cast<float>(k),
+                                  s.sample.data(), s.seen.data());
+                        for (int y = y0; y < y1; ++y) {
+                            correlate_row(windows, y, y0, begin, height, run, o.noise, s, s.value.data());
+                            insert_cost(s.value.data(), width, run, best,
+                                        s.best.data() + static_cast<std::size_t>(y - y0) * width * best);
+                        }
+                    }
+                    for (int y = y0; y < y1; ++y) {
+                        const float* slots = s.best.data() + static_cast<std::size_t>(y - y0) * width * best;
+                        float* out = cost + (static_cast<std::size_t>(y) * o.hypotheses + k) * width;
 #pragma omp simd
-                    for (int x = 0; x < width; ++x) {
-                        float sum = 0.0f;
-                        for (int j = 0; j < best; ++j) sum += slots[static_cast<std::size_t>(j) * width + x];
-                        out[x] = sum * share;
+                        for (int x = run.from; x < run.to; ++x) {
+                            float sum = 0.0f;
+                            for (int j = 0; j < best; ++j) sum += slots[static_cast<std::size_t>(j) * width + x];
+                            out[x] = sum * share;
+                        }
                     }
                 }
             }
@@ -233,9 +270,9 @@ void view_correlation(const float* reference, int height, int width, const float
             windows.prepare(reference, height, y0, y1, o.contrast, o.noise);
             for (int n = 0; n < views; ++n) {
                 warp_rows(neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n], begin, end, width,
-                          o.radius, inverse_depth, step.data(), 0.0f, s.sample.data(), s.seen.data());
+                          {0, width}, o.radius, inverse_depth, step.data(), 0.0f, s.sample.data(), s.seen.data());
                 for (int y = y0; y < y1; ++y)
-                    correlate_row(windows, y, y0, begin, height, o.noise, s,
+                    correlate_row(windows, y, y0, begin, height, {0, width}, o.noise, s,
                                   correlation + (static_cast<std::size_t>(n) * height + y) * width);
             }
         }

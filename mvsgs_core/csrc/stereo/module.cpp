@@ -3,8 +3,10 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <omp.h>
 
+#include <optional>
 #include <stdexcept>
 #include <string>
 
@@ -16,6 +18,7 @@ namespace {
 
 using Image = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Stack = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using Tiles = nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Warps = nb::ndarray<const float, nb::shape<-1, 12>, nb::c_contig, nb::device::cpu>;
 
 int thread_count(int threads) { return threads > 0 ? threads : omp_get_max_threads(); }
@@ -39,13 +42,16 @@ nb::ndarray<nb::numpy, T> allocate(const std::size_t (&shape)[N]) {
 
 nb::ndarray<nb::numpy, float> cost_volume(Image reference, Stack neighbors, Warps warps, Image first, Image step,
                                           int hypotheses, int radius, int best, float noise,
-                                          float contrast, int threads) {
+                                          float contrast, int threads, std::optional<Tiles> needed) {
     same_size(reference, first);
     same_size(reference, step);
     require(neighbors.shape(0) == warps.shape(0) && neighbors.shape(0) > 0, "one warp per neighbor, at least one");
     require(neighbors.shape(1) >= 2 && neighbors.shape(2) >= 2, "neighbor images need at least 2x2 pixels");
     require(hypotheses >= 1 && radius >= 0 && radius <= 16 && best >= 1, "bad hypotheses, radius or best");
     const std::size_t h = reference.shape(0), w = reference.shape(1), d = static_cast<std::size_t>(hypotheses);
+    require(!needed || (needed->shape(0) == (h + stereo::kTileRows - 1) / stereo::kTileRows && needed->shape(1) == d &&
+                        needed->shape(2) == (w + stereo::kTileColumns - 1) / stereo::kTileColumns),
+            "needed must be (tile rows, D, tile columns)");
     auto cost = allocate<float>({h, d, w});
     const stereo::CostOptions options{hypotheses, radius, best, noise, contrast, thread_count(threads)};
     {
@@ -53,7 +59,7 @@ nb::ndarray<nb::numpy, float> cost_volume(Image reference, Stack neighbors, Warp
         stereo::cost_volume(reference.data(), static_cast<int>(h), static_cast<int>(w), neighbors.data(),
                             reinterpret_cast<const stereo::Warp*>(warps.data()), static_cast<int>(neighbors.shape(0)),
                             static_cast<int>(neighbors.shape(1)), static_cast<int>(neighbors.shape(2)), first.data(),
-                            step.data(), options, cost.data());
+                            step.data(), needed ? needed->data() : nullptr, options, cost.data());
     }
     return cost;
 }
@@ -165,7 +171,8 @@ nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack
 MVSGS_EXPAND(MVSGS_MODULE, m) {
     using namespace nb::literals;
     m.def("cost_volume", &cost_volume, "reference"_a, "neighbors"_a, "warps"_a, "first"_a, "step"_a, "hypotheses"_a,
-          "radius"_a, "best"_a, "noise"_a, "contrast"_a, "threads"_a = 0);
+          "radius"_a, "best"_a, "noise"_a, "contrast"_a, "threads"_a = 0, "needed"_a = nb::none());
+    m.attr("TILE") = nb::make_tuple(stereo::kTileRows, stereo::kTileColumns);
     m.def("view_correlation", &view_correlation, "reference"_a, "neighbors"_a, "warps"_a, "inverse_depth"_a,
           "radius"_a, "noise"_a, "contrast"_a, "threads"_a = 0);
     m.def("semi_global", &semi_global, "cost"_a, "reference"_a, "first"_a, "step"_a, "small_jump"_a, "large_jump"_a,

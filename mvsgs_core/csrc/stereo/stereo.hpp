@@ -14,6 +14,8 @@ struct Warp {
     float b[3];
 };
 
+constexpr int kTileRows = 8, kTileColumns = 16;  // of a tile that can be left out of a sweep, pixels
+
 struct CostOptions {
     int hypotheses;   // D
     int radius;       // window is (2 radius + 1)^2 pixels
@@ -25,9 +27,10 @@ struct CostOptions {
 
 // cost (H, D, W) in [0, 1]: 1 - ZNCC, mean over the best views, 1 where a view does not see the hypothesis.
 // Hypothesis k of a pixel is first + k step: the window follows the surface first + k step, so it is as slanted as that.
+// needed (tile rows, D, tile columns), or null for all: elsewhere nothing is computed and the cost is 1.
 void cost_volume(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
                  int neighbor_height, int neighbor_width, const float* first, const float* step,
-                 const CostOptions& options, float* cost);
+                 const std::uint8_t* needed, const CostOptions& options, float* cost);
 
 // correlation (N, H, W): ZNCC of each view at one inverse depth per pixel; -2 where the view does not see it.
 void view_correlation(const float* reference, int height, int width, const float* neighbors, const Warp* warps,

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvsgs_core.mvs.backend import CostOptions, NativeBackend, SmoothOptions
+from mvsgs_core.mvs.backend import TILE, CostOptions, NativeBackend, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.mvs.warp import relative_warp
+from mvsgs_core.native import load
 from tests.core.mvs.plane_scene import look, render
 
 SIZE = (36, 52)
@@ -45,6 +46,25 @@ def test_cost_volumes_of_both_backends_agree(radius: int) -> None:
     # Rounding decides on which side of the border a sample falls: a few pixels may differ by more.
     assert np.mean(np.abs(native - twin) > 1e-3) < 2e-3
     assert native.std() > 0.05
+
+
+def test_tiles_that_are_not_needed_cost_one_and_the_others_stay() -> None:
+    p = problem()
+    rows, columns = (-(-size // tile) for size, tile in zip(SIZE, TILE, strict=True))
+    needed = (np.random.default_rng(3).random((rows, 9, columns)) < 0.5).astype(np.uint8)
+    whole = NativeBackend(1).cost_volume(**p, hypotheses=9, options=COST)
+    part = NativeBackend(1).cost_volume(**p, hypotheses=9, options=COST, needed=needed)
+    twin = TorchBackend("cpu").cost_volume(**p, hypotheses=9, options=COST, needed=needed)
+    inside = needed.repeat(TILE[0], 0).repeat(TILE[1], 2)[: SIZE[0], :, : SIZE[1]] > 0
+    np.testing.assert_allclose(part[inside], whole[inside], atol=1e-5)
+    assert np.all(part[~inside] == 1)
+    assert np.mean(np.abs(part - twin) > 1e-3) < 2e-3
+    with pytest.raises(ValueError, match="tile rows"):
+        NativeBackend(1).cost_volume(**p, hypotheses=9, options=COST, needed=needed[:, :8].copy())
+
+
+def test_the_tile_is_the_kernels() -> None:
+    assert load("stereo").TILE == TILE
 
 
 def test_correlations_agree_and_mark_what_is_not_seen() -> None:
