@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from mvsgs_core.fusion.backend import Fused
+from mvsgs_core.fusion.interface import Fused
 
 # Logistic regression on `features_of`, by `python -m bench.depth_calibration`.
 WEIGHTS = np.array([-0.981, 1.16, 1.546, -0.759, -0.123, 1.309, 0.074, -1.097, -1.354])

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.fusion.backend import FusionBackend, make_fusion_backend
+from mvsgs_core.fusion.backend import make_fusion_backend
 from mvsgs_core.fusion.confidence import features_of, probability_of_inlier
+from mvsgs_core.fusion.interface import FusionBackend
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.views import DepthView, warps_between
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.fusion.backend import Fused
+from mvsgs_core.fusion.interface import Fused
 
 
 class TorchFusionBackend:

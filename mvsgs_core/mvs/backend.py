@@ -2,75 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
-
 import numpy as np
 
 from mvsgs_core import native
-
-TILE = (8, 16)  # (rows, columns) of the tiles that a sweep can leave out
-
-
-@dataclass(frozen=True)
-class CostOptions:
-    """Windowed ZNCC of a sweep."""
-
-    radius: int = 3  # pixels: a window of 2 radius + 1
-    best: int = 3  # views whose cost counts, of all
-    noise: float = 1.5  # gray levels²: added to both variances
-    contrast: float = 11.0  # gray levels: a pixel that differs so from the window's center counts 1 / e
-
-
-@dataclass(frozen=True)
-class SmoothOptions:
-    """Semi-global smoothing, and the softmax that gives the probability."""
-
-    small_jump: float = 0.3  # cost of a change by one hypothesis
-    large_jump: float = 2.0  # cost of a larger change
-    edge: float = 12.0  # gray levels that halve these
-    break_steps: float = 4.0  # hypotheses: a larger jump of the surface ends the path
-    temperature: float = 0.02  # of the softmax, in cost
-    paths: int = 8  # directions, 4 or 8
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What a stage found, each (H, W)."""
-
-    index: np.ndarray  # float32 the best hypothesis, between whole ones by a parabola
-    probability: np.ndarray  # float32 softmax mass within one hypothesis of the best
-    margin: np.ndarray  # float32 how much worse the best other hypothesis is, in cost, at most 1
-    best: np.ndarray  # int32 the best hypothesis
-
-
-class Backend(Protocol):
-    """Images (H, W) and (N, H, W) float32; warps (N, 12) float32; `first`, `step` (H, W) float32: hypothesis k of a
-
-    pixel is the inverse depth first + k step. Costs are (H, D, W) float32 in [0, 1].
-    """
-
-    def cost_volume(
-        self,
-        reference: np.ndarray,
-        neighbors: np.ndarray,
-        warps: np.ndarray,
-        first: np.ndarray,
-        step: np.ndarray,
-        hypotheses: int,
-        options: CostOptions,
-        needed: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """`needed` (tile rows, D, tile columns) uint8, tiles of TILE pixels: elsewhere the cost is 1, uncomputed."""
-
-    def semi_global(
-        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
-    ) -> Choice: ...
-
-    def view_correlation(
-        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,
-        options: CostOptions,
-    ) -> np.ndarray: ...  # fmt: skip
+from mvsgs_core.mvs.interface import Backend, Choice, CostOptions, SmoothOptions
 
 
 class NativeBackend:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core import camera
-from mvsgs_core.mvs.backend import Choice
+from mvsgs_core.mvs.interface import Choice
 from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.mvs.warp import apply_warp, relative_warp
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.mvs.backend import TILE, Choice, CostOptions, SmoothOptions
+from mvsgs_core.mvs.interface import TILE, Choice, CostOptions, SmoothOptions
 
 _MANY = 1e9
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvsgs_core.mvs.backend import TILE, CostOptions, NativeBackend, SmoothOptions
+from mvsgs_core.mvs.backend import NativeBackend
+from mvsgs_core.mvs.interface import TILE, CostOptions, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.mvs.warp import relative_warp
 from mvsgs_core.native import load
