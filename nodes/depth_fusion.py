@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,47 +17,17 @@ from mvsgs_core.fusion.views import DepthView
 from nodes import Node
 
 
-class DepthFusion(Node):
-    """Geometric consistency and temporal refinement; see mvsgs_core.fusion."""
+class FusionNode(Node, ABC):
+    """What every fusion of depth maps does with messages; a subclass makes the fusion itself from its Config."""
 
-    @dataclass
-    class Config:
-        lag: int = 2  # keyframes after the reference that are waited for
-        window: int = 4  # keyframes before the reference that may be neighbors
-        neighbors: int = 4  # depth maps that a reference is checked with
-        refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
-        sigma: float = 0.01  # relative depth: width of the support
-        check: bool = True  # geometric consistency
-        relative: float = 0.02  # relative depth difference that still agrees
-        round_trip: bool = False  # check by projecting back, instead of the paper's one way
-        least_views: int = 3  # views that must agree, the reference counted
-        confidence: float = 0.7  # least confidence of a kept pixel
-        device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
-        threads: int | None = None  # of the C++ kernels; null: all
-
-    config: Config
-
-    def __init__(self, config: Config | None = None) -> None:
+    def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        c = self.config
-        self._fusion = Fusion(
-            FusionConfig(
-                lag=c.lag,
-                window=c.window,
-                neighbors=c.neighbors,
-                refine=c.refine,
-                sigma=c.sigma,
-                check=c.check,
-                relative=c.relative,
-                round_trip=c.round_trip,
-                least_views=c.least_views,
-                confidence=c.confidence,
-                device=c.device,
-                threads=c.threads,
-            )
-        )
+        self._fusion = self._make_fusion()
         self._depths: dict[int, Depth] = {}  # not sent yet
         self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
+
+    @abstractmethod
+    def _make_fusion(self) -> Fusion: ...
 
     def on_depth(self, depth: Depth) -> Iterator[View]:
         self._depths[depth.index] = depth
@@ -109,4 +81,44 @@ class DepthFusion(Node):
             confidence=found.confidence,
             normals=found.normals,
             segment=message.segment,
+        )
+
+
+class DepthFusion(FusionNode):
+    """Geometric consistency and temporal refinement; see mvsgs_core.fusion."""
+
+    @dataclass
+    class Config:
+        lag: int = 2  # keyframes after the reference that are waited for
+        window: int = 4  # keyframes before the reference that may be neighbors
+        neighbors: int = 4  # depth maps that a reference is checked with
+        refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
+        sigma: float = 0.01  # relative depth: width of the support
+        check: bool = True  # geometric consistency
+        relative: float = 0.02  # relative depth difference that still agrees
+        round_trip: bool = False  # check by projecting back, instead of the paper's one way
+        least_views: int = 3  # views that must agree, the reference counted
+        confidence: float = 0.7  # least confidence of a kept pixel
+        device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
+        threads: int | None = None  # of the C++ kernels; null: all
+
+    config: Config
+
+    def _make_fusion(self) -> Fusion:
+        c = self.config
+        return Fusion(
+            FusionConfig(
+                lag=c.lag,
+                window=c.window,
+                neighbors=c.neighbors,
+                refine=c.refine,
+                sigma=c.sigma,
+                check=c.check,
+                relative=c.relative,
+                round_trip=c.round_trip,
+                least_views=c.least_views,
+                confidence=c.confidence,
+                device=c.device,
+                threads=c.threads,
+            )
         )

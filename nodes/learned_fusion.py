@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
+import torch
 
-from msgs import Depth
+from mvsgs_core.fusion.fusion import DepthFusion as Fusion
 from mvsgs_core.fusion.fusion import FusionConfig
-from mvsgs_core.fusion.learned import RANDOM
-from mvsgs_core.fusion.learned import LearnedFusion as Fusion
-from nodes import Node
-from nodes.depth_fusion import DepthFusion
+from mvsgs_core.fusion.learned import RANDOM, VFuseConfig
+from mvsgs_core.fusion.learned import LearnedFusion as LearnedCore
+from nodes.depth_fusion import FusionNode
 
 
-class LearnedFusion(DepthFusion):
+class LearnedFusion(FusionNode):
     """V-FUSE (Burgdorfer and Mordohai 2023); see mvsgs_core.fusion.learned."""
 
     @dataclass
     class Config:
         weights: str | None = None  # checkpoint; null: where mvsgs_core.weights finds it; random: untrained, for tests
         center: str = "conf"  # of a pixel's search window: conf, the most confident depth, or mean, the weighted mean
+        confidence_mode: str = "swr"  # swr, single, pns, pns_swr, pkrn: see mvsgs_core.networks.vfuse_confidence
         lag: int = 2  # keyframes after the reference that are waited for
         window: int = 4  # keyframes before the reference that may be neighbors
         neighbors: int = 4  # depth maps that a reference is refined and checked with
@@ -29,14 +28,20 @@ class LearnedFusion(DepthFusion):
         relative: float = 0.01  # relative depth difference that still agrees
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
         least_views: int = 3  # views that must agree, the reference counted
-        confidence: float = 0.7  # least confidence of a kept pixel, relative to the image: see networks.vfuse
+        confidence: float = 0.7  # least confidence of a kept pixel; that of swr is relative to the image
+        device: str = "auto"  # auto (CUDA if there is one), cpu, cuda
+        threads: int | None = None  # of the C++ kernels; null: all
 
-    config: Config  # type: ignore[assignment]
+    config: Config
 
-    def __init__(self, config: Any = None) -> None:
-        Node.__init__(self, config)
+    def _make_fusion(self) -> Fusion:
         c = self.config
-        self._fusion = Fusion(
+        device = c.device
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        if c.weights == RANDOM:
+            self.stats.warn("V-FUSE runs untrained, with random weights: its refinement is noise")
+        return LearnedCore(
             FusionConfig(
                 lag=c.lag,
                 window=c.window,
@@ -46,11 +51,8 @@ class LearnedFusion(DepthFusion):
                 round_trip=c.round_trip,
                 least_views=c.least_views,
                 confidence=c.confidence,
+                device=c.device,
+                threads=c.threads,
             ),
-            c.weights,
-            c.center,
+            VFuseConfig(file=c.weights, center=c.center, confidence=c.confidence_mode, device=device),
         )
-        self._depths: dict[int, Depth] = {}
-        self._poses: dict[int, tuple[np.ndarray, float]] = {}
-        if c.weights == RANDOM:
-            self.stats.warn("V-FUSE runs untrained, with random weights: its refinement is noise")

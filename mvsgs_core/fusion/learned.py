@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from mvsgs_core import camera, geometry, weights
-from mvsgs_core.fusion.fusion import DepthFusion, FusedDepth, FusionConfig, fuse, nearest_views
+from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
 from mvsgs_core.fusion.views import DepthView
 from mvsgs_core.networks import checkpoints
-from mvsgs_core.networks.vfuse import FusionInput, VFuse
+from mvsgs_core.networks.vfuse import FusionInput, VFuse, check_choices
 
 RANDOM = "random"
 _PERCENTILES, _MARGIN = (1.0, 99.0), 1.1  # of the known depths, for the range that the network normalizes by
@@ -32,26 +32,33 @@ def make_network(file: str | None) -> VFuse:
     return net.eval().requires_grad_(False)
 
 
+@dataclass(frozen=True)
+class VFuseConfig:
+    """V-FUSE for the fusion."""
+
+    file: str | None = None  # checkpoint; None: where mvsgs_core.weights finds it; "random": untrained, for tests
+    center: str = "conf"  # of the search window: "conf", the most confident depth, or "mean", the weighted mean
+    confidence: str = "swr"  # of networks.vfuse_confidence.MODES
+    device: str = "cpu"  # "cpu" or "cuda[:N]"
+
+
 class LearnedFusion(DepthFusion):
-    """`center`: "conf", the most confident depth, or "mean", the confidence-weighted mean, as the window's center."""
+    """Raises ValueError for an unknown center or confidence, and what `make_network` raises."""
 
-    def __init__(self, config: FusionConfig, file: str | None, center: str = "conf") -> None:
+    def __init__(self, config: FusionConfig, learned: VFuseConfig) -> None:
         super().__init__(replace(config, refine=False))
-        self._net = make_network(file)
-        self._center = center
+        check_choices(learned.center, learned.confidence)
+        self.learned = learned
+        self._net = make_network(learned.file).to(learned.device)
 
-    def _next(self) -> FusedDepth:
-        index = self._waiting.pop(0)
-        reference = next(v for v in self._views if v.index == index)
-        others = [v for v in self._views if v.index != index]
-        neighbors = nearest_views(reference, others, self.config.neighbors)
-        if neighbors and (reference.depth > 0).any():
-            reference = refine(self._net, reference, neighbors, self._center)
-        return fuse(reference, neighbors, self.config, self._backend)
+    def _prepared(self, reference: DepthView, neighbors: list[DepthView]) -> DepthView:
+        if not neighbors or not (reference.depth > 0).any():
+            return reference
+        return refine(self._net, reference, neighbors, self.learned)
 
 
-def refine(net: VFuse, reference: DepthView, neighbors: list[DepthView], center: str) -> DepthView:
-    """The reference with V-FUSE's depth and confidence, which is relative to the image (see networks.vfuse)."""
+def refine(net: VFuse, reference: DepthView, neighbors: list[DepthView], learned: VFuseConfig) -> DepthView:
+    """The reference with V-FUSE's depth and confidence (what it means: networks.vfuse_confidence)."""
     views = [reference, *neighbors]
     depths = np.stack([v.depth for v in views]).astype(np.float32)
     # around the reference and at unit median depth: float32 has no digits to spare in a far or tiny world
@@ -59,21 +66,17 @@ def refine(net: VFuse, reference: DepthView, neighbors: list[DepthView], center:
     low, high = np.percentile(depths[depths > 0] / unit, _PERCENTILES)
     cam_from_world = np.stack([geometry.inverse(v.world_from_cam) for v in views]) @ reference.world_from_cam
     cam_from_world[:, :3, 3] /= unit
-    fused = net(
-        FusionInput(
-            torch.from_numpy(depths / np.float32(unit)),
-            torch.from_numpy(np.stack([v.confidence for v in views]).clip(0, 1)),
-            torch.from_numpy(cam_from_world),
-            torch.from_numpy(np.stack([camera.matrix(v.intrinsics) for v in views])),
-            near=float(low / _MARGIN),
-            far=float(high * _MARGIN),
-        ),
-        center,
+    given = FusionInput(
+        torch.from_numpy(depths / np.float32(unit)).to(learned.device),
+        torch.from_numpy(np.stack([v.confidence for v in views]).clip(0, 1)).to(learned.device),
+        torch.from_numpy(cam_from_world).to(learned.device),
+        torch.from_numpy(np.stack([camera.matrix(v.intrinsics) for v in views])).to(learned.device),
+        near=float(low / _MARGIN),
+        far=float(high * _MARGIN),
     )
-    depth = fused.depth.numpy() * np.float32(unit)
-    good = np.isfinite(depth) & (depth > 0) & (fused.confidence.numpy() >= 0)
+    fused = net(given, learned.center, confidence=learned.confidence)
+    depth, confidence = fused.depth.cpu().numpy() * np.float32(unit), fused.confidence.cpu().numpy()
+    good = np.isfinite(depth) & (depth > 0) & (confidence >= 0)
     return replace(
-        reference,
-        depth=np.where(good, depth, np.float32(0)),
-        confidence=np.where(good, fused.confidence.numpy(), np.float32(0)),
+        reference, depth=np.where(good, depth, np.float32(0)), confidence=np.where(good, confidence, np.float32(0))
     )

@@ -1,8 +1,8 @@
 """V-FUSE (Burgdorfer and Mordohai 2023): fuses depth maps of several views through a visibility constraint volume.
 
-Written from the paper; keys and shapes are those of the official checkpoints. Their confidence `swr` is relative to
-the image (1 for its narrowest search window, 0 for its widest), so a threshold on it keeps a share of the pixels
-and is no probability.
+Written from the paper; keys and shapes are those of the official checkpoints. The default confidence `swr` is relative
+to the image (1 for its narrowest search window, 0 for its widest), so a threshold on it keeps a share of the pixels
+and is no probability; the others are in vfuse_confidence.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from mvsgs_core.networks.vfuse_confidence import check_mode, confidence_of
 
 PLANES = 8
 
@@ -77,7 +79,7 @@ class FusionInput:
 
 class Fused(NamedTuple):
     depth: Tensor  # (H, W); 0 where no view has a depth
-    confidence: Tensor  # (H, W), `swr`
+    confidence: Tensor  # (H, W), 0 to 1, of the mode asked for
     bounds: Tensor  # (2, H, W) ends of the search window
     window: Tensor  # (H, W) in 0..1
     statistics: Tensor  # (5, H, W) input of the window network
@@ -100,15 +102,20 @@ class VFuse(nn.Module):
         self.conv6_2 = nn.Sequential(nn.Conv3d(8, 1, 3, 1, 1), nn.ReLU())
 
     @torch.no_grad()
-    def forward(self, views: FusionInput, center: str = "conf", warped: tuple[Tensor, Tensor] | None = None) -> Fused:
+    def forward(
+        self,
+        views: FusionInput,
+        center: str = "conf",
+        warped: tuple[Tensor, Tensor] | None = None,
+        confidence: str = "swr",
+    ) -> Fused:
         """Fuses the views' depths into the reference.
 
         center: "conf", the most confident depth, or "mean", the confidence-weighted mean. `warped`: depths and
-        confidences (V, H, W) already in the reference, else they are splatted here. H and W: multiples of 8.
-        Raises ValueError for other sizes or an unknown center.
+        confidences (V, H, W) already in the reference, else they are splatted here. confidence: see vfuse_confidence.
+        H and W: multiples of 8. Raises ValueError for other sizes, an unknown center or an unknown confidence.
         """
-        if center not in ("conf", "mean"):
-            raise ValueError(f"center={center!r}: it is conf or mean")
+        check_choices(center, confidence)
         if views.depths.shape[1] % 8 or views.depths.shape[2] % 8:
             raise ValueError(f"V-FUSE needs maps of multiples of 8, got {tuple(views.depths.shape[1:])}")
         depths, confidences = warped if warped is not None else splat_views(views)
@@ -128,9 +135,11 @@ class VFuse(nn.Module):
         volume = self._visibility(views, depths, confidences, known, planes, extent)
         logits = self._regularize(volume)
         probability = logits.softmax(dim=0)
+        depth = (planes * probability).sum(dim=0)
+        place = (depth - bounds[0]) / ((bounds[1] - bounds[0]) / (PLANES - 1))
+        certainty = confidence_of(confidence, probability, place, radius)
         seen = known.amax(dim=0)
-        depth = (planes * probability).sum(dim=0) * seen
-        return Fused(depth, _window_confidence(radius) * seen, bounds, window, statistics, volume, logits, probability)
+        return Fused(depth * seen, certainty * seen, bounds, window, statistics, volume, logits, probability)
 
     def _statistics(
         self,
@@ -181,6 +190,23 @@ class VFuse(nn.Module):
         return logits
 
 
+def check_choices(center: str, confidence: str) -> None:
+    """Raises ValueError for what `VFuse` does not know."""
+    if center not in ("conf", "mean"):
+        raise ValueError(f"center={center!r}: it is conf or mean")
+    check_mode(confidence)
+
+
+def _pixels(height: int, width: int, device: torch.device) -> Tensor:
+    """(3, H * W) float64 homogeneous, in raster order."""
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=torch.float64, device=device),
+        torch.arange(width, dtype=torch.float64, device=device),
+        indexing="ij",
+    )
+    return torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1)
+
+
 def splat_views(views: FusionInput) -> tuple[Tensor, Tensor]:
     """Depths and confidences (V, H, W) of all views seen from the reference; 0 where nothing lands.
 
@@ -189,8 +215,7 @@ def splat_views(views: FusionInput) -> tuple[Tensor, Tensor]:
     """
     _, h, w = views.depths.shape
     depths, confidences = [views.depths[0]], [views.confidences[0]]
-    y, x = torch.meshgrid(torch.arange(h).double(), torch.arange(w).double(), indexing="ij")
-    pixels = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1)
+    pixels = _pixels(h, w, views.cameras.device)
     for view in range(1, len(views.depths)):
         z = views.depths[view].double().reshape(-1)
         points = torch.linalg.inv(views.cameras[view]) @ pixels * z
@@ -211,8 +236,7 @@ def splat_views(views: FusionInput) -> tuple[Tensor, Tensor]:
 def _look_up(views: FusionInput, view: int, planes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Depth z of the planes' points in a source view, and that view's own depth and confidence there; (M, H, W)."""
     m, h, w = planes.shape
-    y, x = torch.meshgrid(torch.arange(h).double(), torch.arange(w).double(), indexing="ij")
-    rays = torch.linalg.inv(views.cameras[0]) @ torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1)
+    rays = torch.linalg.inv(views.cameras[0]) @ _pixels(h, w, views.cameras.device)
     points = rays[:, None] * planes.double().reshape(1, m, -1)
     move = views.cam_from_world[view] @ torch.linalg.inv(views.cam_from_world[0])
     points = move[:3, :3] @ points.reshape(3, -1) + move[:3, 3:]
@@ -228,8 +252,3 @@ def _look_up(views: FusionInput, view: int, planes: Tensor) -> tuple[Tensor, Ten
 def _mean_nonzero(terms: Tensor) -> Tensor:
     count = (terms != 0).sum(dim=0)
     return terms.sum(dim=0) / count.clamp(min=1)
-
-
-def _window_confidence(radius: Tensor) -> Tensor:
-    spread = radius.max() - radius.min()
-    return 1 - (radius - radius.min()) / spread.clamp(min=1e-12)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from mvsgs_core.networks.vfuse import Fused, FusionInput, VFuse, splat_views
+from mvsgs_core.networks.vfuse_confidence import MODES, confidence_of
 from tests.core.networks.golden import error, folder, rule_weights
 
 
@@ -29,7 +30,8 @@ def views(stored: dict[str, np.ndarray]) -> FusionInput:
 
 def _fuse(net: VFuse, views: FusionInput, stored: dict[str, np.ndarray], center: str = "conf") -> Fused:
     warped = torch.from_numpy(stored["warped_depths"]), torch.from_numpy(stored["warped_confs"])
-    return net(views, center, warped)  # type: ignore[no-any-return]
+    fused: Fused = net(views, center, warped)
+    return fused
 
 
 def test_splatting(views: FusionInput, stored: dict[str, np.ndarray]) -> None:
@@ -40,11 +42,13 @@ def test_splatting(views: FusionInput, stored: dict[str, np.ndarray]) -> None:
         assert np.abs(ours.numpy() - theirs)[settled].max() / theirs.max() < 2e-5
 
 
-def test_search_window(net: VFuse, views: FusionInput, stored: dict[str, np.ndarray]) -> None:
-    fused = _fuse(net, views, stored)
-    assert error(fused.statistics, stored["swenet_input"]) < 2e-5
-    assert error(fused.window, stored["conf_window"]) < 2e-5
-    assert error(fused.bounds, stored["conf_depth_bounds"]) < 2e-5
+@pytest.mark.parametrize("center", ["conf", "mean"])
+def test_search_window(net: VFuse, views: FusionInput, stored: dict[str, np.ndarray], center: str) -> None:
+    fused = _fuse(net, views, stored, center)
+    if center == "conf":
+        assert error(fused.statistics, stored["swenet_input"]) < 2e-5
+    assert error(fused.window, stored[f"{center}_window"]) < 2e-5
+    assert error(fused.bounds, stored[f"{center}_depth_bounds"]) < 2e-5
 
 
 def test_visibility_volume(net: VFuse, views: FusionInput, stored: dict[str, np.ndarray]) -> None:
@@ -57,6 +61,7 @@ def test_regularization(net: VFuse, stored: dict[str, np.ndarray]) -> None:
     with torch.no_grad():
         logits = net._regularize(torch.from_numpy(stored["volume"]))
     assert error(logits, stored["logits"]) < 2e-5
+    assert error(logits.softmax(dim=0), stored["prob_volume"]) < 2e-5
 
 
 @pytest.mark.parametrize("center", ["conf", "mean"])
@@ -66,6 +71,37 @@ def test_fused_depth(net: VFuse, views: FusionInput, stored: dict[str, np.ndarra
     assert (difference < 1e-4).mean() > 0.98
     assert difference.max() < 1e-3
     assert error(fused.confidence, stored[f"{center}_fused_conf"]) < 2e-5
+
+
+@pytest.mark.parametrize("mode", [m for m in MODES if m != "swr"])
+def test_other_confidences(net: VFuse, views: FusionInput, stored: dict[str, np.ndarray], mode: str) -> None:
+    warped = torch.from_numpy(stored["warped_depths"]), torch.from_numpy(stored["warped_confs"])
+    ours = net(views, "conf", warped, mode).confidence.numpy()
+    difference = np.abs(ours - stored[f"conf_method_{mode}"]) / stored[f"conf_method_{mode}"].max()
+    assert (difference < 1e-3).mean() > 0.99  # they round to a plane
+    assert 0 <= ours.min() <= ours.max() <= 1 + 1e-6
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_confidences_at_the_windows_ends(mode: str) -> None:
+    probability = torch.full((8, 1, 5), 0.125)
+    place = torch.tensor([[0.0, 0.4, 3.5, 6.9, 7.0]])
+    wanted = {
+        "swr": [1.0, 1.0, 1.0, 1.0, 1.0],  # all windows alike: none is wider
+        "single": [0.125] * 5,
+        "pns": [0.375, 0.375, 0.5, 0.375, 0.375],  # nothing beyond the ends; a place on a plane counts it twice
+        "pns_swr": [0.25] * 5,
+        "pkrn": [0.0] * 5,
+    }
+    ours = confidence_of(mode, probability, place, torch.ones(1, 5))
+    np.testing.assert_allclose(ours[0], wanted[mode], atol=1e-6)
+
+
+def test_an_unknown_choice_is_refused(net: VFuse, views: FusionInput) -> None:
+    with pytest.raises(ValueError, match="give one of swr, single, pns, pns_swr, pkrn"):
+        net(views, confidence="nsum")
+    with pytest.raises(ValueError, match="conf or mean"):
+        net(views, center="median")
 
 
 def test_holes_and_odd_sizes(net: VFuse, views: FusionInput) -> None:
