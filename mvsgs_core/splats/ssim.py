@@ -1,4 +1,4 @@
-"""SSIM (Wang et al. 2004) of images with channels last: a fused C++ kernel, and its twin in PyTorch.
+"""SSIM (Wang et al. 2004) of images with channels last: fused kernels in C++ and Triton, and their twin in PyTorch.
 
 11x11 Gaussian window of sigma 1.5, separable, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, mean over pixels and
 channels: the form that 3DGS trains with.
@@ -59,9 +59,11 @@ class _ImageLoss(torch.autograd.Function):
         return gradient * on_loss, None, None, None, None, None
 
 
-def fused(image: Tensor) -> bool:
-    """Whether the C++ kernel takes this image: float32, on the CPU, three channels."""
-    return image.dtype == torch.float32 and image.device.type == "cpu" and image.shape[-1] == 3
+def chosen_backend(image: Tensor) -> str:
+    """For float32 with three channels "cpu" (C++) or on a GPU "triton"; "reference" (PyTorch) for anything else."""
+    if image.dtype != torch.float32 or image.shape[-1] != 3:
+        return "reference"
+    return {"cpu": "cpu", "cuda": "triton"}.get(image.device.type, "reference")
 
 
 def image_loss(
@@ -72,26 +74,47 @@ def image_loss(
     ssim_weight: float,
     pixel_weight: Tensor | None = None,
     threads: int | None = None,
+    backend: str = "auto",
 ) -> Tensor:
     """mean((l1_weight + pixel_weight) |image - target|) + ssim_weight (1 - SSIM), a scalar.
 
-    image, target: (H, W, 3); the gradient goes to `image` only. pixel_weight: (H, W), carries no gradient. float32 on
-    the CPU takes the C++ kernel, anything else (float64, GPU) the same in PyTorch. Raises ValueError if shapes differ.
+    image, target: (H, W, 3); the gradient goes to `image` only. pixel_weight: (H, W), carries no gradient.
+    backend: "cpu", "triton", "reference" or "auto", see `chosen_backend`. Raises ValueError if shapes differ or the
+    back end has no such name, ImportError if a GPU is asked for without triton.
     """
     if image.shape != target.shape or image.dim() != 3:
         raise ValueError(f"image is {tuple(image.shape)}, target {tuple(target.shape)}: expected two (H, W, C)")
     if pixel_weight is not None and pixel_weight.shape != image.shape[:2]:
         raise ValueError(f"pixel_weight is {tuple(pixel_weight.shape)}: expected {tuple(image.shape[:2])}")
     weight = None if pixel_weight is None else pixel_weight.detach().to(image.dtype).contiguous()
-    if fused(image):
+    chosen = chosen_backend(image) if backend == "auto" else backend
+    if chosen == "cpu":
         loss: Tensor = _ImageLoss.apply(image, target.float(), weight, l1_weight, ssim_weight, threads or 0)
         return loss
+    if chosen == "triton":
+        return _triton_image_loss(image, target.float(), weight, l1_weight, ssim_weight)
+    if chosen != "reference":
+        raise ValueError(f"backend {backend!r}: choose one of auto, cpu, triton, reference")
     target = target.detach().to(image)
     difference = (image - target).abs()
     weighted = l1_weight * difference.mean()
     if weight is not None:
         weighted = weighted + (weight[..., None] * difference).mean()
     return weighted + ssim_weight * (1.0 - ssim_reference(image, target))
+
+
+def _triton_image_loss(
+    image: Tensor, target: Tensor, weight: Tensor | None, l1_weight: float, ssim_weight: float
+) -> Tensor:
+    try:
+        from mvsgs_core.splats.triton_ssim import ImageLoss
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            "the loss on a GPU needs the package triton, which comes with torch's CUDA builds: take "
+            "backend='reference' or device=cpu"
+        ) from error
+    loss: Tensor = ImageLoss.apply(image, target, weight, l1_weight, ssim_weight)
+    return loss
 
 
 def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
