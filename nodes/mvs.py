@@ -12,6 +12,7 @@ from msgs import Depth, Keyframe, Poses
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth
 from mvsgs_core.mvs.hypotheses import RangeChoice
 from mvsgs_core.mvs.neighbors import NeighborChoice
+from mvsgs_core.mvs.skipping import SkipChoice
 from mvsgs_core.mvs.stereo import Stage, StereoConfig
 from nodes import Node
 
@@ -30,6 +31,8 @@ class Mvs(Node):
         paths: int = 8  # directions of the smoothing, 4 or 8
         range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
         least_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
+        skip_cells: bool = True  # hypotheses that the tracker's depths around rule out
+        skip_certain: float = 1.0  # later stages where the one before was more certain than this; 1: nowhere
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
         threads: int | None = None  # of the C++ kernels; null: all
 
@@ -38,7 +41,8 @@ class Mvs(Node):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c = self.config
-        stereo = StereoConfig(best_views=c.best_views, paths=c.paths)
+        skips = SkipChoice(outside_cells=c.skip_cells, certain=c.skip_certain)
+        stereo = StereoConfig(best_views=c.best_views, paths=c.paths, skips=skips)
         if c.stages:
             stereo = replace(stereo, stages=tuple(Stage(**stage) for stage in c.stages))
         self._cascade = Cascade(
@@ -101,7 +105,8 @@ class Mvs(Node):
             self.stats.warn(f"some depth ranges come from the {found.search.source}: the tracker knew too little depth")
         self.stats.count("neighbors", len(found.neighbors))
         self.stats.count("hypotheses", found.result.counts.get("hypotheses", 0.0))
-        self.stats.skip("hypotheses outside the range", found.result.counts.get("hypotheses_pruned", 0.0))
+        for what in ("outside the range", "outside the cells", "settled before"):
+            self.stats.skip(f"hypotheses {what}", found.result.counts.get(what, 0.0))
         kept = found.result.confidence
         self.stats.values["mean confidence"] = float(np.mean(kept))
         return Depth(

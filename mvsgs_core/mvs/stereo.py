@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from mvsgs_core.mvs.backend import Backend, Choice, CostOptions, SmoothOptions
 from mvsgs_core.mvs.confidence import Evidence, probability_of_inlier
 from mvsgs_core.mvs.hypotheses import SearchRange, certainty, fill_uncertain, upsample_surface
+from mvsgs_core.mvs.interface import Backend, Choice, CostOptions, SmoothOptions
+from mvsgs_core.mvs.skipping import SkipChoice, keep_settled, settled_tiles, tiles_in_cells
 from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.mvs.warp import parallax, relative_warp
 
@@ -42,6 +43,7 @@ class StereoConfig:
     temperature: float = 0.02  # cost
     paths: int = 8  # 4 or 8
     fill: bool = True  # between stages, where matching says nothing, from the surroundings
+    skips: SkipChoice = field(default_factory=SkipChoice)
 
     def cost_options(self, stage: Stage) -> CostOptions:
         return CostOptions(stage.radius, self.best_views, self.noise, self.contrast)
@@ -59,7 +61,7 @@ class StereoDepth:
     depth: np.ndarray  # (H, W) float32, 0 = unknown
     confidence: np.ndarray  # (H, W) float32 0 to 1
     evidence: Evidence | None  # what the confidence was computed from
-    counts: dict[str, float] = field(default_factory=dict)  # pixel-hypotheses evaluated and pruned
+    counts: dict[str, float] = field(default_factory=dict)  # pixel-hypotheses: all, and those left out by each skip
 
 
 def empty_depth(size: tuple[int, int]) -> StereoDepth:
@@ -75,7 +77,8 @@ def estimate_depth(
     if not neighbors:
         raise ValueError("stereo needs at least one neighbor with a baseline")
     middle = float(np.mean([search.low, search.high]))
-    counts = {"hypotheses": 0.0, "hypotheses_pruned": 0.0}
+    counts = dict.fromkeys(("hypotheses", "outside the range", "outside the cells", "settled before"), 0.0)
+    skips = config.skips
     surface = np.empty((0, 0), dtype=np.float32)
     first_probability = surface
     interval = 0.0
@@ -90,23 +93,31 @@ def estimate_depth(
         wanted = stage.step / max(moved, 1e-12)
         if number == 0:
             needed = int(np.ceil((search.high - search.low) / wanted)) + 1
-            count = int(np.clip(needed, 8, stage.hypotheses))
+            count = int(np.clip(needed, 8, stage.hypotheses)) if skips.outside_range else stage.hypotheses
             interval = (search.high - search.low) / (count - 1)
             first: np.ndarray = np.full(size, search.low, dtype=np.float32)
-            counts["hypotheses_pruned"] += float(stage.hypotheses - count) * gray.size
+            counts["outside the range"] += float(stage.hypotheses - count) * gray.size
+            tiles = tiles_in_cells(reference, size, search.low, interval, count, skips) if skips.outside_cells else None
+            counts["outside the cells"] += 0.0 if tiles is None else float(1.0 - tiles.mean()) * count * gray.size
         else:
             count = stage.hypotheses
             previous = interval
-            if config.fill and choice is not None:
-                surface = fill_uncertain(surface, certainty(choice), reference.gray(config.stages[number - 1].scale))
+            assert choice is not None
+            before, sure = choice, certainty(choice)
+            if config.fill:
+                surface = fill_uncertain(surface, sure, reference.gray(config.stages[number - 1].scale))
             interval = min(wanted, previous)
             centers = upsample_surface(surface, size, 1.5 * previous)
             first = centers - np.float32(interval * (count - 1) / 2)
+            tiles = settled_tiles(sure, size, count, skips) if skips.certain < 1 else None
+            counts["settled before"] += 0.0 if tiles is None else float(1.0 - tiles.mean()) * count * gray.size
         step = np.full(size, interval, dtype=np.float32)
         cost = backend.cost_volume(
-            gray, images, warps.astype(np.float32), first, step, count, config.cost_options(stage)
+            gray, images, warps.astype(np.float32), first, step, count, config.cost_options(stage), tiles
         )
         choice = backend.semi_global(cost, gray, first, step, config.smooth_options(stage))
+        if number > 0 and tiles is not None:
+            choice = keep_settled(choice, before, tiles)
         surface = first + choice.index * np.float32(interval)
         counts["hypotheses"] += float(count) * gray.size
         if number == 0:
