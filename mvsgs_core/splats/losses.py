@@ -38,6 +38,18 @@ def mask_sigma(frequency: float) -> float:
     return 0.1 + 0.1 * (frequency if frequency < 50.0 else 100.0 - frequency)
 
 
+def lowered_gray(image: Tensor) -> Tensor:
+    """(1, 1, h, w): the mean of the channels of (H, W, 3) at 0.2 of the size, at least a pixel."""
+    gray = image.mean(dim=-1)[None, None]
+    if min(gray.shape[2:]) * LOWERED >= 1.0:
+        # coordinates by the factor, not by the ratio of the sizes, as in the released code
+        return functional.interpolate(
+            gray, scale_factor=LOWERED, mode="bilinear", align_corners=False, recompute_scale_factor=False
+        )
+    size = [max(1, int(side * LOWERED)) for side in gray.shape[2:]]
+    return functional.interpolate(gray, size=size, mode="bilinear", align_corners=False)
+
+
 def _blur(image: Tensor, sigma: float) -> Tensor:
     """Gaussian of (1, 1, h, w), zeros beyond the border, window of 2 round(3 sigma) + 1 with weights that sum to 1."""
     radius = round(3.0 * sigma)
@@ -48,6 +60,12 @@ def _blur(image: Tensor, sigma: float) -> Tensor:
     return functional.conv2d(rows, window.view(1, 1, 1, -1), padding=(0, radius))
 
 
+def difference_of_gaussians(lowered: Tensor, frequency: float) -> Tensor:
+    """Edges of (1, 1, h, w) at the width of a frequency; taken in float64, as at the ends they are of the size 1e-6."""
+    sigma, exact = mask_sigma(frequency), lowered.double()
+    return (_blur(exact, sigma) - _blur(exact, 2.0 * sigma)).to(lowered.dtype)
+
+
 def edge_response(image: Tensor, frequency: float) -> Tensor:
     """(H, W) in 0 to 1: the difference of Gaussians of a render (H, W, 3), normalized, inverted below frequency 50.
 
@@ -56,17 +74,8 @@ def edge_response(image: Tensor, frequency: float) -> Tensor:
     if not 0.0 <= frequency <= 100.0:
         raise ValueError(f"frequency {frequency}: expected 0 to 100")
     with torch.no_grad():
-        grey = image.mean(dim=-1)[None, None]
-        size = (max(1, int(grey.shape[2] * LOWERED)), max(1, int(grey.shape[3] * LOWERED)))
-        if min(grey.shape[2:]) * LOWERED >= 1.0:
-            lowered = functional.interpolate(
-                grey, scale_factor=LOWERED, mode="bilinear", align_corners=False, recompute_scale_factor=False
-            )
-        else:
-            lowered = functional.interpolate(grey, size=size, mode="bilinear", align_corners=False)
-        sigma = mask_sigma(frequency)
-        edges = _blur(lowered, sigma) - _blur(lowered, 2.0 * sigma)
-        raised = functional.interpolate(edges, size=grey.shape[2:], mode="bilinear", align_corners=False)[0, 0]
+        edges = difference_of_gaussians(lowered_gray(image), frequency)
+        raised = functional.interpolate(edges, size=image.shape[:2], mode="bilinear", align_corners=False)[0, 0]
         low, high = raised.min(), raised.max()
         response = (raised - low) / (high - low).clamp(min=TINY)
         return 1.0 - response if frequency < 50.0 else response
