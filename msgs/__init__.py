@@ -7,6 +7,7 @@ Conventions (ARCHITECTURE.md): camera axes x right, y down, z forward; depth is 
 first pixel; `world_from_cam` maps camera to world coordinates; images are RGB; intrinsics are (fx, fy, cx, cy) in
 pixels of the image they come with. Maps smaller than the image (`h w` against `H W`) cover the same field of view:
 scale the intrinsics with `mvsgs_core.camera.scale_intrinsics`. 0 in a depth or inverse-depth map means "unknown".
+A number with a default is left out of the wire where it has that value, so that older programs still fit.
 
 `index` is the index of the frame in its stream; a keyframe keeps its frame's index as its id everywhere.
 """
@@ -38,6 +39,7 @@ class Frame:
     timestamp: float  # seconds
     image: Annotated[np.ndarray, "uint8 H W 3"]
     intrinsics: Annotated[np.ndarray, "float64 4"]
+    intrinsics_guessed: bool = False  # the focal length is a guess, to be estimated by the tracker if it can
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,7 @@ class Trajectory:
     keyframe: Annotated[np.ndarray, "bool N"]
     state: Annotated[np.ndarray, "uint8 N"]  # TrackingState
     segment: Annotated[np.ndarray, "int32 N"]
+    focal_factor: float = 1.0  # by which the tracker multiplied the focal lengths of the frames, if they were guessed
 
 
 @dataclass(frozen=True)

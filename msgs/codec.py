@@ -12,7 +12,7 @@ import struct
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Any, NamedTuple
 
 import msgpack
@@ -90,7 +90,9 @@ def encode(
         value = getattr(message, field)
         where = f"{name}.{field}"
         if not isinstance(spec, ArraySpec):
-            scalars[field] = _checked_scalar(value, spec, where)
+            value = _checked_scalar(value, spec, where)
+            if field not in _DEFAULTS[name] or value != _DEFAULTS[name][field]:
+                scalars[field] = value
         elif value is None and spec.optional:
             scalars[field] = None
         else:
@@ -147,6 +149,7 @@ def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int
         raise CodecError(f"a frame of {view.nbytes} bytes, more than the {max_bytes} that a {name} may have")
     sequence, scalars, arrays = _unpack_header(header, name)
     specs = _SPECS[name]
+    scalars = {**{field: value for field, value in _DEFAULTS[name].items() if field not in arrays}, **scalars}
     if len(scalars) + len(arrays) != len(specs) or (scalars.keys() | arrays.keys()) != specs.keys():
         given = ", ".join(map(str, (*scalars, *arrays)))
         raise CodecError(f"{name} has the fields {', '.join(specs)}; this frame has {given or 'none'}")
@@ -348,4 +351,7 @@ def _field_spec(hint: Any) -> FieldSpec:
 
 
 _SPECS: dict[str, dict[str, FieldSpec]] = {name: _specs_of(t) for name, t in msgs.TYPES.items()}
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    name: {f.name: f.default for f in fields(t) if f.default is not MISSING} for name, t in msgs.TYPES.items()
+}
 _TYPES = tuple(msgs.TYPES.values())

@@ -76,7 +76,8 @@ class Camera(Node):
                 picture, timestamp = shot
                 image, intrinsics = self._frame(picture)
                 self.stats.count("frames")
-                yield Frame(index, timestamp, image, intrinsics)
+                assert self._lens is not None
+                yield Frame(index, timestamp, image, intrinsics, self._lens.guessed)
                 yield GroundTruth(index, timestamp, image, intrinsics, None, None)
                 index += 1
         finally:

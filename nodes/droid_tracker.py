@@ -72,6 +72,10 @@ class DroidTracker(Node):
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
         self._frames[frame.index] = frame
+        if frame.intrinsics_guessed:
+            self.stats.warn(
+                "the focal length is a guess, which this tracker takes for true: tracker=dense estimates it"
+            )
         yield from self._send(self._tracker.add(frame.index, frame.timestamp, frame.image, frame.intrinsics))
 
     def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:

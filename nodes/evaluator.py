@@ -53,7 +53,13 @@ class Evaluator(Node):
 
     def on_trajectory(self, track: Trajectory) -> Iterator[None]:
         self.evaluation.track = Track(
-            track.index, track.timestamp, track.world_from_cam, track.keyframe, track.state, track.segment
+            track.index,
+            track.timestamp,
+            track.world_from_cam,
+            track.keyframe,
+            track.state,
+            track.segment,
+            track.focal_factor,
         )
         yield from ()
 

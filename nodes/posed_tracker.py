@@ -53,6 +53,10 @@ class PosedTracker(Node):
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe]:
         self._frames[frame.index] = frame
+        if frame.intrinsics_guessed:
+            self.stats.warn(
+                "the focal length is a guess, which this tracker takes for true: tracker=dense estimates it"
+            )
         if frame.index in self._truths:
             yield from self._join(frame.index)
 

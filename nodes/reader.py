@@ -45,7 +45,7 @@ class Reader(Node):
                 if self.config.realtime:
                     pace.wait(item.timestamp)
                 self.stats.count("frames")
-                yield Frame(item.index, item.timestamp, item.image, item.intrinsics)
+                yield Frame(item.index, item.timestamp, item.image, item.intrinsics, item.intrinsics_guessed)
                 yield _ground_truth(item)
         finally:  # also when the run is interrupted
             self._pass_warnings_on(sequence)

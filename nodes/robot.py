@@ -106,4 +106,4 @@ class Robot(Node):
             return None
         size = target_size(self.config.size, native)
         intrinsics = scale_intrinsics(frame.intrinsics, native, size)
-        return Frame(index, frame.timestamp, resize_image(frame.image, size), intrinsics)
+        return Frame(index, frame.timestamp, resize_image(frame.image, size), intrinsics, frame.intrinsics_guessed)

@@ -63,12 +63,14 @@ class Tracker(Node):
                 saturation=c.saturation,
             )
         )
-        self._frames: dict[int, Frame] = {}  # those that may still become keyframes of the first start
+        self._frames: dict[int, Frame] = {}  # those that may still be sent as keyframes
         self._revision = 0
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
         self._frames[frame.index] = frame
-        update = self._tracker.add(frame.index, frame.timestamp, frame.image, frame.intrinsics)
+        update = self._tracker.add(
+            frame.index, frame.timestamp, frame.image, frame.intrinsics, frame.intrinsics_guessed
+        )
         yield from self._send(update)
 
     def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
@@ -83,6 +85,7 @@ class Tracker(Node):
             keyframe=path.keyframe,
             state=path.state,
             segment=path.segment,
+            focal_factor=self._tracker.focal_factor,
         )
 
     def _send(self, update: core.Update) -> Iterator[Keyframe | Poses]:
@@ -102,7 +105,7 @@ class Tracker(Node):
             index=index,
             timestamp=frame.timestamp,
             image=frame.image,
-            intrinsics=frame.intrinsics,
+            intrinsics=frame.intrinsics * [self._tracker.focal_factor, self._tracker.focal_factor, 1.0, 1.0],
             world_from_cam=geometry.inverse(keyframe.cam_from_world),
             scale=1.0,
             inverse_depth=inverse_depth,

@@ -84,6 +84,16 @@ def test_every_type_comes_back_equal(message_type: type, absent: bool) -> None:
         assert type_name(data) == message_type.__name__
 
 
+def test_a_default_is_left_out_and_comes_back() -> None:
+    plain, guessed = frame(), replace(frame(), intrinsics_guessed=True)
+    assert b"intrinsics_guessed" not in bytes(encode(plain))
+    assert b"intrinsics_guessed" in bytes(encode(guessed))
+    for message in (plain, guessed):
+        assert decode(encode(message)).message.intrinsics_guessed == message.intrinsics_guessed
+    wrong = with_header(bytes(encode(guessed)), lambda c: c["scalars"].__setitem__("intrinsics_guessed", 1))
+    refused(wrong, "must be bool")
+
+
 def test_arrays_are_read_only_views_on_the_frame() -> None:
     data = encode(frame())
     image = decode(data).message.image

@@ -137,6 +137,15 @@ def test_lost_frames_have_no_pose_and_are_not_scored(evaluator: Evaluator) -> No
     assert report["rendering"]["held_out"]["count"] == 1
 
 
+def test_frames_are_rendered_with_the_focal_length_that_the_tracker_found(evaluator: Evaluator) -> None:
+    poses, index, none = _poses(), np.arange(N), np.zeros(N, np.int32)
+    list(evaluator.on_trajectory(Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, 1.25)))
+    list(evaluator.on_splat_map(_splat_map(True)))
+    for view in evaluator.evaluation.views():
+        np.testing.assert_array_equal(view.intrinsics, INTRINSICS * [1.25, 1.25, 1.0, 1.0])
+    evaluator.evaluation.close()
+
+
 def test_without_truth_the_figures_are_null(tmp_path: Path) -> None:
     node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
     for k in range(N):

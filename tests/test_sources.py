@@ -130,6 +130,7 @@ def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCaptur
     assert messages[0].image[0, 0, 1] == 0  # RGB
     assert messages[0].image[0, 0, 0] > 0
     assert messages[0].intrinsics[2] == 15.5
+    assert messages[0].intrinsics_guessed
     assert messages[1].world_from_cam is None
     assert any("guess" in w for w in camera.stats.warnings)
 

@@ -87,6 +87,24 @@ def test_a_stream_too_short_for_a_start_is_forced_to_one_and_says_so() -> None:
     assert any("forced" in warning for warning in node.stats.warnings)
 
 
+def test_a_guessed_focal_length_is_estimated_and_sent() -> None:
+    frames, _ = messages()
+    wrong = np.array([1.4, 1.4, 1.0, 1.0])
+    node = Tracker()
+    sent = []
+    for frame in frames:
+        sent += list(node.on_frame(Frame(frame.index, frame.timestamp, frame.image, frame.intrinsics * wrong, True)))
+    sent += list(node.on_end())
+    path = sent[-1]
+    assert isinstance(path, Trajectory)
+    keyframes = of_type(sent, Keyframe)
+    assert keyframes
+    for keyframe in keyframes:
+        np.testing.assert_allclose(keyframe.intrinsics, frames[0].intrinsics, rtol=0.03)
+        np.testing.assert_array_equal(keyframe.intrinsics[:2], path.focal_factor * wrong[:2] * frames[0].intrinsics[:2])
+    assert node.stats.counts["focal length over its guess"] == path.focal_factor
+
+
 def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
     for node in (Tracker(), PosedTracker()):
         sent = list(node.on_end())

@@ -20,6 +20,7 @@ class Item:
     intrinsics: np.ndarray  # (4,) float64 fx, fy, cx, cy at this image's size
     world_from_cam: np.ndarray | None = None  # (4, 4) float64
     depth: np.ndarray | None = None  # (H, W) float32, z in the poses' unit, 0 = unknown
+    intrinsics_guessed: bool = False  # the focal length is a guess, to be estimated by who can
 
 
 class Sequence(Protocol):

@@ -107,7 +107,7 @@ class Bag:
     def _item(self, index: int, seconds: float, image: np.ndarray) -> Item:
         native = image.shape[0], image.shape[1]
         framed, intrinsics = self._framing.image(image, self._lens.at(native), self._framing.size_of(self._lens.size))
-        return Item(index, seconds, framed, intrinsics)
+        return Item(index, seconds, framed, intrinsics, intrinsics_guessed=self._lens.guessed)
 
     @contextmanager
     def _open(self) -> Iterator[AnyReader]:

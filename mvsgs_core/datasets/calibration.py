@@ -7,6 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from mvsgs_core.datasets.exif import read_exif_lens
 from mvsgs_core.datasets.files import upright_size
 from mvsgs_core.datasets.lens import Lens, guess_lens
 
@@ -16,7 +17,8 @@ def lens_from_option(
 ) -> tuple[Lens, list[str]]:
     """The lens of the option `intrinsics`: [fx, fy, cx, cy] in pixels of the original image (height, width), or "auto".
 
-    Returns the lens and warnings: "auto" is a guess and says so. Raises ValueError for anything else.
+    Returns the lens and warnings: "auto" is a guess and says so, also in `Lens.guessed`. Raises ValueError for anything
+    else.
     """
     if isinstance(intrinsics, str):
         if intrinsics != "auto":
@@ -24,7 +26,8 @@ def lens_from_option(
         lens = guess_lens(size)
         return lens, [
             f"intrinsics are a guess: {lens.intrinsics[0]:.0f} pixels focal length for {size[1]}x{size[0]} (65 degrees "
-            "across the longer side), no distortion; calibrate the camera and set dataset.intrinsics=[fx,fy,cx,cy]"
+            "across the longer side), no distortion; tracker=dense estimates the focal length, a calibration "
+            "(dataset.intrinsics=[fx,fy,cx,cy]) is better"
         ]
     values = [float(v) for v in intrinsics]
     if len(values) != 4:
@@ -35,8 +38,19 @@ def lens_from_option(
 def lens_for_images(
     intrinsics: Sequence[float] | str, distortion: Sequence[float], images: Iterable[Path]
 ) -> tuple[Lens, list[str]]:
-    """`lens_from_option` for the size of the first of `images` whose header can be read."""
-    return lens_from_option(intrinsics, distortion, image_size(images))
+    """`lens_from_option` for the size of the first of `images` whose header can be read.
+
+    "auto" takes the focal length from the EXIF header of the first of the images, where it has one.
+    """
+    images = list(images)
+    size = image_size(images)
+    lens = read_exif_lens(images[0]) if intrinsics == "auto" else None
+    if lens is None or lens.size != size:
+        return lens_from_option(intrinsics, distortion, size)
+    return lens, [
+        f"intrinsics are from EXIF: focal length {lens.intrinsics[0]:.0f} pixels for {size[1]}x{size[0]}, good to a "
+        "few percent, distortion unknown"
+    ]
 
 
 def image_size(images: Iterable[Path]) -> tuple[int, int]:

@@ -28,8 +28,9 @@ _SUBFOLDERS = ("images", "rgb", "input", "frames")
 class Images(ImageSequence):
     """Images in natural order, undistorted where the distortion is known.
 
-    intrinsics: [fx, fy, cx, cy] in pixels of the images, "auto" for a guess, null for what is found: a COLMAP model, a
-    transforms.json, Strecha's .camera files, whose poses then are the ground truth, or EXIF headers, in this order.
+    intrinsics: [fx, fy, cx, cy] in pixels of the images, "auto" for EXIF or a guess, null for what is found: a COLMAP
+    model, a transforms.json, Strecha's .camera files, whose poses then are the ground truth, or EXIF headers, in this
+    order.
     model: path of a COLMAP model's folder, a transforms.json or a folder of .camera files that lies elsewhere.
     rate: images per second, for the timestamps. crop: see `Framing`.
     Raises FileNotFoundError and ValueError, which say what was expected.
@@ -133,7 +134,8 @@ def _lenses(
     if not known:
         raise ValueError(
             f"no calibration for {images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal "
-            "lengths were found; set dataset.intrinsics=[fx,fy,cx,cy] in pixels, or dataset.intrinsics=auto for a guess"
+            "lengths were found; set dataset.intrinsics=[fx,fy,cx,cy] in pixels, or dataset.intrinsics=auto to have "
+            "the focal length estimated"
         )
     notes.append(
         f"intrinsics are from EXIF: focal length {known[0].intrinsics[0]:.0f} pixels for "

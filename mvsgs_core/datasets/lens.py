@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ class Lens:
     size: tuple[int, int]  # (height, width) that the intrinsics are for
     distortion: tuple[float, ...] = ()
     fisheye: bool = False
+    guessed: bool = False  # the focal length is a guess
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(v) for v in (*self.intrinsics, *self.distortion)):
@@ -41,13 +42,13 @@ class Lens:
         if size == self.size:
             return self
         fx, fy, cx, cy = scale_intrinsics(np.array(self.intrinsics), self.size, size)
-        return Lens((float(fx), float(fy), float(cx), float(cy)), size, self.distortion, self.fisheye)
+        return replace(self, intrinsics=(float(fx), float(fy), float(cx), float(cy)), size=size)
 
 
 def guess_lens(size: tuple[int, int]) -> Lens:
     """A lens of 65 degrees across the longer side, principal point in the middle: a guess, to be announced as one."""
     focal = 0.5 * max(size) / math.tan(0.5 * _GUESSED_FIELD_OF_VIEW)
-    return Lens((focal, focal, 0.5 * (size[1] - 1), 0.5 * (size[0] - 1)), size)
+    return Lens((focal, focal, 0.5 * (size[1] - 1), 0.5 * (size[0] - 1)), size, guessed=True)
 
 
 class Undistortion:

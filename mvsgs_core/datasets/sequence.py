@@ -141,7 +141,7 @@ class ImageSequence:
         depth = self._depth(record, native)
         if depth is not None:
             depth = self._framing.depth(depth, lens, size)
-        return Item(index, record.timestamp, framed, intrinsics, record.world_from_cam, depth)
+        return Item(index, record.timestamp, framed, intrinsics, record.world_from_cam, depth, lens.guessed)
 
     def registered(self, depth: np.ndarray) -> np.ndarray:
         """The depth map (h, w) as the color camera would see it: of most sets it is already."""

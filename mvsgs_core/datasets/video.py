@@ -27,8 +27,8 @@ _SHORT = 0.98  # less of the promised frames than this: the file is cut off (con
 class Video:
     """Frames of a video file, undistorted, with the container's timestamps.
 
-    intrinsics: [fx, fy, cx, cy] in pixels of the video's frames, or "auto": 65 degrees across the longer side, which a
-    warning then says. A video says nothing of its camera, so null is refused. size, crop: see `Framing`.
+    intrinsics: [fx, fy, cx, cy] in pixels of the video's frames, or "auto": 65 degrees across the longer side, for the
+    tracker to estimate. A video says nothing of its camera, so null is refused. size, crop: see `Framing`.
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
@@ -50,7 +50,7 @@ class Video:
         if intrinsics is None:
             raise ValueError(
                 "a video does not say what camera took it: set dataset.intrinsics=[fx,fy,cx,cy] in pixels of its "
-                "frames, or dataset.intrinsics=auto for a guess (65 degrees across the longer side)"
+                "frames, or dataset.intrinsics=auto to have the focal length estimated"
             )
         self._wanted = selection(start, stop, stride)
         self._framing = Framing(size, crop)
@@ -111,7 +111,7 @@ class Video:
         native = frame.shape[0], frame.shape[1]
         rgb = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
         image, intrinsics = self._framing.image(rgb, self._lens.at(native), self._framing.size_of(native))
-        return Item(index, seconds, image, intrinsics)
+        return Item(index, seconds, image, intrinsics, intrinsics_guessed=self._lens.guessed)
 
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self._path))

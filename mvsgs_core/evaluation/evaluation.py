@@ -50,6 +50,7 @@ class Track:
     keyframe: np.ndarray
     state: np.ndarray
     segment: np.ndarray
+    focal_factor: float = 1.0  # on the focal lengths of the frames, where they were guessed
 
     @property
     def posed(self) -> np.ndarray:
@@ -141,7 +142,7 @@ class Evaluation:
                     index,
                     bool(self.track.keyframe[k]),
                     from_world @ finished.keyframe_poses.get(index, self.track.world_from_cam[k]),
-                    self._intrinsics[index],
+                    self._intrinsics[index] * [self.track.focal_factor, self.track.focal_factor, 1.0, 1.0],
                     lambda index=index: self.photograph(index),  # type: ignore[misc]
                     near,
                 )

@@ -147,11 +147,21 @@ class KeyframeGraph:
             damping=DAMPING / inverse_depth**2,
         )
 
-    def optimize(self, indices: Iterable[int], free_poses: set[int], free_depths: set[int], solver: Solver) -> Solution:
+    def optimize(
+        self,
+        indices: Iterable[int],
+        free_poses: set[int],
+        free_depths: set[int],
+        solver: Solver,
+        free_focal: bool = False,
+    ) -> Solution:
         """Bundle adjustment of a part of the graph, written back unless it failed."""
         order = sorted(indices)
-        solution = adjust(self.problem(order, free_poses, free_depths), solver)
+        problem = self.problem(order, free_poses, free_depths)
+        problem.free_focal = free_focal
+        solution = adjust(problem, solver)
         if not solution.failure:
+            self.intrinsics = self.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]
             for n, index in enumerate(order):
                 keyframe = self.keyframes[index]
                 if index in free_poses:

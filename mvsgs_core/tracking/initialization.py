@@ -39,15 +39,18 @@ class Start:
     parallax: float  # pixels
     baseline: float  # over the median depth
     failure: str
+    focal_factor: float = 1.0  # on the graph's focal length, where it was free
 
 
-def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, threads: int) -> Start:
-    """Solves keyframes `order` of the graph, without changing it."""
+def start_up(
+    graph: KeyframeGraph, order: list[int], criteria: StartCriteria, threads: int, free_focal: bool = False
+) -> Start:
+    """Solves keyframes `order` of the graph, without changing it. free_focal: the focal length is unknown too."""
     everything = set(order)
     problem = graph.problem(order, everything - {order[0]}, everything)
     k, m = problem.inverse_depth.shape
     matched = float(np.sum(problem.information[:, 0] > 0))
-    turned = _rotation_error(problem, threads)
+    turned = _rotation_error(problem, threads, free_focal)
     if turned < criteria.min_turn_error:
         ones = np.ones((k, m))
         reason = f"a camera that only turned explains the matches to {turned:.1f} pixels"
@@ -60,8 +63,9 @@ def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, th
         for scale, steps in ((8.0, 12), (3.0, 8), (1.0, 12)):
             held = np.full((k, m), 0.05 if scale > 1.0 else 0.0)  # keeps depths from running away at first
             current = replace(current, prior=np.ones((k, m)), prior_weight=held)
-            solver = Solver(steps=steps, robust_scale=scale, lm=1e-3, threads=threads)
-            attempt = adjust(current, solver)
+            last = free_focal and scale == 1.0
+            solver = Solver(steps=2 * steps if last else steps, robust_scale=scale, lm=1e-3, threads=threads)
+            attempt = adjust(replace(current, free_focal=last), solver)
             if attempt.failure:
                 break
             current = replace(current, cam_from_world=attempt.cam_from_world, inverse_depth=attempt.inverse_depth)
@@ -80,9 +84,8 @@ def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, th
     depths = depths / scale
     centers = geometry.inverse(poses)[:, :3, 3]
     baseline = float(np.max(np.linalg.norm(centers[:, None] - centers[None], axis=-1)))
-    parallax = _parallax(
-        poses, depths, problem.pixels, graph.intrinsics, problem.source, problem.to, problem.information
-    )
+    intrinsics = graph.intrinsics * [best.focal_factor, best.focal_factor, 1.0, 1.0]
+    parallax = _parallax(poses, depths, problem.pixels, intrinsics, problem.source, problem.to, problem.information)
     cost = best.cost / max(matched, 1.0)
     failure = ""
     if not np.isfinite(cost) or cost > criteria.max_cost:
@@ -91,10 +94,11 @@ def start_up(graph: KeyframeGraph, order: list[int], criteria: StartCriteria, th
         failure = f"too little parallax ({parallax:.1f} pixels, baseline {baseline:.3f} of the depth)"
     elif known.sum() < 0.3 * np.mean(problem.information[:, 0] > 0) * k * m:
         failure = "too few points could be triangulated"
-    return Start(poses, depths, best.information * scale**2, cost, parallax, baseline, failure)
+    information = best.information * scale**2
+    return Start(poses, depths, information, cost, parallax, baseline, failure, best.focal_factor)
 
 
-def _rotation_error(problem: Graph, threads: int) -> float:
+def _rotation_error(problem: Graph, threads: int, free_focal: bool) -> float:
     """Pixels by which the best rotations miss the matches: the largest median over the edges."""
     k, m = problem.inverse_depth.shape
     far = replace(
@@ -102,12 +106,14 @@ def _rotation_error(problem: Graph, threads: int) -> float:
         cam_from_world=np.tile(np.eye(4), (k, 1, 1)),
         inverse_depth=np.full((k, m), 1e-9),
         free_depth=np.zeros(k, bool),
+        free_focal=free_focal,
     )
     for scale in (8.0, 2.0):
         solution = adjust(far, Solver(steps=10, ep=1e-3, robust_scale=scale, threads=threads))
         if solution.failure:
             return np.inf
-        far = replace(far, cam_from_world=solution.cam_from_world)
+        intrinsics = far.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]
+        far = replace(far, cam_from_world=solution.cam_from_world, intrinsics=intrinsics)
     pixels, z = reproject(far.cam_from_world, far.inverse_depth, far.pixels, far.intrinsics, far.source, far.to)
     seen = (far.information[:, 0] > 0) & (z > 0.05)
     distance = np.linalg.norm(pixels - far.target, axis=1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core.tracking.flow import Matches, spread
+from mvsgs_core.tracking.focal import FocalConfig, start_with_unknown_focal
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.initialization import StartCriteria, start_up
@@ -58,13 +59,19 @@ class Starter:
             self.graph.remove(index)
         self.waiting = []
 
-    def try_start(self, forced: bool = False) -> bool:
-        """Solves the waiting keyframes; True where that succeeded: they are then part of the map."""
+    def try_start(self, forced: bool = False, focal: FocalConfig | None = None) -> bool:
+        """Solves the waiting keyframes; True where that succeeded: they are then part of the map.
+
+        focal: how the graph's focal length is found too; None where it is known.
+        """
         if len(self.waiting) < (3 if forced else self.config.keyframes):
             return False
         self.attempts += 1
         criteria = self.config.forced if forced else self.config.criteria
-        start = start_up(self.graph, self.waiting, criteria, self.threads)
+        if focal is None:
+            start = start_up(self.graph, self.waiting, criteria, self.threads)
+        else:
+            start = start_with_unknown_focal(self.graph, self.waiting, criteria, focal, self.threads)
         if start.failure:
             self.reason = start.failure
             if len(self.waiting) >= self.config.limit:

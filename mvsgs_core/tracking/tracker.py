@@ -17,7 +17,9 @@ import numpy as np
 from mvsgs_core.camera import fit_size, scale_intrinsics
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
 from mvsgs_core.tracking.bundle_adjustment import Solver
+from mvsgs_core.tracking.calibration import READOUT_AGAIN, Calibration
 from mvsgs_core.tracking.flow import make_flow
+from mvsgs_core.tracking.focal import FocalConfig
 from mvsgs_core.tracking.frames import FrameRecord, Path, State, compact, solve_path
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
@@ -27,7 +29,6 @@ from mvsgs_core.tracking.loop_closure import LoopCloser, LoopConfig
 from mvsgs_core.tracking.matcher import Matcher
 from mvsgs_core.tracking.publish import Correction, Publisher
 from mvsgs_core.tracking.recovery import Recovery, RecoveryConfig
-from mvsgs_core.tracking.rolling_shutter import estimate_readout
 from mvsgs_core.tracking.sighting import Sighting
 from mvsgs_core.tracking.starting import Starter, StartingConfig
 from mvsgs_core.tracking.stats import TrackingStats
@@ -46,6 +47,7 @@ class TrackerConfig:
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
     starting: StartingConfig = field(default_factory=StartingConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
+    focal: FocalConfig = field(default_factory=FocalConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     back_end: BackEndConfig = field(default_factory=BackEndConfig)
@@ -70,12 +72,18 @@ class Tracker:
         self.segment = 0
         self.graph: KeyframeGraph | None = None
         self._since = 0  # frames since the last keyframe
+        self._held: list[int] = []  # keyframes that are not told yet: the focal length is not settled
         self._path = solve_path([], KeyframeGraph(np.ones(4)), Solver())
 
-    def add(self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> Update:
-        """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow."""
+    def add(
+        self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray, guessed: bool = False
+    ) -> Update:
+        """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow.
+
+        guessed: the focal length is to be estimated; keyframes are told when it is settled, see `focal_factor`.
+        """
         if self.graph is None:
-            self._set_up(image.shape[0], image.shape[1], intrinsics)
+            self._set_up(image.shape[0], image.shape[1], intrinsics, guessed)
         here = scale_intrinsics(intrinsics, (image.shape[0], image.shape[1]), self.size)
         if not np.allclose(here, self.intrinsics, rtol=1e-3):
             self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
@@ -108,7 +116,13 @@ class Tracker:
         if self.graph is None:
             return set()
         last = self.front_end.last  # the end of the stream may force a start with it
-        return set(self.starter.waiting) | ({last.index} if last is not None and not self.started else set())
+        waiting = set(self.starter.waiting) | set(self._held)
+        return waiting | ({last.index} if last is not None and not self.started else set())
+
+    @property
+    def focal_factor(self) -> float:
+        """What the focal lengths that came with the frames are to be multiplied with; 1 unless they were a guess."""
+        return 1.0 if self.graph is None else self.calibration.focal_factor
 
     def finish(self) -> Iterator[Update]:
         """The stream has ended: a start by force if there was none, and the global bundle adjustment."""
@@ -117,7 +131,9 @@ class Tracker:
         if not self.started:
             yield from self._force_start()
         if self.started:
-            self._estimate_readout(40)
+            self.calibration.estimate_readout(self.local_map.members(self.segment)[-40:])
+        if self._held:
+            yield Update(State.TRACKED, self._settle())
         with self.stats.time("global bundle adjustment"):
             for segment in sorted({k.segment for k in self.graph.keyframes.values()}):
                 self._adjust_globally(segment)
@@ -125,6 +141,8 @@ class Tracker:
             found = self.recovery.fill_in(self.records)
             self._path = solve_path(self.records, self.graph, Solver(steps=8, threads=self.config.threads))
         self.stats.count("frames posed in the end", found)
+        if self.started:
+            self.calibration.check(self.local_map.members(self.segment))
         self._warn_at_end()
         yield Update(State.TRACKED if self.started else State.NOT_STARTED, (), self.publisher.corrections(True))
 
@@ -136,12 +154,14 @@ class Tracker:
         assert self.graph is not None
         return self.graph.keyframes[index]
 
-    def _set_up(self, height: int, width: int, intrinsics: np.ndarray) -> None:
+    def _set_up(self, height: int, width: int, intrinsics: np.ndarray, guessed: bool) -> None:
         config = self.config
         self.size = fit_size(height, width, config.area)
         self.intrinsics = scale_intrinsics(intrinsics, (height, width), self.size)
         self.graph = KeyframeGraph(self.intrinsics)
-        self.graph.readout = config.readout or 0.0
+        self.calibration = Calibration(
+            self.graph, config.focal, self.stats, self.intrinsics, not guessed, config.readout, config.threads
+        )
         self.flow = make_flow(config.flow)
         self.matcher = Matcher(self.flow)
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, config.threads)
@@ -175,7 +195,7 @@ class Tracker:
             self.front_end.refer_to(frame)
             self._since = 0
             waiting = list(self.starter.waiting)
-            started = self.starter.try_start()
+            started = self.starter.try_start(focal=self._unknown_focal())
         if not started:
             sighting = self.recovery.relocalize(frame) if self.segment > 0 else None
             if sighting is None:
@@ -188,16 +208,16 @@ class Tracker:
     def _started(self, waiting: list[int], record: FrameRecord) -> Update:
         assert self.graph is not None
         self.started = True
-        self._estimate_readout()
+        self.calibration.estimate_readout(waiting)
         self.local_map.adjust_window(waiting[-1])
+        self.calibration.refine(waiting)
         self.front_end.pose = self.graph.keyframes[waiting[-1]].cam_from_world
-        for index in waiting:
-            self.publisher.tell(index)
-            if self.config.loops:
+        if self.config.loops:
+            for index in waiting:
                 self.loops.add(index)
         self.stats.count("keyframes", len(waiting))
         record.state = State.TRACKED
-        return Update(State.TRACKED, tuple(waiting))
+        return Update(State.TRACKED, self._tell(waiting))
 
     def _go_on(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """A tracked frame; perhaps a keyframe."""
@@ -226,26 +246,34 @@ class Tracker:
             self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
         self.stats.count("keyframes")
         self._since = 0
-        if len(self.graph.keyframes) in (10, 20, 40):
-            self._estimate_readout()
+        if len(self.graph.keyframes) in READOUT_AGAIN:
+            self.calibration.estimate_readout(self.local_map.members(self.segment)[-12:])
+        self.calibration.refine(self.local_map.members(self.segment))
         self._close_loops(frame.index)
         for index in self.local_map.members(self.segment)[: -self.config.local_map.window]:
             self.graph.keyframes[index].image.release()
         self.front_end.refer_to(frame)
         self.front_end.pose = self.graph.keyframes[frame.index].cam_from_world
         correction = self.publisher.corrections()
-        self.publisher.tell(frame.index)
-        return Update(record.state, (frame.index,), correction)
+        return Update(record.state, self._tell([frame.index]), correction)
 
-    def _estimate_readout(self, keyframes: int = 12) -> None:
-        """From the newest keyframes: once for a camera would do, but the first ones say little."""
-        assert self.graph is not None
-        if self.config.readout is not None:
-            return
-        with self.stats.time("rolling shutter"):
-            members = self.local_map.members(self.segment)[-keyframes:]
-            self.graph.readout = estimate_readout(self.graph, members, self.config.threads)
-        self.stats.values["rolling shutter"] = f"{1e3 * self.graph.readout:.1f} ms"
+    def _tell(self, keyframes: list[int]) -> tuple[int, ...]:
+        """Keyframes, and those held back before, if they may go out."""
+        self._held += keyframes
+        if not self.calibration.settled:
+            return ()
+        told, self._held = tuple(self._held), []
+        for index in told:
+            self.publisher.tell(index)
+        return told
+
+    def _settle(self) -> tuple[int, ...]:
+        """Keyframes that were held back, with the focal length as far as it is known."""
+        self.calibration.settle(list(self._held))
+        return self._tell([])
+
+    def _unknown_focal(self) -> FocalConfig | None:
+        return None if self.calibration.settled else self.config.focal
 
     def _known_here(self, frame: TrackingImage, pose: np.ndarray) -> bool:
         """Enough keyframes already see this from here: the nearest becomes the reference again."""
@@ -304,7 +332,8 @@ class Tracker:
         if self.recovery.hopeless:
             self.started = False
             self.segment = 1 + max(k.segment for k in self._keyframes())
-            return self._begin(frame, record)
+            told = self._settle() if self._held else ()
+            return Update(self._begin(frame, record).state, told)
         return Update(record.state)
 
     def _resume(self, frame: TrackingImage, record: FrameRecord, sighting: Sighting) -> Update:
@@ -332,7 +361,7 @@ class Tracker:
             self.starter.add(frame, self.segment, step.matches)
         waiting = list(self.starter.waiting)
         record = next(r for r in self.records if r.index == frame.index)
-        if self.starter.try_start(forced=True):
+        if self.starter.try_start(True, self._unknown_focal()):
             self.stats.warn("the start was forced at the end of the stream, on little motion")
             yield self._started(waiting, record)
         else:

@@ -188,6 +188,10 @@ def test_focal_length_from_exif(tmp_path: Path) -> None:
     sequence = open_dataset("images", path=tmp_path)
     assert next(iter(sequence)).intrinsics[0] == pytest.approx(26 * 80 / np.hypot(36, 24))
     assert "intrinsics are from EXIF: focal length 48 pixels for 64x48" in sequence.warnings[0]
+    auto = open_dataset("images", path=tmp_path, intrinsics="auto")
+    assert next(iter(auto)).intrinsics[0] == pytest.approx(26 * 80 / np.hypot(36, 24))
+    assert not next(iter(auto)).intrinsics_guessed
+    assert "intrinsics are from EXIF" in auto.warnings[0]
     # 4.5 mm in front of 160 pixels a millimeter, on a picture that was 640 wide and is 64 now
     sensor = {equivalent: 99, focal: 4.5, resolution: 1600.0, unit: 3, width: 640, height: 480}
     save_photo(tmp_path / "a.jpg", sensor)
@@ -217,7 +221,11 @@ def test_without_calibration_it_says_what_to_do(tmp_path: Path) -> None:
     write_photos(tmp_path, 2)
     with pytest.raises(ValueError, match=r"no calibration.*intrinsics="):
         open_dataset("images", path=tmp_path)
-    assert "are a guess" in open_dataset("images", path=tmp_path, intrinsics="auto").warnings[0]
+    guessed = open_dataset("images", path=tmp_path, intrinsics="auto", size=[24, 32])
+    assert "are a guess" in guessed.warnings[0]
+    assert all(item.intrinsics_guessed for item in guessed)
+    known = open_dataset("images", path=tmp_path, intrinsics=[50, 50, 31.5, 23.5])
+    assert not any(item.intrinsics_guessed for item in known)
     for bad in ("guess", [1, 2, 3], [-1, 1, 1, 1]):
         with pytest.raises(ValueError, match=r"intrinsics is|positive"):
             open_dataset("images", path=tmp_path, intrinsics=bad)

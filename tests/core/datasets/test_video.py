@@ -44,6 +44,7 @@ def test_frames_and_timestamps(video: Path) -> None:
 
 def test_selection_and_size(video: Path) -> None:
     sequence = open_dataset("video", path=video, intrinsics="auto", start=3, stop=20, stride=4, size=(24, 32))
+    assert all(item.intrinsics_guessed for item in sequence)
     items = list(sequence)
     assert len(sequence) == len(items) == 5
     np.testing.assert_allclose([item.timestamp for item in items], [0.15, 0.35, 0.55, 0.75, 0.95], atol=1e-3)

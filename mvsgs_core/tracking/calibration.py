@@ -1,0 +1,108 @@
+"""What the tracker finds out about the camera itself: its focal length, where that was a guess, and its readout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core.tracking.bundle_adjustment import Solver
+from mvsgs_core.tracking.focal import FocalConfig, focal_of_all, observability, refine_focal
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.rolling_shutter import estimate_readout
+from mvsgs_core.tracking.stats import TrackingStats
+
+READOUT_AGAIN = (10, 20, 40)  # keyframes of the map at which the readout is estimated again: the first say little
+
+
+@dataclass
+class Calibration:
+    """`settled`: the focal length will not change any more, so keyframes may go out with it."""
+
+    graph: KeyframeGraph
+    config: FocalConfig
+    stats: TrackingStats
+    given: np.ndarray  # (4,) intrinsics that came with the frames, at the tracker's size
+    settled: bool  # from the start on, where the intrinsics are no guess
+    readout: float | None  # seconds; None: to be estimated
+    threads: int
+
+    def __post_init__(self) -> None:
+        self.graph.readout = self.readout or 0.0
+        self.guessed = not self.settled
+
+    @property
+    def focal_factor(self) -> float:
+        """On the focal length that came with the frames."""
+        return float(self.graph.intrinsics[0] / self.given[0])
+
+    def refine(self, members: list[int]) -> None:
+        """With one more keyframe: the focal length again, until it is certain or has to do."""
+        if self.settled:
+            return
+        with self.stats.time("focal length"):
+            failure = refine_focal(self.graph, members, self.threads)
+            if failure:
+                self.stats.warn(f"the focal length could not be adjusted: {failure}")
+            elif len(members) >= self.config.keyframes:
+                rise = observability(self.graph, members, self.config.probe, self.threads)
+                if rise > self.config.certain and self._sensible():
+                    self.settled = True
+                    self._report()
+            if not self.settled and len(members) >= self.config.limit:
+                self.settle(members)
+
+    def settle(self, members: list[int]) -> None:
+        """Takes what there is, or goes back to the guess."""
+        if self.settled:
+            return
+        self.settled = True
+        rise = observability(self.graph, members, self.config.probe, self.threads) if len(members) > 2 else 0.0
+        if rise > self.config.usable and self._sensible():
+            self._report()
+            if rise < self.config.certain:
+                self.stats.warn(
+                    f"the focal length {self.focal_factor:.3f} times the guess is uncertain: the camera hardly turned "
+                    f"({100 * self.config.probe:.0f} % more or less cost only {100 * rise:.1f} % in the matches)"
+                )
+            return
+        self.graph.intrinsics = self.given.copy()
+        self.graph.optimize(members, set(members[1:]), set(members), Solver(steps=15, threads=self.threads))
+        self._report()
+        self.stats.warn(
+            "the focal length can't be told from these images (a camera that hardly turns, or a flat scene): the guess "
+            "is kept, and the map may be stretched in depth; calibrate and set dataset.intrinsics=[fx,fy,cx,cy]"
+        )
+
+    def check(self, members: list[int]) -> None:
+        """At the end: whether the whole stream agrees with the focal length that the keyframes went out with."""
+        if not self.guessed or len(members) < self.config.keyframes:
+            return
+        factor = focal_of_all(self.graph, members, self.threads)
+        if factor is None:
+            return
+        total = factor * self.focal_factor
+        self.stats.values["focal length, whole stream"] = f"{total:.3f} x the guess"
+        if abs(np.log(factor)) > self.config.drift:
+            self.stats.warn(
+                f"all keyframes together want a focal length {total:.3f} times the guess, {self.focal_factor:.3f} "
+                "times was used: run again with dataset.intrinsics set to it"
+            )
+
+    def estimate_readout(self, members: list[int]) -> None:
+        """Of a rolling shutter, from these keyframes."""
+        if self.readout is not None:
+            return
+        with self.stats.time("rolling shutter"):
+            self.graph.readout = estimate_readout(self.graph, members, self.threads)
+        self.stats.values["rolling shutter"] = f"{1e3 * self.graph.readout:.1f} ms"
+
+    def _sensible(self) -> bool:
+        return self.config.bounds[0] < self.focal_factor < self.config.bounds[1]
+
+    def _report(self) -> None:
+        self.stats.values["focal length"] = f"{self.focal_factor:.3f} x the guess"
+        self.stats.counts["focal length over its guess"] = self.focal_factor
+
+
+__all__ = ["READOUT_AGAIN", "Calibration"]

@@ -1,0 +1,84 @@
+"""The focal length where it was only guessed: an unknown of the start-up and of bundle adjustment until it is certain.
+
+Turning makes it observable: a camera that only shifts gives the same images with every focal length and depths scaled
+to match. So what is found is believed where a focal length that is off by some percent fits the matches clearly worse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.initialization import Start, StartCriteria, start_up
+
+
+@dataclass(frozen=True)
+class FocalConfig:
+    factors: tuple[float, ...] = (1.0, 1.35, 0.75, 1.8, 0.55)  # on the guess: 100 to 40 degrees around one of 65
+    bounds: tuple[float, float] = (0.35, 3.0)  # on the guess: what lies outside is no solution
+    keyframes: int = 12  # before anything is certain
+    limit: int = 30  # keyframes that wait for it at most
+    probe: float = 0.1  # share by which the focal length is made wrong ...
+    certain: float = 0.03  # ... and that of the cost which it must then rise by to be certain,
+    usable: float = 0.002  # or, at the limit, to be better than the guess
+    drift: float = 0.03  # share by which the whole stream may contradict what was used, before it is told
+
+
+def start_with_unknown_focal(
+    graph: KeyframeGraph, order: list[int], criteria: StartCriteria, config: FocalConfig, threads: int
+) -> Start:
+    """`start_up` from several focal lengths, each then free; the lowest cost wins and is written to the graph."""
+    guess = graph.intrinsics
+    criteria = replace(criteria, certain_cost=0.0)  # with a free focal length, a wrong start can be cheap too
+    best: tuple[Start, np.ndarray] | None = None
+    failed: Start | None = None
+    for factor in config.factors:
+        graph.intrinsics = guess * [factor, factor, 1.0, 1.0]
+        start = start_up(graph, order, criteria, threads, free_focal=True)
+        if not start.failure and not config.bounds[0] < factor * start.focal_factor < config.bounds[1]:
+            start = replace(start, failure="no focal length in a sensible range explains the matches")
+        if start.failure:
+            failed = failed or start
+        elif best is None or start.cost < best[0].cost:
+            best = start, graph.intrinsics * [start.focal_factor, start.focal_factor, 1.0, 1.0]
+    graph.intrinsics = guess
+    if best is None:
+        assert failed is not None
+        return failed
+    graph.intrinsics = best[1]
+    return best[0]
+
+
+def refine_focal(graph: KeyframeGraph, members: list[int], threads: int) -> str:
+    """Bundle adjustment of these keyframes with the focal length; returns why it failed, or nothing."""
+    solver = Solver(steps=15, robust_scale=1.0, tolerance=1e-4, threads=threads)
+    return graph.optimize(members, set(members[1:]), set(members), solver, free_focal=True).failure
+
+
+def observability(graph: KeyframeGraph, members: list[int], probe: float, threads: int) -> float:
+    """Share by which the cost rises where the focal length is wrong by `probe`, the rest adjusted to it; the graph
+    stays as it is. The lesser of both directions."""
+    problem = graph.problem(members, set(members[1:]), set(members))
+    solver = Solver(steps=10, robust_scale=1.0, tolerance=1e-4, threads=threads)
+    here = adjust(problem, solver)
+    rises = []
+    for factor in (1.0 - probe, 1.0 / (1.0 - probe)):
+        wrong = replace(problem, intrinsics=problem.intrinsics * [factor, factor, 1.0, 1.0])
+        solution = adjust(wrong, solver)
+        if here.failure or solution.failure or here.cost <= 0.0:
+            return 0.0
+        rises.append(solution.cost / here.cost - 1.0)
+    return min(rises)
+
+
+def focal_of_all(graph: KeyframeGraph, members: list[int], threads: int) -> float | None:
+    """Factor on the focal length that all these keyframes would rather have; None where they can't tell."""
+    problem = replace(graph.problem(members, set(members[1:]), set(members)), free_focal=True)
+    solution = adjust(problem, Solver(steps=10, robust_scale=1.0, tolerance=1e-4, threads=threads))
+    return None if solution.failure else solution.focal_factor
+
+
+__all__ = ["FocalConfig", "focal_of_all", "observability", "refine_focal", "start_with_unknown_focal"]
