@@ -32,6 +32,7 @@ class Model:
     points: np.ndarray  # (M, 3)
     colors: np.ndarray  # (M, 3) uint8 RGB
     seconds: dict[str, float]  # by stage
+    processor_seconds: float  # of all threads, from start to end
 
 
 def reconstruct(
@@ -54,9 +55,15 @@ def reconstruct(
     if not file.exists():
         last = (done.stderr.strip().splitlines() or ["nothing said"])[-1]
         return None, f"COLMAP ended with code {done.returncode}: {last}"
-    arrays = np.load(file)
-    seconds = json.loads((folder / "seconds.json").read_text())
-    return Model(arrays["index"], arrays["world_from_cam"], arrays["points"], arrays["colors"], seconds), ""
+    return load(folder), ""
+
+
+def load(folder: Path) -> Model:
+    """The model that `reconstruct` left in a folder. Raises FileNotFoundError where there is none."""
+    with np.load(folder / "model.npz") as arrays:
+        index, poses, points, colors = (arrays[name] for name in ("index", "world_from_cam", "points", "colors"))
+    times = json.loads((folder / "seconds.json").read_text())
+    return Model(index, poses, points, colors, times["wall"], times["processor"])
 
 
 def run(folder: Path, threads: int) -> None:
@@ -99,7 +106,8 @@ def run(folder: Path, threads: int) -> None:
     for pose, image in zip(poses, registered):
         pose[:3] = image.cam_from_world().inverse().matrix()
     points = list(best.points3D.values())
-    (folder / "seconds.json").write_text(json.dumps(seconds))
+    times = {"wall": seconds, "processor": time.process_time()}
+    (folder / "seconds.json").write_text(json.dumps(times))
     np.savez(
         folder / "model.npz",
         index=np.array([int(Path(image.name).stem) for image in registered], dtype=np.int64),

@@ -1,27 +1,30 @@
 """The tracker's error and its time, sequence by sequence: `python -m bench.tracking`.
 
 ATE is the RMS position error after Sim(3) alignment, of keyframes and of all frames with a pose, each segment apart
-(the worst counts). Times are CPU time of one thread, so that a busy machine does not change them.
---runs 3 repeats every sequence; --colmap runs pycolmap on the same frames; --curve the settings on two sequences.
+(the worst counts). Times are processor time of one thread, so that a busy machine does not change them. On the other
+core run COLMAP, on the same frames, and then a long stream whose memory is watched.
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
+import multiprocessing
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path as File
 from typing import Any
 
 import cv2
 import numpy as np
 
-from bench.table import Row, at_least, at_most, main
+from bench import tracking_curve, tracking_loop, tracking_memory, tracking_peers
+from bench.runs import folder
+from bench.table import Row, at_most, main
 from bench.tracking_cases import CASES, Case
-from bench.tracking_parts import global_adjustment_seconds, loop_with_drift
-from mvsgs_core import geometry
+from bench.tracking_parts import global_adjustment_seconds
+from bench.tracking_peers import Peer, aligned_error
 from mvsgs_core.datasets import Item
 from mvsgs_core.tracking.frames import Path, State
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
@@ -37,6 +40,7 @@ class Result:
     length: float  # of the true path
     seconds: dict[str, float]  # CPU, by stage
     total: float  # CPU seconds of all `add` calls
+    end: float  # CPU seconds of `finish`
     warnings: list[str]
 
     @property
@@ -54,8 +58,10 @@ def run(items: Sequence[Item], config: TrackerConfig | None = None) -> Result:
     for item in items:
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
     total = time.process_time() - start
+    start = time.process_time()
     for _ in tracker.finish():
         pass
+    end = time.process_time() - start
     path = tracker.path()
     truth = {i.index: i.world_from_cam for i in items if i.world_from_cam is not None}
     segments = sorted({int(s) for s in path.segment if s >= 0})
@@ -68,6 +74,7 @@ def run(items: Sequence[Item], config: TrackerConfig | None = None) -> Result:
         float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()) if len(positions) > 1 else 0.0,
         tracker.stats.seconds,
         total,
+        end,
         tracker.stats.warnings,
     )
 
@@ -77,8 +84,7 @@ def _ate(path: Path, truth: dict[int, np.ndarray], chosen: np.ndarray) -> float:
         return float("nan")
     found = path.world_from_cam[chosen, :3, 3]
     wanted = np.stack([truth[int(n)][:3, 3] for n in path.index[chosen]])
-    s, r, t = geometry.umeyama(found, wanted)
-    return float(np.sqrt(np.mean(np.sum(np.square(s * found @ r.T + t - wanted), axis=1))))
+    return aligned_error(found, wanted)
 
 
 def rows_of(name: str, case: Case, results: list[Result]) -> list[Row]:
@@ -87,6 +93,7 @@ def rows_of(name: str, case: Case, results: list[Result]) -> list[Row]:
     rows = [_ate_row(f"{name}: ATE keyframes", float(np.max(keyframe)), case.goal, first.length)]
     if len(results) > 1:
         rows.append(at_most(f"{name}: spread of {len(results)} runs", float(np.ptp(keyframe)), "cm", 1e-9))
+        rows.append(at_most(f"{name}: the same run again, largest difference", _difference(results), "", 0.0))
     rows.append(Row(f"{name}: ATE all frames", 100.0 * max(first.frame_errors, default=float("nan")), "cm"))
     rows.append(Row(f"{name}: keyframes", first.keyframes, f"of {len(first.path.index)}"))
     states = {s.name.lower(): int(np.sum(first.path.state == s)) for s in State if s != State.TRACKED}
@@ -100,11 +107,23 @@ def rows_of(name: str, case: Case, results: list[Result]) -> list[Row]:
     else:
         rows.append(at_most(f"{name}: without a pose", first.unposed, "frames", 0))
     frames = max(1, len(first.path.index))
-    goal = 40.0
-    rows.append(at_most(f"{name}: front end, all of it", 1e3 * first.total / frames, "ms/frame CPU", goal))
-    local = first.seconds.get("local bundle adjustment", 0.0) / max(1, first.keyframes)
+    total = float(np.mean([r.total for r in results])) / frames
+    rows.append(at_most(f"{name}: front end, all of it", 1e3 * total, "ms/frame CPU", 40.0))
+    adjusting = float(np.mean([r.seconds.get("local bundle adjustment", 0.0) for r in results]))
+    local = adjusting / max(1, first.keyframes)
     rows.append(at_most(f"{name}: local bundle adjustment", 1e3 * local, "ms/keyframe CPU", 25.0))
     return rows
+
+
+def _difference(results: list[Result]) -> float:
+    """Largest difference of any entry of any pose between the first run and the others; infinite if frames differ."""
+    first = results[0].path
+    worst = 0.0
+    for other in (r.path for r in results[1:]):
+        if not np.array_equal(np.isnan(other.world_from_cam), np.isnan(first.world_from_cam)):
+            return float("inf")
+        worst = max(worst, float(np.nanmax(np.abs(other.world_from_cam - first.world_from_cam), initial=0.0)))
+    return worst
 
 
 def _ate_row(name: str, centimeters: float, goal: str, length: float) -> Row:
@@ -114,93 +133,71 @@ def _ate_row(name: str, centimeters: float, goal: str, length: float) -> Row:
     return at_most(name, centimeters, "cm", limit)
 
 
-def colmap_row(name: str, items: Sequence[Item], ours: Result) -> Row:
-    """pycolmap on the same frames at the tracker's size; the error of both over the frames that it registered."""
-    from bench.colmap_poses import reconstruct
-    from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
+def curve(name: str, items: Sequence[Item], folder: File) -> list[Row]:
+    """Run time against error over the main settings; the plot goes to `folder`."""
 
-    size = items[0].image.shape[0], items[0].image.shape[1]
-    small = fit_size(*size, 512 * 384)
-    frames = {i.index: resize_image(i.image, small) for i in items}
-    with tempfile.TemporaryDirectory() as folder:
-        model, why = reconstruct(frames, scale_intrinsics(items[0].intrinsics, size, small), File(folder), 1)
-    if model is None:
-        return Row(f"{name}: pycolmap", why)
-    truth = {i.index: i.world_from_cam for i in items if i.world_from_cam is not None}
-    found = {int(n): pose for n, pose in zip(model.index, model.world_from_cam) if int(n) in truth}
-    mine = dict(zip(ours.path.index.tolist(), ours.path.world_from_cam))
-    both = [n for n in found if np.isfinite(mine[n]).all()]
-    errors = []
-    for poses in (found, mine):
-        at = np.stack([poses[n][:3, 3] for n in both])
-        to = np.stack([truth[n][:3, 3] for n in both])
-        s, r, t = geometry.umeyama(at, to)
-        errors.append(float(np.sqrt(np.mean(np.sum(np.square(s * at @ r.T + t - to), axis=1)))))
-    text = f"times pycolmap's {100 * errors[0]:.2f} cm ({len(found)} of {len(items)} frames)"
-    return at_most(f"{name}: our ATE, same frames", errors[1] / errors[0], text, 1.2)
+    def one(config: TrackerConfig) -> tuple[float, float, int]:
+        result = run(items, config)
+        milliseconds = 1e3 * result.total / len(items)
+        return milliseconds, 100.0 * max(result.keyframe_errors, default=float("nan")), result.keyframes
 
-
-def curve(names: Sequence[str]) -> list[Row]:
-    """Run time against error over the main settings, one changed at a time."""
-    base = TrackerConfig()
-    settings: dict[str, TrackerConfig] = {
-        "default": base,
-        "area 192x144": replace(base, area=192 * 144),
-        "area 512x384": replace(base, area=512 * 384),
-        "keyframe flow 0.035": replace(base, front_end=replace(base.front_end, keyframe_flow=0.035)),
-        "keyframe flow 0.08": replace(base, front_end=replace(base.front_end, keyframe_flow=0.08)),
-        "window 6": replace(base, local_map=replace(base.local_map, window=6)),
-        "window 20": replace(base, local_map=replace(base.local_map, window=20)),
-        "1 recent, no proximity": replace(base, local_map=replace(base.local_map, recent=1, proximity=0)),
-        "6 recent, 6 proximity": replace(base, local_map=replace(base.local_map, recent=6, proximity=6)),
-        "2 steps": replace(base, local_map=replace(base.local_map, steps=2)),
-        "10 steps": replace(base, local_map=replace(base.local_map, steps=10)),
-        "no loops": replace(base, loops=False),
-        "flow dis": replace(base, flow="dis"),
-    }
-    rows = []
-    for name in names:
-        items = CASES[name].items()
-        for label, config in settings.items():
-            result = run(items, config)
-            error = 100.0 * max(result.keyframe_errors, default=float("nan"))
-            speed = f"cm at {1e3 * result.total / len(items):.1f} ms/frame CPU, {result.keyframes} keyframes"
-            rows.append(Row(f"{name}, {label}", error, speed))
-    return rows
+    points = tracking_curve.measure(one)
+    tracking_curve.draw(folder / f"{name}.svg", points)
+    return tracking_curve.rows(name, points)
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
+    chosen = [n for n, c in CASES.items() if (c.quick or not options.quick) and n in (options.only or CASES)]
+    whole = not options.quick
+    place = folder(options, "tracking")
     rows: list[Row] = []
-    for name, case in CASES.items():
-        if (options.quick and not case.quick) or (options.only and name not in options.only):
-            continue
-        try:
-            items = case.items()
-        except FileNotFoundError as error:
-            rows.append(Row(f"{name}: skipped", str(error)))
-            continue
-        results = [run(items) for _ in range(1 if options.quick else options.runs)]
-        rows += rows_of(name, case, results)
-        if options.colmap and not case.hard:
-            rows.append(colmap_row(name, items, results[0]))
-    if not options.only:
-        seconds = global_adjustment_seconds(40 if options.quick else 100)
-        rows.append(at_most("global bundle adjustment, 100 keyframes", seconds, "s CPU", 3.0))
-        if not options.quick:
-            before, after = loop_with_drift(CASES["room, loop"].items())
-            rows.append(Row("loop with 25 % drift of scale: ATE before", 100.0 * before, "cm"))
-            rows.append(at_least("loop with 25 % drift of scale: before / after", before / after, "", 3.0))
-    if options.curve:
-        rows += curve([n for n in ("tum_fr1_xyz", "room") if not options.only or n in options.only])
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as beside:
+        peers: dict[str, Future[Peer]] = {}
+        for name in chosen if options.colmap and whole else []:
+            if CASES[name].peer_stride and not CASES[name].hard and CASES[name].there:
+                peers[name] = beside.submit(tracking_peers.solve_case, name, place / "colmap")
+        memory = beside.submit(tracking_memory.follow, options.frames) if whole and not options.only else None
+        for name in chosen:
+            rows += rows_of_case(name, CASES[name], options)
+        if options.curve and whole:
+            for name in tracking_curve.SEQUENCES:
+                if name in chosen and CASES[name].there:
+                    rows += curve(name, CASES[name].items(), place)
+        if not options.only:
+            rows += parts(options)
+        for name, peer in peers.items():
+            items = CASES[name].items()[:: CASES[name].peer_stride]
+            ours = run(items)
+            rows += tracking_peers.rows(name, peer.result(), ours.path, items, ours.total + ours.end)
+        if memory is not None:
+            rows += tracking_memory.rows(memory.result())
     return rows
 
 
+def rows_of_case(name: str, case: Case, options: argparse.Namespace) -> list[Row]:
+    try:
+        items = case.items()
+    except FileNotFoundError as error:
+        return [Row(f"{name}: skipped", str(error))]
+    return rows_of(name, case, [run(items) for _ in range(1 if options.quick else options.runs)])
+
+
+def parts(options: argparse.Namespace) -> list[Row]:
+    keyframes = 40 if options.quick else 100
+    seconds = global_adjustment_seconds(keyframes)
+    rows = [at_most(f"global bundle adjustment, {keyframes} keyframes", seconds, "s CPU", 3.0)]
+    return rows if options.quick else rows + tracking_loop.rows(CASES["room, loop"].items())
+
+
 def arguments(parser: argparse.ArgumentParser) -> Any:
+    flag = argparse.BooleanOptionalAction
     parser.add_argument("--runs", type=int, default=3, help="of every sequence")
     parser.add_argument("--only", nargs="*", help="names of sequences")
-    parser.add_argument("--colmap", action="store_true", help="pycolmap beside it (minutes a sequence)")
-    parser.add_argument("--curve", action="store_true", help="run time against error over the main settings")
+    parser.add_argument("--colmap", action=flag, default=True, help="pycolmap on the same frames (one core, minutes)")
+    parser.add_argument("--curve", action=flag, default=True, help="run time against error over the main settings")
+    parser.add_argument("--frames", type=int, default=2000, help="of the run whose memory is measured, more than 500")
+    parser.add_argument("--output", type=File, help="folder for plots and COLMAP's models; default: in runs")
 
 
 if __name__ == "__main__":

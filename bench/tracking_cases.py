@@ -21,10 +21,16 @@ class Case:
     goal: str = ""
     hard: bool = False  # what counts is that the loss is reported and nothing wrong goes out
     quick: bool = False
+    peer_stride: int = 2  # every nth frame is for COLMAP, and for us beside it; 0: none
 
     @property
     def path(self) -> Path | None:
         return SHARED / "data" / self.folder if self.folder else None
+
+    @property
+    def there(self) -> bool:
+        """Whether the data is on this machine."""
+        return self.path is None or self.path.is_dir()
 
     def items(self) -> list[Item]:
         """The frames; raises FileNotFoundError where the data is not there."""
@@ -39,12 +45,12 @@ def _room(**options: Any) -> Mapping[str, Any]:
 
 
 CASES: dict[str, Case] = {
-    "tum_fr1_xyz": Case("tum", folder="tum_fr1_xyz", goal="1.1", quick=True),
+    "tum_fr1_xyz": Case("tum", folder="tum_fr1_xyz", goal="1.1", quick=True, peer_stride=1),
     "redkitchen": Case("seven_scenes", {"registered": False}, "seven_scenes_redkitchen", goal="4.5"),
     "redkitchen, color camera 525": Case("seven_scenes", {}, "seven_scenes_redkitchen", goal="4.5"),
-    "icl_nuim_of_kt0": Case("icl_nuim", folder="icl_nuim_of_kt0"),
+    "icl_nuim_of_kt0": Case("icl_nuim", folder="icl_nuim_of_kt0", peer_stride=1),
     "room": Case("synthetic", _room(frames=120), goal="0.3%", quick=True),
-    "room, loop": Case("synthetic", _room(frames=300, loop=True), goal="0.3%"),
+    "room, loop": Case("synthetic", _room(frames=300, loop=True), goal="0.3%", peer_stride=3),
     "room, motion blur": Case("synthetic", _room(frames=120, motion_blur=0.5)),
     "room, noise and exposure": Case("synthetic", _room(frames=120, noise=6.0, exposure=0.5)),
     "room, gloss": Case("synthetic", _room(frames=120, gloss=0.5)),

@@ -1,19 +1,15 @@
-"""Parts of the tracker measured alone: global bundle adjustment of a given size, and a loop with drift put in."""
+"""A part of the tracker measured alone: global bundle adjustment of a given size."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.datasets import Item
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.bundle_adjustment import Graph, Solver, adjust, reproject
-from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
 
 
 def global_adjustment_seconds(keyframes: int, cells: int = 1200, edges: int = 12, seed: int = 0) -> float:
@@ -59,48 +55,3 @@ def global_adjustment_seconds(keyframes: int, cells: int = 1200, edges: int = 12
             raise RuntimeError(f"global bundle adjustment failed: {solution.failure}")
         graph = replace(graph, cam_from_world=solution.cam_from_world, inverse_depth=solution.inverse_depth)
     return time.process_time() - start
-
-
-def loop_with_drift(items: Sequence[Item], drift: float = 0.25) -> tuple[float, float]:
-    """ATE in meters of a map whose scale drifts by a share over the loop, before and after it is closed.
-
-    The frames are tracked without loops; matches between its two ends are removed, and every step is scaled.
-    """
-    tracker = Tracker(TrackerConfig(loops=False))
-    for item in items:
-        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
-    graph = tracker.graph
-    assert graph is not None
-    order = sorted(graph.keyframes)
-    place = {index: n for n, index in enumerate(order)}
-    for a, b in [pair for pair in graph.edges if abs(place[pair[0]] - place[pair[1]]) > len(order) // 4]:
-        del graph.edges[a, b]
-    _let_drift(graph, order, drift)
-    before = _error(graph, order, items)
-    for index in order[:-1]:
-        tracker.loops.add(index)
-    closure = tracker.loops.search(order[-1])
-    if closure is None or not closure.moved:
-        return before, before
-    tracker.back_end.adjust(graph.keyframes[order[0]].segment)
-    return before, _error(graph, order, items)
-
-
-def _let_drift(graph: KeyframeGraph, order: list[int], drift: float) -> None:
-    old = {index: graph.keyframes[index].cam_from_world for index in order}
-    for n, index in enumerate(order[1:], start=1):
-        keyframe, last = graph.keyframes[index], order[n - 1]
-        scale = float(np.exp(-drift * n / len(order)))
-        step = old[index] @ geometry.inverse(old[last])
-        step[:3, 3] *= scale
-        keyframe.cam_from_world = step @ graph.keyframes[last].cam_from_world
-        keyframe.inverse_depth = keyframe.inverse_depth / scale
-        keyframe.information = keyframe.information * scale**2
-
-
-def _error(graph: KeyframeGraph, order: list[int], items: Sequence[Item]) -> float:
-    truth = {i.index: i.world_from_cam for i in items}
-    found = np.stack([graph.world_from_cam(index)[:3, 3] for index in order])
-    wanted = np.stack([np.asarray(truth[index])[:3, 3] for index in order])
-    s, r, t = geometry.umeyama(found, wanted)
-    return float(np.sqrt(np.mean(np.sum(np.square(s * found @ r.T + t - wanted), axis=1))))

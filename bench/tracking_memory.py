@@ -1,0 +1,72 @@
+"""Memory of the tracker over a long stream: a camera that goes around a room again and again, never twice the same way.
+
+Frames are rendered as they are needed, in the process that is measured: the scene is in its resident memory from the
+start and does not grow.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import psutil
+
+from bench.table import Row, at_most
+from mvsgs_core.datasets import open_dataset
+from mvsgs_core.tracking.tracker import Tracker
+
+SETTLED = 500  # frames after which nothing may grow but what a keyframe needs
+GROWTH = 1.25  # memory of a keyframe at the end over that after SETTLED frames: what counts as flat
+
+
+@dataclass(frozen=True)
+class Sample:
+    frames: int
+    keyframes: int
+    megabytes: float  # resident, above what it was before the first frame
+
+
+def follow(frames: int, every: int = 100) -> list[Sample]:
+    """Tracks so many frames of the room; a sample after each `every`. For a process of its own."""
+    cv2.setNumThreads(1)
+    tracker = Tracker()
+    process = psutil.Process()
+    samples: list[Sample] = []
+    before = 0.0
+    for number, item in enumerate(open_dataset("synthetic", frames=frames, threads=1), start=1):
+        before = before or process.memory_info().rss / 1e6
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+        if number % every == 0:
+            assert tracker.graph is not None
+            resident = process.memory_info().rss / 1e6
+            samples.append(Sample(number, len(tracker.graph.keyframes), resident - before))
+    return samples
+
+
+def in_own_process(frames: int) -> list[Sample]:
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(follow, frames).result()
+
+
+def rows(samples: Sequence[Sample]) -> list[Row]:
+    """samples: at least one after SETTLED frames and one later."""
+    last = samples[-1]
+    settled = next(s for s in samples if s.frames >= SETTLED)
+    name = f"{last.frames} frames of the room"
+
+    def each(sample: Sample) -> float:
+        return sample.megabytes / sample.keyframes
+
+    return [
+        Row(f"{name}: keyframes", last.keyframes, f"(after {settled.frames} frames: {settled.keyframes})"),
+        Row(f"{name}: resident memory of the tracker", last.megabytes, f"MB (then: {settled.megabytes:.0f})"),
+        at_most(
+            f"{name}: memory of a keyframe over that after {settled.frames}",
+            each(last) / each(settled),
+            f"x ({each(last):.2f} MB)",
+            GROWTH,
+        ),
+    ]

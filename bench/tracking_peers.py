@@ -1,0 +1,93 @@
+"""COLMAP (sequential matching, calibration given) on the frames that the tracker saw: error and time beside ours."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path as File
+
+import numpy as np
+
+from bench.colmap_poses import Model, load, reconstruct
+from bench.table import Row, at_most
+from bench.tracking_cases import CASES
+from mvsgs_core import geometry
+from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
+from mvsgs_core.datasets import Item
+from mvsgs_core.tracking.frames import Path
+
+AREA = 512 * 384  # pixels of COLMAP's images: 2.6 times those of the tracker
+SUCCESS = 0.5  # share of the frames that COLMAP must register for its error to be a mark
+
+
+@dataclass(frozen=True)
+class Peer:
+    """What COLMAP made of a sequence; `model` is None where it found none, `why` says so."""
+
+    model: Model | None
+    why: str
+    size: tuple[int, int]
+
+
+def solve(items: Sequence[Item], folder: File, threads: int) -> Peer:
+    """COLMAP's model of the frames. One that an earlier call left in `folder` for the same images is taken again."""
+    size = items[0].image.shape[0], items[0].image.shape[1]
+    small = fit_size(*size, AREA) if size[0] * size[1] > AREA else size
+    frames = {i.index: resize_image(i.image, small) for i in items}
+    intrinsics = scale_intrinsics(items[0].intrinsics, size, small)
+    digest = hashlib.sha256(intrinsics.tobytes())
+    for index, image in frames.items():
+        digest.update(index.to_bytes(8, "little") + image.tobytes())
+    key = folder / "images.sha256"
+    if key.exists() and key.read_text() == digest.hexdigest():
+        return Peer(load(folder), "", small)
+    key.unlink(missing_ok=True)
+    model, why = reconstruct(frames, intrinsics, folder, threads)
+    if model is not None:
+        key.write_text(digest.hexdigest())
+    return Peer(model, why, small)
+
+
+def solve_case(name: str, folder: File) -> Peer:
+    """`solve` for a sequence of the benchmark, by one thread: for a process of its own, beside which ours is timed."""
+    case = CASES[name]
+    place = folder / "".join(c if c.isalnum() else "_" for c in name)
+    place.mkdir(parents=True, exist_ok=True)
+    return solve(case.items()[:: case.peer_stride], place, 1)
+
+
+def rows(name: str, peer: Peer, path: Path, items: Sequence[Item], seconds: float) -> list[Row]:
+    """Both errors over the frames that COLMAP registered and we posed; seconds: processor time of our whole run."""
+    model = peer.model
+    if model is None:
+        return [Row(f"{name}: pycolmap", peer.why)]
+    truth = {i.index: i.world_from_cam for i in items if i.world_from_cam is not None}
+    theirs = dict(zip(model.index.tolist(), model.world_from_cam, strict=True))
+    posed = np.isfinite(path.world_from_cam).all(axis=(1, 2))
+    ours = dict(zip(path.index[posed].tolist(), path.world_from_cam[posed], strict=True))
+    both = sorted(set(theirs) & set(ours) & set(truth))
+    registered = f"{len(theirs)} of {len(items)} frames{_every(name)}, {peer.size[1]}x{peer.size[0]}"
+    if len(both) < 3:
+        return [Row(f"{name}: pycolmap", f"registered {registered}")]
+    wanted = np.stack([truth[n][:3, 3] for n in both])
+    mine, his = (aligned_error(np.stack([poses[n][:3, 3] for n in both]), wanted) for poses in (ours, theirs))
+    ratio = f"{name}: ATE / pycolmap's, same frames"
+    found = [Row(f"{name}: pycolmap's ATE", 100.0 * his, f"cm ({registered})")]
+    if len(theirs) >= SUCCESS * len(items):
+        found.append(at_most(ratio, mine / his, "", 1.2))
+    else:
+        found.append(Row(ratio, mine / his, "(it failed: most frames are not registered)"))
+    total = model.processor_seconds
+    return [*found, Row(f"{name}: seconds, pycolmap's / ours", total / seconds, f"({total:.0f} / {seconds:.1f} s CPU)")]
+
+
+def _every(name: str) -> str:
+    stride = CASES[name].peer_stride
+    return "" if stride == 1 else f", one of {stride}"
+
+
+def aligned_error(found: np.ndarray, wanted: np.ndarray) -> float:
+    """RMS distance of positions (N, 3) after Sim(3) alignment."""
+    s, r, t = geometry.umeyama(found, wanted)
+    return float(np.sqrt(np.mean(np.sum(np.square(s * found @ r.T + t - wanted), axis=1))))

@@ -1,0 +1,95 @@
+"""The tracking benchmark's own logic: fronts, memory, peers, and a loop that a small map follows."""
+
+from __future__ import annotations
+
+from pathlib import Path as File
+
+import numpy as np
+import pytest
+
+from bench import tracking_curve, tracking_memory, tracking_peers
+from bench.colmap_poses import Model, load
+from bench.tracking_curve import Point
+from bench.tracking_memory import Sample
+from bench.tracking_peers import Peer
+from mvsgs_core.datasets import Item
+from mvsgs_core.tracking.frames import Path
+
+
+def test_the_default_is_on_the_front_unless_something_is_faster_and_better_by_more_than_noise(tmp_path: File) -> None:
+    points = [
+        Point("default", "", 20.0, 1.0, 50), Point("size", "small", 10.0, 1.5, 50),
+        Point("size", "odd", 19.9, 0.99, 50), Point("size", "bad", 30.0, 2.0, 50),
+    ]  # fmt: skip
+    rows = tracking_curve.rows("room", points)
+    assert [r.unit.rsplit(", ", 1)[1] for r in rows[:4]] == [
+        "not on the front", "on the front", "on the front", "not on the front",
+    ]  # fmt: skip
+    assert rows[-1].met
+    worse = tracking_curve.rows("room", [*points, Point("window", "6", 15.0, 0.5, 50)])[-1]
+    assert (worse.met, worse.value) == (False, "no: window 6")
+    tracking_curve.draw(tmp_path / "room.svg", points)
+    assert "odd" in (tmp_path / "room.svg").read_text()
+
+
+def test_settings_of_the_curve_differ_from_the_default_and_from_each_other() -> None:
+    configs = list(tracking_curve.settings().values())
+    assert all(a != b for k, a in enumerate(configs) for b in configs[:k])
+
+
+def test_memory_of_a_keyframe_that_grows_misses_the_goal() -> None:
+    def met(end: float) -> bool | None:
+        return tracking_memory.rows([Sample(500, 50, 100.0), Sample(2000, 100, end)])[-1].met
+
+    assert met(200.0)
+    assert not met(300.0)
+
+
+def test_a_short_stream_is_followed_and_measured() -> None:
+    samples = tracking_memory.follow(40, every=20)
+    assert [s.frames for s in samples] == [20, 40]
+    assert samples[-1].keyframes > 0
+
+
+def moving(count: int) -> tuple[list[Item], np.ndarray]:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(count, 3))
+    image = np.zeros((4, 4, 3), np.uint8)
+    return [Item(index=k, timestamp=0.0, image=image, intrinsics=np.ones(4), world_from_cam=p, depth=None)
+            for k, p in enumerate(poses)], poses  # fmt: skip
+
+
+@pytest.mark.parametrize(("registered", "goal"), [(18, "<= 1.2"), (6, "")])
+def test_colmap_is_a_mark_only_where_it_registers_most_frames(registered: int, goal: str) -> None:
+    items, poses = moving(20)
+    theirs, ours = poses[:registered].copy(), poses.copy()
+    theirs[0, :3, 3] += 0.1
+    ours[0, :3, 3] += 0.05
+    ours[3] = np.nan
+    model = Model(np.arange(registered), 2.0 * theirs, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), {}, 30.0)
+    path = Path(np.arange(20), np.zeros(20), ours, np.ones(20, bool), np.zeros(20, np.uint8), np.zeros(20, np.int32))
+    rows = tracking_peers.rows("room", Peer(model, "", (240, 320)), path, items, 3.0)
+    assert f"{registered} of 20 frames" in rows[0].unit
+    assert rows[1].goal == goal
+    assert rows[1].value == pytest.approx(0.5, rel=0.1)
+    assert rows[2].value == 10.0
+    none = tracking_peers.rows("room", Peer(None, "no model", (240, 320)), path, items, 3.0)
+    assert [r.value for r in none] == ["no model"]
+
+
+def test_colmaps_model_is_kept_for_the_same_images_only(tmp_path: File, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def fake(frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: File, threads: int) -> tuple[Model, str]:
+        calls.append(len(frames))
+        np.savez(folder / "model.npz", index=np.arange(2), world_from_cam=np.zeros((2, 4, 4)), points=0, colors=0)
+        (folder / "seconds.json").write_text('{"wall": {"matching": 1.0}, "processor": 2.0}')
+        return load(folder), ""
+
+    monkeypatch.setattr(tracking_peers, "reconstruct", fake)
+    items, _ = moving(5)
+    for used in (items, items, items[:4]):
+        peer = tracking_peers.solve(used, tmp_path, 1)
+        assert peer.model is not None
+        assert peer.model.processor_seconds == 2.0
+    assert calls == [5, 4]
