@@ -11,8 +11,9 @@ import argparse
 import numpy as np
 
 from bench.depth_data import Scene, load_scene
-from bench.depth_run import run
+from bench.depth_run import Run, run, scaled_to
 from bench.depth_tracked import load_tracked
+from bench.table import Row
 from mvsgs_core.fusion import confidence as fused_confidence
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs import confidence as stereo_confidence
@@ -78,6 +79,31 @@ def reliability(
             curve.append((float(probability[inside].mean()), float(labels[inside].mean()), share))
             error += share * abs(curve[-1][0] - curve[-1][1])
     return error, curve
+
+
+def calibration_rows(scene: Scene, found: Run, align: bool, bins: int = 5) -> list[Row]:
+    """Inliers (within 5 %) among the pixels of each range of confidence, of stereo and after fusion, unfiltered."""
+    rows = []
+    maps = {
+        "stereo": [(d.result.depth, d.result.confidence) for d in found.stereo],
+        "fusion": [(f.unfiltered, f.confidence) for f in found.fused],
+    }
+    for kind, pairs in maps.items():
+        probability, labels = [], []
+        for (depth, confidence), truth in zip(pairs, scene.truths, strict=True):
+            if truth is None:
+                continue
+            use = (truth > 0) & (depth > 0)
+            scaled = scaled_to(depth, truth) if align else depth
+            probability.append(confidence[use])
+            labels.append(np.abs(scaled[use] - truth[use]) < INLIER * truth[use])
+        if not any(len(p) for p in probability):
+            continue
+        error, curve = reliability(np.concatenate(probability), np.concatenate(labels), bins)
+        text = ", ".join(f"{c:.2f}: {i:.2f} ({100 * s:.0f} %)" for c, i, s in curve)
+        rows.append(Row(f"calibration, {scene.name}, {kind}: error", error))
+        rows.append(Row(f"calibration, {scene.name}, {kind}: confidence: inliers (share of pixels)", text))
+    return rows
 
 
 def main() -> None:

@@ -5,10 +5,52 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from bench.depth_data import Scene
+from bench.depth_run import Run, score
+from bench.table import Row, at_least
 from mvsgs_core import camera, geometry
 from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.mvs.warp import relative_warp
+
+
+def peer_rows(scene: Scene, found: Run, align: bool) -> list[Row]:
+    """Outliers at equal completeness against a plain plane sweep; both figures against SGBM."""
+    by_index = {v.index: v for v in scene.views}
+    plain: list[np.ndarray] = []
+    unsure: list[np.ndarray] = []
+    pair: list[np.ndarray] = []
+    for one in found.stereo:
+        if one.search is None or not one.neighbors:
+            empty = np.zeros(one.view.size, np.float32)
+            for maps in (plain, unsure, pair):
+                maps.append(empty)
+            continue
+        neighbors = [by_index[i] for i in one.neighbors]
+        depth, confidence = plane_sweep(one.view, neighbors, one.search, hypotheses=96)
+        plain.append(depth)
+        unsure.append(confidence)
+        pair.append(sgbm(one.view, neighbors[0], one.search))
+    ours = score([f.depth for f in found.fused], scene, align)
+    stereo_only = [np.where(d.result.confidence >= 0.7, d.result.depth, 0).astype(np.float32) for d in found.stereo]
+    alone = score(stereo_only, scene, align)
+    known = [(t > 0) if t is not None else np.zeros_like(d, bool) for t, d in zip(scene.truths, plain, strict=True)]
+    pooled = np.concatenate([c[k] for c, k in zip(unsure, known, strict=True)])
+    rows = []
+    for name, reference in (("filtered", ours), ("stereo alone, confidence 0.7", alone)):
+        limit = np.quantile(pooled, 1.0 - reference.completeness)
+        cut = [np.where(c >= limit, d, 0).astype(np.float32) for c, d in zip(unsure, plain, strict=True)]
+        swept = score(cut, scene, align)
+        ratio = (1.0 - swept.inliers) / max(1.0 - reference.inliers, 1e-6)
+        rows.append(Row(f"{scene.name}: plane sweep inliers at completeness {swept.completeness:.2f}", swept.inliers))
+        rows.append(at_least(f"{scene.name}: outliers of the plane sweep over ours, {name}", ratio, "", 2.0))
+    pairwise = score(pair, scene, align)
+    rows.append(Row(f"{scene.name}: SGBM inliers", pairwise.inliers))
+    rows.append(Row(f"{scene.name}: SGBM completeness", pairwise.completeness))
+    better = alone.inliers > pairwise.inliers and alone.completeness > pairwise.completeness
+    text = f"{alone.inliers:.3f}, {alone.completeness:.3f}"
+    rows.append(Row(f"{scene.name}: stereo alone, inliers and completeness", text, "", "better than SGBM", better))
+    return rows
 
 
 def plane_sweep(

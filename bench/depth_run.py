@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class Run:
     fused: list[FusedDepth]
     stereo_seconds: float
     fusion_seconds: float
+    processor_seconds: float = 0.0  # of both, a keyframe, all threads together
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Score:
 def run(views: list[StereoView], cascade: CascadeConfig, fusion: FusionConfig) -> Run:
     """Stereo and fusion of views in stream order."""
     stereo_node, fusion_node = Cascade(cascade), DepthFusion(fusion)
+    begin = time.process_time()
     stereo: list[CascadeDepth] = []
     fused: list[FusedDepth] = []
     stereo_times: list[float] = []
@@ -60,7 +62,7 @@ def run(views: list[StereoView], cascade: CascadeConfig, fusion: FusionConfig) -
     keep(list(stereo_node.flush()))
     fused.extend(fusion_node.flush())
     median = [float(np.median(t)) if t else 0.0 for t in (stereo_times, fusion_times)]
-    return Run(stereo, fused, median[0], median[1])
+    return Run(stereo, fused, median[0], median[1], (time.process_time() - begin) / max(1, len(views)))
 
 
 def depth_view(found: CascadeDepth) -> DepthView:
@@ -82,8 +84,9 @@ def score(depths: list[np.ndarray], scene: Scene, align: bool = False) -> Score:
         kept = known & (depth > 0)
         if not kept.any():
             continue
-        factor = float(np.median(truth[kept] / depth[kept])) if align else 1.0
-        errors.append(np.abs(depth[kept] * factor - truth[kept]) / truth[kept])
+        if align:
+            depth = scaled_to(depth, truth)
+        errors.append(np.abs(depth[kept] - truth[kept]) / truth[kept])
     if not errors or total == 0:
         return Score(float("nan"), 0.0, float("nan"), float("nan"))
     error = np.concatenate(errors)
@@ -95,7 +98,8 @@ def score(depths: list[np.ndarray], scene: Scene, align: bool = False) -> Score:
     )
 
 
-def with_poses(scene: Scene, world_from_cam: list[np.ndarray]) -> Scene:
-    """The same scene seen through other poses."""
-    views = [replace(v, world_from_cam=p) for v, p in zip(scene.views, world_from_cam, strict=True)]
-    return replace(scene, views=views)
+def scaled_to(depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """A map (H, W) with its median ratio to the truth divided out."""
+    both = (truth > 0) & (depth > 0)
+    factor = np.median(truth[both] / depth[both]) if both.any() else 1.0
+    return (depth * factor).astype(np.float32)

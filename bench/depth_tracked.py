@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,11 +16,9 @@ from mvsgs_core.mvs.views import prepare_view
 from nodes.tracker import Tracker
 
 
-def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scene:
-    """The sequence's keyframes with the tracker's final poses, scaled to the truth by the median over all keyframes.
-
-    Raises FileNotFoundError where the data is missing and ValueError where the tracker gave no keyframe.
-    """
+@lru_cache(maxsize=2)
+def _track(name: str) -> tuple[dict[int, Item], dict[int, Keyframe], dict[int, tuple[np.ndarray, float]]]:
+    """Frames, keyframes and their last corrected pose and scale, by index."""
     source = SOURCES[name]
     options = dict(source.options)
     if source.dataset != "synthetic":
@@ -28,8 +28,8 @@ def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scen
     latest: dict[int, tuple[np.ndarray, float]] = {}
     tracker = Tracker()
 
-    def take(messages: object) -> None:
-        for message in messages:  # type: ignore[attr-defined]
+    def take(messages: Any) -> None:
+        for message in messages:
             if isinstance(message, Keyframe):
                 keyframes[message.index] = message
             elif isinstance(message, Poses):
@@ -44,6 +44,15 @@ def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scen
     take(tracker.on_end())
     if not keyframes:
         raise ValueError(f"{name}: the tracker gave no keyframe")
+    return items, keyframes, latest
+
+
+def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scene:
+    """The sequence's keyframes with the tracker's final poses, scaled to the truth by the median over all keyframes.
+
+    Raises FileNotFoundError where the data is missing and ValueError where the tracker gave no keyframe.
+    """
+    items, keyframes, latest = _track(name)
     views, truths, ratios = [], [], []
     for index, keyframe in sorted(keyframes.items()):
         view = prepare_view(
@@ -68,4 +77,4 @@ def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scen
         pose[:3, 3] *= factor
         scaled.append(view.moved(pose, view.scale * factor))
     kept = [items[view.index] for view in views]
-    return Scene(f"{name}, tracked", kept, scaled, truths, source.tolerance)
+    return Scene(f"{name}, tracked", kept, scaled, truths, SOURCES[name].tolerance)

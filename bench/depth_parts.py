@@ -1,0 +1,83 @@
+"""What each part of stereo, each filter and each skip gains and costs: one thing changed at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from bench.depth_data import Scene
+from bench.depth_run import Run, run, score
+from bench.table import Row
+from mvsgs_core.fusion.fusion import FusionConfig
+from mvsgs_core.mvs.cascade import CascadeConfig
+from mvsgs_core.mvs.stereo import StereoConfig
+
+Variant = tuple[CascadeConfig, FusionConfig]
+_COUNTED = ("outside the range", "outside the cells", "settled before")
+
+
+def part_variants(area: int) -> dict[str, Variant]:
+    """Parts of stereo, and filters."""
+    base, fusion = CascadeConfig(area=area), FusionConfig()
+    stereo = StereoConfig()
+
+    def changed(**values: object) -> Variant:
+        return replace(base, stereo=replace(stereo, **values)), fusion  # type: ignore[arg-type]
+
+    return {
+        "no adaptive windows": changed(contrast=1e6),
+        "4 paths": changed(paths=4),
+        "no membrane": changed(fill=False),
+        "best 2 views": changed(best_views=2),
+        "all 4 views": changed(best_views=4),
+        "2 neighbors": (replace(base, neighbors=replace(base.neighbors, count=2)), fusion),
+        "no refinement": (base, replace(fusion, refine=False)),
+        "no consistency check": (base, replace(fusion, check=False)),
+        "round trip": (base, replace(fusion, round_trip=True)),
+        "no confidence threshold": (base, replace(fusion, confidence=0.0)),
+        "no filter": (base, replace(fusion, confidence=0.0, check=False)),
+    }
+
+
+def skip_variants(area: int) -> dict[str, Variant]:
+    """The skips, off one by one where they are on, on where they are off."""
+    base, fusion, stereo = CascadeConfig(area=area), FusionConfig(), StereoConfig()
+
+    def skips(**values: object) -> Variant:
+        chosen = replace(stereo.skips, **values)  # type: ignore[arg-type]
+        return replace(base, stereo=replace(stereo, skips=chosen)), fusion
+
+    return {
+        "no skip": skips(outside_range=False, outside_cells=False),
+        "all hypotheses, in the cells' range": skips(outside_range=False),
+        "hypotheses outside the cells too": skips(outside_cells=False),
+        "later stage only where uncertain (0.95)": skips(certain=0.95),
+        "later stage only where uncertain (0.5)": skips(certain=0.5),
+    }
+
+
+def variant_rows(title: str, scene: Scene, default: Run, variants: Mapping[str, Variant], align: bool) -> list[Row]:
+    """Each variant's figures, and its changes against the default."""
+    base = _figures(scene, default, align)
+    rows = [Row(f"{title}, {scene.name}, default: {name}", value, unit) for name, (value, unit) in base.items()]
+    for variant, (cascade, fusion) in variants.items():
+        found = _figures(scene, run(scene.views, cascade, fusion), align)
+        text = ", ".join(f"{name} {found[name][0] - value:+.3g}" for name, (value, _) in base.items())
+        rows.append(Row(f"{title}, {scene.name}, {variant}: change", text))
+    return rows
+
+
+def _figures(scene: Scene, found: Run, align: bool) -> dict[str, tuple[float, str]]:
+    raw = score([d.result.depth for d in found.stereo], scene, align)
+    kept = score([f.depth for f in found.fused], scene, align)
+    totals = [sum(d.result.counts.get(what, 0.0) for d in found.stereo) for what in _COUNTED]
+    everything = sum(d.result.counts.get("hypotheses", 0.0) for d in found.stereo) + totals[0]
+    return {
+        "unfiltered error": (raw.relative_error, ""),
+        "inliers": (kept.inliers, ""),
+        "completeness": (kept.completeness, ""),
+        "processor ms": (1000 * found.processor_seconds, "ms"),
+        "share skipped": (float(np.sum(totals) / everything) if everything else 0.0, ""),
+    }
