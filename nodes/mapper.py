@@ -46,10 +46,12 @@ class Mapper(Node):
         loss: str = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
         sh_degree: int = 0  # of the view-dependent color, 0 to 3
         exposure: bool = False  # train a color affine for each keyframe
+        refine_poses: bool = False  # train the keyframes' poses too
         unexplored: bool = True  # add splats only where the map does not explain the image
         unexplored_psnr: float = 25.0  # dB of a pixel; below: unexplored (the paper: 40)
         voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
         map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
+        map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another
         density_control: str = "adaptive"  # adaptive, relocate or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls
@@ -191,7 +193,7 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
         device=device,
         training=TrainingConfig(
             density=config.density, betas=config.betas, exposure=config.exposure, threads=config.threads,
-            loss=_loss(config.loss),
+            poses=config.refine_poses, loss=_loss(config.loss),
         ),
         skipping=SkipConfig(
             converged=config.skip_converged, tiles=config.skip_tiles, coarse_to_fine=config.coarse_to_fine,
@@ -200,7 +202,7 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
         rates=LearningRates(),
         insertion=InsertionConfig(
             unexplored=config.unexplored, unexplored_psnr=config.unexplored_psnr, voxel=config.voxel,
-            map_voxel=config.map_voxel,
+            map_voxel=config.map_voxel, map_voxel_error=config.map_voxel_error,
         ),
         density_control=DensityConfig(mode=config.density_control, max_splats=config.max_splats),
     )  # fmt: skip

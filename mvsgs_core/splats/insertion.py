@@ -26,6 +26,7 @@ class InsertionConfig:
     unexplored_opacity: float = 0.5  # rendered opacity below: unexplored, whatever the color
     voxel: float = 0.01  # edge of the voxel filter in median depths; 0: no filter
     map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
+    map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another; inf: none
     initial_scale: float = 0.5  # standard deviation in spacings of the points
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
@@ -62,6 +63,19 @@ def unexplored_mask(
     """
     squared = np.mean((rendered - observed) ** 2, axis=-1)
     return (squared > 10.0 ** (-config.unexplored_psnr / 10.0)) | (opacity < config.unexplored_opacity)
+
+
+def outliers(rendered: np.ndarray, opacity: np.ndarray, observed: np.ndarray, config: InsertionConfig) -> np.ndarray:
+    """Pixels (H, W) bool whose RMS error over RGB is `map_voxel_error` times the median of the pixels that are mapped.
+
+    The median is what blur, noise, exposure and a pose's error do to this view: no splat mends that. Where a view is
+    explained to the decibel it is small, and detail that the map lacks stands out.
+    """
+    squared = np.mean((rendered - observed) ** 2, axis=-1)
+    mapped = opacity >= config.unexplored_opacity
+    if not mapped.any():
+        return np.ones(squared.shape, dtype=bool)
+    return squared > config.map_voxel_error**2 * np.median(squared[mapped])
 
 
 def points_from_depth(

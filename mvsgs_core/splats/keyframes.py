@@ -37,6 +37,10 @@ class TrainingView:
     local_from_cam: np.ndarray  # (4, 4) float64, in the mapper's frame and unit
     exposure: Tensor  # (3, 4) color affine [A | b]
     exposure_moments: tuple[Tensor, Tensor]
+    pose_delta: np.ndarray = field(default_factory=lambda: np.eye(4))  # (4, 4) from the tracker's camera to the refined
+    pose_moments: np.ndarray = field(default_factory=lambda: np.zeros((2, 6)))  # of (translation, rotation)
+    pose_steps: int = 0
+    fixed: bool = False  # its pose is not refined: it holds the frame of reference
     median_depth: float = 0.0  # of its depth map, in the mapper's unit; 0: it has none
     valid: list[Tensor] | None = None  # (H, W) bool for each level; None: every pixel is
     visits: int = 0  # training iterations so far
@@ -44,6 +48,11 @@ class TrainingView:
     loss_fast: float = field(default=float("nan"))  # running means of the full-resolution loss
     loss_slow: float = field(default=float("nan"))
     tile_error: Tensor | None = None  # (rows, columns) mean absolute error of each tile at full resolution
+
+    @property
+    def refined_from_cam(self) -> np.ndarray:
+        """(4, 4) the pose to train and render from: the tracker's, and what the map made of it."""
+        return self.local_from_cam @ self.pose_delta
 
     def size(self, level: int) -> tuple[int, int]:
         height, width = self.levels[level].shape[:2]

@@ -21,6 +21,7 @@ from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.insertion import (
     InsertionConfig,
     depth_colors,
+    outliers,
     points_from_depth,
     splats_from_points,
     unexplored_mask,
@@ -137,6 +138,7 @@ class OnlineMapper:
             view, self._local(pose), self.config.max_pixels, self.config.skipping.levels, self.state.device
         )
         added.world_from_cam, added.scale, added.median_depth = pose, scale, median / (self.unit or 1.0)
+        added.fixed = not self.views
         self.views.append(added)
         if added.valid is not None:
             self.log.refuse(
@@ -190,6 +192,7 @@ class OnlineMapper:
             similarity = Similarity.between(view.local_from_cam, self._local(pose), s / view.scale)
             view.world_from_cam, view.local_from_cam = pose, self._local(pose)
             view.median_depth *= s / view.scale
+            view.pose_delta[:3, 3] *= s / view.scale
             view.scale = s
             if similarity.moves(max(view.median_depth, 1e-6)):
                 moved[key] = similarity
@@ -204,7 +207,7 @@ class OnlineMapper:
         """The map from a keyframe's pose, without gradients."""
         with torch.no_grad():
             return rasterize(
-                self.state.detached(), view.local_from_cam, view.intrinsics[level], view.size(level),
+                self.state.detached(), view.refined_from_cam, view.intrinsics[level], view.size(level),
                 density=self.config.training.density, near=self.config.training.near * self.median_depth,
                 backend=self.config.training.backend, exposure=view.exposure if self.config.training.exposure else None,
                 antialiased=self.config.training.antialiased, threads=self.config.training.threads,
@@ -221,7 +224,7 @@ class OnlineMapper:
         )
         train_once(
             self.state, view, config.training, config.skipping, factors, config.rates.decay_steps,
-            self.median_depth, refining, self.log,
+            self.median_depth, self.global_rate, refining, self.log,
         )  # fmt: skip
         self.iterations += 1
         self.log.count("iterations")
@@ -239,31 +242,32 @@ class OnlineMapper:
             valid &= view.confidence >= config.min_confidence
         if added.valid is not None:
             valid &= camera.resize_image(added.valid[0].cpu().numpy().astype(np.float32), size) > 0.999
-        mask = valid
-        if config.unexplored and len(self.state):
+        mask, standing_out = valid, np.zeros(size, dtype=bool)
+        occupancy = config.map_voxel > 0 and len(self.state) > 0
+        if (config.unexplored or occupancy) and len(self.state):
             level = self._level_of(added, size)
             render = self.render(added, level)
-            observed = added.target(level).cpu().numpy()
-            unexplored = unexplored_mask(
-                render.color.cpu().numpy(), render.opacity.cpu().numpy(), observed, config
-            ).astype(np.float32)
-            mask = valid & (camera.resize_image(unexplored, size) > 0.5)
-            self.log.skip("points_explored", int(valid.sum() - mask.sum()))
+            images = render.color.cpu().numpy(), render.opacity.cpu().numpy(), added.target(level).cpu().numpy()
+            if config.unexplored:
+                mask = valid & _resized(unexplored_mask(*images, config), size)
+                self.log.skip("points_explored", int(valid.sum() - mask.sum()))
+            if occupancy and config.map_voxel_error < float("inf"):
+                standing_out = _resized(outliers(*images, config), size)
         intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
         colors = depth_colors(added.levels[0].cpu().numpy(), size)
         assert self.unit is not None
         points = points_from_depth(depth / self.unit, intrinsics, colors, view.normals, mask)
+        if occupancy and len(points):
+            pose = added.local_from_cam
+            positions = points.positions @ pose[:3, :3].T + pose[:3, 3]
+            means = self.state.splats.means.detach().cpu().numpy()
+            free = unoccupied(positions, means, config.map_voxel * self.median_depth) | standing_out[mask]
+            self.log.skip("points_occupied", int((~free).sum()))
+            points = points.where(free)
         if config.voxel > 0 and len(points):
             before = len(points)
             points = voxel_filter(points, config.voxel * self.median_depth)
             self.log.skip("points_voxel_filter", before - len(points))
-        if config.map_voxel > 0 and len(self.state):
-            pose = added.local_from_cam
-            positions = points.positions @ pose[:3, :3].T + pose[:3, 3]
-            means = self.state.splats.means.detach().cpu().numpy()
-            free = unoccupied(positions, means, config.map_voxel * self.median_depth)
-            self.log.skip("points_occupied", int((~free).sum()))
-            points = points.where(free)
         room = self.config.density_control.max_splats - len(self.state)
         if len(points) > room:
             self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
@@ -289,3 +293,8 @@ class OnlineMapper:
         if bad.any():
             self.log.refuse("depths", int(bad.sum()), "depths that are not finite or negative were left out")
         return np.where(bad, 0.0, view.depth).astype(np.float32)
+
+
+def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask (H, W) bool at another size, by majority."""
+    return np.asarray(camera.resize_image(mask.astype(np.float32), size) > 0.5)

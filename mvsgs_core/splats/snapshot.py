@@ -23,7 +23,7 @@ class Snapshot:
     density: str
     iterations: int
     keyframes: np.ndarray  # (K,) int64
-    world_from_cam: np.ndarray  # (K, 4, 4) float64, world frame (not relative to the origin)
+    world_from_cam: np.ndarray  # (K, 4, 4) float64, as refined, world frame (not relative to the origin)
     scale: np.ndarray  # (K,) float64
     exposures: np.ndarray  # (K, 3, 4) float32
 
@@ -50,9 +50,15 @@ def snapshot(
         density=density,
         iterations=iterations,
         keyframes=np.array([view.index for view in views], dtype=np.int64),
-        world_from_cam=np.stack([v.world_from_cam for v in views]) if count else np.zeros((0, 4, 4)),
+        world_from_cam=np.stack([_refined(v, length) for v in views]) if count else np.zeros((0, 4, 4)),
         scale=np.array([view.scale for view in views], dtype=np.float64),
         exposures=np.stack([v.exposure.detach().cpu().numpy() for v in views]).astype(np.float32)
         if count
         else np.zeros((0, 3, 4), dtype=np.float32),
     )
+
+
+def _refined(view: TrainingView, length: float) -> np.ndarray:
+    delta = view.pose_delta.copy()
+    delta[:3, 3] *= length
+    return view.world_from_cam @ delta

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mvsgs_core.splats import optimizer
+from mvsgs_core.splats.camera_steps import step_exposure, step_pose
 from mvsgs_core.splats.keyframes import TrainingView
 from mvsgs_core.splats.losses import LossConfig, frequency_of, ges_loss
 from mvsgs_core.splats.map_state import MapState
@@ -23,6 +24,9 @@ class TrainingConfig:
     betas: bool = False  # train the shape; without effect for density "gaussian"
     exposure: bool = False  # train a color affine for each keyframe
     exposure_rate: float = 1e-3  # learning rate of it
+    poses: bool = False  # train the keyframes' poses, the first one's excepted
+    pose_rate: float = 2e-4  # learning rate of them, radians and median depths a step
+    pose_visits: int = 5  # iterations on a keyframe before its pose is trained: new splats show nothing new
     antialiased: bool = False
     near: float = 1e-3  # splats nearer than this many median depths are left out
     backend: str = "auto"
@@ -80,6 +84,7 @@ def train_once(
     groups: list[optimizer.Group],
     decay_steps: int,
     median_depth: float,
+    global_rate: float,
     refining: bool,
     log: Log,
 ) -> None:
@@ -87,9 +92,11 @@ def train_once(
     level = 0 if refining else level_of_visit(view, skipping)
     tiles = busy_tiles(view, skipping) if skipping.tiles and level == 0 and not refining else None
     exposure = view.exposure.requires_grad_(True) if training.exposure else None
+    moving = training.poses and not view.fixed and view.visits >= training.pose_visits
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
     render = rasterize(
-        state.splats, view.local_from_cam, view.intrinsics[level], view.size(level),
-        density=training.density, backend=training.backend, exposure=exposure, tile_mask=tiles,
+        state.splats, view.refined_from_cam, view.intrinsics[level], view.size(level), density=training.density,
+        backend=training.backend, exposure=exposure, pose_delta=twist, tile_mask=tiles,
         near=training.near * median_depth, antialiased=training.antialiased, threads=training.threads,
     )  # fmt: skip
     target = view.target(level)
@@ -119,6 +126,10 @@ def train_once(
         log.skip("splats_unseen", len(state) - int(visible.sum()))
     if exposure is not None:
         step_exposure(view, training.exposure_rate)
+    if twist is not None and twist.grad is not None:
+        rate = training.pose_rate * global_rate
+        if not step_pose(view, twist.grad.numpy(), rate, rate * median_depth):
+            log.refuse("pose_steps", 1, "a step of a keyframe's pose that was not finite was refused")
     if level == 0 and tiles is None:
         view.record(value)
         if skipping.tiles:
@@ -135,21 +146,3 @@ def pixels_of_tiles(tiles: Tensor, size: tuple[int, int]) -> Tensor:
     """(H, W) bool: each pixel has its tile's value."""
     rows = tiles.repeat_interleave(TILE, dim=0)[: size[0]]
     return rows.repeat_interleave(TILE, dim=1)[:, : size[1]]
-
-
-@torch.no_grad()
-def step_exposure(view: TrainingView, rate: float) -> None:
-    """Adam on the color affine, drawn toward the identity, so that the map and not the exposure explains the color."""
-    gradient = view.exposure.grad
-    view.exposure.grad = None
-    view.exposure.requires_grad_(False)
-    if gradient is None or not bool(torch.isfinite(gradient).all()):
-        return
-    gradient = gradient + 1e-3 * (view.exposure - torch.eye(3, 4, device=view.exposure.device))
-    first, second = view.exposure_moments
-    steps = view.visits
-    first.mul_(optimizer.BETA_1).add_(gradient, alpha=1 - optimizer.BETA_1)
-    second.mul_(optimizer.BETA_2).addcmul_(gradient, gradient, value=1 - optimizer.BETA_2)
-    mean, square = first / (1 - optimizer.BETA_1**steps), second / (1 - optimizer.BETA_2**steps)
-    view.exposure -= rate * mean / (square.sqrt() + 1e-8)
-    view.exposure.clamp_(-4.0, 4.0)

@@ -9,6 +9,7 @@ import torch
 from mvsgs_core.splats.insertion import (
     InsertionConfig,
     Points,
+    outliers,
     points_from_depth,
     rotation_to,
     splats_from_points,
@@ -125,3 +126,17 @@ def test_a_voxel_that_holds_a_splat_needs_no_second() -> None:
     assert 0 < sum(expected) < len(expected)
     assert unoccupied(positions, means[:0], edge).all()
     assert unoccupied(positions[:0], means, edge).shape == (0,)
+
+
+def test_outliers_are_told_from_what_the_whole_view_suffers_from() -> None:
+    observed = np.full((4, 10, 3), 0.5)
+    opacity = np.ones((4, 10))
+    opacity[3] = 0.0
+    noisy, clean = observed + 0.1, observed + 0.01
+    for rendered in (noisy, clean):
+        rendered[3] += 0.3  # not mapped: does not count in the median
+        rendered[0, 0] = observed[0, 0] + 0.2
+    config = InsertionConfig(map_voxel_error=3.0)
+    assert not outliers(noisy, opacity, observed, config)[:3].any()
+    assert np.argwhere(outliers(clean, opacity, observed, config)[:3]).tolist() == [[0, 0]]
+    assert outliers(noisy, np.zeros((4, 10)), observed, config).all()

@@ -1,0 +1,47 @@
+"""Adam on what belongs to a keyframe's camera and not to the map: its color affine and its pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from mvsgs_core import geometry
+from mvsgs_core.splats.keyframes import TrainingView
+from mvsgs_core.splats.optimizer import BETA_1, BETA_2
+
+
+@torch.no_grad()
+def step_exposure(view: TrainingView, rate: float) -> None:
+    """Adam on the color affine, drawn toward the identity, so that the map and not the exposure explains the color."""
+    gradient = view.exposure.grad
+    view.exposure.grad = None
+    view.exposure.requires_grad_(False)
+    if gradient is None or not bool(torch.isfinite(gradient).all()):
+        return
+    gradient = gradient + 1e-3 * (view.exposure - torch.eye(3, 4, device=view.exposure.device))
+    first, second = view.exposure_moments
+    steps = view.visits
+    first.mul_(BETA_1).add_(gradient, alpha=1 - BETA_1)
+    second.mul_(BETA_2).addcmul_(gradient, gradient, value=1 - BETA_2)
+    mean, square = first / (1 - BETA_1**steps), second / (1 - BETA_2**steps)
+    view.exposure -= rate * mean / (square.sqrt() + 1e-8)
+    view.exposure.clamp_(-4.0, 4.0)
+
+
+def step_pose(view: TrainingView, gradient: np.ndarray, angle: float, length: float) -> bool:
+    """Adam on the pose: composes the view's `pose_delta` with a twist in the camera's frame, in float64.
+
+    gradient: (6,) of the loss by (translation, rotation) of the camera's frame. angle, length: the rates, radians and
+    the mapper's unit a step. Returns False, and leaves all as it was, where the gradient is not finite.
+    """
+    if not np.isfinite(gradient).all():
+        return False
+    rates = np.array([length] * 3 + [angle] * 3)
+    view.pose_steps += 1
+    first, second = view.pose_moments
+    first[:] = BETA_1 * first + (1 - BETA_1) * gradient
+    second[:] = BETA_2 * second + (1 - BETA_2) * gradient**2
+    mean, square = first / (1 - BETA_1**view.pose_steps), second / (1 - BETA_2**view.pose_steps)
+    twist = -rates * mean / (np.sqrt(square) + 1e-15)
+    view.pose_delta = view.pose_delta @ geometry.se3_exp(twist)
+    return True
