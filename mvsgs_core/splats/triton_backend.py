@@ -1,4 +1,8 @@
-"""The rasterizer for GPUs: projection and lists in PyTorch, blending in Triton, no CUDA compiler needed."""
+"""The rasterizer for GPUs in Triton: no CUDA compiler needed, no float atomics, the same result every time.
+
+Project (with the pairs counted), sort by depth, list the pairs, sort by tile, blend; backward: blend, sum up by splat,
+project. The host waits once a view, for the number of pairs.
+"""
 
 from __future__ import annotations
 
@@ -9,93 +13,144 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mvsgs_core.splats import densities, rasterizer, reference
+from mvsgs_core.splats import rasterizer
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.rasterizer import Render, View
 
 try:
-    from mvsgs_core.splats import triton_kernels
+    import triton
+
+    from mvsgs_core.splats.triton_blend import SUMS, blend, blend_backward
+    from mvsgs_core.splats.triton_lists import Lists, emit, sort_by_tile
+    from mvsgs_core.splats.triton_projection import FOOTPRINT, ROW, project
+    from mvsgs_core.splats.triton_projection_backward import project_backward
 except ModuleNotFoundError as error:
     raise ImportError(
         "the triton back end needs the package triton, which comes with torch's CUDA builds: take backend='cpu'"
     ) from error
 
+BLOCK = 64  # splats of a program
+MOST_PAIRS = 1 << 31  # places are 32-bit integers
+LAUNCH = {"num_warps": 2, "enable_fp_fusion": True}
+LAUNCH_TILE = {"num_warps": 1, "enable_fp_fusion": True}
+
 
 @dataclass
-class Lists:
-    """The splats of every tile, front to back."""
+class Pass:
+    """What the backward pass reads again."""
 
-    pair_splats: Tensor  # (P,) int32, index into the shown splats
-    tile_begin: Tensor  # (tiles + 1,) int32
-    by_splat: Tensor  # (P,) int64, the pairs in the order of their splats
-    counts: Tensor  # (V,) int64, pairs of each splat
-
-
-def tile_lists(centers: Tensor, half_sizes: Tensor, view: View) -> Lists:
-    """Lists from the boxes that hold every splat's ellipse; centers, half_sizes: (V, 2) px, ordered by depth."""
-    rows, columns = rasterizer.tile_grid(view.size)
-    most = torch.tensor([columns - 1, rows - 1], device=centers.device)
-    first = ((centers - half_sizes) / rasterizer.TILE).floor().clamp(min=0).minimum(most).long()
-    last = ((centers + half_sizes) / rasterizer.TILE).floor().clamp(min=0).minimum(most).long()
-    span = last - first + 1
-    counts = span.prod(dim=1)
-    splat = torch.repeat_interleave(torch.arange(len(centers), device=centers.device), counts)
-    within = torch.arange(len(splat), device=centers.device) - (counts.cumsum(0) - counts)[splat]
-    x = first[splat, 0] + within % span[splat, 0]
-    y = first[splat, 1] + within // span[splat, 0]
-    tile = y * columns + x
-    if view.tile_mask is not None:
-        wanted = view.tile_mask.to(centers.device).flatten()[tile]
-        tile, splat = tile[wanted], splat[wanted]
-    tile, order = torch.sort(tile, stable=True)
-    splat = splat[order]
-    per_tile = torch.bincount(tile, minlength=rows * columns)
-    return Lists(
-        pair_splats=splat.int(),
-        tile_begin=torch.nn.functional.pad(per_tile.cumsum(0), (1, 0)).int(),
-        by_splat=torch.argsort(splat, stable=True),
-        counts=torch.bincount(splat, minlength=len(centers)),
-    )
+    camera: Tensor  # (16,) float64 world_from_cam by rows, on the device
+    rows: Tensor  # (N, ROW)
+    radii: Tensor  # (N,) px, 0 if not seen
+    lists: Lists
+    refused: int
 
 
-def per_splat(pair_values: Tensor, lists: Lists, reduce: str) -> Tensor:
-    """(V, ...) "sum" or "max" over the pairs of each splat, in a fixed order."""
-    if not len(lists.counts):
-        return pair_values.new_zeros(0, *pair_values.shape[1:])
-    return torch.segment_reduce(pair_values[lists.by_splat], reduce, lengths=lists.counts, initial=0.0)
+def projected(parameters: list[Tensor], view: View) -> Pass:
+    """Projects and lists the splats of `parameters`, the fields of `Splats`. Raises ValueError for too many pairs."""
+    means, sh = parameters[0], parameters[4]
+    count, device = len(means), means.device
+    height, width = view.size
+    tiles_y, tiles_x = rasterizer.tile_grid(view.size)
+    tiles = tiles_y * tiles_x
+    camera = view.pose.detach().reshape(-1).to(device)
+    rows, footprints = means.new_empty(count, ROW), means.new_empty(count, FOOTPRINT)
+    depths, radii = means.new_empty(2, count).unbind(0)
+    pairs = torch.empty(count, dtype=torch.int32, device=device)
+    programs = triton.cdiv(count, BLOCK)
+    refused = torch.zeros(max(1, programs), dtype=torch.int32, device=device)
+    if count:
+        project[(programs,)](
+            *parameters, camera, rows, footprints, depths, radii, pairs, refused, count, width, height,
+            *view.intrinsics, view.near, BASES=sh.shape[1], USED=(view.degree + 1) ** 2, EXACT=view.density == "exact",
+            ANTIALIASED=view.antialiased, BLOCK=BLOCK, ROW=ROW, FOOTPRINT=FOOTPRINT, **LAUNCH,
+        )  # fmt: skip
+    order = torch.argsort(depths, stable=True)
+    ends = torch.cumsum(pairs[order], dim=0, dtype=torch.int64)
+    slots = torch.empty_like(pairs)
+    slots[order] = (ends - pairs[order]).int()
+    total, left_out = torch.stack([pairs.sum(dtype=torch.int64), refused.sum()]).tolist()  # the host waits here
+    if total >= MOST_PAIRS:
+        raise ValueError(f"{total} pairs of splats and tiles are too many for a view: fewer or smaller splats are")
+    pair_tiles = torch.full((total,), tiles, dtype=torch.int32, device=device)
+    pair_splats = torch.zeros(total, dtype=torch.int32, device=device)
+    mask = None if view.tile_mask is None else view.tile_mask.to(device=device, dtype=torch.uint8)
+    if total:
+        emit[(triton.cdiv(count, 32),)](
+            order, rows, footprints, radii, slots, pairs, pair_tiles if mask is None else mask, pair_tiles,
+            pair_splats, count, width, height, tiles_x, tiles, MASKED=mask is not None, BLOCK=32, ROW=ROW,
+            FOOTPRINT=FOOTPRINT, **LAUNCH_TILE,
+        )  # fmt: skip
+    lists = Lists(*sort_by_tile(pair_tiles, pair_splats, tiles), slots, pairs)
+    return Pass(camera, rows, radii, lists, int(left_out))
 
 
-class _Blend(torch.autograd.Function):
-    """Rows of splats (V, 11) -> image (H, W, 5): color over the background, sum of w z, transmittance."""
+class _Rasterize(torch.autograd.Function):
+    """(parameters, screen, pose) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
 
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, lists: Lists, view: View, pair_weights: Tensor) -> Tensor:
-        rows = rows.detach().contiguous()
+    def forward(
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor,
+        betas: Tensor, screen: Tensor, pose: Tensor, view: View, extra: dict[str, Any],
+    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+        parameters = [t.detach().contiguous() for t in (means, log_scales, quaternions, opacity_logits, sh, betas)]
+        passed = projected(parameters, view)
+        lists = passed.lists
         height, width = view.size
         tiles_y, tiles_x = rasterizer.tile_grid(view.size)
-        image = rows.new_empty(height, width, 5)
-        background = torch.tensor(view.background, dtype=torch.float32, device=rows.device)
-        triton_kernels.blend[(tiles_y * tiles_x,)](
-            rows, lists.pair_splats, lists.tile_begin, image, background, pair_weights, height, width, tiles_x,
-            COLUMNS=triton_kernels.COLUMNS, EXACT=view.density == "exact", WEIGHTS=view.weights,
+        color = means.new_empty(height, width, 3)
+        depth, opacity = means.new_empty(2, height, width).unbind(0)
+        weights = means.new_zeros(2, len(lists.pair_splats) if view.weights else 1)
+        blend[(tiles_y * tiles_x,)](
+            passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
+            weights[1], *view.background, height, width, tiles_x, EXACT=view.density == "exact", WEIGHTS=view.weights,
+            ROW=ROW, **LAUNCH_TILE,
         )  # fmt: skip
-        ctx.lists, ctx.view = lists, view
-        ctx.save_for_backward(rows, image)
-        return image
+        extra.update(passed=passed)
+        if view.weights:
+            extra["weight_sum"] = lists.sums(weights[0][:, None])[:, 0]
+            extra["weight_max"] = lists.sums(weights[1][:, None], largest=True)[:, 0]
+        ctx.passed, ctx.view = passed, view
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*parameters, color, depth, opacity)
+        return color, depth, opacity
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        rows, image = ctx.saved_tensors
-        lists, view = ctx.lists, ctx.view
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        *parameters, color, depth, opacity = ctx.saved_tensors
+        passed, view = ctx.passed, ctx.view
+        lists, count = passed.lists, len(parameters[0])
         height, width = view.size
         tiles_y, tiles_x = rasterizer.tile_grid(view.size)
-        sums = rows.new_zeros(len(lists.pair_splats), triton_kernels.COLUMNS)
-        triton_kernels.blend_backward[(tiles_y * tiles_x,)](
-            rows, lists.pair_splats, lists.tile_begin, image, gradient.contiguous(), sums, height, width, tiles_x,
-            COLUMNS=triton_kernels.COLUMNS, EXACT=view.density == "exact",
+        outputs = (color, depth, opacity)
+        on_color, on_depth, on_opacity = (
+            torch.zeros_like(output) if gradient is None else gradient.contiguous()
+            for output, gradient in zip(outputs, gradients)
+        )
+        sums = color.new_zeros(len(lists.pair_splats), SUMS)
+        exact = view.density == "exact"
+        blend_backward[(tiles_y * tiles_x,)](
+            passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, *outputs, on_color, on_depth,
+            on_opacity, sums, height, width, tiles_x, EXACT=exact, DEPTH=any(g is not None for g in gradients[1:]),
+            SUMS=SUMS, ROW=ROW, **LAUNCH_TILE,
         )  # fmt: skip
-        return per_splat(sums, lists, "sum"), None, None, None
+        results = [torch.empty_like(parameter) for parameter in parameters]
+        on_screen = color.new_empty(count, 2)
+        programs = triton.cdiv(count, BLOCK)
+        wants_pose = ctx.needs_input_grad[7]
+        on_pose = torch.zeros(max(1, programs), 12, dtype=torch.float64, device=color.device)
+        if count:
+            project_backward[(programs,)](
+                *parameters, passed.camera, passed.rows, lists.sums(sums), lists.pairs, *results, on_screen, on_pose,
+                count, width, height, *view.intrinsics, BASES=parameters[4].shape[1], USED=(view.degree + 1) ** 2,
+                EXACT=exact, ANTIALIASED=view.antialiased, POSE=wants_pose, BLOCK=BLOCK, ROW=ROW, SUMS=SUMS, **LAUNCH,
+            )  # fmt: skip
+        pose = None
+        if wants_pose:
+            pose = torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(view.pose.device)
+        *shared, on_betas = results
+        return (*shared, on_betas if exact else None, on_screen, pose, None, None)
 
 
 def render(splats: Splats, view: View) -> Render:
@@ -103,36 +158,17 @@ def render(splats: Splats, view: View) -> Render:
     if splats.means.dtype != torch.float32:
         raise ValueError(f"the triton back end takes float32 splats, got {splats.means.dtype}")
     screen = rasterizer.screen_points(splats, view)
-    choice = reference.choose(splats, view)
-    shown = Splats(*(tensor.index_select(0, choice.order) for tensor in splats.tensors().values()))
-    p = reference.project(shown, screen.index_select(0, choice.order), view)
-    lists = tile_lists(p.centers.detach(), choice.half_sizes, view)
-    betas = (p.betas if view.density == "exact" else p.betas.detach()).clamp(*densities.BETA_RANGE)
-    rows = torch.stack(
-        [
-            p.centers[:, 0], p.centers[:, 1], (p.yy / p.determinant).sqrt(), p.xy / p.yy, p.yy.rsqrt(),
-            torch.log2(p.opacity), *p.colors.unbind(-1), p.depths, 0.5 * betas,
-        ],
-        dim=1,
-    )  # fmt: skip
-    pair_weights = splats.means.new_zeros(len(lists.pair_splats) if view.weights else 1, 2)
-    image: Tensor = _Blend.apply(rows, lists, view, pair_weights)
-    opacity = 1.0 - image[..., 4]
-    covered = opacity > 0
-    depth = torch.where(covered, image[..., 3], 0.0) / torch.where(covered, opacity, 1.0)
-    radii, weight_sum, weight_max = splats.means.new_zeros(3, len(splats)).unbind(0)
-    if view.weights:
-        weight_sum[choice.order] = per_splat(pair_weights[:, 0], lists, "sum")
-        weight_max[choice.order] = per_splat(pair_weights[:, 1], lists, "max")
-    radii[choice.order] = choice.half_sizes.amax(dim=1)
+    extra: dict[str, Any] = {}
+    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), screen, view.pose, view, extra)
+    passed: Pass = extra["passed"]
     return Render(
-        color=image[..., :3],
+        color=color,
         depth=depth,
         opacity=opacity,
-        visible=radii > 0,
-        radii=radii,
+        visible=passed.radii > 0,
+        radii=passed.radii,
         screen=screen,
-        weight_sum=weight_sum if view.weights else None,
-        weight_max=weight_max if view.weights else None,
-        refused=choice.refused,
+        weight_sum=extra.get("weight_sum"),
+        weight_max=extra.get("weight_max"),
+        refused=passed.refused,
     )

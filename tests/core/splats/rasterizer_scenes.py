@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -27,9 +29,14 @@ def random_splats(count: int, bases: int = 4, seed: int = 0, log_scale: float = 
     )
 
 
-def copy(splats: Splats, dtype: torch.dtype = torch.float32) -> Splats:
+def copy(splats: Splats, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Splats:
     """The same values as leaves that take gradients."""
-    return Splats(*(t.detach().to(dtype).clone().requires_grad_() for t in splats.tensors().values()))
+    return Splats(*(t.detach().to(device, dtype, copy=True).requires_grad_() for t in splats.tensors().values()))
+
+
+def device_of(backend: str) -> str:
+    """Where a back end is tested: Triton on a GPU where there is one, else its interpreter on the CPU."""
+    return "cuda" if backend == "triton" and torch.cuda.is_available() else "cpu"
 
 
 def intrinsics(size: tuple[int, int]) -> np.ndarray:
@@ -37,23 +44,21 @@ def intrinsics(size: tuple[int, int]) -> np.ndarray:
     return np.array([0.9 * width, 0.95 * width, 0.5 * width - 0.7, 0.5 * height - 0.2])
 
 
-def gradients(
-    splats: Splats, size: tuple[int, int], seed: int = 1, **options: object
-) -> tuple[Render, dict[str, Tensor]]:
+def gradients(splats: Splats, size: tuple[int, int], seed: int = 1, **options: Any) -> tuple[Render, dict[str, Tensor]]:
     """A render, and the gradients of a random weighting of color, depth and opacity by every input."""
     g = torch.Generator().manual_seed(seed)
     delta = torch.full((6,), 0.01, dtype=torch.float64, requires_grad=True)
-    exposure = (torch.eye(3, 4) + 0.05).to(splats.means.dtype).requires_grad_()
+    exposure = (torch.eye(3, 4) + 0.05).to(splats.means).requires_grad_()
     render = rasterize(
         splats, POSE, intrinsics(size), size, background=np.array([0.1, 0.2, 0.3]), pose_delta=delta,
-        exposure=exposure, weights=True, **options,  # type: ignore[arg-type]
+        exposure=exposure, weights=True, **options,
     )  # fmt: skip
     loss = sum(
-        (image * torch.randn(image.shape, generator=g, dtype=torch.float64)).sum()
+        (image * torch.randn(image.shape, generator=g, dtype=torch.float64).to(image.device)).sum()
         for image in (render.color, render.depth, render.opacity)
     )
     assert isinstance(loss, Tensor)
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward()
     found = {name: t.grad for name, t in splats.tensors().items() if t.grad is not None}
     assert render.screen.grad is not None
     assert delta.grad is not None
@@ -65,26 +70,26 @@ def relative_error(value: Tensor, truth: Tensor) -> float:
     """Largest difference over the largest magnitude of the truth."""
     if truth.numel() == 0:
         return 0.0
-    return float((value.double() - truth.double()).abs().max() / truth.double().abs().max().clamp(min=1e-12))
+    return float((value.cpu().double() - truth.double()).abs().max() / truth.double().abs().max().clamp(min=1e-12))
 
 
-def assert_agree(splats: Splats, size: tuple[int, int], backend: str, **options: object) -> None:
+def assert_agree(splats: Splats, size: tuple[int, int], backend: str, **options: Any) -> None:
     """A back end in float32 against the reference in float64: images within 1e-5, gradients within 1e-3.
 
     A pixel whose alpha lies within rounding of 1/255, or whose transmittance lies within rounding of 1e-4, may fall on
     the other side: at most 1 in 2000 may, and then by no more than such a splat weighs.
     """
-    render, found = gradients(copy(splats), size, backend=backend, **options)
+    render, found = gradients(copy(splats, device=device_of(backend)), size, backend=backend, **options)
     truth, expected = gradients(copy(splats, torch.float64), size, backend="reference", **options)
     for name in ("color", "depth", "opacity"):
-        value, wanted = getattr(render, name).detach().double(), getattr(truth, name).detach()
+        value, wanted = getattr(render, name).detach().cpu().double(), getattr(truth, name).detach()
         error = (value - wanted).abs() / max(1.0, float(wanted.abs().max()))
         assert float((error > 1e-5).double().mean()) <= 5e-4, name
         assert float(error.max()) < 1e-2, name
     assert found.keys() == expected.keys()
     for name, wanted in expected.items():
         assert relative_error(found[name], wanted) < 1e-3, name
-    assert bool((render.visible == truth.visible).all())
+    assert bool((render.visible.cpu() == truth.visible).all())
     assert render.refused == truth.refused
     assert relative_error(render.weight_sum, truth.weight_sum) < 1e-3  # type: ignore[arg-type]
     assert relative_error(render.weight_max, truth.weight_max) < 1e-2  # type: ignore[arg-type]

@@ -1,43 +1,144 @@
-"""The Triton back end against the reference: on a GPU where there is one, else in Triton's interpreter."""
+"""The Triton back end against the other two: on a GPU where there is one, else in Triton's interpreter."""
 
 from __future__ import annotations
 
 import os
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+
+from mvsgs_core import native
+from mvsgs_core.splats import rasterizer
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.rasterizer import Render, rasterize
+from tests.core.splats.rasterizer_scenes import (
+    POSE,
+    assert_agree,
+    copy,
+    device_of,
+    gradients,
+    intrinsics,
+    random_splats,
+    relative_error,
+)
+from tests.core.splats.test_rasterizer_adversarial import assert_finite, extremes
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # read when triton is first imported
 pytest.importorskip("triton", reason="triton is not installed: pip install triton to run its interpreter")
 
-from mvsgs_core.splats import rasterizer
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
-from tests.core.splats.rasterizer_scenes import POSE, assert_agree, intrinsics, random_splats
+SIZE = (20, 35)
+DEVICE = device_of("triton")
 
 
 @pytest.mark.parametrize("density", ["gaussian", "exact", "ges_scale"])
 def test_random_scene(density: str) -> None:
-    assert_agree(random_splats(40), (20, 35), "triton", density=density)
+    assert_agree(random_splats(40), SIZE, "triton", density=density)
+
+
+def test_harmonics_of_degree_three_and_what_a_lower_degree_leaves_out() -> None:
+    assert_agree(random_splats(30, bases=16), SIZE, "triton", antialiased=True)
+    assert_agree(random_splats(15, bases=9), SIZE, "triton", degree=1)
 
 
 def test_full_pixels_end_and_tiles_left_out() -> None:
-    splats, size = random_splats(60, bases=1, log_scale=-1.0), (20, 35)
+    splats = random_splats(30, bases=1, log_scale=-1.0)
     splats.opacity_logits += 6.0
-    mask = torch.ones(rasterizer.tile_grid(size), dtype=torch.bool)
+    mask = torch.ones(rasterizer.tile_grid(SIZE), dtype=torch.bool)
     mask[0, 1] = False
-    assert_agree(splats, size, "triton", tile_mask=mask, antialiased=True)
+    assert_agree(splats, SIZE, "triton", tile_mask=mask, antialiased=True)
 
 
-def test_zero_splats() -> None:
-    render = rasterize(Splats.empty(), POSE, intrinsics((9, 9)), (9, 9), backend="triton")
-    assert not bool(render.opacity.any())
+def needles(count: int) -> Splats:
+    """Splats of many tiles, most of them long and thin and across the rows."""
+    splats = random_splats(count, bases=1, log_scale=-4.0)
+    splats.log_scales[:, 0] = torch.linspace(-4.0, 0.5, count)
+    return splats
 
 
-def test_not_finite() -> None:
+def pairs_of(splats: Splats, size: tuple[int, int], density: str, mask: torch.Tensor | None) -> tuple[int, list[int]]:
+    """(pairs that the C++ kernel blends, pairs of each tile in the Triton lists)."""
+    from mvsgs_core.splats import triton_backend
+
+    view = rasterizer.View(
+        pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, density=density,
+        background=(0.0, 0.0, 0.0), tile_mask=mask, near=1e-3, antialiased=False, degree=0, weights=False, threads=1,
+    )  # fmt: skip
+    passed = native.load("splats").forward(
+        *splats.tensors().values(), pose=view.pose, intrinsics=view.intrinsics, near=view.near,
+        background=view.background, exact=density == "exact", antialiased=False, degree=0, tile_mask=mask,
+        weights=False, threads=1, color=torch.empty(*size, 3), depth=torch.empty(size), opacity=torch.empty(size),
+        radii=torch.empty(len(splats)),
+    )  # fmt: skip
+    lists = triton_backend.projected([tensor.to(DEVICE) for tensor in splats.tensors().values()], view).lists
+    return passed.pairs, lists.tile_begin.diff().tolist()
+
+
+@pytest.mark.parametrize("density", ["gaussian", "exact"])
+def test_as_many_pairs_as_the_kernel_for_cpus(density: str) -> None:
+    """Exact spans of the ellipses on each row of blocks, no boxes."""
+    size = (70, 90)
+    for splats in (random_splats(80, bases=1), needles(40)):
+        expected, per_tile = pairs_of(splats, size, density, None)
+        assert sum(per_tile) == expected > 100
+    mask = torch.arange(30).reshape(rasterizer.tile_grid(size)) % 3 > 0
+    expected, per_tile = pairs_of(needles(40), size, density, mask)
+    assert sum(per_tile) == expected
+    assert not any(np.array(per_tile)[~mask.flatten().numpy()])
+
+
+def test_the_same_every_time() -> None:
+    runs = [gradients(copy(needles(20), device=DEVICE), SIZE, backend="triton") for _ in range(2)]
+    assert all(torch.equal(found, runs[1][1][name]) for name, found in runs[0][1].items())
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of the interpreter: overflow is what is provoked here
+@pytest.mark.parametrize(
+    "name",
+    [
+        "zero quaternions", "scales from 1e-12 to 1e6", "scales beyond float32", "aspect 1:1e5", "opacity 0 and 1",
+        "exponents out of range", "at and behind the near plane", "in the camera", "far away",
+    ],
+)  # fmt: skip
+def test_extremes(name: str) -> None:
+    options: dict[str, Any] = {"density": "exact", "antialiased": True}
+    splats = Splats(*(tensor[::2] for tensor in extremes(name).tensors().values()))
+    render, found = gradients(copy(splats, device=DEVICE), SIZE, backend="triton", **options)
+    truth, expected = gradients(copy(splats), SIZE, backend="cpu", **options)
+    assert_finite(render, found)
+    assert render.refused == truth.refused
+    assert bool((render.visible.cpu() == truth.visible).all())
+    assert float((render.color.cpu() - truth.color).detach().abs().max()) < 1e-3
+    for key in ("sh", "exposure"):
+        assert relative_error(found[key], expected[key]) < 1e-2, key
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_parameters_that_are_not_finite() -> None:
     splats = random_splats(20)
-    splats.means[0, 0] = torch.nan
-    render = rasterize(splats, POSE, intrinsics((16, 16)), (16, 16), backend="triton")
-    assert render.refused == 1
-    assert bool(torch.isfinite(render.color).all())
+    for i, tensor in enumerate(splats.tensors().values()):
+        tensor[2 * i].view(-1)[0] = torch.nan
+        tensor[2 * i + 1].view(-1)[-1] = torch.inf
+    render, found = gradients(copy(splats, device=DEVICE), SIZE, backend="triton")
+    assert render.refused == 12
+    assert_finite(render, found)
+    assert all(bool((found[name][:12] == 0).all()) for name in ("means", "sh", "screen"))
+
+
+def render_of(splats: Splats, size: tuple[int, int]) -> Render:
+    return rasterize(splats, POSE, intrinsics(size), size, backend="triton", weights=True)
+
+
+def test_zero_splats_nothing_in_view_and_one_pixel() -> None:
+    empty = copy(Splats.empty(4), device=DEVICE)
+    render = render_of(empty, (9, 9))
+    assert not bool(render.opacity.any())
+    render.color.sum().backward()
+    assert empty.sh.grad is not None
+    assert empty.sh.grad.shape == (0, 4, 3)
+    behind = copy(random_splats(5), device=DEVICE)
+    behind.means = -behind.means
+    assert not bool(render_of(behind, (9, 9)).visible.any())
+    assert_agree(random_splats(50, log_scale=0.0), (1, 1), "triton")

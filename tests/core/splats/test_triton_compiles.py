@@ -1,0 +1,65 @@
+"""Every Triton kernel compiles to machine code of two GPU generations, which needs no GPU; the interpreter is laxer."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("triton", reason="triton is not installed: pip install triton to compile for GPUs")
+
+SCRIPT = """
+import sys
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from mvsgs_core.splats import triton_blend, triton_lists, triton_projection, triton_projection_backward, triton_ssim
+
+INTEGERS = {"count", "width", "height", "length", "tiles_x", "tiles"}
+FLOATS = {
+    "fx", "fy", "cx", "cy", "near", "red_behind", "green_behind", "blue_behind", "l1_weight", "l1_share", "ssim_share",
+}
+POINTERS = {
+    "camera": "*fp64", "on_pose": "*fp64", "order": "*i64", "tile_mask": "*u8", "pairs": "*i32", "slots": "*i32",
+    "refused": "*i32", "pair_tiles": "*i32", "pair_splats": "*i32", "pair_slots": "*i32", "tile_begin": "*i32",
+}
+
+def compile_for(capability, function, warps, **constants):
+    names = function.arg_names
+    kinds = {n: "i32" if n in INTEGERS else "fp32" if n in FLOATS else POINTERS.get(n, "*fp32") for n in names}
+    kinds.update(dict.fromkeys(constants, "constexpr"))
+    source = ASTSource(function, kinds, {(names.index(n),): value for n, value in constants.items()})
+    options = {"num_warps": warps, "enable_fp_fusion": True}
+    compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=options)
+    print(capability, function.__name__, len(compiled.asm["cubin"]))
+
+for capability in (80, 90):
+    tiles = {"EXACT": capability == 80, "ROW": triton_projection.ROW}
+    splats = {**tiles, "BASES": 4, "USED": 4, "ANTIALIASED": capability == 80, "BLOCK": 64}
+    sums = triton_blend.SUMS
+    compile_for(capability, triton_blend.blend, 1, WEIGHTS=capability == 80, **tiles)
+    compile_for(capability, triton_blend.blend_backward, 1, DEPTH=capability == 80, SUMS=sums, **tiles)
+    compile_for(capability, triton_ssim.similarity, 4, ROWS=16, COLUMNS=128)
+    compile_for(capability, triton_ssim.loss_gradient, 4, WEIGHTED=True, ROWS=16, COLUMNS=128)
+    footprint = triton_projection.FOOTPRINT
+    compile_for(capability, triton_lists.emit, 1, MASKED=True, BLOCK=32, ROW=16, FOOTPRINT=footprint)
+    compile_for(
+        capability, triton_lists.per_splat, 1, COLUMNS=sums, WIDTH=16, LARGEST=False, SPLATS=8, AT_ONCE=4
+    )
+    if capability == 80:  # the longest ones, with their whole range of switches on, once
+        compile_for(capability, triton_projection.project, 2, FOOTPRINT=footprint, **splats)
+        compile_for(capability, triton_projection_backward.project_backward, 2, POSE=True, SUMS=sums, **splats)
+"""
+
+
+def test_kernels_compile_without_a_gpu(tmp_path: Path) -> None:
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    environment["TRITON_CACHE_DIR"] = str(tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env=environment, cwd=Path(__file__).parents[3], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert len(done.stdout.splitlines()) == 14
