@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
 import torch
 
-from msgs import Depth, Keyframe
 from mvsgs_core.mvs.cascade import CascadeConfig
 from mvsgs_core.mvs.hypotheses import RangeChoice
 from mvsgs_core.mvs.learned import RANDOM, LearnedCascade, LearnedConfig
 from mvsgs_core.mvs.neighbors import NeighborChoice
-from nodes import Node
-from nodes.mvs import Mvs
+from nodes.mvs import StereoNode
 
 
-class LearnedMvs(Mvs):
+class LearnedMvs(StereoNode):
     """MVSFormer (Cao et al. 2022) or IterMVS (Wang et al. 2022); see mvsgs_core.mvs.learned."""
 
     @dataclass
@@ -35,17 +30,18 @@ class LearnedMvs(Mvs):
         device: str = "auto"  # auto (CUDA if there is one), cpu, cuda
         threads: int | None = None  # of PyTorch; null: as the launcher sets it
 
-    config: Config  # type: ignore[assignment]
+    config: Config
 
-    def __init__(self, config: Any = None) -> None:
-        Node.__init__(self, config)
+    def _make_cascade(self) -> LearnedCascade:
         c = self.config
         device = c.device
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         if c.threads:
             torch.set_num_threads(c.threads)
-        self._cascade: LearnedCascade = LearnedCascade(
+        if c.weights == RANDOM:
+            self.stats.warn(f"{c.network} runs untrained, with random weights: its depth is noise")
+        return LearnedCascade(
             CascadeConfig(
                 area=c.area,
                 lag=c.lag,
@@ -55,11 +51,3 @@ class LearnedMvs(Mvs):
             ),
             LearnedConfig(network=c.network, file=c.weights, area=c.network_area, device=device),
         )
-        self._keyframes: dict[int, Keyframe] = {}
-        self._poses: dict[int, tuple[np.ndarray, float]] = {}
-        if c.weights == RANDOM:
-            self.stats.warn(f"{c.network} runs untrained, with random weights: its depth is noise")
-
-    def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
-        self._cascade.remember(keyframe.index, keyframe.image)
-        yield from super().on_keyframe(keyframe)

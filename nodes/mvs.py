@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,48 +18,17 @@ from mvsgs_core.mvs.stereo import Stage, StereoConfig
 from nodes import Node
 
 
-class Mvs(Node):
-    """Plane-sweep cascade without weights; see mvsgs_core.mvs."""
+class StereoNode(Node, ABC):
+    """What every multi-view stereo does with messages; a subclass makes the cascade itself from its Config."""
 
-    @dataclass
-    class Config:
-        area: int = 320 * 240  # pixels of a depth map, aspect kept
-        lag: int = 2  # keyframes after the reference that are waited for
-        window: int = 8  # keyframes before the reference that may be neighbors
-        neighbors: int = 4  # views that a reference is matched with
-        best_views: int = 3  # of these, per pixel and hypothesis: the others may be occluded
-        stages: list[dict[str, Any]] = field(default_factory=list)  # of the cascade, empty: the defaults of the core
-        paths: int = 8  # directions of the smoothing, 4 or 8
-        range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
-        least_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
-        skip_cells: bool = True  # hypotheses that the tracker's depths around rule out
-        skip_certain: float = 1.0  # later stages where the one before was more certain than this; 1: nowhere
-        device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
-        threads: int | None = None  # of the C++ kernels; null: all
-
-    config: Config
-
-    def __init__(self, config: Config | None = None) -> None:
+    def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        c = self.config
-        skips = SkipChoice(outside_cells=c.skip_cells, certain=c.skip_certain)
-        stereo = StereoConfig(best_views=c.best_views, paths=c.paths, skips=skips)
-        if c.stages:
-            stereo = replace(stereo, stages=tuple(Stage(**stage) for stage in c.stages))
-        self._cascade = Cascade(
-            CascadeConfig(
-                area=c.area,
-                lag=c.lag,
-                window=c.window,
-                device=c.device,
-                threads=c.threads,
-                neighbors=NeighborChoice(count=c.neighbors),
-                ranges=RangeChoice(margin=c.range_margin, least_cells=c.least_cells),
-                stereo=stereo,
-            )
-        )
+        self._cascade = self._make_cascade()
         self._keyframes: dict[int, Keyframe] = {}  # without depth yet
         self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
+
+    @abstractmethod
+    def _make_cascade(self) -> Cascade: ...
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
         self._keyframes[keyframe.index] = keyframe
@@ -119,4 +89,45 @@ class Mvs(Node):
             depth=found.result.depth,
             confidence=found.result.confidence,
             segment=keyframe.segment,
+        )
+
+
+class Mvs(StereoNode):
+    """Plane-sweep cascade without weights; see mvsgs_core.mvs."""
+
+    @dataclass
+    class Config:
+        area: int = 320 * 240  # pixels of a depth map, aspect kept
+        lag: int = 2  # keyframes after the reference that are waited for
+        window: int = 8  # keyframes before the reference that may be neighbors
+        neighbors: int = 4  # views that a reference is matched with
+        best_views: int = 3  # of these, per pixel and hypothesis: the others may be occluded
+        stages: list[dict[str, Any]] = field(default_factory=list)  # of the cascade, empty: the defaults of the core
+        paths: int = 8  # directions of the smoothing, 4 or 8
+        range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
+        least_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
+        skip_cells: bool = True  # hypotheses that the tracker's depths around rule out
+        skip_certain: float = 1.0  # later stages where the one before was more certain than this; 1: nowhere
+        device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
+        threads: int | None = None  # of the C++ kernels; null: all
+
+    config: Config
+
+    def _make_cascade(self) -> Cascade:
+        c = self.config
+        skips = SkipChoice(outside_cells=c.skip_cells, certain=c.skip_certain)
+        stereo = StereoConfig(best_views=c.best_views, paths=c.paths, skips=skips)
+        if c.stages:
+            stereo = replace(stereo, stages=tuple(Stage(**stage) for stage in c.stages))
+        return Cascade(
+            CascadeConfig(
+                area=c.area,
+                lag=c.lag,
+                window=c.window,
+                device=c.device,
+                threads=c.threads,
+                neighbors=NeighborChoice(count=c.neighbors),
+                ranges=RangeChoice(margin=c.range_margin, least_cells=c.least_cells),
+                stereo=stereo,
+            )
         )

@@ -9,6 +9,7 @@ import pytest
 
 from msgs import Depth, Keyframe
 from mvsgs_core.datasets import Item, open_dataset
+from mvsgs_core.mvs.learned import calibrated
 from nodes.learned_mvs import LearnedMvs
 from tests.shared_data import shared
 
@@ -42,7 +43,20 @@ def test_itermvs_with_published_weights_finds_the_room() -> None:
     truth = frame.depth[
         :: frame.depth.shape[0] // found.depth.shape[0], :: frame.depth.shape[1] // found.depth.shape[1]
     ]
-    assert np.median(np.abs(found.depth - truth) / truth) < 0.06
+    error = np.abs(found.depth - truth) / truth
+    assert np.median(error) < 0.06
+    # the confidence is a probability: as many depths are within 5 % as it says (calibrated on other frames)
+    assert abs(found.confidence.mean() - (error < 0.05).mean()) < 0.12
+    assert (error < 0.05)[found.confidence > 0.8].mean() > 0.85
+
+
+def test_a_calibration_keeps_the_order_and_the_range() -> None:
+    confidence = np.linspace(0, 1, 101, dtype=np.float32)
+    ours = calibrated(confidence, (2.69, 1.27))
+    assert (np.diff(ours[1:-1]) > 0).all()
+    assert 0 <= ours.min() < ours.max() <= 1
+    np.testing.assert_array_equal(calibrated(confidence, None), confidence)
+    np.testing.assert_allclose(calibrated(confidence, (0.0, 1.0))[1:-1], confidence[1:-1], atol=1e-6)
 
 
 @pytest.mark.parametrize("network", ["mvsformer", "mvsformer_p"])
