@@ -39,6 +39,7 @@ class Tracker(Node):
         loops: bool = True  # old keyframes are looked for by appearance
         saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
         tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
+        device: str = "cpu"  # of bundle adjustment: cpu (C++), cuda or cuda:0 (PyTorch), auto (CUDA if there is one)
         threads: int | None = None  # of the C++ kernels; null: 1
 
     config: Config
@@ -52,6 +53,7 @@ class Tracker(Node):
                 flow=c.flow,
                 tolerance=c.tolerance,
                 threads=c.threads or 1,
+                device=_device(c.device),
                 front_end=FrontEndConfig(
                     still_flow=c.still_flow, keyframe_flow=c.keyframe_flow, keyframe_share=c.keyframe_share
                 ),
@@ -125,3 +127,11 @@ class Tracker(Node):
         self.stats.values.update(core_stats.values)
         for warning in core_stats.warnings:
             self.stats.warn(warning)
+
+
+def _device(name: str) -> str:
+    if name != "auto":
+        return name
+    import torch  # takes a second to load, and the CPU does without
+
+    return "cuda" if torch.cuda.is_available() else "cpu"

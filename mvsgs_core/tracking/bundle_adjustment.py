@@ -2,7 +2,8 @@
 
 An edge i -> j says where each cell of keyframe i was found in keyframe j (`target`) and how well (`information`). The
 residual of a cell is r = target - project(T_ij [x, y, 1, d]), T_ij = T_j T_i^-1, its cost rho(r' W r). Inverse depths
-are eliminated by the Schur complement, all in float64; the kernel is mvsgs_core/csrc/tracking/bundle_adjustment.cpp.
+are eliminated by the Schur complement, all in float64; the kernel is mvsgs_core/csrc/tracking/bundle_adjustment.cpp,
+torch_adjustment.py does the same on a GPU.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class Solver:
     min_z: float = 0.05  # scaled depth in the target keyframe below which a cell has no weight
     min_inverse_depth: float = 1e-3  # per unit of the map
     tolerance: float = 1e-3  # adaptive: ends where the cost falls by less than this share
-    threads: int = 1
+    threads: int = 1  # of the C++ kernel
+    device: str = "cpu"  # cpu: the C++ kernel; cuda or cuda:<number>, torch: PyTorch there, or on the CPU
 
 
 DROID_LOCAL = Solver(steps=2, adaptive=False, lm=1e-4, ep=0.1, robust="none", min_z=0.25)
@@ -79,11 +81,16 @@ class Solution:
 def adjust(graph: Graph, solver: Solver) -> Solution:
     """Optimizes the free poses and inverse depths. Pose-only and structure-only are graphs with nothing else free.
 
-    Raises ValueError where shapes disagree, an edge leads nowhere or back to itself, or an input is not finite.
+    Raises ValueError where shapes disagree, an edge leads nowhere or back to itself, or an input is not finite, and
+    where there is no such device.
     """
     k, m = graph.inverse_depth.shape
     edges = len(graph.source)
     _check(graph, k, m, edges)
+    if solver.device != "cpu":
+        from mvsgs_core.tracking.torch_adjustment import adjust_with_torch  # torch takes a second to load
+
+        return adjust_with_torch(graph, solver, solver.device)
     damping = np.full((k, m), 1e-6) if graph.damping is None else graph.damping
     result = native.load("tracking").bundle_adjust(
         poses=_f64(graph.cam_from_world),

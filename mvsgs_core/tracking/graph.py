@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -62,6 +62,7 @@ class KeyframeGraph:
 
     def __init__(self, intrinsics: np.ndarray) -> None:
         self.intrinsics = np.asarray(intrinsics, dtype=np.float64)  # (4,) at the tracker's size
+        self.device = "cpu"  # of the bundle adjustments of several keyframes, see Solver
         self.readout = 0.0  # seconds that the camera needs for an image, from the first row to the last
         self.keyframes: dict[int, Keyframe] = {}  # by frame index
         self.edges: dict[tuple[int, int], Edge] = {}  # by frame indices
@@ -159,7 +160,7 @@ class KeyframeGraph:
         order = sorted(indices)
         problem = self.problem(order, free_poses, free_depths)
         problem.free_focal = free_focal
-        solution = adjust(problem, solver)
+        solution = adjust(problem, replace(solver, device=self.device))
         if not solution.failure:
             self.intrinsics = self.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]
             for n, index in enumerate(order):

@@ -22,6 +22,9 @@ class LocalMapConfig:
     window: int = 12  # keyframes in the local bundle adjustment; the two oldest poses are held
     steps: int = 5  # of the local bundle adjustment
     robust_scale: float = 1.0  # pixels
+    tolerance: float = (
+        0.01  # share of the cost: a step that gains less is the last (0.001 costs more and gains nothing)
+    )
     min_share: float = 0.25  # of the textured points that an edge must have found
 
 
@@ -134,7 +137,12 @@ class LocalMap:
         young = len(members) <= len(window)  # nothing older holds the scale: it is put back afterwards
         held = {window[0]} if young else set(window[:2])
         around = {n for index in window for n in self.graph.neighbors(index)} & set(members)
-        solver = Solver(steps=self.config.steps, robust_scale=self.config.robust_scale, threads=self.threads)
+        solver = Solver(
+            steps=self.config.steps,
+            robust_scale=self.config.robust_scale,
+            tolerance=self.config.tolerance,
+            threads=self.threads,
+        )
         before = [self.graph.keyframes[index].inverse_depth for index in window]
         solution = self.graph.optimize(set(window) | around, set(window) - held, set(window), solver)
         if young:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core.camera import fit_size, scale_intrinsics
+from mvsgs_core.tracking.assessment import warn_of_gaps
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
 from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.calibration import READOUT_AGAIN, Calibration
@@ -44,6 +45,7 @@ class TrackerConfig:
     saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
     texture: float = 0.05  # share of the cells that must be textured for an image to be of any use
     threads: int = 1
+    device: str = "cpu"  # of the local and global bundle adjustment, see Solver; single frames stay on the CPU
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
     starting: StartingConfig = field(default_factory=StartingConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
@@ -64,8 +66,12 @@ class Update:
 
 class Tracker:
     def __init__(self, config: TrackerConfig | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
-        """clock: what the stages are timed with, in seconds."""
+        """clock: what the stages are timed with, in seconds. Raises ValueError where there is no such device."""
         self.config = config or TrackerConfig()
+        if self.config.device != "cpu":
+            from mvsgs_core.tracking.torch_adjustment import find_device  # torch takes a second to load
+
+            find_device(self.config.device)
         self.records: list[FrameRecord] = []
         self.stats = TrackingStats(clock=clock)
         self.started = False
@@ -143,7 +149,11 @@ class Tracker:
         self.stats.count("frames posed in the end", found)
         if self.started:
             self.calibration.check(self.local_map.members(self.segment))
-        self._warn_at_end()
+        self.stats.counts["matches"] = self.matcher.calls
+        self.stats.counts["matches that needed features"] = self.matcher.feature_calls
+        if not self._keyframes():
+            self.stats.warn(f"tracking never started: {self.starter.reason}")
+        warn_of_gaps(self.stats, self._path)
         yield Update(State.TRACKED if self.started else State.NOT_STARTED, (), self.publisher.corrections(True))
 
     def path(self) -> Path:
@@ -159,6 +169,7 @@ class Tracker:
         self.size = fit_size(height, width, config.area)
         self.intrinsics = scale_intrinsics(intrinsics, (height, width), self.size)
         self.graph = KeyframeGraph(self.intrinsics)
+        self.graph.device = config.device
         self.calibration = Calibration(
             self.graph, config.focal, self.stats, self.intrinsics, not guessed, config.readout, config.threads
         )
@@ -377,21 +388,6 @@ class Tracker:
         for solution in self.back_end.adjust(segment):
             if solution.failure:
                 self.stats.warn(f"global bundle adjustment failed: {solution.failure}")
-
-    def _warn_at_end(self) -> None:
-        self.stats.counts["matches"] = self.matcher.calls
-        self.stats.counts["matches that needed features"] = self.matcher.feature_calls
-        segments = {k.segment for k in self._keyframes()}
-        if not segments:
-            self.stats.warn(f"tracking never started: {self.starter.reason}")
-        elif len(segments) > 1:
-            self.stats.warn(f"the map is in {len(segments)} segments: no verified loop joins them")
-        states = self._path.state
-        lost, unstarted = int(np.sum(states == State.LOST)), int(np.sum(states == State.NOT_STARTED))
-        if lost:
-            self.stats.warn(f"{lost} of {len(states)} frames were lost")
-        if segments and unstarted:
-            self.stats.warn(f"{unstarted} of {len(states)} frames came before a start and have no pose")
 
     def _keyframes(self) -> list[Keyframe]:
         return [] if self.graph is None else list(self.graph.keyframes.values())

@@ -1,0 +1,23 @@
+"""How far the result can be trusted: what the tracker says of it in its warnings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core.tracking.frames import Path, State
+from mvsgs_core.tracking.stats import TrackingStats
+
+
+def warn_of_gaps(stats: TrackingStats, path: Path) -> None:
+    """Frames without a pose, and a map in several segments."""
+    segments = len(np.unique(path.segment[path.keyframe]))
+    if segments > 1:
+        stats.warn(f"the map is in {segments} segments: no verified loop joins them")
+    lost, unstarted = int(np.sum(path.state == State.LOST)), int(np.sum(path.state == State.NOT_STARTED))
+    if lost:
+        stats.warn(f"{lost} of {len(path.state)} frames were lost")
+    if segments and unstarted:
+        stats.warn(f"{unstarted} of {len(path.state)} frames came before a start and have no pose")
+
+
+__all__ = ["warn_of_gaps"]
