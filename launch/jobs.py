@@ -22,6 +22,7 @@ from launch.screen import Screen, make_screen
 from launch.status import NodeStatus
 from launch.summary import summary
 from launch.supervise import Outcome, Supervisor
+from nodes.parameters import make_config
 
 
 class RunFailed(RuntimeError):
@@ -61,6 +62,7 @@ def run(job: Job) -> int:
 def _run(job: Job) -> int:
     try:
         graph = graph_of(job.config, job.overrides, job.choices)
+        _check_nodes(graph)
         output = _prepare_output(graph)
         screen = make_screen(graph.settings.screen)
         began = time.time()
@@ -79,6 +81,17 @@ def _run(job: Job) -> int:
     else:
         _report_failure(outcome)
     return outcome.code
+
+
+def _check_nodes(graph: Graph) -> None:
+    """What nodes that run here already know they lack. Raises GraphError."""
+    for name, slot in graph.slots.items():
+        if slot.placement.external:
+            continue
+        try:
+            slot.node.check(make_config(slot.node, slot.config))
+        except (OSError, ValueError) as error:
+            raise GraphError(f"{name}: {error}") from error
 
 
 def _prepare_output(graph: Graph) -> Path:

@@ -16,6 +16,8 @@ The parameter's type declares the input, the yielded type the output. Hooks:
 - `on_idle(self) -> list[U] | None`: one slice (well under 100 ms) of background work while no message waits;
   None when there is nothing to do until the next message.
 - `on_end(self) -> Iterator[U]`: every input has ended.
+- `check(cls, config)`: before any process starts, on the launcher's machine: raises OSError or ValueError, saying what
+  to do, where it is plain that the node cannot run (its file is missing). Quick, and opens nothing.
 
 Arrays of a message that came from another process are read-only views that keep its whole frame in memory: copy
 what you change, and what is small and kept.
@@ -79,6 +81,10 @@ class Node:
         self.config = self.Config() if config is None else config
         self.stats = Stats()
         self.upstream: dict[str, Any] = {}  # what each node upstream counted, by name: complete when on_end runs
+
+    @classmethod
+    def check(cls, config: Any) -> None:
+        """Nothing to check."""
 
     def run(self) -> Iterator[Any]:
         """Sources only: yields messages until the stream ends."""

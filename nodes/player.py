@@ -31,10 +31,15 @@ class Player(Node):
 
     config: Config
 
+    @classmethod
+    def check(cls, config: Config) -> None:
+        if config.path is None or not Path(config.path).is_file():
+            raise FileNotFoundError(f"dataset.path={config.path}: must be an .mcap file, as recorder=mcap writes it")
+
     def run(self) -> Iterator[Frame | GroundTruth]:
         c = self.config
-        if c.path is None or not Path(c.path).is_file():
-            raise FileNotFoundError(f"dataset.path={c.path}: must be an .mcap file, as recorder=mcap writes it")
+        self.check(c)
+        assert c.path is not None
         if c.start < 0 or c.stride < 1 or (c.stop is not None and c.stop <= c.start):
             raise ValueError(f"start={c.start}, stop={c.stop}, stride={c.stride}: 0 <= start < stop and stride >= 1")
         last = -1

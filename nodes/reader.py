@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from msgs import Frame, GroundTruth
-from mvsgs_core.datasets import Item, Sequence, open_dataset
+from mvsgs_core.datasets import Item, Sequence, check_path, open_dataset
 from nodes import Node
 
 
@@ -29,6 +29,10 @@ class Reader(Node):
         options: dict[str, Any] = field(default_factory=dict)  # of that format: see its class in mvsgs_core.datasets
 
     config: Config
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        check_path(config.name, config.path)
 
     def run(self) -> Iterator[Frame | GroundTruth]:
         sequence = self._open()

@@ -10,6 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from launch.compose import compose
+from launch.jobs import Job, run
 from msgs import Frame, GroundTruth
 from mvsgs_core.datasets.bag import Bag
 from mvsgs_core.datasets.images import Images
@@ -53,3 +54,17 @@ def test_every_choice_lists_all_options_of_its_format() -> None:
     synthetic = set(OmegaConf.load(ROOT / "launch/conf/dataset/synthetic.yaml").options)
     explicit = {p.name for p in inspect.signature(Synthetic).parameters.values() if p.kind is not p.VAR_KEYWORD}
     assert synthetic == (explicit | {f.name for f in dataclasses.fields(Difficulties)}) - own
+
+
+@pytest.mark.parametrize("choice", ["tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "player"])
+@pytest.mark.parametrize("path", [None, "/nowhere/at/all"])
+def test_a_missing_path_is_refused_before_a_process_starts(
+    choice: str, path: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [f"dataset={choice}", f"output={tmp_path / 'out'}"] + ([f"dataset.path={path}"] if path else [])
+    config = OmegaConf.create(compose(given).resolved)
+    assert run(Job(config, [], {"dataset": choice}, None)) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: dataset: ")
+    assert "dataset.path" in said if path is None or choice == "player" else f"{path} is missing" in said
+    assert not (tmp_path / "out").exists()

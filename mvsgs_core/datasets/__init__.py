@@ -45,6 +45,18 @@ READERS = {
 }
 
 
+def check_path(name: str, path: str | None) -> None:
+    """Raises ValueError for an unknown name, and FileNotFoundError, saying where the data can be had, where there is
+
+    nothing at `path` to read it from. Opens nothing; "synthetic" takes no path.
+    """
+    if name not in READERS:
+        raise ValueError(f"no dataset {name!r}; there are: {', '.join(READERS)}")
+    layout = getattr(importlib.import_module(READERS[name].partition(":")[0]), "LAYOUT", None)
+    if layout is not None:
+        layout.present(path)
+
+
 def open_dataset(name: str, **options: Any) -> Sequence:
     """Opens a sequence: `open_dataset("tum", path=..., start=0, stop=None, stride=1, size=(240, 320))`.
 

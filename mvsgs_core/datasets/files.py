@@ -24,13 +24,20 @@ class Layout:
     def missing(self, what: str) -> FileNotFoundError:
         return FileNotFoundError(f"{what}\n{self.name} expects: {self.files}\nWhere to get it: {self.source}")
 
-    def folder(self, path: str | Path | None) -> Path:
-        """`path` as an existing folder. Raises FileNotFoundError saying the layout and where the data can be had."""
+    def present(self, path: str | Path | None) -> Path:
+        """`path` as a folder or file that is there. Raises FileNotFoundError saying where the data can be had."""
         if path is None or not str(path):
             raise self.missing("no path was given (set dataset.path)")
-        folder = Path(path).expanduser()
+        found = Path(path).expanduser()
+        if not found.exists():
+            raise self.missing(f"{found} is missing")
+        return found
+
+    def folder(self, path: str | Path | None) -> Path:
+        """`path` as an existing folder. Raises FileNotFoundError saying the layout and where the data can be had."""
+        folder = self.present(path)
         if not folder.is_dir():
-            raise self.missing(f"{folder} is {'not a folder' if folder.exists() else 'missing'}")
+            raise self.missing(f"{folder} is not a folder")
         return folder
 
     def file(self, path: Path) -> Path:
