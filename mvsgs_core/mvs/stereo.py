@@ -32,12 +32,12 @@ class StereoConfig:
     """The cascade of one view."""
 
     stages: tuple[Stage, ...] = (
-        Stage(scale=2, step=0.7, hypotheses=128, radius=3, small_jump=0.3, large_jump=2.0),
-        Stage(scale=1, step=0.35, hypotheses=11, radius=3, small_jump=0.05, large_jump=0.4),
+        Stage(scale=2, step=0.7, hypotheses=128, radius=2, small_jump=0.3, large_jump=2.0),
+        Stage(scale=1, step=0.35, hypotheses=11, radius=2, small_jump=0.05, large_jump=0.4),
     )
     best_views: int = 3  # of the neighbors, per pixel and hypothesis: the others may be occluded
     noise: float = 1.5  # gray levels²
-    contrast: float = 11.0  # gray levels: what differs so from a window's center counts 1 / e in it
+    contrast: float = 8.0  # gray levels: what differs so from a window's center counts 1 / e in it
     edge: float = 12.0  # gray levels
     break_steps: float = 4.0  # hypotheses
     temperature: float = 0.02  # cost
