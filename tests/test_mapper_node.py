@@ -6,10 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import nodes
-from msgs import Poses, Preview, SplatMap, View
+from msgs import MapView, Poses, Preview, SplatMap, View
+from mvsgs_core.evaluation.image_metrics import psnr
 from mvsgs_core.splats.export_ply import read_ply
+from mvsgs_core.splats.map_state import PARAMETERS
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.rasterizer import rasterize
 from nodes.mapper import Mapper, mapper_config
 from tests.core.splats.tiny_scene import pose_on_arc, posed_view
 
@@ -30,7 +35,7 @@ def settings(**changes: object) -> Mapper.Config:
 
 def test_inputs_and_outputs_are_declared() -> None:
     assert nodes.handlers(Mapper) == {View: "on_view", Poses: "on_poses"}
-    assert set(nodes.outputs(Mapper)) == {SplatMap, Preview}
+    assert set(nodes.outputs(Mapper)) == {SplatMap, Preview, MapView}
 
 
 def test_two_maps_leave_the_mapper_before_and_after_the_refinement(tmp_path: Path) -> None:
@@ -100,6 +105,9 @@ def test_a_preview_is_capped_and_relative_to_the_origin() -> None:
     assert 50 <= len(preview.means) <= 100
     assert preview.render.shape == preview.image.shape
     assert np.abs(preview.world_from_cam[:3, 3]).max() == 0.0  # the first keyframe is the origin
+    assert preview.keyframes.tolist() == [0]
+    np.testing.assert_array_equal(preview.keyframe_poses[0], preview.world_from_cam)
+    np.testing.assert_array_equal(preview.origin, view_message(0, 0.5).world_from_cam[:3, 3])
     assert (np.linalg.eigvalsh(preview.covariances) > -1e-9).all()
 
 
@@ -133,3 +141,28 @@ def test_the_core_configuration_has_the_nodes_values() -> None:
     assert config.insertion.unexplored_psnr == 33.0
     assert config.training.density == "exact"
     assert config.density_control.mode == "none"
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parent.parent / "launch/conf/mapper").glob("*.yaml")))
+def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
+    from omegaconf import OmegaConf
+
+    small = {"iterations": 30, "refinement": 10, "output": str(tmp_path), "seed": 0, "threads": 1}
+    chosen = {**OmegaConf.load(path), **small}
+    node = Mapper(Mapper.Config(**{str(k): v for k, v in chosen.items() if k not in ("_target_", "reads")}))
+    for k in range(3):
+        list(node.on_view(view_message(7 * k, k / 2)))
+    before, after = list(node.on_end())
+    assert before.iterations == 90
+    assert after.density == chosen["density"]
+    assert bool((after.betas != after.betas[0]).any()) == chosen["betas"]
+    assert (tmp_path / "map.ply").exists()
+    message = view_message(99, 0.25)
+    with torch.no_grad():
+        render = rasterize(
+            Splats(**{name: torch.from_numpy(getattr(after, name)) for name in PARAMETERS}),
+            message.world_from_cam - np.pad(after.origin[:, None], ((0, 1), (3, 0))), message.intrinsics,
+            (24, 32), density=after.density,
+        )  # fmt: skip
+    assert psnr(render.color.clamp(0, 1).numpy(), message.image / np.float32(255)) > 25.0
+    assert not node.stats.warnings
