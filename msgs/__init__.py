@@ -161,6 +161,9 @@ class Preview:
     covariances: Annotated[np.ndarray, "float32 N 3 3"]
     colors: Annotated[np.ndarray, "uint8 N 3"]
     opacities: Annotated[np.ndarray, "float32 N"]
+    keyframes: Annotated[np.ndarray, "int64 K"] | None = None  # all, in the order of the stream; None: not said
+    keyframe_poses: Annotated[np.ndarray, "float64 K 4 4"] | None = None  # of those, with every correction so far
+    origin: Annotated[np.ndarray, "float64 3"] | None = None  # SplatMap.origin
 
 
 @dataclass(frozen=True)

@@ -160,11 +160,14 @@ class Mapper(Node):
         self._last_preview = now
         view = self.mapper.views[-1]
         arrays = preview_arrays(self.mapper, self.config.preview_splats)
-        pose = view.world_from_cam.copy()
-        pose[:3, 3] -= np.zeros(3) if self.mapper.origin is None else self.mapper.origin
+        origin = np.zeros(3) if self.mapper.origin is None else self.mapper.origin
+        poses = np.stack([view.world_from_cam for view in self.mapper.views])
+        poses[:, :3, 3] -= origin
         yield Preview(
-            index=view.index, iterations=self.mapper.iterations, world_from_cam=pose, intrinsics=view.intrinsics[0],
-            image=view.levels[0].cpu().numpy(), **arrays,
+            index=view.index, iterations=self.mapper.iterations, world_from_cam=poses[-1],
+            intrinsics=view.intrinsics[0], image=view.levels[0].cpu().numpy(), **arrays,
+            keyframes=np.array([view.index for view in self.mapper.views], dtype=np.int64), keyframe_poses=poses,
+            origin=origin,
         )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ class Viewer(Node):
     """A page with the splats, a frustum for each keyframe seen, the path, and the newest photo beside its render.
 
     Lengths are divided by the first preview's median distance, so that any map fits the browser's near and far planes.
-    Keyframes stand where they were when they were previewed: later corrections move the splats, not their frustums.
+    Keyframes stand where the newest preview has them: later corrections move their frustums with the splats.
     """
 
     @dataclass
@@ -60,6 +60,7 @@ class Viewer(Node):
             if self.unit is None:
                 self._begin(preview)
             self._show_splats(preview)
+            self._move_keyframes(preview)
             self._show_keyframe(preview)
             self._show_path()
             self._photo.image, self._render.image = _thumbnail(preview.image), _thumbnail(preview.render)
@@ -105,6 +106,23 @@ class Viewer(Node):
             self._splats = self.server.scene.add_gaussian_splats("/splats", **arrays)
         else:
             self._splats.set_gaussians(**arrays)
+
+    def _move_keyframes(self, preview: Preview) -> None:
+        """Earlier frustums to where corrections have put them since; those that the map no longer has go."""
+        assert self.unit is not None
+        if preview.keyframes is None or preview.keyframe_poses is None:
+            return
+        poses = dict(zip(preview.keyframes.tolist(), preview.keyframe_poses))
+        for index, frustum in list(self._frustums.items()):
+            pose = poses.get(index)
+            if pose is None:
+                self._frustums.pop(index).remove()
+                continue
+            position, rotation = pose[:3, 3] / self.unit, quaternion_from_rotation(pose[:3, :3])
+            if not np.allclose(frustum.position, position, rtol=0.0, atol=1e-5):
+                frustum.position = position
+            if not np.allclose(frustum.wxyz, rotation, rtol=0.0, atol=1e-5):
+                frustum.wxyz = rotation
 
     def _show_keyframe(self, preview: Preview) -> None:
         assert self.unit is not None

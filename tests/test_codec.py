@@ -90,6 +90,9 @@ def test_a_default_is_left_out_and_comes_back() -> None:
     assert b"intrinsics_guessed" in bytes(encode(guessed))
     for message in (plain, guessed):
         assert decode(encode(message)).message.intrinsics_guessed == message.intrinsics_guessed
+    preview = example(msgs.Preview, absent=True)
+    shorter = with_header(bytes(encode(preview)), lambda c: c["scalars"].pop("keyframe_poses"))
+    assert decode(shorter).message.keyframe_poses is None  # as a sender of before these fields has it
     wrong = with_header(bytes(encode(guessed)), lambda c: c["scalars"].__setitem__("intrinsics_guessed", 1))
     refused(wrong, "must be bool")
 

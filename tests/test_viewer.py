@@ -6,6 +6,7 @@ import socket
 import threading
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 
 import msgpack
 import numpy as np
@@ -110,6 +111,24 @@ def test_map_grows_and_oldest_frustums_go(viewer: Viewer) -> None:
     assert len(splats.centers) == 24
     drawn = [viewer.server.scene.get_handle_by_name(f"/keyframes/{index}") is not None for index in range(5)]
     assert drawn == [False, False, True, True, True]
+
+
+def test_frustums_follow_corrections(viewer: Viewer) -> None:
+    for index in (0, 1):
+        show(viewer, preview(index))
+    assert viewer.unit is not None
+    poses = np.stack([np.eye(4), np.eye(4)])
+    poses[0, :3, 3] = viewer.unit * np.array([0.0, 3.0, 0.0])
+    poses[1, :3, 3] = preview(2).world_from_cam[:3, 3]
+    moved = replace(preview(2), keyframes=np.array([0, 2]), keyframe_poses=poses, origin=np.zeros(3))
+    show(viewer, moved)
+    first, gone, newest = (viewer.server.scene.get_handle_by_name(f"/keyframes/{index}") for index in range(3))
+    assert first is not None
+    assert newest is not None
+    assert gone is None  # the map begins anew or has dropped it
+    np.testing.assert_allclose(first.position, [0.0, 3.0, 0.0], atol=1e-5)
+    show(viewer, preview(3))  # says nothing of the others: they stay
+    assert viewer.server.scene.get_handle_by_name("/keyframes/0") is not None
 
 
 def test_splats_that_are_not_finite_are_left_out_and_said(viewer: Viewer) -> None:
