@@ -250,6 +250,10 @@ def test_stress_passes_what_holds_or_says_that_it_does_not() -> None:
 
     assert not verdict(ate_percent=30.0).met  # broken, and not a word
     assert verdict(ate_percent=30.0, frames_tracked=50).met
+    photographs = report(rendering={"held_out": {"psnr": None}, "keyframes": {"psnr": 22.0}})
+    mapped = stress.Outcome.of(Run("fox", "full", 0, Path("x"), photographs))
+    assert mapped.kept_a_map
+    assert any(row.name == "fox: keyframes PSNR" and row.value == 22.0 for row in stress.rows_of("fox", mapped, None))
     nothing = stress.Outcome.of(Run("room", "full", 0, Path("x"), None))
     assert not stress.rows_of("x", nothing, easy)[-1].met  # not even a report
     assert "no map" in str(stress.rows_of("x", nothing, easy)[-1].value)
