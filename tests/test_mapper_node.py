@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -36,6 +38,18 @@ def settings(**changes: object) -> Mapper.Config:
 def test_inputs_and_outputs_are_declared() -> None:
     assert nodes.handlers(Mapper) == {View: "on_view", Poses: "on_poses"}
     assert set(nodes.outputs(Mapper)) == {SplatMap, Preview, MapView}
+
+
+def test_what_the_map_shows_is_sent_for_the_keyframe_before() -> None:
+    node = Mapper(settings(map_views=True))
+    sent = [m for k in range(3) for m in node.on_view(view_message(7 * k, k / 2)) if isinstance(m, MapView)]
+    assert [m.index for m in sent] == [0, 7]
+    assert node.mapper.iterations == 8  # what the two were owed was done before
+    view = view_message(0, 0.0)
+    shown = cv2.resize(sent[0].depth, view.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    both = (shown > 0) & (view.depth > 0)
+    assert both.mean() > 0.5
+    assert np.median(np.abs(shown - view.depth)[both] / view.depth[both]) < 0.1
 
 
 def test_two_maps_leave_the_mapper_before_and_after_the_refinement(tmp_path: Path) -> None:
@@ -102,6 +116,7 @@ def test_a_preview_is_capped_and_relative_to_the_origin() -> None:
     node = Mapper(settings(preview_splats=100))
     node.config.preview_period = 1e-9
     (preview,) = list(node.on_view(view_message(0, 0.5)))
+    assert isinstance(preview, Preview)
     assert 50 <= len(preview.means) <= 100
     assert preview.render.shape == preview.image.shape
     assert np.abs(preview.world_from_cam[:3, 3]).max() == 0.0  # the first keyframe is the origin
@@ -148,8 +163,8 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
     from omegaconf import OmegaConf
 
     small = {"iterations": 30, "refinement": 10, "output": str(tmp_path), "seed": 0, "threads": 1}
-    chosen = {**OmegaConf.load(path), **small}
-    node = Mapper(Mapper.Config(**{str(k): v for k, v in chosen.items() if k not in ("_target_", "reads")}))
+    chosen: dict[str, Any] = {str(k): v for k, v in OmegaConf.merge(OmegaConf.load(path), small).items()}
+    node = Mapper(Mapper.Config(**{k: v for k, v in chosen.items() if k not in ("_target_", "reads")}))
     for k in range(3):
         list(node.on_view(view_message(7 * k, k / 2)))
     before, after = list(node.on_end())
