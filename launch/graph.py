@@ -10,7 +10,7 @@ import functools
 import importlib
 import inspect
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import msgs
@@ -56,6 +56,7 @@ class Edge:
     sender: str
     reader: str
     best_effort: bool
+    feedback: bool = False  # closes a cycle: its reader ends before its sender and does not wait for its End
 
 
 @dataclass(frozen=True)
@@ -115,9 +116,10 @@ def build(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | None = N
         if section.get("_target_") is not None:
             slots[name] = _build_slot(name, section, replaced.get(name), device)
     edges, warnings = connect(slots, list(sections))
+    names, edges = order(slots, edges)
     resolved = {key: value for key, value in config.items() if key not in sections}
     resolved |= {name: _section(slots[name]) if name in slots else {"_target_": None} for name in sections}
-    return Graph({name: slots[name] for name in order(slots, edges)}, edges, settings, resolved, warnings)
+    return Graph({name: slots[name] for name in names}, edges, settings, resolved, warnings)
 
 
 def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None, device: _Device) -> Slot:
@@ -216,19 +218,27 @@ def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edg
     return edges, warnings
 
 
-def order(slots: Collection[str], edges: Collection[Edge]) -> list[str]:
-    """Slot names, every sender before its readers. Raises GraphError for a cycle."""
+def order(slots: Collection[str], edges: Collection[Edge]) -> tuple[list[str], list[Edge]]:
+    """Slot names, every sender before its readers, and the edges, with those marked that feed something back.
+
+    Only best-effort edges may close a cycle. Raises GraphError where reliable ones do.
+    """
     done: list[str] = []
     while len(done) < len(slots):
-        ready = [n for n in slots if n not in done and all(e.sender in done for e in edges if e.reader == n)]
+        waits = {n: [e for e in edges if e.reader == n and e.sender not in done] for n in slots if n not in done}
+        ready = [n for n, left in waits.items() if not left]
+        ready = ready or [n for n, left in waits.items() if all(e.best_effort for e in left)][:1]
         if not ready:
             path = [next(n for n in slots if n not in done)]
             while path[-1] not in path[:-1]:
                 path.append(next(e.sender for e in edges if e.reader == path[-1] and e.sender not in done))
             loop = path[path.index(path[-1]) :][::-1]
-            raise GraphError(f"a cycle: {' -> '.join(loop)}; a node cannot wait for what it causes itself")
+            raise GraphError(
+                f"a cycle: {' -> '.join(loop)}; a node cannot wait for what it causes itself"
+                ' (best effort, "slot?", may close one)'
+            )
         done += ready
-    return done
+    return done, [replace(e, feedback=done.index(e.sender) >= done.index(e.reader)) for e in edges]
 
 
 def _handlers(name: str, node: type[nodes.Node]) -> dict[type, str]:

@@ -49,7 +49,7 @@ class _Inline:
         for name, runner in self._runners.items():  # senders come before their readers
             self._send(name, runner.end())
             end = End(runner.node.upstream | {name: self._stats(runner)})
-            for reader in dict.fromkeys(edge.reader for edge in self._graph.out_of(name)):
+            for reader in dict.fromkeys(edge.reader for edge in self._graph.out_of(name) if not edge.feedback):
                 list(self._runners[reader].handle(end))
         return {name: runner.node for name, runner in self._runners.items()}
 

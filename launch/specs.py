@@ -98,6 +98,7 @@ def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_
                 "slot": edge.sender,
                 "address": address[_topic(edge)],
                 "best_effort": edge.best_effort,
+                "feedback": edge.feedback,
             }
             for edge in graph.into(name)
         ],

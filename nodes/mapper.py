@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs import Poses, Preview, SplatMap, View
+from msgs import MapView, Poses, Preview, SplatMap, View
 from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.export_ply import write_ply
 from mvsgs_core.splats.insertion import InsertionConfig
@@ -60,6 +60,7 @@ class Mapper(Node):
         selective: bool = True  # step only the splats that were seen
         preview_period: float = 1.0  # seconds between previews; 0: none
         preview_splats: int = 100000  # at most so many in a preview
+        map_views: bool = False  # send what the map shows from each keyframe, as mvs=skipping reads it
         output: str | None = None  # folder for map.ply; null: none is written
         seed: int = 0
         threads: int | None = None  # of the rasterizer; null: all
@@ -77,8 +78,12 @@ class Mapper(Node):
         self._by_segment: dict[int, OnlineMapper] = {}
         self._last_preview = 0.0
 
-    def on_view(self, view: View) -> Iterator[Preview]:
+    def on_view(self, view: View) -> Iterator[Preview | MapView]:
         self._enter(view.segment)
+        if self.config.map_views:
+            while not self.config.realtime and self.mapper.step():  # as add_view would
+                pass
+            yield from self._map_view(view.segment)
         self.mapper.add_view(
             PosedView(
                 index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
@@ -151,6 +156,20 @@ class Mapper(Node):
             anchors=final.anchors, keyframes=final.keyframes, world_from_cam=final.world_from_cam, scale=final.scale,
             exposures=final.exposures,
         )  # fmt: skip
+
+    def _map_view(self, segment: int) -> Iterator[MapView]:
+        """Of the newest keyframe, at the coarsest size."""
+        if self.mapper.views and len(self.mapper.state):
+            view = self.mapper.views[-1]
+            level = len(view.levels) - 1
+            shown = self.mapper.render(view, level)
+            color = (shown.color.clamp(0.0, 1.0) * 255.0).round().byte().cpu().numpy()
+            depth = (shown.depth * (self.mapper.unit or 1.0)).float().cpu().numpy()
+            yield MapView(
+                index=view.index, segment=segment, scale=view.scale, world_from_cam=view.world_from_cam,
+                intrinsics=view.intrinsics[level], render=color,
+                depth=np.where(shown.opacity.cpu().numpy() > 0.5, depth, np.float32(0)),
+            )  # fmt: skip
 
     def _preview(self) -> Iterator[Preview]:
         now = time.monotonic()

@@ -120,7 +120,8 @@ class _Process:
     def _answers(self, runner: Runner, inbox: Inbox) -> Iterator[Message]:
         """What a node makes of its inputs, and of the time when none waits."""
         idle = False  # background work is left
-        while not all(reader.ended for reader in self._readers):
+        awaited = [reader for reader, given in zip(self._readers, self._spec.inputs, strict=True) if not given.feedback]
+        while not all(reader.ended for reader in awaited):
             received = inbox.receive(0.0 if idle else POLL)
             if received is not None:
                 idle = True

@@ -111,6 +111,18 @@ def test_a_cycle_is_refused_with_its_path() -> None:
         fake(f"sink._target_={STAGES}.Loop", "relay.reads.Frame=sink")
 
 
+def test_only_best_effort_may_close_a_cycle_and_is_marked() -> None:
+    graph = fake(f"sink._target_={STAGES}.Loop", "relay.reads.Frame=sink?")
+    assert [(e.sender, e.reader) for e in graph.edges if e.feedback] == [("sink", "relay")]
+    assert not any(e.feedback for e in fake().edges)
+
+
+def test_what_the_map_shows_is_fed_back_to_stereo() -> None:
+    graph = compose(["mvs=skipping", "mapper.map_views=true"])
+    assert [(e.sender, e.reader) for e in graph.edges if e.feedback] == [("mapper", "mvs")]
+    assert list(graph.slots).index("mvs") < list(graph.slots).index("mapper")
+
+
 def test_another_target_starts_from_its_own_defaults() -> None:
     graph = fake(f"relay._target_={STAGES}.Uncorrected", "relay.every=3", "device=cpu")
     assert graph.slots["relay"].config == {"device": "cpu", "every": 3}  # and no `stride` of the old choice

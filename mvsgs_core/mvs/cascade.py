@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mvsgs_core.mvs.backend import make_backend
+from mvsgs_core.mvs.explained import Explained
 from mvsgs_core.mvs.hypotheses import RangeChoice, SearchRange, search_range
 from mvsgs_core.mvs.neighbors import NeighborChoice, select_neighbors
 from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, empty_depth, estimate_depth
@@ -48,6 +49,7 @@ class Cascade:
         self._views: list[StereoView] = []  # a window of the stream, oldest first
         self._waiting: list[int] = []  # indices without depth yet, oldest first
         self._previous_range: SearchRange | None = None
+        self.explained: Explained | None = None  # if set, keyframes that the map explains get no depth
 
     def prepare(
         self,
@@ -108,6 +110,9 @@ class Cascade:
         if not chosen:
             return CascadeDepth(reference, empty_depth(reference.size), (), search, "no neighbor with a baseline")
         self._previous_range = search
+        if self.explained is not None and self.explained.enough(reference):
+            nothing = replace(empty_depth(reference.size), counts={"explained": 1.0})
+            return CascadeDepth(reference, nothing, (), search)
         views = [n.view for n in chosen]
         result = self._estimate(reference, views, search)
         return CascadeDepth(reference, result, tuple(v.index for v in views), search)
