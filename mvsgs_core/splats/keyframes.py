@@ -62,6 +62,10 @@ class TrainingView:
         """Image (H, W, 3) float32 in [0, 1]."""
         return self.levels[level].to(torch.float32) / 255.0
 
+    def drop_images(self) -> None:
+        """Frees what only the training needs; pose, scale and exposure stay."""
+        self.levels, self.valid, self.tile_error = [], None, None
+
     def record(self, loss: float) -> None:
         """Takes in the loss of a full-resolution iteration."""
         self.visits_full += 1

@@ -46,6 +46,7 @@ class MapperConfig:
     window: int = 6  # newest keyframes that the local half trains on
     realtime: bool = False  # a new keyframe cancels what older ones are owed
     max_pixels: int | None = None  # area of the training images; None: as they come
+    max_keyframes: int = 1000  # whose images are kept and trained on; beyond, they are thinned out evenly
     sh_degree: int = 0  # 0 to 3
     seed: int = 0
     device: str = "cpu"
@@ -93,6 +94,7 @@ class OnlineMapper:
         self.config = config or MapperConfig()
         self.state = MapState((self.config.sh_degree + 1) ** 2, torch.device(self.config.device))
         self.views: list[TrainingView] = []
+        self._with_image: list[TrainingView] = []  # those of them that are trained on
         self.schedule = Schedule(self.config.window, self.config.seed)
         self.log = log or MapperLog()
         self.iterations = 0
@@ -140,6 +142,7 @@ class OnlineMapper:
         added.world_from_cam, added.scale, added.median_depth = pose, scale, median / (self.unit or 1.0)
         added.fixed = not self.views
         self.views.append(added)
+        self._bound_images()
         if added.valid is not None:
             self.log.refuse(
                 "pixels", int((~added.valid[0]).sum()), "pixels that are not finite were left out of the training"
@@ -157,7 +160,7 @@ class OnlineMapper:
             self.schedule.drop()
             return False
         with self.log.time("optimization"):
-            view = self.views[self.schedule.next(len(self.views))]
+            view = self._with_image[self.schedule.next(len(self._with_image))]
             skip = self.config.skipping
             done = skip.converged and view.converged(skip.converged_visits, skip.converged_improvement)
             if done and not self.schedule.chance(skip.converged_keep):
@@ -172,7 +175,7 @@ class OnlineMapper:
             return
         with self.log.time("refinement"):
             self.global_rate = 0.1 ** (done / max(total, 1))
-            self._train(self.views[self.schedule.next_of_all(len(self.views))], refining=True)
+            self._train(self._with_image[self.schedule.next_of_all(len(self._with_image))], refining=True)
 
     def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> int:
         """Takes corrected absolute poses (K, 4, 4) and cumulative scales (K,) of the keyframes `index` (K,).
@@ -216,6 +219,31 @@ class OnlineMapper:
     def snapshot(self) -> Snapshot:
         """The map in world units, relative to its origin."""
         return snapshot(self.state, self.views, self.origin, self.unit, self.config.training.density, self.iterations)
+
+    @property
+    def image_bytes(self) -> int:
+        """Of the keyframes' images that are kept for training: what grows with the length of a run, to a bound."""
+        return sum(level.numel() for view in self._with_image for level in view.levels)
+
+    def _bound_images(self) -> None:
+        """Lets go the image of the keyframe whose neighbors in time are closest, where there are too many.
+
+        The newest ones, which the local half trains on, stay. Its splats stay, and move with its pose.
+        """
+        self._with_image.append(self.views[-1])
+        last = len(self._with_image) - max(1, self.config.window)
+        if len(self._with_image) <= self.config.max_keyframes or last < 2:
+            return
+        order = [view.index for view in self._with_image]
+        k = min(range(1, last), key=lambda k: order[k + 1] - order[k - 1])
+        self._with_image.pop(k).drop_images()
+        self.schedule.forget()
+        self.log.refuse(
+            "images",
+            1,
+            f"more than {self.config.max_keyframes} keyframes (max_keyframes): images of "
+            "older ones are thinned out and no longer trained on",
+        )
 
     def _train(self, view: TrainingView, refining: bool = False) -> None:
         config = self.config

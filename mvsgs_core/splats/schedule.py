@@ -28,6 +28,10 @@ class Schedule:
         dropped, self.owed = self.owed, 0
         return dropped
 
+    def forget(self) -> None:
+        """The positions have changed: begins new rounds."""
+        self._local, self._all = [], []
+
     def next(self, count: int) -> int:
         """Position of the next of `count` > 0 keyframes; takes one off what is owed."""
         self.owed = max(0, self.owed - 1)

@@ -224,3 +224,19 @@ def test_wild_learning_rates_leave_the_map_finite() -> None:
     for name in PARAMETERS:
         assert torch.isfinite(getattr(mapper.state.splats, name)).all()
     assert torch.isfinite(mapper.render(mapper.views[0]).color).all()
+
+
+def test_images_are_kept_for_a_bounded_number_of_keyframes_spread_over_the_run() -> None:
+    views = [posed_view(k, pose_on_arc(k / 9)) for k in range(10)]
+    mapper = mapped(views, replace(CONFIG, iterations=4, window=2, max_keyframes=5))
+    kept = [view.index for view in mapper.views if view.levels]
+    assert len(kept) == 5
+    assert kept[0] == 0
+    assert kept[-2:] == [8, 9]
+    assert max(np.diff(kept)) <= 4
+    assert mapper.image_bytes == 5 * 48 * 64 * 3 * 5 // 4
+    assert len(mapper.snapshot().keyframes) == 10
+    assert any("max_keyframes" in text for text in mapper.log.warnings)
+    shift = np.stack([view.world_from_cam for view in views])
+    shift[:, 0, 3] += 1.0
+    assert mapper.correct(np.arange(10), shift, np.ones(10)) == len(mapper.state)
