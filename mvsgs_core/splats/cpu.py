@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from mvsgs_core import native
 from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import Render, View, screen_points
+from mvsgs_core.splats.view import Backward, Render, View, screen_points
 
 
 class _Rasterize(torch.autograd.Function):
@@ -44,7 +44,7 @@ class _Rasterize(torch.autograd.Function):
             radii=radii,
         )
         extra.update(passed=passed, radii=radii)
-        ctx.passed, ctx.view = passed, view
+        ctx.passed, ctx.view, ctx.report = passed, view, extra["backward"]
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*parameters, color, depth, opacity)
         return color, depth, opacity
@@ -57,7 +57,7 @@ class _Rasterize(torch.autograd.Function):
         results = [torch.empty_like(parameter) for parameter in parameters]
         on_screen = torch.empty(len(parameters[0]), 2)
         on_pose = torch.zeros(4, 4, dtype=torch.float64)
-        native.load("splats").backward(
+        ctx.report.refused = native.load("splats").backward(
             ctx.passed,
             *parameters,
             color=color,
@@ -89,7 +89,7 @@ def render(splats: Splats, view: View) -> Render:
         )
     count = len(splats)
     screen = screen_points(splats, view)
-    extra: dict[str, Any] = {}
+    extra: dict[str, Any] = {"backward": Backward()}
     color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), screen, view.pose, view, extra)
     weight_sum = weight_max = None
     if view.weights:
@@ -105,4 +105,5 @@ def render(splats: Splats, view: View) -> Render:
         weight_sum=weight_sum,
         weight_max=weight_max,
         refused=extra["passed"].refused,
+        backward=extra["backward"],
     )

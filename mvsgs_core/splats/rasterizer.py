@@ -12,81 +12,25 @@ The mathematics, the same in each: EWA splatting (Zwicker et al. 2001) as in 3D 
   nothing is seen; opacity = sum w = 1 - T.
 
 A splat with a parameter that is not finite, a quaternion of length 0 or an extent beyond 1e8 px is left out and counted
-in `Render.refused`; its gradients are 0.
+in `Render.refused`; its gradients are 0. So are those of a splat that has one which is not finite; the "cpu" back end
+counts them in `Render.backward.refused`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats import densities, spherical_harmonics
+from mvsgs_core.splats import cpu, densities, reference, spherical_harmonics
 from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.view import TILE, Render, View, tile_grid
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-BLUR = 0.3  # px^2, low-pass on the diagonal of the image covariance
-MAX_ALPHA = 0.99
-MIN_TRANSMITTANCE = 1e-4
-CLAMP_MARGIN = 0.3  # of tan(fov): how far beyond the image the Jacobian follows x/z and y/z
-MIN_COMPENSATION = 0.005  # floor of the antialiased opacity factor
-MAX_VARIANCE = 1e16  # px^2
-MAX_REACH = 1e12  # of m, where an exact density of a small exponent ends at the latest
-MIN_QUATERNION = 1e-8
-TILE = 16  # pixels
+__all__ = ["BACKENDS", "TILE", "Render", "View", "rasterize", "se3_exp", "tile_grid"]
 
 BACKENDS = ("auto", "reference", "cpu", "triton")
-
-
-@dataclass(frozen=True)
-class View:
-    """What the back ends get besides the splats: a checked camera and the switches."""
-
-    pose: Tensor  # (4, 4) float64 world_from_cam, may carry a gradient
-    intrinsics: tuple[float, ...]  # fx, fy, cx, cy, px at `size`
-    size: tuple[int, int]  # height, width, px
-    density: str  # "gaussian" or "exact"
-    background: tuple[float, ...]  # red, green, blue
-    tile_mask: Tensor | None  # (ceil(H / 16), ceil(W / 16)) bool, False = leave the tile out
-    near: float  # map units
-    antialiased: bool
-    degree: int  # of the spherical harmonics
-    weights: bool  # whether to sum up the blending weights of every splat
-    threads: int  # 0 = as many as OpenMP would take
-
-
-@dataclass
-class Render:
-    """A rendered view and what density control reads from it; H, W pixels, N splats."""
-
-    color: Tensor  # (H, W, 3), nominally 0 to 1, not clamped
-    depth: Tensor  # (H, W), expected z in map units, 0 where opacity is 0
-    opacity: Tensor  # (H, W), 0 to 1
-    visible: Tensor  # (N,) bool: in front, on the image, opacity at least 1/255
-    radii: Tensor  # (N,), half of the longer side of the splat's box on the image, px; 0 if not visible
-    screen: (
-        Tensor  # (N, 2) zeros; after backward its .grad is dL/d(mean on the image), in units of half the image (3DGS)
-    )
-    weight_sum: Tensor | None  # (N,), blending weight alpha * T summed over the pixels; None unless asked for
-    weight_max: Tensor | None  # (N,), the largest blending weight at any pixel; None unless asked for
-    refused: int  # splats left out because a parameter is not finite or degenerate
-
-
-def tile_grid(size: tuple[int, int]) -> tuple[int, int]:
-    """(rows, columns) of 16x16 tiles that cover an image of (height, width)."""
-    return -(-size[0] // TILE), -(-size[1] // TILE)
-
-
-def screen_points(splats: Splats, view: View) -> Tensor:
-    """Zeros (N, 2) for `Render.screen`; they take a gradient where anything else does."""
-    inputs = [*splats.tensors().values(), view.pose]
-    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
-    return splats.means.new_zeros(len(splats), 2).requires_grad_(wanted)
 
 
 def se3_exp(twist: Tensor) -> Tensor:
@@ -173,15 +117,11 @@ def _backend(name: str, device: torch.device) -> Callable[[Splats, View], Render
     if name == "auto":
         name = "cpu" if device.type == "cpu" else "triton"
     if name == "reference":
-        from mvsgs_core.splats import reference
-
         return reference.render
     if name == "cpu":
-        from mvsgs_core.splats import cpu
-
         return cpu.render
     if name == "triton":
-        from mvsgs_core.splats import triton_backend
+        from mvsgs_core.splats import triton_backend  # an optional package
 
         return triton_backend.render
     raise ValueError(f"backend {name!r}: choose one of {', '.join(BACKENDS)}")

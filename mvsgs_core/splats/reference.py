@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats import densities, rasterizer, spherical_harmonics
+from mvsgs_core.splats import densities, spherical_harmonics
+from mvsgs_core.splats import view as interface
 from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import Render, View
+from mvsgs_core.splats.view import Backward, Render, View
 
 PAIRS_AT_ONCE = 1 << 22  # splat-pixel pairs held in memory at a time
 
@@ -32,7 +33,7 @@ def usable(splats: Splats) -> Tensor:
     """(N,) bool: all parameters finite, quaternion not 0."""
     finite = [torch.isfinite(tensor.flatten(1) if tensor.dim() > 1 else tensor[:, None]).all(dim=1)
               for tensor in splats.tensors().values()]  # fmt: skip
-    return torch.stack(finite).all(dim=0) & (splats.quaternions.norm(dim=-1) > rasterizer.MIN_QUATERNION)
+    return torch.stack(finite).all(dim=0) & (splats.quaternions.norm(dim=-1) > interface.MIN_QUATERNION)
 
 
 def axes_on_image(splats: Splats, points: Tensor, view: View) -> Tensor:
@@ -40,7 +41,7 @@ def axes_on_image(splats: Splats, points: Tensor, view: View) -> Tensor:
     fx, fy, cx, cy = view.intrinsics
     height, width = view.size
     x, y, z = points.unbind(-1)
-    margin_x, margin_y = (rasterizer.CLAMP_MARGIN * 0.5 * n / f for n, f in ((width, fx), (height, fy)))
+    margin_x, margin_y = (interface.CLAMP_MARGIN * 0.5 * n / f for n, f in ((width, fx), (height, fy)))
     slope_x = (x / z).clamp(-(cx + 0.5) / fx - margin_x, (width - 0.5 - cx) / fx + margin_x)
     slope_y = (y / z).clamp(-(cy + 0.5) / fy - margin_y, (height - 0.5 - cy) / fy + margin_y)
     zero = torch.zeros_like(z)
@@ -83,15 +84,15 @@ def project(splats: Splats, screen: Tensor, view: View) -> Projected:
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     # the determinant as a sum of squares (Lagrange's identity): no cancellation for needles
     sharp = torch.linalg.cross(row_x, row_y).square().sum(-1)
-    determinant = sharp + rasterizer.BLUR * (xx + yy) + rasterizer.BLUR**2
+    determinant = sharp + interface.BLUR * (xx + yy) + interface.BLUR**2
 
     opacity = torch.sigmoid(splats.opacity_logits)
     if view.antialiased:
-        opacity = opacity * (sharp / determinant).clamp(min=rasterizer.MIN_COMPENSATION**2).sqrt()
+        opacity = opacity * (sharp / determinant).clamp(min=interface.MIN_COMPENSATION**2).sqrt()
     directions = from_camera / from_camera.norm(dim=-1, keepdim=True)
     colors = spherical_harmonics.colors(splats.sh, directions.to(dtype), view.degree)
     return Projected(
-        centers, depths, xx + rasterizer.BLUR, xy, yy + rasterizer.BLUR, determinant, opacity, colors, splats.betas
+        centers, depths, xx + interface.BLUR, xy, yy + interface.BLUR, determinant, opacity, colors, splats.betas
     )
 
 
@@ -114,8 +115,8 @@ def choose(splats: Splats, view: View) -> Choice:
     kept = torch.nonzero(keep & (z > view.near))[:, 0]
     chosen = Splats(*(tensor[kept] for tensor in splats.tensors().values()))
     p = project(chosen, torch.zeros_like(chosen.means[:, :2]), view)
-    sane = torch.isfinite(p.determinant) & (p.xx < rasterizer.MAX_VARIANCE) & (p.yy < rasterizer.MAX_VARIANCE)
-    reach = densities.extent(p.opacity, p.betas, view.density).clamp(max=rasterizer.MAX_REACH)
+    sane = torch.isfinite(p.determinant) & (p.xx < interface.MAX_VARIANCE) & (p.yy < interface.MAX_VARIANCE)
+    reach = densities.extent(p.opacity, p.betas, view.density).clamp(max=interface.MAX_REACH)
     half_x, half_y = (reach * p.xx).sqrt(), (reach * p.yy).sqrt()
     on_image = (p.centers[:, 0] + half_x >= 0) & (p.centers[:, 0] - half_x <= width - 1)
     on_image &= (p.centers[:, 1] + half_y >= 0) & (p.centers[:, 1] - half_y <= height - 1)
@@ -129,10 +130,10 @@ def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, view: View) -> Tensor
     """(P, V) of pixels (P,) by splats (V,); 0 below 1/255 and in tiles left out."""
     dx, dy = pixel_x[:, None] - p.centers[:, 0], pixel_y[:, None] - p.centers[:, 1]
     m = p.yy / p.determinant * (dx - p.xy / p.yy * dy) ** 2 + dy * dy / p.yy
-    alpha = (p.opacity * densities.falloff(m, p.betas, view.density)).clamp(max=rasterizer.MAX_ALPHA)
+    alpha = (p.opacity * densities.falloff(m, p.betas, view.density)).clamp(max=interface.MAX_ALPHA)
     counted = alpha >= densities.MIN_ALPHA
     if view.tile_mask is not None:
-        counted = counted & view.tile_mask[pixel_y // rasterizer.TILE, pixel_x // rasterizer.TILE][:, None]
+        counted = counted & view.tile_mask[pixel_y // interface.TILE, pixel_x // interface.TILE][:, None]
     return torch.where(counted, alpha, 0.0)
 
 
@@ -140,7 +141,7 @@ def render(splats: Splats, view: View) -> Render:
     """See `rasterizer.rasterize`."""
     dtype, device, count = splats.means.dtype, splats.means.device, len(splats)
     height, width = view.size
-    screen = rasterizer.screen_points(splats, view)
+    screen = interface.screen_points(splats, view)
     choice = choose(splats, view)
     shown = Splats(*(tensor.index_select(0, choice.order) for tensor in splats.tensors().values()))
     p = project(shown, screen.index_select(0, choice.order), view)
@@ -156,7 +157,7 @@ def render(splats: Splats, view: View) -> Render:
         alpha = alphas(p, pixel_x, pixel_y, view)
         before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1.0 - alpha], dim=1), dim=1)[:, :-1]
         before = before[:, : alpha.shape[1]]
-        alpha = alpha * (before >= rasterizer.MIN_TRANSMITTANCE)
+        alpha = alpha * (before >= interface.MIN_TRANSMITTANCE)
         weights = alpha * before
         transmittance = torch.prod(1.0 - alpha, dim=1)
         covered = weights.sum(dim=1)
@@ -179,4 +180,5 @@ def render(splats: Splats, view: View) -> Render:
         weight_sum=weight_sum if view.weights else None,
         weight_max=weight_max if view.weights else None,
         refused=choice.refused,
+        backward=Backward(),
     )

@@ -115,6 +115,11 @@ def train_once(
         log.refuse("iterations", 1, "an iteration whose loss was not finite was refused")
         return
     loss.backward()
+    if render.backward.refused:
+        log.refuse("gradients", render.backward.refused, "gradients of splats that were not finite were taken as none")
+    if render.backward.refused:
+        text = "gradients of splats that were not finite were set to 0 in the rasterizer's backward pass"
+        log.refuse("gradients", render.backward.refused, text)
     if render.screen.grad is not None:
         gradient = render.screen.grad.norm(dim=1)
         state.accumulate_screen(torch.where(torch.isfinite(gradient), gradient, 0.0), render.visible)

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mvsgs_core.splats import rasterizer
 from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import Render, View
+from mvsgs_core.splats.view import Backward, Render, View, screen_points, tile_grid
 
 try:
     import triton
@@ -51,7 +50,7 @@ def projected(parameters: list[Tensor], view: View) -> Pass:
     means, sh = parameters[0], parameters[4]
     count, device = len(means), means.device
     height, width = view.size
-    tiles_y, tiles_x = rasterizer.tile_grid(view.size)
+    tiles_y, tiles_x = tile_grid(view.size)
     tiles = tiles_y * tiles_x
     camera = view.pose.detach().reshape(-1).to(device)
     rows, footprints = means.new_empty(count, ROW), means.new_empty(count, FOOTPRINT)
@@ -97,7 +96,7 @@ class _Rasterize(torch.autograd.Function):
         passed = projected(parameters, view)
         lists = passed.lists
         height, width = view.size
-        tiles_y, tiles_x = rasterizer.tile_grid(view.size)
+        tiles_y, tiles_x = tile_grid(view.size)
         color = means.new_empty(height, width, 3)
         depth, opacity = means.new_empty(2, height, width).unbind(0)
         weights = means.new_zeros(2, len(lists.pair_splats) if view.weights else 1)
@@ -122,7 +121,7 @@ class _Rasterize(torch.autograd.Function):
         passed, view = ctx.passed, ctx.view
         lists, count = passed.lists, len(parameters[0])
         height, width = view.size
-        tiles_y, tiles_x = rasterizer.tile_grid(view.size)
+        tiles_y, tiles_x = tile_grid(view.size)
         outputs = (color, depth, opacity)
         on_color, on_depth, on_opacity = (
             torch.zeros_like(output) if gradient is None else gradient.contiguous()
@@ -157,7 +156,7 @@ def render(splats: Splats, view: View) -> Render:
     """See `rasterizer.rasterize`. Raises ValueError for other than float32."""
     if splats.means.dtype != torch.float32:
         raise ValueError(f"the triton back end takes float32 splats, got {splats.means.dtype}")
-    screen = rasterizer.screen_points(splats, view)
+    screen = screen_points(splats, view)
     extra: dict[str, Any] = {}
     color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), screen, view.pose, view, extra)
     passed: Pass = extra["passed"]
@@ -171,4 +170,5 @@ def render(splats: Splats, view: View) -> Render:
         weight_sum=extra.get("weight_sum"),
         weight_max=extra.get("weight_max"),
         refused=passed.refused,
+        backward=Backward(),
     )

@@ -1,109 +1,126 @@
-// Front-to-back blending, tile by tile: splats outside, the 4x4 blocks that a splat's ellipse touches inside, so that a
-// splat's parameters stay in registers and blocks which are full drop out.
+// Front-to-back blending, tile by tile and in a tile block by block: the block's pixels stay in registers while the
+// splats whose ellipse touches it pass by, a group of them at a time, until the block is full.
 #include <omp.h>
 
+#include "splats/pixels.hpp"
 #include "splats/tile.hpp"
 
 namespace splats {
 namespace {
 
-struct Block {
-    Lanes transmittance, red, green, blue, depth;
+// What a thread keeps of the tile at hand.
+struct Workspace {
+    std::vector<Placed> placed;         // of every pair; behind them one that is seen nowhere
+    std::vector<uint16_t> touched;      // of every pair: blocks that the ellipse touches
+    std::vector<uint16_t> hits;         // of every pair: blocks that got color
+    std::vector<uint32_t> list;         // pairs that touch the block at hand
+    std::vector<Lanes> weight_sum, weight_max;
+    int64_t evaluated = 0, contributed = 0;
+
+    void take(const Frame& frame, const Tile& tile, bool weights) {
+        const uint32_t count = tile.end - tile.begin;
+        if (placed.size() < count + 1) {
+            placed.resize(count + count / 2 + 64);
+            hits.resize(placed.size());
+            touched.resize(placed.size() + kLanes);
+            list.resize(placed.size() + kLanes);
+        }
+        for (uint32_t i = 0; i < count; ++i) {
+            const uint32_t soon = std::min(tile.begin + i + 8, tile.end - 1);
+            __builtin_prefetch(&frame.splats[frame.pairs[soon].splat]);
+            const Pair& pair = frame.pairs[tile.begin + i];
+            placed[i] = Placed(frame.splats[pair.splat], tile);
+            touched[i] = pair.blocks;
+            hits[i] = 0;
+        }
+        placed[count] = Placed{};
+        placed[count].log2_opacity = 2.0f * kLog2MinAlpha;
+        if (!weights) return;
+        weight_sum.assign(count + 1, Lanes{});
+        weight_max.assign(count + 1, Lanes{});
+    }
+
+    // Lists the pairs that touch `block`, filled up to whole groups; returns how many touch it.
+    uint32_t find(uint32_t count, int block) {
+        const uint32_t found = list_with_bit(touched.data(), count, block, list.data());
+        for (int i = 0; i < kTogether; ++i) list[found + i] = count;
+        return found;
+    }
 };
-using Pixels = Block[16];
 
 template <bool Exact, bool Weights>
-int64_t blend_tile(Frame& frame, const Tile& tile, Pixels& pixels) {
-    uint32_t open = 0;  // blocks with a pixel that is not full
-    for (int block = 0; block < 16; ++block) {
-        pixels[block] = {BlockSpan(tile, block).inside(), Lanes{}, Lanes{}, Lanes{}, Lanes{}};
-        open |= uint32_t(any(at_least(pixels[block].transmittance, kMinTransmittance))) << block;
-    }
-    int64_t evaluated = 0;
-    uint32_t index = tile.begin;
-    for (; index < tile.end && open; ++index) {
-        Pair& pair = frame.pairs[index];
-        uint32_t blocks = pair.blocks & open, hit = 0;
-        const ScreenSplat& s = frame.splats[pair.splat];
-        if (index + 8 < tile.end) __builtin_prefetch(&frame.splats[frame.pairs[index + 8].splat]);
-        const Placed placed(s, tile);
-        Lanes weight_sum{}, weight_max{};
-        for (; blocks; blocks &= blocks - 1) {
-            const int block = __builtin_ctz(blocks);
-            Lanes u, v, log2_m, power;
-            placed.at(s, block, u, v);
-            const Lanes exponent = log2_alpha<Exact>(s, u, v, log2_m, power);
-            const Lanes before = pixels[block].transmittance;
-            const Mask counted = at_least(exponent, kLog2MinAlpha) & at_least(before, kMinTransmittance);
-            evaluated += kLanes;
-            hit |= uint32_t(any(counted)) << block;
-            const Lanes weight = where(counted, before * minimum(exp2_of_negative(exponent), all(kMaxAlpha)));
-            const Lanes after = before - weight;
-            pixels[block].transmittance = after;
-            pixels[block].red += s.red * weight;
-            pixels[block].green += s.green * weight;
-            pixels[block].blue += s.blue * weight;
-            pixels[block].depth += s.depth * weight;
-            if (!any(at_least(after, kMinTransmittance))) [[unlikely]] open &= ~(1u << block);
+PixelSums blend_block(const Tile& tile, int block, Workspace& work) {
+    PixelSums sums;
+    const Lanes inside = BlockSpan(tile, block).inside();
+    Lanes ahead = inside;  // transmittance, and on below the least one; sums.transmittance stops there
+    sums.transmittance = inside;
+    const uint32_t found = work.find(tile.end - tile.begin, block);
+    const BlockPixels pixels;
+    const Lanes x = pixels.x[block & 3], y = pixels.y[block >> 2];
+    for (uint32_t first = 0; first < found; first += kTogether) {
+        if (!any(at_least(ahead, kMinTransmittance))) break;
+        const uint32_t* list = work.list.data() + first;
+        const Placed* placed = work.placed.data();
+        const Densities<Exact> densities([&](int i) -> const Placed& { return placed[list[i]]; },
+                                         [&](int) { return x; }, [&](int) { return y; });
+        Lanes alphas[kTogether];
+        store(minimum(densities.alpha, Group{} + kMaxAlpha), alphas);
+        work.evaluated += kLanes * kTogether;
+        for (int i = 0; i < kTogether; ++i) {
+            const Placed& s = placed[list[i]];
+            const Mask counted = at_least(ahead, kMinTransmittance);
+            const Lanes weight = where(counted, ahead * alphas[i]);
+            ahead = ahead - ahead * alphas[i];
+            sums.transmittance = choose(counted, ahead, sums.transmittance);
+            sums.red += s.red * weight;
+            sums.green += s.green * weight;
+            sums.blue += s.blue * weight;
+            sums.depth += s.depth * weight;
+            const Mask hit = at_least(weight, kTiny);
+            work.hits[list[i]] |= uint16_t(any(hit)) << block;
             if constexpr (Weights) {
-                weight_sum += weight;
-                weight_max = maximum(weight_max, weight);
+                work.weight_sum[list[i]] += weight;
+                work.weight_max[list[i]] = maximum(work.weight_max[list[i]], weight);
+                work.contributed += count(hit);
             }
         }
-        pair.blocks = uint16_t(hit);
-        if constexpr (Weights) {
-            frame.weight_slots[2 * size_t(pair.slot)] = sum(weight_sum);
-            frame.weight_slots[2 * size_t(pair.slot) + 1] = largest(weight_max);
-        }
     }
-    for (; index < tile.end; ++index) {
-        Pair& pair = frame.pairs[index];
-        pair.blocks = 0;
-        if constexpr (Weights)
-            frame.weight_slots[2 * size_t(pair.slot)] = frame.weight_slots[2 * size_t(pair.slot) + 1] = 0.0f;
-    }
-    return evaluated;
+    return sums;
 }
 
-void write(const Frame& frame, const Tile& tile, Pixels& pixels, float* color, float* depth, float* opacity) {
-    for (int block = 0; block < 16; ++block) {
-        Block& b = pixels[block];
-        const Lanes left = b.transmittance, covered = 1.0f - left;
-        b.red += left * frame.background[0];
-        b.green += left * frame.background[1];
-        b.blue += left * frame.background[2];
-        b.depth = b.depth / maximum(covered, all(kTiny));  // 0 / tiny where nothing is seen
-        alignas(64) float sums[5][kLanes];
-        store(b.red, sums[0]);
-        store(b.green, sums[1]);
-        store(b.blue, sums[2]);
-        store(b.depth, sums[3]);
-        store(covered, sums[4]);
+template <bool Exact, bool Weights>
+void blend_tile(Frame& frame, const Tile& tile, const Images<float>& images, Workspace& work) {
+    work.take(frame, tile, Weights);
+    for (int block = 0; block < kBlocks; ++block) {
         const BlockSpan span(tile, block);
-        for (int dy = 0; dy < span.rows; ++dy) {
-            const size_t first = size_t(span.y + dy) * frame.camera.width + span.x;
-            for (int dx = 0; dx < span.columns; ++dx) {
-                const int lane = 4 * dy + dx;
-                for (int c = 0; c < 3; ++c) color[3 * (first + dx) + c] = sums[c][lane];
-                depth[first + dx] = sums[3][lane];
-                opacity[first + dx] = sums[4][lane];
-            }
+        if (span.columns <= 0 || span.rows <= 0) continue;
+        write_pixels(frame, span, blend_block<Exact, Weights>(tile, block, work), images);
+    }
+    for (uint32_t i = 0; i < tile.end - tile.begin; ++i) {
+        Pair& pair = frame.pairs[tile.begin + i];
+        pair.blocks = work.hits[i];
+        if constexpr (Weights) {
+            frame.weight_slots[2 * size_t(pair.slot)] = sum(work.weight_sum[i]);
+            frame.weight_slots[2 * size_t(pair.slot) + 1] = largest(work.weight_max[i]);
         }
     }
 }
 
 template <bool Exact, bool Weights>
-void blend_all(Frame& frame, float* color, float* depth, float* opacity, int threads) {
+void blend_all(Frame& frame, const Images<float>& images, int threads) {
     const int tiles = frame.tiles_x * frame.tiles_y;
-    int64_t evaluated = 0;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : evaluated)
-    for (int index = 0; index < tiles; ++index) {
-        const Tile tile(frame, index);
-        Pixels pixels;
-        evaluated += blend_tile<Exact, Weights>(frame, tile, pixels);
-        write(frame, tile, pixels, color, depth, opacity);
+    int64_t evaluated = 0, contributed = 0;
+#pragma omp parallel num_threads(threads) reduction(+ : evaluated, contributed)
+    {
+        Workspace work;
+#pragma omp for schedule(dynamic, 4)
+        for (int index = 0; index < tiles; ++index)
+            blend_tile<Exact, Weights>(frame, Tile(frame, index), images, work);
+        evaluated += work.evaluated;
+        contributed += work.contributed;
     }
-    frame.exponentials = evaluated;
+    frame.evaluated = evaluated;
+    frame.contributed = contributed;
 }
 
 }  // namespace
@@ -112,7 +129,7 @@ void blend(Frame& frame, bool weights, float* color, float* depth, float* opacit
     if (weights) frame.weight_slots.resize(2 * size_t(frame.pair_count));
     auto* chosen = frame.exact ? (weights ? blend_all<true, true> : blend_all<true, false>)
                                : (weights ? blend_all<false, true> : blend_all<false, false>);
-    chosen(frame, color, depth, opacity, threads);
+    chosen(frame, {color, depth, opacity}, threads);
 }
 
 }  // namespace splats

@@ -109,7 +109,9 @@ struct Frame {
     bool exact = false, antialiased = false;
     int degree = 0, tiles_x = 0, tiles_y = 0;
     float background[3] = {0, 0, 0};
-    int64_t refused = 0, pair_count = 0, visible_count = 0, exponentials = 0;
+    int64_t refused = 0, pair_count = 0, visible_count = 0;
+    int64_t evaluated = 0;    // densities of the last forward pass, lanes off the ellipse included
+    int64_t contributed = 0;  // of those, pairs of splat and pixel that got color; counted with the weights only
     Buffer<ScreenSplat> splats;      // by splat index
     Buffer<Footprint> footprints;    // by splat index
     Buffer<uint32_t> order, order_scratch, depth_keys, depth_keys_scratch;

@@ -30,13 +30,25 @@ SPLATS_INLINE void store(const Vector& vector, Scalar (&values)[kLanes]) {
 }
 SPLATS_INLINE Lanes all(float value) { return Lanes{} + value; }
 
+constexpr int kTogether = sizeof(Group) / sizeof(Lanes);
+// The lanes that `of` gives for 0, 1, ... as one group.
+template <class Of>
+SPLATS_INLINE Group group(Of of) {
+    if constexpr (kTogether == 4)
+        return halves(halves(of(0), of(1)), halves(of(2), of(3)));
+    else
+        return of(0);
+}
+SPLATS_INLINE void store(const Group& group, Lanes* first) { std::memcpy(first, &group, sizeof(group)); }
+
 // log2(x) of positive normal x: mantissa in [sqrt(1/2), sqrt(2)), log2(1 + f) = f P(f), P of degree 6 with a
 // relative error of 1e-6: enough for an exponent, where it changes alpha by less than 1e-6.
-SPLATS_INLINE Lanes log2_of_positive(Lanes x) {
-    const Ints bits = as_bits(x);
-    const Ints exponent = (bits - 0x3f3504f3) >> 23;
-    const Lanes f = as_floats(bits - (exponent << 23)) - 1.0f;
-    Lanes p = 1.716245617e-01f * f - 2.693202167e-01f;
+template <class Wide>
+SPLATS_INLINE Wide log2_of_positive(const Wide& x) {
+    const auto bits = as_bits(x);
+    const auto exponent = (bits - 0x3f3504f3) >> 23;
+    const Wide f = as_floats(bits - (exponent << 23)) - 1.0f;
+    Wide p = 1.716245617e-01f * f - 2.693202167e-01f;
     p = p * f + 2.956995207e-01f;
     p = p * f - 3.593716436e-01f;
     p = p * f + 4.806267683e-01f;

@@ -5,22 +5,9 @@
 
 #include "splats/register_part.hpp"
 
+#include "splats/halves.hpp"
+
 namespace splats {
-
-template <class Half>
-struct Halves {
-    Half low, high;
-
-    // For lanes known when compiled; others are read from memory, after store().
-    SPLATS_INLINE_MEMBER auto operator[](int lane) const {
-        constexpr int kCount = int(sizeof(Half) / sizeof(float));
-        return lane < kCount ? low[lane] : high[lane - kCount];
-    }
-};
-template <class Half>
-SPLATS_INLINE Halves<Half> halves(Half low, Half high) {
-    return {low, high};
-}
 
 #if defined(__AVX2__)
 using Lanes = Halves<Part>;
@@ -30,81 +17,20 @@ using Lanes = Halves<Halves<Part>>;
 using Ints = Halves<Halves<IntPart>>;
 #endif
 using Mask = Ints;  // all bits of a lane, or none
+using Group = Lanes;  // how many go in lockstep: the halves are chains enough
 
-#define SPLATS_OPERATOR(op)                                                                     \
-    template <class Half>                                                                       \
-    SPLATS_INLINE auto operator op(const Halves<Half>& a, const Halves<Half>& b) {              \
-        return halves(a.low op b.low, a.high op b.high);                                        \
-    }                                                                                           \
-    template <class Half, class Scalar>                                                         \
-        requires std::is_arithmetic_v<Scalar>                                                   \
-    SPLATS_INLINE auto operator op(const Halves<Half>& a, Scalar b) {                           \
-        return halves(a.low op b, a.high op b);                                                 \
-    }                                                                                           \
-    template <class Half, class Scalar>                                                         \
-        requires std::is_arithmetic_v<Scalar>                                                   \
-    SPLATS_INLINE auto operator op(Scalar a, const Halves<Half>& b) {                           \
-        return halves(a op b.low, a op b.high);                                                 \
-    }
-SPLATS_OPERATOR(+)
-SPLATS_OPERATOR(-)
-SPLATS_OPERATOR(*)
-SPLATS_OPERATOR(/)
-SPLATS_OPERATOR(&)
-SPLATS_OPERATOR(|)
-SPLATS_OPERATOR(<<)
-SPLATS_OPERATOR(>>)
-SPLATS_OPERATOR(<)
-SPLATS_OPERATOR(>)
-SPLATS_OPERATOR(<=)
-SPLATS_OPERATOR(>=)
-#undef SPLATS_OPERATOR
-
-template <class Half>
-SPLATS_INLINE Halves<Half> operator-(const Halves<Half>& a) {
-    return {-a.low, -a.high};
-}
-template <class Half, class Other>
-SPLATS_INLINE Halves<Half>& operator+=(Halves<Half>& a, const Other& b) {
-    return a = a + b;
-}
-
-#define SPLATS_ONE_BY_ONE(function)                                    \
-    template <class Half>                                              \
-    SPLATS_INLINE auto function(const Halves<Half>& a) {               \
-        return halves(function(a.low), function(a.high));              \
-    }
-SPLATS_ONE_BY_ONE(as_bits)
-SPLATS_ONE_BY_ONE(as_floats)
-SPLATS_ONE_BY_ONE(to_floats)
-SPLATS_ONE_BY_ONE(toward_zero)
-SPLATS_ONE_BY_ONE(root)
-#undef SPLATS_ONE_BY_ONE
-
-template <class Half>
-SPLATS_INLINE Halves<Half> minimum(const Halves<Half>& a, const Halves<Half>& b) {
-    return {minimum(a.low, b.low), minimum(a.high, b.high)};
-}
-template <class Half>
-SPLATS_INLINE Halves<Half> maximum(const Halves<Half>& a, const Halves<Half>& b) {
-    return {maximum(a.low, b.low), maximum(a.high, b.high)};
-}
-template <class MaskHalf, class Half>
-SPLATS_INLINE Halves<Half> where(const Halves<MaskHalf>& mask, const Halves<Half>& a) {  // 0 elsewhere
-    return {where(mask.low, a.low), where(mask.high, a.high)};
-}
-template <class Half>
-SPLATS_INLINE Halves<Half> choose(const Halves<Half>& mask, const Halves<Half>& a, const Halves<Half>& b) {
-    return {choose(mask.low, a.low, b.low), choose(mask.high, a.high, b.high)};
-}
-template <class Half>
-SPLATS_INLINE bool any(const Halves<Half>& mask) {
-    return any(mask.low | mask.high);
-}
 SPLATS_INLINE Mask at_least(const Lanes& a, float b) { return a >= b; }
+SPLATS_INLINE Lanes choose(const Mask& mask, const Lanes& a, const Lanes& b) {
+    return as_floats(choose(mask, as_bits(a), as_bits(b)));
+}
+SPLATS_INLINE int count(const Mask& mask) {
+    alignas(64) int32_t values[16];
+    std::memcpy(values, &mask, sizeof(values));
+    int total = 0;
+    for (const int32_t value : values) total -= value;
+    return total;
+}
 SPLATS_INLINE Mask at_most(const Lanes& a, float b) { return a <= b; }
-
-SPLATS_INLINE Lanes reciprocal(const Lanes& x) { return 1.0f / x; }
 
 // 2^x for -126 < x <= 0, relative error 8e-8 plus rounding; other lanes give garbage (the caller masks them).
 // Minimax polynomial of degree 5 on [-1, 0].
@@ -157,6 +83,30 @@ SPLATS_INLINE float sum(const Halves<Half>& v) {
 template <class Half>
 SPLATS_INLINE float largest(const Halves<Half>& v) {
     return largest(maximum(v.low, v.high));
+}
+
+// Appends to `list` the numbers i < count of the masks that have `bit`; returns how many. Both end in room for sixteen.
+SPLATS_INLINE uint32_t list_with_bit(const uint16_t* masks, uint32_t count, int bit, uint32_t* list) {
+    uint32_t found = 0;
+    for (uint32_t i = 0; i < count; ++i) {
+        list[found] = i;
+        found += masks[i] >> bit & 1;
+    }
+    return found;
+}
+
+// Colors of a 4x4 block, rows of which lie `stride` floats apart.
+SPLATS_INLINE void gather_color(const float* first, size_t stride, Lanes (&rgb)[3]) {
+    alignas(64) float values[3][16];
+    for (int dy = 0; dy < 4; ++dy)
+        for (int i = 0; i < 12; ++i) values[i % 3][4 * dy + i / 3] = first[dy * stride + i];
+    for (int c = 0; c < 3; ++c) std::memcpy(&rgb[c], values[c], sizeof(Lanes));
+}
+SPLATS_INLINE void scatter_color(const Lanes (&rgb)[3], float* first, size_t stride) {
+    alignas(64) float values[3][16];
+    for (int c = 0; c < 3; ++c) std::memcpy(values[c], &rgb[c], sizeof(Lanes));
+    for (int dy = 0; dy < 4; ++dy)
+        for (int i = 0; i < 12; ++i) first[dy * stride + i] = values[i % 3][4 * dy + i / 3];
 }
 
 }  // namespace splats

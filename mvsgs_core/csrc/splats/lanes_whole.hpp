@@ -3,6 +3,7 @@
 
 #include <immintrin.h>
 
+#include <algorithm>
 #include <cstdint>
 
 #include "splats/inlining.hpp"
@@ -26,8 +27,11 @@ SPLATS_INLINE Lanes root(Lanes x) { return (Lanes)_mm512_maskz_sqrt_ps(kAll, (__
 SPLATS_INLINE Mask at_least(Lanes a, float b) { return _mm512_cmp_ps_mask((__m512)a, _mm512_set1_ps(b), _CMP_GE_OQ); }
 SPLATS_INLINE Mask at_most(Lanes a, float b) { return _mm512_cmp_ps_mask((__m512)a, _mm512_set1_ps(b), _CMP_LE_OQ); }
 SPLATS_INLINE Lanes where(Mask mask, Lanes a) { return (Lanes)_mm512_maskz_mov_ps(mask, (__m512)a); }  // 0 elsewhere
+SPLATS_INLINE Lanes where_at_least(Lanes x, float limit, Lanes value) { return where(at_least(x, limit), value); }
 SPLATS_INLINE Ints choose(Ints mask, Ints a, Ints b) { return mask ? a : b; }
+SPLATS_INLINE Lanes choose(Mask mask, Lanes a, Lanes b) { return (Lanes)_mm512_mask_mov_ps((__m512)b, mask, (__m512)a); }
 SPLATS_INLINE bool any(Mask mask) { return mask != 0; }
+SPLATS_INLINE int count(Mask mask) { return __builtin_popcount(mask); }
 
 // 1 / x of normal x, relative error 1e-7 or better.
 SPLATS_INLINE Lanes reciprocal(Lanes x) {
@@ -35,28 +39,52 @@ SPLATS_INLINE Lanes reciprocal(Lanes x) {
     return r * (2.0f - x * r);  // one step of Newton's
 }
 
+SPLATS_INLINE Lanes nearest(Lanes x) { return (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, kNearest); }
+SPLATS_INLINE Lanes times_power(Lanes x, Lanes power) {  // of two
+    return (Lanes)_mm512_maskz_scalef_ps(kAll, (__m512)x, (__m512)power);
+}
+
+}  // namespace splats
+
+#include "splats/halves.hpp"
+
+namespace splats {
+
+using Group = Halves<Halves<Lanes>>;  // goes in lockstep
+
+template <class Half>
+SPLATS_INLINE Halves<Half> nearest(const Halves<Half>& x) {
+    return {nearest(x.low), nearest(x.high)};
+}
+template <class Half>
+SPLATS_INLINE Halves<Half> times_power(const Halves<Half>& x, const Halves<Half>& power) {
+    return {times_power(x.low, power.low), times_power(x.high, power.high)};
+}
+
 // 2^x for x <= 0, relative error 8e-8 plus rounding, by a minimax polynomial of degree 5 on [-1/2, 1/2].
-SPLATS_INLINE Lanes exp2_of_negative(Lanes x) {
-    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, kNearest);
-    const Lanes f = x - whole;
-    Lanes p = 1.327647199e-03f * f + 9.675541334e-03f;
+template <class Wide>
+SPLATS_INLINE Wide exp2_of_negative(const Wide& x) {
+    const Wide whole = nearest(x);
+    const Wide f = x - whole;
+    Wide p = 1.327647199e-03f * f + 9.675541334e-03f;
     p = p * f + 5.550713273e-02f;
     p = p * f + 2.402211972e-01f;
     p = p * f + 6.931469671e-01f;
     p = p * f + 1.000000072f;
-    return (Lanes)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)whole);
+    return times_power(p, whole);
 }
 
 // 2^x with x limited to 126 from above, relative error 3e-6, by a polynomial of degree 4: for an exponent, as above.
-SPLATS_INLINE Lanes exp2_limited(Lanes x) {
-    x = minimum(x, Lanes{} + 126.0f);
-    const Lanes whole = (Lanes)_mm512_maskz_roundscale_ps(kAll, (__m512)x, kNearest);
-    const Lanes f = x - whole;
-    Lanes p = 9.570101911e-03f * f + 5.591786032e-02f;
+template <class Wide>
+SPLATS_INLINE Wide exp2_limited(const Wide& exponent) {
+    const Wide x = minimum(exponent, Wide{} + 126.0f);
+    const Wide whole = nearest(x);
+    const Wide f = x - whole;
+    Wide p = 9.570101911e-03f * f + 5.591786032e-02f;
     p = p * f + 2.402474483e-01f;
     p = p * f + 6.931218147e-01f;
     p = p * f + 9.999992614e-01f;
-    return (Lanes)_mm512_maskz_scalef_ps(kAll, (__m512)p, (__m512)whole);
+    return times_power(p, whole);
 }
 
 // Neighboring runs of `Width` lanes of `a` and of `b` are added; the runs of `a` and `b` then alternate.
@@ -105,6 +133,52 @@ SPLATS_INLINE float largest(Lanes v) {
     v = maximum(v, turned<4>(v));
     v = maximum(v, turned<2>(v));
     return maximum(v, turned<1>(v))[0];
+}
+
+// Appends to `list` the numbers i < count of the masks that have `bit`; returns how many. Both end in room for sixteen.
+SPLATS_INLINE uint32_t list_with_bit(const uint16_t* masks, uint32_t count, int bit, uint32_t* list) {
+    const __m512i wanted = _mm512_set1_epi32(1 << bit);
+    Ints numbers = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    uint32_t found = 0;
+    for (uint32_t i = 0; i < count; i += 16, numbers += 16) {
+        const __m512i some = _mm512_maskz_cvtepu16_epi32(kAll, _mm256_loadu_si256((const __m256i*)(masks + i)));
+        const Mask has = _mm512_test_epi32_mask(some, wanted) & Mask((1u << std::min(count - i, 16u)) - 1u);
+        _mm512_storeu_si512(list + found, _mm512_maskz_compress_epi32(has, (__m512i)numbers));
+        found += uint32_t(__builtin_popcount(has));
+    }
+    return found;
+}
+
+// Colors of a 4x4 block, rows of which lie `stride` floats apart.
+SPLATS_INLINE void gather_color(const float* first, size_t stride, Lanes (&rgb)[3]) {
+    constexpr Mask kRow = 0x0fff;  // four pixels
+    const Lanes a = (Lanes)_mm512_maskz_loadu_ps(kRow, first), b = (Lanes)_mm512_maskz_loadu_ps(kRow, first + stride);
+    const Lanes c = (Lanes)_mm512_maskz_loadu_ps(kRow, first + 2 * stride);
+    const Lanes d = (Lanes)_mm512_maskz_loadu_ps(kRow, first + 3 * stride);
+    const Lanes ab[3] = {__builtin_shufflevector(a, b, 0, 3, 6, 9, 16, 19, 22, 25, 0, 0, 0, 0, 0, 0, 0, 0),
+                         __builtin_shufflevector(a, b, 1, 4, 7, 10, 17, 20, 23, 26, 0, 0, 0, 0, 0, 0, 0, 0),
+                         __builtin_shufflevector(a, b, 2, 5, 8, 11, 18, 21, 24, 27, 0, 0, 0, 0, 0, 0, 0, 0)};
+    const Lanes cd[3] = {__builtin_shufflevector(c, d, 0, 3, 6, 9, 16, 19, 22, 25, 0, 0, 0, 0, 0, 0, 0, 0),
+                         __builtin_shufflevector(c, d, 1, 4, 7, 10, 17, 20, 23, 26, 0, 0, 0, 0, 0, 0, 0, 0),
+                         __builtin_shufflevector(c, d, 2, 5, 8, 11, 18, 21, 24, 27, 0, 0, 0, 0, 0, 0, 0, 0)};
+    for (int k = 0; k < 3; ++k)
+        rgb[k] = __builtin_shufflevector(ab[k], cd[k], 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+}
+
+template <int Row>
+SPLATS_INLINE void scatter_row(const Lanes (&rgb)[3], float* first) {
+    constexpr int i = 4 * Row;
+    const Lanes two = __builtin_shufflevector(rgb[0], rgb[1], i, 16 + i, 0, i + 1, 17 + i, 0, i + 2, 18 + i, 0, i + 3,
+                                              19 + i, 0, 0, 0, 0, 0);
+    const Lanes all = __builtin_shufflevector(two, rgb[2], 0, 1, 16 + i, 3, 4, 17 + i, 6, 7, 18 + i, 9, 10, 19 + i, 0, 0,
+                                              0, 0);
+    _mm512_mask_storeu_ps(first, 0x0fff, (__m512)all);
+}
+SPLATS_INLINE void scatter_color(const Lanes (&rgb)[3], float* first, size_t stride) {
+    scatter_row<0>(rgb, first);
+    scatter_row<1>(rgb, first + stride);
+    scatter_row<2>(rgb, first + 2 * stride);
+    scatter_row<3>(rgb, first + 3 * stride);
 }
 
 }  // namespace splats

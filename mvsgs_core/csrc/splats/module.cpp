@@ -1,26 +1,14 @@
-// Python bindings of the rasterizer and of the losses. Arrays come in as they lie in memory; nothing is copied.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/tuple.h>
+// Python bindings of the rasterizer and of the losses.
 #include <nanobind/stl/unique_ptr.h>
-#include <omp.h>
 
-#include <cmath>
 #include <mutex>
 
-#include "splats/baseline.hpp"
-#include "splats/frame.hpp"
+#include "splats/arguments.hpp"
 #include "splats/photometric.hpp"
 
-namespace nb = nanobind;
 using namespace splats;
 
 namespace {
-
-template <class T, class... Shape>
-using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
-using In = Array<const float>;
-using Out = Array<float>;
 
 // Frames come back here, so that the next view finds its memory warm.
 class Pool {
@@ -55,33 +43,6 @@ struct Pass {
     ~Pass() { pool().give(std::move(frame)); }
 };
 
-Parameters parameters(const Frame& frame, In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas) {
-    return {means.data(), log_scales.data(), quaternions.data(), opacity_logits.data(), sh.data(), betas.data(),
-            int64_t(means.shape(0)), int(sh.shape(1)), frame.degree, frame.exact, frame.antialiased};
-}
-
-int thread_count(int threads) { return std::max(1, threads > 0 ? threads : omp_get_max_threads()); }
-
-using Intrinsics = std::tuple<float, float, float, float>;
-
-Camera camera_of(Array<const double> pose, Intrinsics intrinsics, float near, int width, int height) {
-    Camera camera;
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) camera.rotation[i][j] = pose.data()[4 * i + j];
-        camera.center[i] = pose.data()[4 * i + 3];
-    }
-    std::tie(camera.fx, camera.fy, camera.cx, camera.cy) = intrinsics;
-    camera.width = width;
-    camera.height = height;
-    camera.near = near;
-    const float margin_x = kClampMargin * 0.5f * width / camera.fx, margin_y = kClampMargin * 0.5f * height / camera.fy;
-    camera.slope_min[0] = -(camera.cx + 0.5f) / camera.fx - margin_x;
-    camera.slope_max[0] = (width - 0.5f - camera.cx) / camera.fx + margin_x;
-    camera.slope_min[1] = -(camera.cy + 0.5f) / camera.fy - margin_y;
-    camera.slope_max[1] = (height - 0.5f - camera.cy) / camera.fy + margin_y;
-    return camera;
-}
-
 std::unique_ptr<Pass> forward(In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas,
                               Array<const double> pose, Intrinsics intrinsics, float near,
                               std::tuple<float, float, float> background, bool exact, bool antialiased, int degree,
@@ -108,6 +69,7 @@ std::unique_ptr<Pass> forward(In means, In log_scales, In quaternions, In opacit
     return pass;
 }
 
+// Returns how many splats had a gradient that is not finite: theirs are 0.
 int64_t backward(Pass& pass, In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas, In color,
                  In depth, In opacity, In color_gradient, nb::object depth_gradient, nb::object opacity_gradient,
                  int threads, Out on_means, Out on_log_scales, Out on_quaternions, Out on_opacity_logits, Out on_sh,
@@ -155,20 +117,6 @@ std::tuple<double, double> image_loss(In image, In target, nb::object pixel_weig
     return {result.l1, result.ssim};
 }
 
-// (forward, backward) seconds of the plain-loop rasterizer.
-std::tuple<double, double> run_baseline(In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas,
-                                        Array<const double> pose, Intrinsics intrinsics, bool exact, int threads,
-                                        Out color, In color_gradient, Out image_gradient) {
-    const Camera camera = camera_of(pose, intrinsics, 1e-3f, int(color.shape(1)), int(color.shape(0)));
-    Frame frame;
-    frame.exact = exact;
-    const Parameters p = parameters(frame, means, log_scales, quaternions, opacity_logits, sh, betas);
-    const nb::gil_scoped_release released;
-    const BaselineSeconds seconds =
-        baseline(camera, p, color.data(), color_gradient.data(), image_gradient.data(), thread_count(threads));
-    return {seconds.forward, seconds.backward};
-}
-
 }  // namespace
 
 #define SPLATS_MODULE(name) NB_MODULE(name, m)
@@ -177,7 +125,8 @@ SPLATS_MODULE(MVSGS_MODULE) {
     nb::class_<Pass>(m, "Pass")
         .def_prop_ro("refused", [](const Pass& pass) { return pass.frame->refused; })
         .def_prop_ro("pairs", [](const Pass& pass) { return pass.frame->pair_count; })
-        .def_prop_ro("exponentials", [](const Pass& pass) { return pass.frame->exponentials; });
+        .def_prop_ro("evaluated", [](const Pass& pass) { return pass.frame->evaluated; })
+        .def_prop_ro("contributed", [](const Pass& pass) { return pass.frame->contributed; });
     m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("pose"),
           nb::arg("intrinsics"), nb::arg("near"), nb::arg("background"), nb::arg("exact"), nb::arg("antialiased"),
           nb::arg("degree"), nb::arg("tile_mask").none(), nb::arg("weights"), nb::arg("threads"), nb::arg("color"),
@@ -188,10 +137,6 @@ SPLATS_MODULE(MVSGS_MODULE) {
           nb::arg("on_means"), nb::arg("on_log_scales"), nb::arg("on_quaternions"), nb::arg("on_opacity_logits"),
           nb::arg("on_sh"), nb::arg("on_betas"), nb::arg("on_screen"), nb::arg("on_pose"));
     m.def("weights", &weights);
-    m.def("baseline", &run_baseline);
-    m.def("peak_densities", &peak_densities);
-    m.def("peak_tile_bytes", &peak_tile_bytes);
-    m.def("peak_memory_bytes", &peak_memory_bytes);
     m.def("image_loss", &image_loss, nb::arg("image"), nb::arg("target"), nb::arg("pixel_weight").none(),
           nb::arg("l1_weight"), nb::arg("ssim_weight"), nb::arg("gradient"), nb::arg("threads"));
 }

@@ -26,6 +26,8 @@ SPLATS_INLINE Part as_floats(IntPart a) { return (Part)a; }
 SPLATS_INLINE Part to_floats(IntPart a) { return __builtin_convertvector(a, Part); }
 SPLATS_INLINE IntPart toward_zero(Part a) { return __builtin_convertvector(a, IntPart); }
 SPLATS_INLINE Part where(IntPart mask, Part a) { return (Part)(mask & (IntPart)a); }
+SPLATS_INLINE Part where_at_least(Part x, float limit, Part value) { return where(x >= limit, value); }
+SPLATS_INLINE Part reciprocal(Part x) { return 1.0f / x; }
 SPLATS_INLINE IntPart choose(IntPart mask, IntPart a, IntPart b) { return (mask & a) | (~mask & b); }
 
 #if defined(__AVX2__)

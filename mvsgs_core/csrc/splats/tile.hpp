@@ -6,12 +6,9 @@
 namespace splats {
 
 constexpr float kTiny = 1e-30f;
+constexpr int kBlocks = 16;  // of a tile
 constexpr Lanes kLaneX = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
 constexpr Lanes kLaneY = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
-
-// A block's first pixel in its tile; loads, for a conversion from integer would wait for its register's last value.
-alignas(64) constexpr float kBlockX[16] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
-alignas(64) constexpr float kBlockY[16] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
 
 struct Tile {
     int x, y;          // of its first pixel
@@ -36,34 +33,63 @@ struct BlockSpan {
     SPLATS_INLINE_MEMBER Lanes inside() const {
         return where(at_most(kLaneX, float(columns) - 0.5f) & at_most(kLaneY, float(rows) - 0.5f), all(1.0f));
     }
+    SPLATS_INLINE_MEMBER bool whole() const { return columns == 4 && rows == 4; }
 };
 
-// A splat as a tile sees it: u and v of the tile's first pixel, and how they grow inside a block.
+// Where the pixels of every block lie in their tile.
+struct BlockPixels {
+    Lanes x[4], y[4];  // by column and row of blocks
+
+    SPLATS_INLINE_MEMBER BlockPixels() {
+        for (int i = 0; i < 4; ++i) {
+            x[i] = kLaneX + float(4 * i);
+            y[i] = kLaneY + float(4 * i);
+        }
+    }
+};
+
+// A splat as a tile sees it, with x and y from the tile's first pixel: u = u0 + u_x x + u_y y, v = v0 + v_y y.
 struct Placed {
-    float dx, dy;         // tile's first pixel - mean
-    Lanes inner_u, inner_v;
+    float u0, u_x, u_y, v0, v_y;
+    float log2_opacity, half_beta;
+    float red, green, blue, depth;
 
+    Placed() = default;
     SPLATS_INLINE_MEMBER Placed(const ScreenSplat& s, const Tile& tile)
-        : dx((float(tile.x) - s.whole_x) - s.part_x), dy((float(tile.y) - s.whole_y) - s.part_y),
-          inner_u(s.pitch_u * (kLaneX - s.shear * kLaneY)), inner_v(s.pitch_v * kLaneY) {}
-
-    SPLATS_INLINE_MEMBER void at(const ScreenSplat& s, int block, Lanes& u, Lanes& v) const {
-        const float x = dx + kBlockX[block], y = dy + kBlockY[block];
-        u = inner_u + s.pitch_u * (x - s.shear * y);
-        v = inner_v + s.pitch_v * y;
+        : u_x(s.pitch_u), u_y(-s.pitch_u * s.shear), v_y(s.pitch_v), log2_opacity(s.log2_opacity),
+          half_beta(s.half_beta), red(s.red), green(s.green), blue(s.blue), depth(s.depth) {
+        const float dx = (float(tile.x) - s.whole_x) - s.part_x, dy = (float(tile.y) - s.whole_y) - s.part_y;
+        u0 = s.pitch_u * (dx - s.shear * dy);
+        v0 = s.pitch_v * dy;
     }
+    SPLATS_INLINE_MEMBER Lanes u(Lanes x, Lanes y) const { return (u0 + u_y * y) + u_x * x; }
+    SPLATS_INLINE_MEMBER Lanes v(Lanes y) const { return v0 + v_y * y; }
 };
 
-// log2 of the unclamped alpha; for the exact density also log2(m) and power = m^(beta/2), with m limited from below.
+// Densities of a group of splats, each on a block.
 template <bool Exact>
-SPLATS_INLINE Lanes log2_alpha(const ScreenSplat& s, Lanes u, Lanes v, Lanes& log2_m, Lanes& power) {
-    if constexpr (Exact) {
-        log2_m = log2_of_positive(maximum(u * u + v * v, all(kCenterM)));
-        power = exp2_limited(s.half_beta * log2_m);
-        return s.log2_opacity - kHalfLog2e * power;
-    } else {
-        return s.log2_opacity - u * u - v * v;
+struct Densities {
+    Group u, v;
+    Group m, log2_m, power;  // of the exact density: power = m^(beta/2), with m limited from below
+    Group alpha;             // before it is clamped; 0 where it is below 1/255
+
+    // at(i): the splat of place i in the group; x(i), y(i): its pixels.
+    template <class At, class X, class Y>
+    SPLATS_INLINE_MEMBER Densities(At at, X x, Y y) {
+        u = group([&](int i) { return at(i).u(x(i), y(i)); });
+        v = group([&](int i) { return at(i).v(y(i)); });
+        const Group log2_opacity = group([&](int i) { return all(at(i).log2_opacity); });
+        Group exponent;
+        if constexpr (Exact) {
+            m = u * u + v * v;
+            log2_m = log2_of_positive(maximum(m, Group{} + kCenterM));
+            power = exp2_limited(group([&](int i) { return all(at(i).half_beta); }) * log2_m);
+            exponent = log2_opacity - kHalfLog2e * power;
+        } else {
+            exponent = log2_opacity - u * u - v * v;
+        }
+        alpha = where_at_least(exponent, kLog2MinAlpha, exp2_of_negative(exponent));
     }
-}
+};
 
 }  // namespace splats

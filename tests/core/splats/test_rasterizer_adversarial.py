@@ -42,6 +42,25 @@ def test_a_parameter_that_is_not_finite(backend: str, field: str) -> None:
     torch.testing.assert_close(render.color, without.color, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_gradients_that_are_not_finite_are_refused_and_counted(bad: float) -> None:
+    """One pixel's gradient is bad: the splats seen there get none, the others theirs, and the count says how many."""
+    splats = copy(random_splats(60))
+    render = rasterize(splats, np.eye(4), intrinsics(SIZE), SIZE, backend="cpu")
+    assert render.backward.refused is None
+    gradient = torch.ones_like(render.color)
+    row, column = divmod(int(render.opacity.detach().argmax()), SIZE[1])
+    gradient[row, column] = bad
+    render.color.backward(gradient)  # type: ignore[no-untyped-call]
+    assert render.backward.refused is not None
+    assert 0 < render.backward.refused < int(render.visible.sum())
+    for name, field in splats.tensors().items():
+        assert field.grad is None or bool(torch.isfinite(field.grad).all()), name
+    assert splats.means.grad is not None
+    without = int((render.visible & (splats.means.grad == 0).all(dim=1)).sum())
+    assert without >= render.backward.refused
+
+
 def extremes(name: str) -> Splats:
     splats = random_splats(60)
     if name == "zero quaternions":

@@ -16,6 +16,9 @@ BaselineSeconds baseline(const Camera& camera, const Parameters& parameters, flo
 // Densities per second: u and v to alpha, in registers, all threads together.
 double peak_densities(bool exact, int threads);
 
+// Multiplications with addition per second, single precision, in registers, all threads together.
+double peak_products(int threads);
+
 // Bytes read and written per second when a tile's 4x4 blocks are updated in the first-level cache.
 double peak_tile_bytes(int threads);
 

@@ -3,11 +3,17 @@
 
 #include <chrono>
 
-#include "splats/baseline.hpp"
+#include "bench/bench.hpp"
 #include "splats/tile.hpp"
 
 namespace splats {
 namespace {
+
+// The compiler may not leave out what led to `value`.
+template <class Value>
+void keep(const Value& value) {
+    asm volatile("" ::"m"(value));
+}
 
 // The best of some repetitions of `work` by all threads, in seconds.
 template <class Work>
@@ -22,23 +28,31 @@ double best_seconds(int threads, Work work) {
     return best;
 }
 
+// Densities of splats in lockstep, each on a block of its own: nothing waits, nothing but registers is touched.
 template <bool Exact>
 void evaluate(int rounds) {
-    constexpr int kStreams = 4;  // independent chains, to hide latency
-    ScreenSplat s{};
-    s.log2_opacity = -0.5f;
-    s.half_beta = 0.8f;
-    Lanes u[kStreams], total[kStreams] = {};
-    for (int k = 0; k < kStreams; ++k) u[k] = 0.01f * kLaneX + 0.1f * float(k);
+    Placed splat{};
+    splat.u_x = splat.v_y = 0.3f;
+    splat.log2_opacity = -0.5f;
+    splat.half_beta = 0.8f;
+    Group total{};
     for (int i = 0; i < rounds; ++i) {
-        for (int k = 0; k < kStreams; ++k) {
-            Lanes log2_m, power;
-            total[k] += exp2_of_negative(log2_alpha<Exact>(s, u[k], kLaneY, log2_m, power));
-            u[k] += 1e-6f;
-        }
+        asm volatile("" : "+m"(splat));  // read anew: nothing of it may be computed ahead
+        const Densities<Exact> densities([&](int) -> const Placed& { return splat; },
+                                         [](int k) { return kLaneX + 0.1f * float(k); }, [](int) { return kLaneY; });
+        total += densities.alpha;
     }
-    volatile float sink = sum(total[0] + total[1] + total[2] + total[3]);
-    (void)sink;
+    keep(total);
+}
+
+void multiply(int rounds) {
+    constexpr int kChains = 12;  // more than latency times throughput, fewer than registers
+    const Lanes factor = all(0.999f), step = all(1e-3f);
+    Lanes chains[kChains];
+    for (int k = 0; k < kChains; ++k) chains[k] = all(0.1f * float(k));
+    for (int i = 0; i < rounds; ++i)
+        for (Lanes& chain : chains) chain = chain * factor + step;
+    for (const Lanes& chain : chains) keep(chain);
 }
 
 }  // namespace
@@ -46,7 +60,13 @@ void evaluate(int rounds) {
 double peak_densities(bool exact, int threads) {
     constexpr int kRounds = 1 << 18;
     const double seconds = best_seconds(threads, [&] { exact ? evaluate<true>(kRounds) : evaluate<false>(kRounds); });
-    return 4.0 * kLanes * kRounds * threads / seconds;
+    return double(kTogether) * kLanes * kRounds * threads / seconds;
+}
+
+double peak_products(int threads) {
+    constexpr int kRounds = 1 << 18;
+    const double seconds = best_seconds(threads, [] { multiply(kRounds); });
+    return 12.0 * kLanes * kRounds * threads / seconds;
 }
 
 double peak_tile_bytes(int threads) {

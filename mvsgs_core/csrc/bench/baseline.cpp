@@ -1,7 +1,7 @@
-// What the benchmark compares with: 3D Gaussian Splatting's algorithm in plain loops. Lists by tile from 3-sigma boxes,
+// What the benchmark of the rasterizer compares with: 3D Gaussian Splatting's algorithm in plain loops. Lists by tile from 3-sigma boxes,
 // each pixel walks its tile's list; backward from the last splat to the first, sums by atomic additions, down to the
 // gradients on the image (mean, inverse covariance, opacity, color); the projection's backward pass is not in it.
-#include "splats/baseline.hpp"
+#include "bench/bench.hpp"
 
 #include <omp.h>
 

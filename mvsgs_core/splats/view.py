@@ -1,0 +1,74 @@
+"""What the rasterizer and its back ends share: the view asked for, the render that comes back, the constants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mvsgs_core.splats.model import Splats
+
+BLUR = 0.3  # px^2, low-pass on the diagonal of the image covariance
+MAX_ALPHA = 0.99
+MIN_TRANSMITTANCE = 1e-4
+CLAMP_MARGIN = 0.3  # of tan(fov): how far beyond the image the Jacobian follows x/z and y/z
+MIN_COMPENSATION = 0.005  # floor of the antialiased opacity factor
+MAX_VARIANCE = 1e16  # px^2
+MAX_REACH = 1e12  # of m, where an exact density of a small exponent ends at the latest
+MIN_QUATERNION = 1e-8
+TILE = 16  # pixels
+
+
+@dataclass(frozen=True)
+class View:
+    """What the back ends get besides the splats: a checked camera and the switches."""
+
+    pose: Tensor  # (4, 4) float64 world_from_cam, may carry a gradient
+    intrinsics: tuple[float, ...]  # fx, fy, cx, cy, px at `size`
+    size: tuple[int, int]  # height, width, px
+    density: str  # "gaussian" or "exact"
+    background: tuple[float, ...]  # red, green, blue
+    tile_mask: Tensor | None  # (ceil(H / 16), ceil(W / 16)) bool, False = leave the tile out
+    near: float  # map units
+    antialiased: bool
+    degree: int  # of the spherical harmonics
+    weights: bool  # whether to sum up the blending weights of every splat
+    threads: int  # 0 = as many as OpenMP would take
+
+
+@dataclass
+class Backward:
+    """What a backward pass refused; it fills this in when it runs."""
+
+    refused: int | None = None  # splats whose gradients were not finite and are 0; None: not run, or not counted there
+
+
+@dataclass
+class Render:
+    """A rendered view and what density control reads from it; H, W pixels, N splats."""
+
+    color: Tensor  # (H, W, 3), nominally 0 to 1, not clamped
+    depth: Tensor  # (H, W), expected z in map units, 0 where opacity is 0
+    opacity: Tensor  # (H, W), 0 to 1
+    visible: Tensor  # (N,) bool: in front, on the image, opacity at least 1/255
+    radii: Tensor  # (N,), half of the longer side of the splat's box on the image, px; 0 if not visible
+    screen: (
+        Tensor  # (N, 2) zeros; after backward its .grad is dL/d(mean on the image), in units of half the image (3DGS)
+    )
+    weight_sum: Tensor | None  # (N,), blending weight alpha * T summed over the pixels; None unless asked for
+    weight_max: Tensor | None  # (N,), the largest blending weight at any pixel; None unless asked for
+    refused: int  # splats left out because a parameter is not finite or degenerate
+    backward: Backward  # what the backward pass reports, once it has run
+
+
+def tile_grid(size: tuple[int, int]) -> tuple[int, int]:
+    """(rows, columns) of 16x16 tiles that cover an image of (height, width)."""
+    return -(-size[0] // TILE), -(-size[1] // TILE)
+
+
+def screen_points(splats: Splats, view: View) -> Tensor:
+    """Zeros (N, 2) for `Render.screen`; they take a gradient where anything else does."""
+    inputs = [*splats.tensors().values(), view.pose]
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
+    return splats.means.new_zeros(len(splats), 2).requires_grad_(wanted)
