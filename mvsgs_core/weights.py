@@ -153,11 +153,16 @@ def find(name: str, file: str | Path | None = None) -> Path:
 def missing(weights: Weights) -> str:
     """What to do about weights that are not there."""
     searched = ", ".join(str(f) for f in folders())
-    how = f"python -m mvsgs_core.weights fetch {weights.name}" if weights.url else f"get it from {weights.page}"
     return (
-        f"no weights of {weights.network} ({weights.files[0]}) in {searched}: {how}, "
+        f"no weights of {weights.network} ({weights.files[0]}) in {searched}: {remedy(weights.name)}, "
         "or set MVSGS_WEIGHTS to the folder that holds them"
     )
+
+
+def remedy(name: str) -> str:
+    """How to come by weights, to end an error message with. Raises KeyError for an unknown name."""
+    weights = _entry(name)
+    return f"python -m mvsgs_core.weights fetch {name}" if weights.url else f"get it from {weights.page}"
 
 
 def checksum(file: Path) -> str:
@@ -172,7 +177,7 @@ def checksum(file: Path) -> str:
 def check(file: Path) -> str:
     """Says which registered weights a file is. Raises FileNotFoundError, or ValueError if it is none of them."""
     if not file.is_file():
-        raise FileNotFoundError(f"there is no file {file}")
+        raise FileNotFoundError(f"there is no file {file}: python -m mvsgs_core.weights list shows what there is")
     digest = checksum(file)
     for weights in REGISTRY.values():
         if weights.sha256 == digest:
@@ -180,8 +185,13 @@ def check(file: Path) -> str:
     named = [w for w in REGISTRY.values() if file.name in {Path(f).name for f in w.files}]
     if named and named[0].sha256 is None:
         return f"{file}: named as {named[0].name}; its publisher states no checksum (SHA-256 {digest})"
-    expected = f", but {named[0].name} has {named[0].sha256}: truncated or another file" if named else ""
-    raise ValueError(f"{file}: SHA-256 {digest} is none of the registered weights{expected}")
+    if not named:
+        raise ValueError(f"{file}: SHA-256 {digest} is none of the registered weights ({', '.join(REGISTRY)})")
+    right, size = named[0], file.stat().st_size
+    what = "another file"
+    if right.size and size < right.size:
+        what = f"truncated ({size} of {right.size} bytes) or another file"
+    raise ValueError(f"{file}: SHA-256 {digest}, but {right.name} has {right.sha256}: {what}; {remedy(right.name)}")
 
 
 def fetch(name: str, timeout: float = 30.0) -> Path:
@@ -198,7 +208,7 @@ def fetch(name: str, timeout: float = 30.0) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     part = target.with_name(target.name + ".part")
     try:
-        _download(weights.url, part, timeout)
+        _download(weights.url, part, weights.size, timeout)
     except (urllib.error.URLError, TimeoutError, OSError) as error:
         raise ConnectionError(
             f"{weights.url}: {error}; what has arrived is kept, try again, or: {weights.page}"
@@ -212,8 +222,10 @@ def fetch(name: str, timeout: float = 30.0) -> Path:
     return target
 
 
-def _download(url: str, part: Path, timeout: float) -> None:
+def _download(url: str, part: Path, size: int | None, timeout: float) -> None:
     have = part.stat().st_size if part.exists() else 0
+    if have and size is not None and have >= size:
+        return  # all of it came in an earlier try, which ended before it was verified
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
     with urllib.request.urlopen(request, timeout=timeout) as response:
         resumed = response.status == 206

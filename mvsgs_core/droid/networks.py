@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mvsgs_core import weights
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.correlation import CorrelationVolume, OnTheFlyCorrelation
 from mvsgs_core.networks.droid import DroidNet
@@ -30,10 +28,8 @@ def load(file: str | None) -> DroidNet:
     """
     if file == RANDOM:
         return random_net()
-    path: Path = weights.find("droid", file)
-    state = checkpoints.droid_rows(checkpoints.read(path))
     net = DroidNet()
-    checkpoints.load(net, state, path)
+    checkpoints.load_registered(net, "droid", file, convert=checkpoints.droid_rows)
     return net
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from mvsgs_core import camera, geometry, weights
+from mvsgs_core import camera, geometry
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
 from mvsgs_core.fusion.views import DepthView
 from mvsgs_core.networks import checkpoints
@@ -23,12 +22,11 @@ def make_network(file: str | None) -> VFuse:
 
     Raises what `weights.find` and the checkpoint reader raise, saying what to fetch from where.
     """
-    path = None if file == RANDOM else weights.find("vfuse", file)
-    if path is None:
+    if file == RANDOM:
         torch.manual_seed(0)
     net = VFuse()
-    if path is not None:
-        checkpoints.load(net, checkpoints.read(Path(path), inside="model_state_dict"), Path(path))
+    if file != RANDOM:
+        checkpoints.load_registered(net, "vfuse", file, inside="model_state_dict")
     return net.eval().requires_grad_(False)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import cv2
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mvsgs_core import camera, geometry, weights
+from mvsgs_core import camera, geometry
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.stereo import StereoDepth
@@ -62,16 +61,15 @@ def make_network(config: LearnedConfig) -> nn.Module:
     if config.network not in NETWORKS:
         raise ValueError(f"no network {config.network!r}; there are: {', '.join(NETWORKS)}")
     entry = NETWORKS[config.network]
-    file = None if config.file == RANDOM else weights.find(entry.weights, config.file)
-    if file is None:
+    if config.file == RANDOM:
         torch.manual_seed(0)
     net: nn.Module
     if config.network == "itermvs":
         net = itermvs.IterMvs()
     else:
         net = mvsformer.MvsFormer("dino" if config.network == "mvsformer_p" else "twins")
-    if file is not None:
-        checkpoints.load(net, checkpoints.read(Path(file), inside=entry.inside), Path(file))
+    if config.file != RANDOM:
+        checkpoints.load_registered(net, entry.weights, config.file, inside=entry.inside)
     return net.eval().requires_grad_(False).to(config.device)
 
 

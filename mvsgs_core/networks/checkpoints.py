@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from mvsgs_core import weights
+
+_LONGEST = 400  # characters of what does not fit
 
 
 def read(file: Path, *, inside: str | None = None) -> dict[str, Tensor]:
@@ -60,8 +64,30 @@ def load(net: nn.Module, state: Mapping[str, Tensor], file: Path) -> None:
     try:
         net.load_state_dict(dict(state), strict=True)
     except RuntimeError as error:
-        raise ValueError(f"{file} does not fit {type(net).__name__}: {error}") from error
+        what = " ".join(str(error).split())  # of a wrong file, all keys on hundreds of lines
+        what = what if len(what) < _LONGEST else f"{what[:_LONGEST]} ..."
+        raise ValueError(f"{file} does not fit {type(net).__name__}: {what}") from error
     net.eval().requires_grad_(False)
+
+
+def load_registered(
+    net: nn.Module,
+    name: str,
+    file: str | Path | None = None,
+    *,
+    inside: str | None = None,
+    convert: Callable[[Mapping[str, Tensor]], dict[str, Tensor]] = dict,
+) -> Path:
+    """Loads the weights `name` of the registry, from `file` or where it finds them, and returns the file.
+
+    Raises FileNotFoundError, or ValueError for a truncated or wrong file; both say what to fetch from where.
+    """
+    path = weights.find(name, file)
+    try:
+        load(net, convert(read(path, inside=inside)), path)
+    except ValueError as error:
+        raise ValueError(f"{error}; for the right one: {weights.remedy(name)}") from error
+    return path
 
 
 def droid_rows(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -41,9 +41,8 @@ class RaftFlow:
 
     @cached_property
     def _net(self) -> RaftSmall:
-        file = self._file
         net = RaftSmall()
-        checkpoints.load(net, checkpoints.read(file), file)
+        checkpoints.load_registered(net, "raft_small", self._file)
         return net.to(self.device)
 
     def field(self, a: TrackingImage, b: TrackingImage, start: np.ndarray | None, back: bool) -> np.ndarray:

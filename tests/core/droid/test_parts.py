@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core import geometry
-from mvsgs_core.droid import networks as loading
+from mvsgs_core import geometry, weights
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.framing import Framing
 from mvsgs_core.droid.motion_filter import MotionFilter
@@ -167,7 +166,7 @@ def test_both_correlations_lead_the_graph_to_the_same() -> None:
         assert not g.update_globally().failure
         found.append(np.stack([edge.target for edge in g.active]))
         assert (g.active[0].correlation is None) == transient
-    np.testing.assert_allclose(*found, atol=1e-3)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-3)
 
 
 def test_half_precision_passes_through(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,7 +241,7 @@ def test_an_official_file_loads_and_a_missing_one_says_what_to_do(
     torch.testing.assert_close(net.update.delta[2].weight, state["update.delta.2.weight"][:2])
     monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path))
     torch.testing.assert_close(load(None).state_dict(), net.state_dict())
-    monkeypatch.setattr(loading.weights, "folders", lambda: [tmp_path / "none"])  # type: ignore[operator]
+    monkeypatch.setattr(weights, "folders", lambda: [tmp_path / "none"])  # type: ignore[operator]
     with pytest.raises(FileNotFoundError, match=r"droid\.pth.*DROID-SLAM"):
         load(None)
 
