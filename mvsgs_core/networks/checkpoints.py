@@ -41,17 +41,26 @@ def read(file: Path, *, inside: str | None = None) -> dict[str, Tensor]:
     return state
 
 
-def _with_configuration(file: Path) -> Any:
-    """A checkpoint that also pickles its configuration (MVSFormer's do): known harmless types only are allowed."""
-    import argparse
-    import collections
-    import pathlib
+class _Placeholder:
+    """In the place of an object that is none of PyTorch's: takes whatever the file gives it, keeps and does nothing."""
 
-    allowed: list[Any] = [argparse.Namespace, collections.OrderedDict, collections.defaultdict, pathlib.PosixPath]
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        pass
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
+def _with_configuration(file: Path) -> Any:
+    """A checkpoint that also pickles its configuration (MVSFormer's do), every such object as a placeholder.
+
+    No name of the file is imported or called, so that loading stays as safe as that of tensors alone.
+    """
     try:
-        with torch.serialization.safe_globals(allowed):
+        names = torch.serialization.get_unsafe_globals_in_checkpoint(file)
+        with torch.serialization.safe_globals([(_Placeholder, name) for name in names]):
             return torch.load(file, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
+    except (pickle.UnpicklingError, ValueError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{file} holds Python objects beside the weights, which are not executed ({str(error).splitlines()[0]}); "
             "save its state dict alone, in an environment that you trust: "

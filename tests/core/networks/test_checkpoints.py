@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import argparse
+import datetime
+import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -8,6 +11,10 @@ import torch
 from torch import nn
 
 from mvsgs_core.networks import checkpoints
+
+
+class _Settings(dict[str, int]):
+    """A placeholder has no items."""
 
 
 class _Evil:
@@ -25,7 +32,7 @@ def test_prefix_and_place(tmp_path: Path) -> None:
     assert not other.weight.requires_grad
 
 
-def test_bad_files_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_files_are_named(tmp_path: Path) -> None:
     file = tmp_path / "w.pth"
     with pytest.raises(FileNotFoundError, match=r"w\.pth"):
         checkpoints.read(file)
@@ -41,10 +48,33 @@ def test_bad_files_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     file.write_bytes(b"")
     with pytest.raises(ValueError, match="truncated or no PyTorch checkpoint"):
         checkpoints.read(file)
-    torch.save({"state_dict": {"a": torch.zeros(1)}, "evil": _Evil()}, file)
-    with pytest.raises(ValueError, match="not executed"):
-        checkpoints.read(file)
+
+
+def test_a_pickled_configuration_is_left_out_and_nothing_of_it_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As MVSFormer's files: an object of a class that only its authors have, with a path, a date and a function."""
+    module = types.ModuleType("parse_config")
+    monkeypatch.setitem(sys.modules, "parse_config", module)
+    parser = type("ConfigParser", (), {"__module__": "parse_config"})
+    module.ConfigParser = parser  # type: ignore[attr-defined]
+    config = parser()
+    config.__dict__ |= {"dir": Path("x"), "day": datetime.datetime(2023, 1, 1), "levels": {"a": [1, 2]}, "run": _Evil()}
+    file = tmp_path / "model_best.pth"
+    torch.save({"state_dict": {"module.a": torch.arange(3.0)}, "config": config, "monitor_best": 0.1}, file)
+    monkeypatch.delitem(sys.modules, "parse_config")
+    state = checkpoints.read(file, inside="state_dict")
+    assert state.keys() == {"a"}
+    torch.testing.assert_close(state["a"], torch.arange(3.0))
     assert "executed" not in capsys.readouterr().out
+    assert "parse_config" not in sys.modules
+
+
+def test_what_cannot_be_left_out_is_refused_with_a_way_out(tmp_path: Path) -> None:
+    file = tmp_path / "w.pth"
+    torch.save({"state_dict": {"a": torch.zeros(1)}, "config": _Settings(a=1)}, file)
+    with pytest.raises(ValueError, match=r"not executed.*save its state dict alone"):
+        checkpoints.read(file)
 
 
 def test_droid_rows() -> None:
