@@ -52,8 +52,8 @@ class Edge:
     """Where the points of one keyframe were found in another."""
 
     target: np.ndarray  # (2, M) float32, 0 where lost
-    weight: np.ndarray  # (M,) float32, 0 to 1
-    shift: np.ndarray  # (2, M) float32 pixels by which a second of readout moves the target
+    weight: np.ndarray  # (M,) float16, 0 to 1
+    shift: np.ndarray  # (2, M) float16 pixels by which a second of readout moves the target
     share: float  # of the textured points that were found
 
 
@@ -82,8 +82,8 @@ class KeyframeGraph:
         if share < min_share or matches.alive.sum() < 30:
             return False
         target = np.nan_to_num(matches.target.T).astype(np.float32)
-        shift = np.zeros_like(target) if matches.shift is None else matches.shift.T.astype(np.float32)
-        self.edges[source, to] = Edge(target, matches.weight.astype(np.float32), shift, share)
+        shift = np.zeros(target.shape, np.float16) if matches.shift is None else matches.shift.T.astype(np.float16)
+        self.edges[source, to] = Edge(target, matches.weight.astype(np.float16), shift, share)
         return True
 
     def neighbors(self, index: int) -> set[int]:
