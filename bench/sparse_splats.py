@@ -103,6 +103,7 @@ class SparseMap:
             groups,
             self.config.rates.decay_steps,
             1.0,
+            1.0,
             True,
             self.log,
         )
