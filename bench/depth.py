@@ -13,6 +13,7 @@ import json
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 from bench.depth_calibration import calibration_rows
 from bench.depth_curves import curve_rows
@@ -25,7 +26,7 @@ from bench.depth_photos import PHOTOS, photo_rows
 from bench.depth_pictures import write_pictures
 from bench.depth_run import Run, run, score
 from bench.depth_tracked import load_tracked
-from bench.runs import folder
+from bench.runs import Matrix, figure, folder
 from bench.table import Row, at_least, at_most, main
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
@@ -141,10 +142,30 @@ def time_section(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
+def explained_section(options: argparse.Namespace) -> list[Row]:
+    """Whole runs with and without stereo for keyframes that the map explains, in one process: the same every time."""
+    if options.quick:
+        return []
+    frames = ["inline=true", "dataset.stop=80", "evaluator.lpips=off", "evaluator.max_frames=30"]
+    matrix = Matrix(["room", "tum_fr1_xyz"], ["full", "skip_explained"], overrides=frames)
+    rows = []
+    for one in matrix.run(folder(options, "depth_explained")):
+        figures = {
+            "keyframes passed over": ("skipped.mvs.keyframes that the map explains", ""),
+            "keyframes": ("counts.mvs.keyframes", ""),
+            "stereo": ("time.stages.mvs.stereo", "s"),
+            "completeness of depth": ("depth.completeness", ""),
+            "held-out PSNR": ("rendering.held_out.psnr", "dB"),
+        }
+        name = f"skips, {one.scene}, 80 frames, {one.variant}"
+        rows += [Row(f"{name}: {what}", figure(one.report, path), unit) for what, (path, unit) in figures.items()]
+    return rows
+
+
 def map_section(options: argparse.Namespace) -> list[Row]:
     """The paper's A (tracker's depth), B (+ stereo), C (+ filter), from the recorded `python -m bench.ablation`."""
     file = Path(__file__).with_name("recorded") / "ablation.json"
-    recorded = json.loads(file.read_text()) if file.exists() else {"rows": [], "commit": "", "runs": 0}
+    recorded: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"rows": [], "commit": ""}
     wanted = tuple(f"{variant}: held-out PSNR, change" for variant in "ABC")
     rows = [
         Row(f"map, {row['name']} (recorded by bench.ablation at {recorded['commit']})", row["value"], row["unit"])
@@ -164,6 +185,7 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "photos": photos_section,
     "parts": partial(variants_section, title="parts", variants=part_variants(SMALL)),
     "skips": partial(variants_section, title="skips", variants=skip_variants(SMALL)),
+    "explained": explained_section,
     "curves": curves_section,
     "failures": lambda options: failure_rows(SMALL, QUICK if options.quick else None),
     "time": time_section,
