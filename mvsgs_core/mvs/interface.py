@@ -14,10 +14,10 @@ TILE = (8, 16)  # (rows, columns) of the tiles that a sweep can leave out
 class CostOptions:
     """Windowed ZNCC of a sweep."""
 
-    radius: int = 3  # pixels: a window of 2 radius + 1
+    radius: int = 2  # pixels: a window of 2 radius + 1
     best: int = 3  # views whose cost counts, of all
     noise: float = 1.5  # gray levels²: added to both variances
-    contrast: float = 11.0  # gray levels: a pixel that differs so from the window's center counts 1 / e
+    contrast: float = 8.0  # gray levels: a pixel that differs so from the window's center counts 1 / e
 
 
 @dataclass(frozen=True)
