@@ -16,6 +16,7 @@ import torch
 
 from mvsgs_core import camera
 from mvsgs_core.splats import density_control, optimizer
+from mvsgs_core.splats.camera_steps import center_exposures
 from mvsgs_core.splats.deformation import Similarity, move_with_anchors
 from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.insertion import (
@@ -254,6 +255,8 @@ class OnlineMapper:
             self.state, view, config.training, config.skipping, factors, config.rates.decay_steps,
             self.median_depth, self.global_rate, refining, self.log,
         )  # fmt: skip
+        if config.training.exposure:
+            center_exposures(self.views)
         self.iterations += 1
         self.log.count("iterations")
         if not refining and self.iterations % config.density_control.every == 0:

@@ -25,7 +25,7 @@ class TrainingConfig:
     exposure: bool = False  # train a color affine for each keyframe
     exposure_rate: float = 1e-3  # learning rate of it
     poses: bool = False  # train the keyframes' poses, the first one's excepted
-    pose_rate: float = 2e-4  # learning rate of them, radians and median depths a step
+    pose_rate: float = 4e-5  # learning rate of them, radians and median depths a step
     pose_visits: int = 5  # iterations on a keyframe before its pose is trained: new splats show nothing new
     antialiased: bool = False
     near: float = 1e-3  # splats nearer than this many median depths are left out

@@ -86,3 +86,13 @@ def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
     assert not view.pose_moments.any()
     assert step_pose(view, np.array([0, 0, 1.0, 0, 0, 0.0]), 1e-3, 2e-3)
     np.testing.assert_allclose(view.pose_delta[:3, 3], [0, 0, -2e-3])
+
+
+def test_exposures_are_told_from_the_map_and_their_mean_stays_the_identity() -> None:
+    given = views()
+    bright = np.clip(np.round(given[1].image * 1.15), 0, 255).astype(np.uint8)
+    given[1] = replace(given[1], image=bright)
+    final = mapped(given, replace(TRAINING, poses=False, exposure=True, exposure_rate=3e-3)).snapshot()
+    np.testing.assert_allclose(final.exposures.mean(axis=0), np.eye(3, 4), atol=1e-5)
+    gains = final.exposures[:, :3, :3].sum(axis=2).mean(axis=1)
+    assert gains[1] - np.delete(gains, 1).mean() > 0.03
