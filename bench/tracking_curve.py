@@ -70,7 +70,8 @@ def rows(name: str, points: Sequence[Point]) -> list[Row]:
     for k, point in enumerate(points):
         where = "on the front" if k in front else "not on the front"
         text = f"cm at {point.milliseconds:.1f} ms/frame CPU, {point.keyframes} keyframes, {where}"
-        found.append(Row(f"{name}, {point.setting} {point.label}".rstrip(), point.error, text))
+        value = point.error if np.isfinite(point.error) else "not tracked"
+        found.append(Row(f"{name}, {point.setting} {point.label}".rstrip(), value, text))
     default = points[0]
     better = [f"{p.setting} {p.label}" for p in points[1:] if beats(p, default)]
     text = f"no: {', '.join(better)}" if better else "yes"

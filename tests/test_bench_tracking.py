@@ -26,6 +26,7 @@ def test_the_default_is_on_the_front_unless_something_is_faster_and_better_by_mo
         "not on the front", "on the front", "on the front", "not on the front",
     ]  # fmt: skip
     assert rows[-1].met
+    assert tracking_curve.rows("room", [points[0], Point("flow", "dis", 9.0, np.nan, 0)])[1].value == "not tracked"
     worse = tracking_curve.rows("room", [*points, Point("window", "6", 15.0, 0.5, 50)])[-1]
     assert (worse.met, worse.value) == (False, "no: window 6")
     tracking_curve.draw(tmp_path / "room.svg", points)
