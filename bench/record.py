@@ -168,6 +168,9 @@ def run(arguments: list[str]) -> int:
         if not options.files:
             parser.error(f"{options.name}: which files?")
         stem, quick = options.name.rpartition("/")[2], options.name.startswith("quick/")
+        if not any(read_rows(options.files)):
+            print(f"{options.name} measured nothing here: its record stays as it is")
+            return 0
         command = options.command or f"python -m bench.{stem}" + (" --quick" if quick else "")
         record(options.name, options.files, command.strip(), options.made_in)
     if DOCUMENT.exists():
