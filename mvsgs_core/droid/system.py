@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import cast
 
 import numpy as np
 import torch
@@ -25,7 +24,6 @@ from mvsgs_core.droid.trajectory_filler import StoredFrame, fill
 from mvsgs_core.droid.video import Video, VideoFrame
 from mvsgs_core.networks.droid import DroidNet
 from mvsgs_core.tracking.frames import Path, State
-from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.publish import Publisher
 from mvsgs_core.tracking.stats import TrackingStats
 from mvsgs_core.tracking.tracker import Update
@@ -146,8 +144,7 @@ class DroidSlam:
         )
         self.motion_filter = MotionFilter(self.networks, config.preset.filter_threshold)
         self.frontend = Frontend(self.video, self.graph, config.preset, self.stats)
-        # the publisher reads indices, poses, inverse depths: what a video has as well as a tracker's graph
-        self.publisher = Publisher(cast(KeyframeGraph, self.video), config.tolerance)
+        self.publisher = Publisher(self.video, config.tolerance)
 
     def _tell(self, settled: int) -> Update:
         """Keyframes that have become settled, after corrections of those before."""

@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from mvsgs_core.tracking.graph import KeyframeGraph
+
+class Tracked(Protocol):
+    """A keyframe as far as it is told."""
+
+    @property
+    def inverse_depth(self) -> np.ndarray: ...
+
+    @property
+    def triangulated(self) -> np.ndarray: ...  # bool, of the shape of inverse_depth
+
+    @property
+    def median_depth(self) -> float: ...
+
+
+class Keyframes(Protocol):
+    """What tells of keyframes by their index: a tracker's graph, or DROID-SLAM's video."""
+
+    @property
+    def keyframes(self) -> Mapping[int, Tracked]: ...
+
+    def world_from_cam(self, index: int) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -29,7 +51,7 @@ class _Told:
 class Publisher:
     """tolerance: of the median depth (positions), radians (rotations) and share (scales) that counts as a change."""
 
-    def __init__(self, graph: KeyframeGraph, tolerance: float) -> None:
+    def __init__(self, graph: Keyframes, tolerance: float) -> None:
         self.graph = graph
         self.tolerance = tolerance
         self._told: dict[int, _Told] = {}
@@ -74,4 +96,4 @@ class Publisher:
         return float(np.median(told.inverse_depth[known] / keyframe.inverse_depth[known]))
 
 
-__all__ = ["Correction", "Publisher"]
+__all__ = ["Correction", "Keyframes", "Publisher", "Tracked"]
