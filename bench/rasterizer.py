@@ -6,9 +6,17 @@ Scenes are random: splats spread evenly over the view, about 10 px in radius, ha
 spherical harmonics of degree 0; the gradient is of the color. Everything that is compared runs in turns, one after the
 other in every round, and medians are over the rounds.
 
-Roofline: projection and lists take at least their traffic to memory at the rate of a copy; blending takes at least
-its densities (squared distance and exponential) at the rate reached in registers, or its updates of the tiles at the
-rate of the first-level cache, whichever is longer. The sum of both, at rates measured here with the same threads.
+Roofline: what an ideal implementation needs at the peaks measured here with the same threads, the sum of
+
+- blending: the arithmetic of `Operations` for every pair of splat and pixel that gets color (no lane wasted, nothing
+  looked at in vain), each operation at the rate of a multiplication with addition in registers; or the reads and writes
+  of the tiles' state in the first-level cache where those take longer;
+- projection forward and backward, at the same rate;
+- traffic to memory of parameters, gradients, pairs, sums and images, at the rate of a copy.
+
+Sorting and finding tiles count by their traffic alone. Beside it, the share if every lane that the kernel evaluates
+counted (4x4 pixels go together), and a simpler estimate of exponentials and bytes: the densities that the kernel
+evaluates at their own rate, no other arithmetic.
 """
 
 from __future__ import annotations
@@ -23,7 +31,7 @@ import numpy as np
 import torch
 
 from bench.table import Row, at_least, at_most, main
-from mvsgs_core import native
+from mvsgs_core import camera, native
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.splats import densities, spherical_harmonics, ssim
 from mvsgs_core.splats.densities import DENSITIES
@@ -33,6 +41,7 @@ from mvsgs_core.splats.rasterizer import rasterize
 SPEEDUP = 4.0  # over the plain loops
 ROOFLINE = 35.0  # %
 FORWARD_VECTORS, BACKWARD_VECTORS = 10, 10  # 64-byte loads and stores of a tile's state per block and splat
+PROJECTION_OPERATIONS = 540  # per splat: 190 to the image; as much again without colors, and the chain rule, back
 MARKS = {(240, "gaussian"): 32.0, (480, "gaussian"): 108.0, (240, "exact"): 73.6, (480, "exact"): 248.0}  # ms
 
 
@@ -78,11 +87,17 @@ def intrinsics(size: tuple[int, int]) -> np.ndarray:
     return np.array([0.9 * width, 0.9 * width, 0.5 * width - 0.5, 0.5 * height - 0.5])
 
 
-def run(splats: Splats, size: tuple[int, int], density: str, backend: str, threads: int, times: Times) -> torch.Tensor:
+def run(
+    splats: Splats, size: tuple[int, int], density: str, backend: str, threads: int, times: Times,
+    antialiased: bool = False,
+) -> torch.Tensor:  # fmt: skip
     """One forward and backward pass, timed."""
     gradient = torch.ones(*size, 3)
     start = time.perf_counter()
-    render = rasterize(splats, np.eye(4), intrinsics(size), size, density=density, backend=backend, threads=threads)
+    render = rasterize(
+        splats, np.eye(4), intrinsics(size), size, density=density, backend=backend, threads=threads,
+        antialiased=antialiased,
+    )  # fmt: skip
     middle = time.perf_counter()
     render.color.backward(gradient)
     times.add(middle - start, time.perf_counter() - middle)
@@ -91,7 +106,7 @@ def run(splats: Splats, size: tuple[int, int], density: str, backend: str, threa
 
 def run_baseline(splats: Splats, size: tuple[int, int], density: str, threads: int, times: Times) -> torch.Tensor:
     color = torch.empty(*size, 3)
-    seconds = native.load("splats").baseline(
+    seconds = native.load("bench").baseline(
         *(tensor.detach() for tensor in splats.tensors().values()), torch.eye(4, dtype=torch.float64),
         tuple(intrinsics(size).tolist()), density == "exact", threads, color, torch.ones(*size, 3),
         torch.empty(len(splats), 9),
@@ -100,31 +115,76 @@ def run_baseline(splats: Splats, size: tuple[int, int], density: str, threads: i
     return color
 
 
-def work(splats: Splats, size: tuple[int, int], density: str) -> tuple[int, int]:
-    """(densities evaluated by the forward pass, pairs of splats and tiles)."""
+@dataclass(frozen=True)
+class Operations:
+    """Arithmetic per pair of splat and pixel; a multiplication with addition is one, a comparison or selection is one.
+
+    Density: u, v 3, log2 of alpha 2, exponential 8 (two to split, five products, one to scale); the exact form adds the
+    logarithm 13, the exponential 8, their limits 2 and the exponent 1. Forward: clamp, two comparisons, weight,
+    transmittance, four sums. Backward: clamp, two comparisons, weight, transmittance, three for dL/dweight, one for
+    what lies behind, seven for dL/dalpha (its reciprocal is three), eleven for the sums; the exact form adds eight.
+    """
+
+    density: int
+    forward: int = 9
+    backward: int = 27
+
+    def pair(self) -> int:
+        """Of the forward and the backward pass: both evaluate the density, for keeping it costs more bytes."""
+        return 2 * self.density + self.forward + self.backward
+
+
+OPERATIONS = {"gaussian": Operations(13), "exact": Operations(37, backward=35)}
+
+
+@dataclass(frozen=True)
+class Work:
+    """What the kernel did in one forward pass."""
+
+    evaluated: int  # densities, lanes off the ellipse included
+    contributed: int  # of those, pairs of splat and pixel that got color
+    pairs: int  # of splats and tiles
+
+
+def work(splats: Splats, size: tuple[int, int], density: str) -> Work:
     height, width = size
     passed = native.load("splats").forward(
         *(tensor.detach() for tensor in splats.tensors().values()), pose=torch.eye(4, dtype=torch.float64),
         intrinsics=tuple(intrinsics(size).tolist()), near=1e-3, background=(0.0, 0.0, 0.0), exact=density == "exact",
-        antialiased=False, degree=0, tile_mask=None, weights=False, threads=0, color=torch.empty(height, width, 3),
+        antialiased=False, degree=0, tile_mask=None, weights=True, threads=0, color=torch.empty(height, width, 3),
         depth=torch.empty(size), opacity=torch.empty(size), radii=torch.empty(len(splats)),
     )  # fmt: skip
-    return passed.exponentials, passed.pairs
+    return Work(passed.evaluated, passed.contributed, passed.pairs)
 
 
-def roofline(splats: Splats, size: tuple[int, int], density: str, threads: int) -> float:
+@dataclass(frozen=True)
+class Roofline:
     """Milliseconds that forward and backward would take at the machine's peaks."""
-    kernels = native.load("splats")
-    evaluated, pairs = work(splats, size, density)
-    vectors = (FORWARD_VECTORS + BACKWARD_VECTORS) * evaluated // 16
+
+    necessary: float  # all necessary arithmetic of the pairs that contribute, and bytes
+    evaluated: float  # the same for every lane that is evaluated
+    simple: float  # exponentials and bytes
+
+
+def roofline(done: Work, count: int, size: tuple[int, int], density: str, threads: int) -> Roofline:
+    peaks = native.load("bench")
+    products = peaks.peak_products(threads)
+    cache = peaks.peak_tile_bytes(threads)
     # splats: parameters read twice, gradients written, projection written and read twice; pairs written and read with
     # their splat, sums written and read; images
-    traffic = len(splats) * (2 * 60 + 60 + 3 * 64) + pairs * (4 * 12 + 2 * 64 + 2 * 64) + size[0] * size[1] * 4 * 13
-    blending = max(
-        2 * evaluated / kernels.peak_densities(density == "exact", threads),
-        64 * vectors / kernels.peak_tile_bytes(threads),
-    )
-    return 1e3 * (blending + traffic / kernels.peak_memory_bytes(threads))
+    traffic = count * (2 * 60 + 60 + 3 * 64) + done.pairs * (4 * 12 + 2 * 64 + 2 * 64) + size[0] * size[1] * 4 * 13
+    memory = traffic / peaks.peak_memory_bytes(threads)
+
+    def state(pairs: int) -> float:
+        return 64 * (FORWARD_VECTORS + BACKWARD_VECTORS) * pairs / 16 / cache
+
+    def bound(pairs: int) -> float:
+        blending = max(pairs * OPERATIONS[density].pair() / products, state(pairs))
+        return 1e3 * (blending + count * PROJECTION_OPERATIONS / products + memory)
+
+    densities_only = 2 * done.evaluated / peaks.peak_densities(density == "exact", threads)
+    simple = 1e3 * (max(densities_only, state(done.evaluated)) + memory)
+    return Roofline(bound(done.contributed), bound(done.evaluated), simple)
 
 
 def compare(size: tuple[int, int], count: int, threads: int, rounds: int) -> list[Row]:
@@ -153,10 +213,17 @@ def compare(size: tuple[int, int], count: int, threads: int, rounds: int) -> lis
             Row(f"{label}: mean difference to plain loops", float((image - other).abs().mean()), ""),
             Row(f"{label}: times faster than with 1 thread", one.total() / totals[density], "x"),
         ]
-        bound = roofline(splats, size, density, threads)
+        done = work(splats, size, density)
+        bound, alone = (roofline(done, count, size, density, n) for n in (threads, 1))
+        total = totals[density]
         rows += [
-            Row(f"{label}: roofline", bound, "ms"),
-            at_least(f"{label}: share of the roofline", 100.0 * bound / totals[density], "%", ROOFLINE),
+            Row(f"{label}: pairs of splat and pixel that get color", done.contributed / 1e6, "million"),
+            Row(f"{label}: pairs evaluated", done.evaluated / 1e6, "million"),
+            Row(f"{label}: roofline", bound.necessary, "ms"),
+            at_least(f"{label}: share of the roofline", 100.0 * bound.necessary / total, "%", ROOFLINE),
+            Row(f"{label}: share if all lanes counted", 100.0 * bound.evaluated / total, "%"),
+            Row(f"{label}: share by exponentials and bytes only", 100.0 * bound.simple / total, "%"),
+            Row(f"{label}: share of the roofline, 1 thread", 100.0 * alone.necessary / one.total(), "%"),
         ]
     for density in DENSITIES[1:]:
         price = totals[density] / totals["gaussian"]
@@ -198,17 +265,26 @@ def similarity() -> list[Row]:
     ]
 
 
-def fit(image: torch.Tensor, camera: np.ndarray, density: str, seconds: float) -> tuple[float, int]:
-    """(PSNR, iterations) of 3,000 splats fitted to one image in `seconds` of one core."""
+def psnr(render: torch.Tensor, image: torch.Tensor) -> float:
+    error = (render.detach().clamp(0.0, 1.0) - image).square().mean()
+    return -10.0 * math.log10(error.item())
+
+
+def fit(
+    image: torch.Tensor, intrinsics_of_view: np.ndarray, density: str, seconds: float, antialiased: bool = False
+) -> tuple[Splats, float, int]:
+    """(splats, PSNR, iterations) of 3,000 splats fitted to one image in `seconds` of one core."""
     height, width = image.shape[:2]
     g = torch.Generator().manual_seed(0)
     pixels = torch.rand(3000, 2, generator=g) * torch.tensor([width, height])
     z = 2.0 + torch.rand(3000, generator=g)
-    rays = (pixels - torch.from_numpy(camera[2:]).float()) / torch.from_numpy(camera[:2]).float()
+    rays = (pixels - torch.from_numpy(intrinsics_of_view[2:]).float()) / torch.from_numpy(
+        intrinsics_of_view[:2]
+    ).float()
     colors = image[pixels[:, 1].long(), pixels[:, 0].long()]
     splats = Splats(
         means=torch.cat([rays, torch.ones(3000, 1)], dim=1) * z[:, None],
-        log_scales=torch.log(3.0 * z / float(camera[0]))[:, None].repeat(1, 3),
+        log_scales=torch.log(3.0 * z / float(intrinsics_of_view[0]))[:, None].repeat(1, 3),
         quaternions=torch.randn(3000, 4, generator=g),
         opacity_logits=torch.full((3000,), -1.0),
         sh=spherical_harmonics.from_rgb(colors)[:, None],
@@ -219,24 +295,52 @@ def fit(image: torch.Tensor, camera: np.ndarray, density: str, seconds: float) -
     adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in zip(leaves, rates)], eps=1e-15)
     start, iterations, render = time.process_time(), 0, None
     while time.process_time() - start < seconds or render is None:
-        render = rasterize(splats, np.eye(4), camera, (height, width), density=density, threads=1)
+        render = rasterize(
+            splats, np.eye(4), intrinsics_of_view, (height, width), density=density, threads=1, antialiased=antialiased
+        )
         adam.zero_grad()
         ssim.image_loss(render.color, image, l1_weight=0.8, ssim_weight=0.2, threads=1).backward()
         adam.step()
         iterations += 1
-    error = (render.color.detach().clamp(0.0, 1.0) - image).square().mean()
-    return -10.0 * math.log10(error.item()), iterations
+    return splats, psnr(render.color, image), iterations
+
+
+def room() -> tuple[torch.Tensor, np.ndarray]:
+    """One view of the synthetic room, 320x240, and its camera."""
+    item = next(iter(open_dataset("synthetic", size=(240, 320))))
+    return torch.from_numpy(item.image.copy()).float() / 255.0, item.intrinsics
 
 
 def worth(seconds: float) -> list[Row]:
     """What each density form reaches in the same time: one view of the synthetic room, one core."""
     rows = []
-    item = next(iter(open_dataset("synthetic", size=(240, 320))))
-    image = torch.from_numpy(item.image.copy()).float() / 255.0
+    image, intrinsics_of_room = room()
     for density in densities.DENSITIES:
-        psnr, iterations = fit(image, item.intrinsics, density, seconds)
-        rows.append(Row(f"one view, {seconds:g} s of one core, {density}: PSNR", psnr, "dB"))
+        _, reached, iterations = fit(image, intrinsics_of_room, density, seconds)
+        rows.append(Row(f"one view, {seconds:g} s of one core, {density}: PSNR", reached, "dB"))
         rows.append(Row(f"one view, {seconds:g} s of one core, {density}: iterations", float(iterations), ""))
+    return rows
+
+
+def antialiasing(threads: int, rounds: int, seconds: float) -> list[Row]:
+    """What `antialiased` costs, and what it is worth to a map that is seen from farther away than it was made."""
+    size, splats = (240, 320), scene(20_000, 320, "gaussian")
+    times = {mode: Times() for mode in (False, True)}
+    for _ in range(rounds):
+        for mode, spent in times.items():
+            run(splats, size, "gaussian", "cpu", threads, spent, mode)
+    rows = [Row("320x240 20k gaussian: price of antialiased", times[True].total() / times[False].total(), "x")]
+    image, near = room()
+    small = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 4).permute(1, 2, 0)
+    far = camera.scale_intrinsics(near, size, (60, 80))
+    for mode in (False, True):
+        fitted, reached, _ = fit(image, near, "gaussian", seconds, mode)
+        render = rasterize(fitted, np.eye(4), far, (60, 80), threads=1, antialiased=mode)
+        name = "antialiased" if mode else "not antialiased"
+        rows += [
+            Row(f"one view, {seconds:g} s, {name}: PSNR", reached, "dB"),
+            Row(f"one view, {seconds:g} s, {name}: PSNR at a quarter of the size", psnr(render.color, small), "dB"),
+        ]
     return rows
 
 
@@ -245,7 +349,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
     rounds = 9 if options.quick else 25
     rows = compare((240, 320), 20_000, threads, rounds)
     rows += compare((480, 640), 50_000, threads, rounds)
-    return rows + beside_reference(threads) + similarity() + worth(2.0 if options.quick else 8.0)
+    seconds = 2.0 if options.quick else 8.0
+    rows += beside_reference(threads) + similarity() + worth(seconds)
+    return rows + antialiasing(threads, rounds, seconds)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

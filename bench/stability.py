@@ -122,7 +122,8 @@ def once(
         for key, value in state.detached().tensors().items()
     )
     text = (
-        f"{int(render.visible.sum())} of {len(splats)} seen, {render.refused} left out, {refused_steps} steps refused"
+        f"{int(render.visible.sum())} of {len(splats)} seen, {render.refused} left out, "
+        f"{render.backward.refused or 0} gradients and {refused_steps} steps refused"
     )
     return Row(name, text, "", "render and map finite", finite and spread_no_further)
 

@@ -9,6 +9,9 @@
 namespace splats {
 namespace {
 
+constexpr int kStreams = 4;  // independent chains of densities, to hide latency
+constexpr int kChains = 12;  // of products: more than latency times throughput, fewer than registers
+
 // The compiler may not leave out what led to `value`.
 template <class Value>
 void keep(const Value& value) {
@@ -28,25 +31,24 @@ double best_seconds(int threads, Work work) {
     return best;
 }
 
-// Densities of splats in lockstep, each on a block of its own: nothing waits, nothing but registers is touched.
+// u and v to alpha, v the same all the time.
 template <bool Exact>
 void evaluate(int rounds) {
-    Placed splat{};
-    splat.u_x = splat.v_y = 0.3f;
-    splat.log2_opacity = -0.5f;
-    splat.half_beta = 0.8f;
-    Group total{};
+    constexpr float kLog2Opacity = -0.5f, kHalfBeta = 0.8f;
+    Lanes u[kStreams], total[kStreams] = {};
+    for (int k = 0; k < kStreams; ++k) u[k] = 0.01f * kLaneX + 0.1f * float(k);
     for (int i = 0; i < rounds; ++i) {
-        asm volatile("" : "+m"(splat));  // read anew: nothing of it may be computed ahead
-        const Densities<Exact> densities([&](int) -> const Placed& { return splat; },
-                                         [](int k) { return kLaneX + 0.1f * float(k); }, [](int) { return kLaneY; });
-        total += densities.alpha;
+        for (int k = 0; k < kStreams; ++k) {
+            Lanes m = u[k] * u[k] + kLaneY * kLaneY;
+            if constexpr (Exact) m = exp2_limited(kHalfBeta * log2_of_positive(maximum(m, all(kCenterM))));
+            total[k] += exp2_of_negative(kLog2Opacity - kHalfLog2e * m);
+            u[k] += 1e-6f;
+        }
     }
-    keep(total);
+    for (const Lanes& sum : total) keep(sum);
 }
 
 void multiply(int rounds) {
-    constexpr int kChains = 12;  // more than latency times throughput, fewer than registers
     const Lanes factor = all(0.999f), step = all(1e-3f);
     Lanes chains[kChains];
     for (int k = 0; k < kChains; ++k) chains[k] = all(0.1f * float(k));
@@ -60,13 +62,13 @@ void multiply(int rounds) {
 double peak_densities(bool exact, int threads) {
     constexpr int kRounds = 1 << 18;
     const double seconds = best_seconds(threads, [&] { exact ? evaluate<true>(kRounds) : evaluate<false>(kRounds); });
-    return double(kTogether) * kLanes * kRounds * threads / seconds;
+    return double(kStreams) * kLanes * kRounds * threads / seconds;
 }
 
 double peak_products(int threads) {
     constexpr int kRounds = 1 << 18;
     const double seconds = best_seconds(threads, [] { multiply(kRounds); });
-    return 12.0 * kLanes * kRounds * threads / seconds;
+    return double(kChains) * kLanes * kRounds * threads / seconds;
 }
 
 double peak_tile_bytes(int threads) {
