@@ -21,7 +21,7 @@ class PosedTracker(Node):
 
     @dataclass
     class Config:
-        area: int = 320 * 240  # pixels of the tracker's own image, aspect kept
+        area: int = 320 * 240  # pixels of the tracker's own image, aspect kept; at most twice enlarged
         flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
         keyframe_flow: float = 0.05  # of the width: median flow that makes a keyframe
         keyframe_share: float = 0.5  # of the textured points: fewer found make a keyframe

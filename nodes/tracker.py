@@ -5,26 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
-from msgs import Frame, Keyframe, Poses, Trajectory
+from msgs import Frame, Keyframe, Poses
 from mvsgs_core import geometry
 from mvsgs_core.tracking import tracker as core
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
-from mvsgs_core.tracking.publish import Correction
 from mvsgs_core.tracking.starting import StartingConfig
-from nodes import Node
+from nodes.tracking import TrackerNode
 
 
-class Tracker(Node):
+class Tracker(TrackerNode):
     """Dense bundle adjustment over semi-dense matches; see mvsgs_core.tracking.tracker."""
 
     @dataclass
     class Config:
-        area: int = 320 * 240  # pixels of the tracker's own image, aspect kept
+        area: int = 320 * 240  # pixels of the tracker's own image, aspect kept; at most twice enlarged
         flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
         keyframe_flow: float = 0.05  # of the width: median flow that makes a keyframe
         keyframe_share: float = 0.5  # of the textured points: fewer found make a keyframe
@@ -65,8 +62,6 @@ class Tracker(Node):
                 saturation=c.saturation,
             )
         )
-        self._frames: dict[int, Frame] = {}  # those that may still be sent as keyframes
-        self._revision = 0
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
         self._frames[frame.index] = frame
@@ -75,30 +70,13 @@ class Tracker(Node):
         )
         yield from self._send(update)
 
-    def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
-        for update in self._tracker.finish():
-            yield from self._send(update)
-        path = self._tracker.path()
-        self._report()
-        yield Trajectory(
-            index=path.index,
-            timestamp=path.timestamp,
-            world_from_cam=path.world_from_cam,
-            keyframe=path.keyframe,
-            state=path.state,
-            segment=path.segment,
-            focal_factor=self._tracker.focal_factor,
-        )
+    @property
+    def _core(self) -> core.Tracker:
+        return self._tracker
 
-    def _send(self, update: core.Update) -> Iterator[Keyframe | Poses]:
-        for index in update.keyframes:
-            yield self._keyframe(index)
-        if update.correction is not None:
-            yield self._poses(update.correction)
-        for index in [index for index in self._frames if index not in self._tracker.pending]:
-            del self._frames[index]
-        self.stats.values["tracking"] = update.state.name.lower()
-        self._report()
+    @property
+    def _focal_factor(self) -> float:
+        return self._tracker.focal_factor
 
     def _keyframe(self, index: int) -> Keyframe:
         frame, keyframe = self._frames[index], self._tracker.keyframe(index)
@@ -114,19 +92,6 @@ class Tracker(Node):
             inverse_depth_weight=weight,
             segment=keyframe.segment,
         )
-
-    def _poses(self, correction: Correction) -> Poses:
-        self._revision += 1
-        return Poses(self._revision, correction.index, correction.world_from_cam, correction.scale.astype(np.float64))
-
-    def _report(self) -> None:
-        core_stats = self._tracker.stats
-        self.stats.counts.update(core_stats.counts)
-        self.stats.seconds.update(core_stats.seconds)
-        self.stats.skipped.update(core_stats.skipped)
-        self.stats.values.update(core_stats.values)
-        for warning in core_stats.warnings:
-            self.stats.warn(warning)
 
 
 def _device(name: str) -> str:

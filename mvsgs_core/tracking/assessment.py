@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core.tracking.frames import Path, State
+from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.stats import TrackingStats
 
 
@@ -20,4 +21,17 @@ def warn_of_gaps(stats: TrackingStats, path: Path) -> None:
         stats.warn(f"{unstarted} of {len(path.state)} frames came before a start and have no pose")
 
 
-__all__ = ["warn_of_gaps"]
+def warn_of_few_matches(stats: TrackingStats, graph: KeyframeGraph, enough: int) -> None:
+    """Few points hold the poses: their errors do not average out, and the whole map bends without any residual."""
+    if not graph.edges:
+        return
+    found = float(np.median([np.count_nonzero(edge.weight) for edge in graph.edges.values()]))
+    stats.counts["matches of a pair of keyframes, median"] = found
+    if found < enough:
+        stats.warn(
+            f"few matches: {found:.0f} of a pair of keyframes, {enough} are enough. Poses and depths may be bent as a "
+            "whole; larger images (dataset.size, tracker.area) or a scene with more texture help"
+        )
+
+
+__all__ = ["warn_of_few_matches", "warn_of_gaps"]

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.camera import fit_size, scale_intrinsics
+from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.tracking.bundle_adjustment import Solver, reproject
 from mvsgs_core.tracking.flow import Matches, make_flow
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
-from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from mvsgs_core.tracking.matcher import Matcher
 from mvsgs_core.tracking.stats import TrackingStats
@@ -84,7 +84,7 @@ class PosedTracker:
         return self.graph.keyframes[index]
 
     def _set_up(self, height: int, width: int, intrinsics: np.ndarray) -> None:
-        self.size = fit_size(height, width, self.config.area)
+        self.size = tracking_size(height, width, self.config.area)
         self.graph = KeyframeGraph(scale_intrinsics(intrinsics, (height, width), self.size))
         self.flow = make_flow(self.config.flow)
         matcher = Matcher(self.flow)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mvsgs_core.camera import fit_size, scale_intrinsics
-from mvsgs_core.tracking.assessment import warn_of_gaps
+from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
 from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.calibration import READOUT_AGAIN, Calibration
@@ -24,7 +24,7 @@ from mvsgs_core.tracking.focal import FocalConfig
 from mvsgs_core.tracking.frames import FrameRecord, Path, State, compact, solve_path
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
-from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from mvsgs_core.tracking.loop_closure import LoopCloser, LoopConfig
 from mvsgs_core.tracking.matcher import Matcher
@@ -44,6 +44,7 @@ class TrackerConfig:
     readout: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated
     saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
     texture: float = 0.05  # share of the cells that must be textured for an image to be of any use
+    matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is told
     threads: int = 1
     device: str = "cpu"  # of the local and global bundle adjustment, see Solver; single frames stay on the CPU
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
@@ -154,6 +155,7 @@ class Tracker:
         if not self._keyframes():
             self.stats.warn(f"tracking never started: {self.starter.reason}")
         warn_of_gaps(self.stats, self._path)
+        warn_of_few_matches(self.stats, self.graph, self.config.matches)
         yield Update(State.TRACKED if self.started else State.NOT_STARTED, (), self.publisher.corrections(True))
 
     def path(self) -> Path:
@@ -166,7 +168,7 @@ class Tracker:
 
     def _set_up(self, height: int, width: int, intrinsics: np.ndarray, guessed: bool) -> None:
         config = self.config
-        self.size = fit_size(height, width, config.area)
+        self.size = tracking_size(height, width, config.area)
         self.intrinsics = scale_intrinsics(intrinsics, (height, width), self.size)
         self.graph = KeyframeGraph(self.intrinsics)
         self.graph.device = config.device

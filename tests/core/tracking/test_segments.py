@@ -1,0 +1,58 @@
+"""A camera that is lost, begins anew, and sees known ground again: the two segments become one map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core.datasets import Item
+from mvsgs_core.datasets.synthetic import Synthetic
+from mvsgs_core.tracking.frames import State
+from mvsgs_core.tracking.tracker import Tracker
+from tests.core.tracking.sequences import ate
+
+BEFORE, COVERED = 30, 3
+
+
+def out_and_back() -> list[Item]:
+    """30 frames of a loop, a hand before the lens, a walk from elsewhere back to where it began."""
+    room = Synthetic(frames=300, loop=True, threads=1)
+    way = [*range(BEFORE), *[BEFORE] * COVERED, *range(110, 30, -2), *range(30, 14, -1)]
+    items = [replace(room[k], index=n, timestamp=n / 20.0) for n, k in enumerate(way)]
+    for n in range(BEFORE, BEFORE + COVERED):
+        items[n] = replace(items[n], image=np.zeros_like(items[n].image))
+    return items
+
+
+def test_a_lost_segment_is_joined_by_a_loop() -> None:
+    items = out_and_back()
+    tracker = Tracker()
+    told: dict[int, int] = {}  # segment of each keyframe when it was told
+    states, joined_at, moved = [], None, set()
+    for item in items:
+        update = tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+        states.append(update.state)
+        told |= {index: tracker.keyframe(index).segment for index in update.keyframes}
+        if update.correction is not None:
+            moved |= set(update.correction.index.tolist()) if joined_at is None else set()
+        if joined_at is None and tracker.stats.counts.get("segments joined"):
+            joined_at = item.index
+            assert update.correction is not None
+            moved = set(update.correction.index.tolist())
+    list(tracker.finish())
+    path = tracker.path()
+    assert all(state == State.LOST for state in states[BEFORE : BEFORE + COVERED])
+    second = {index for index, segment in told.items() if segment == 1}
+    assert len(second) >= 6, "there was no segment of its own"
+    assert min(second) > BEFORE + COVERED
+    assert joined_at is not None
+    assert second <= moved | {joined_at}, "the second segment must be told where it lies in the first"
+    assert set(path.segment[path.keyframe]) == {0}
+    assert not any("segments" in warning for warning in tracker.stats.warnings)
+    posed = np.isfinite(path.world_from_cam).all(axis=(1, 2))
+    assert posed[: BEFORE - 1].all()
+    assert not posed[BEFORE : BEFORE + COVERED].any()
+    assert posed[BEFORE + COVERED :].all()
+    error, length = ate(path, items)
+    assert error < 0.003 * length
