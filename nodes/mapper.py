@@ -41,6 +41,7 @@ class Mapper(Node):
         window: int = 6  # keyframes of the local half
         realtime: bool = False  # a new keyframe cancels what older ones are owed
         max_pixels: int | None = None  # area of the training images; null: as they come
+        max_keyframes: int = 1000  # whose images are kept and trained on; beyond, they are thinned out evenly
         density: str = "gaussian"  # gaussian, exact or ges_scale
         betas: bool = False  # train the shape (exact, ges_scale)
         loss: str = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
@@ -147,6 +148,7 @@ class Mapper(Node):
         self.stats.values["splats"] = len(self.mapper.state)
         self.stats.values["iterations"] = self.mapper.iterations
         self.stats.values["iterations_owed"] = self.mapper.schedule.owed
+        self.stats.values["image_bytes"] = self.mapper.image_bytes
 
     def _map(self, refined: bool) -> SplatMap:
         final = self.mapper.snapshot()
@@ -210,6 +212,7 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
         window=config.window,
         realtime=config.realtime,
         max_pixels=config.max_pixels,
+        max_keyframes=config.max_keyframes,
         sh_degree=config.sh_degree,
         seed=config.seed,
         device=device,
