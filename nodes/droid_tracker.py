@@ -6,19 +6,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 
-from msgs import Frame, Keyframe, Poses, Trajectory
+from msgs import Frame, Keyframe, Poses
 from mvsgs_core import geometry
 from mvsgs_core.droid.presets import preset
 from mvsgs_core.droid.system import DroidConfig, DroidSlam
-from mvsgs_core.tracking.publish import Correction
-from mvsgs_core.tracking.tracker import Update
-from nodes import Node
+from nodes.tracking import TrackerNode
 
 
-class DroidTracker(Node):
+class DroidTracker(TrackerNode):
     """Learned tracking as published in 2021; see mvsgs_core.droid. The preset's values hold where null is given."""
 
     @dataclass
@@ -66,8 +63,6 @@ class DroidTracker(Node):
                 threads=c.threads or 1,
             )
         )
-        self._frames: dict[int, Frame] = {}  # those that may still be sent as keyframes
-        self._revision = 0
         self._report()
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
@@ -78,29 +73,9 @@ class DroidTracker(Node):
             )
         yield from self._send(self._tracker.add(frame.index, frame.timestamp, frame.image, frame.intrinsics))
 
-    def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
-        for update in self._tracker.finish():
-            yield from self._send(update)
-        path = self._tracker.path()
-        self._report()
-        yield Trajectory(
-            index=path.index,
-            timestamp=path.timestamp,
-            world_from_cam=path.world_from_cam,
-            keyframe=path.keyframe,
-            state=path.state,
-            segment=path.segment,
-        )
-
-    def _send(self, update: Update) -> Iterator[Keyframe | Poses]:
-        for index in update.keyframes:
-            yield self._keyframe(index)
-        if update.correction is not None:
-            yield self._poses(update.correction)
-        for index in self._frames.keys() - self._tracker.pending:
-            del self._frames[index]
-        self.stats.values["tracking"] = update.state.name.lower()
-        self._report()
+    @property
+    def _core(self) -> DroidSlam:
+        return self._tracker
 
     def _keyframe(self, index: int) -> Keyframe:
         frame, coarse = self._frames[index], self._tracker.coarse_map(index)
@@ -115,15 +90,3 @@ class DroidTracker(Node):
             inverse_depth_weight=coarse.weight,
             segment=0,
         )
-
-    def _poses(self, correction: Correction) -> Poses:
-        self._revision += 1
-        return Poses(self._revision, correction.index, correction.world_from_cam, correction.scale.astype(np.float64))
-
-    def _report(self) -> None:
-        stats = self._tracker.stats
-        self.stats.counts.update(stats.counts)
-        self.stats.seconds.update(stats.seconds)
-        self.stats.skipped.update(stats.skipped)
-        for warning in stats.warnings:
-            self.stats.warn(warning)
