@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from bench.runs import SHARED
 from bench.table import Row, main
 from mvsgs_core import weights
 from mvsgs_core.droid.networks import random_net
@@ -164,6 +166,8 @@ _UNITS = (
 
 def measure(options: argparse.Namespace) -> list[Row]:
     h, w = (192, 256) if options.quick else (384, 512)
+    if (SHARED / "weights").is_dir():
+        os.environ.setdefault("MVSGS_WEIGHTS", str(SHARED / "weights"))
     rows = [Row("image size", f"{w}x{h}")]
     for name in CASES:
         command = [sys.executable, "-m", "bench.networks", "--case", name, str(h), str(w)]
