@@ -79,21 +79,24 @@ class Explained:
     def _explained_by(self, sight: MapSight, reference: StereoView, target: np.ndarray) -> np.ndarray:
         size = (target.shape[0], target.shape[1])
         intrinsics = camera.scale_intrinsics(reference.intrinsics, reference.size, size)
-        v, u = np.nonzero(sight.depth > 0)
-        inverse = 1.0 / sight.depth[v, u].astype(np.float64)
-        warp = relative_warp(sight.intrinsics, sight.world_from_cam, intrinsics, reference.world_from_cam)
-        x, y, z = apply_warp(warp, u.astype(np.float64), v.astype(np.float64), inverse)
-        inside = (z > 1e-6) & (x > -0.5) & (x < size[1] - 0.5) & (y > -0.5) & (y < size[0] - 0.5)
-        if not inside.any():
-            return np.zeros(size, dtype=bool)
-        at = np.round(y[inside]).astype(int) * size[1] + np.round(x[inside]).astype(int)
+        stride = max(1, round(sight.depth.shape[1] / (2 * size[1])))  # two points a pixel of the grid are enough
         # Compared at the point's own place, both images blurred over three of the grid's pixels.
         blur = 2 * round(1.5 * sight.gray.shape[1] / size[1]) + 1
-        gray = cv2.blur(sight.gray, (blur, blur))[v, u][inside]
-        at_x, at_y = (a[inside].astype(np.float32)[None] for a in (x, y))  # one row: OpenCV takes no plain lists
-        there = cv2.remap(target, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(-1)
-        difference = gray - there
+        gray = cv2.blur(sight.gray, (blur, blur))[::stride, ::stride]
+        depth = sight.depth[::stride, ::stride].astype(np.float64)
+        known = depth > 0
+        inverse = 1.0 / np.where(known, depth, 1.0)
+        v, u = (stride * a.astype(np.float64) for a in np.indices(depth.shape))
+        warp = relative_warp(sight.intrinsics, sight.world_from_cam, intrinsics, reference.world_from_cam)
+        x, y, z = apply_warp(warp, u, v, inverse)
+        inside = known & (z > 1e-6) & (x > -0.5) & (x < size[1] - 0.5) & (y > -0.5) & (y < size[0] - 0.5)
+        if not inside.any():
+            return np.zeros(size, dtype=bool)
+        at_x, at_y = (np.where(inside, a, 0.0).astype(np.float32) for a in (x, y))
+        there = cv2.remap(target, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        difference = (gray - there)[inside]
         order = np.argsort(-(z / inverse)[inside], kind="stable")  # the nearest last: it stays
+        cell = np.round(y[inside]).astype(int) * size[1] + np.round(x[inside]).astype(int)
         shown = np.full(target.size, np.nan)
-        shown[at[order]] = (difference - np.median(difference))[order]
+        shown[cell[order]] = (difference - np.median(difference))[order]
         return np.asarray(np.abs(shown.reshape(size)) < self.choice.tolerance)

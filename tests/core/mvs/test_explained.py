@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from mvsgs_core import camera
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.explained import ExplainChoice, Explained, MapSight
 from mvsgs_core.mvs.views import StereoView, prepare_view
@@ -59,6 +60,18 @@ def test_a_wrong_color_a_wrong_depth_or_another_segment_explains_nothing() -> No
     assert explained(replace(right, gray=right.gray[:, ::-1].copy())).share(reference) < 0.7 * whole
     assert explained(replace(right, depth=0.4 * right.depth)).share(reference) < 0.7 * whole
     assert explained(replace(right, segment=1)).share(reference) == 0.0
+
+
+def test_a_large_render_explains_as_much_as_a_small_one() -> None:
+    small = sight(0, 0.0)
+    order = (2 * SIZE[1], 2 * SIZE[0])
+    large = replace(
+        small, gray=cv2.resize(small.gray, order), depth=cv2.resize(small.depth, order, interpolation=cv2.INTER_NEAREST),
+        intrinsics=camera.scale_intrinsics(small.intrinsics, SIZE, (2 * SIZE[0], 2 * SIZE[1])),
+    )  # fmt: skip
+    assert large.gray.size > 2**15  # OpenCV's limit of a row
+    reference = view(1, 0.3)
+    assert abs(explained(large).share(reference) - explained(small).share(reference)) < 0.05
 
 
 def test_a_corrected_pose_moves_the_sight() -> None:
