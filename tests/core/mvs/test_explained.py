@@ -65,8 +65,9 @@ def test_a_wrong_color_a_wrong_depth_or_another_segment_explains_nothing() -> No
 def test_a_large_render_explains_as_much_as_a_small_one() -> None:
     small = sight(0, 0.0)
     order = (2 * SIZE[1], 2 * SIZE[0])
+    nearest = cv2.INTER_NEAREST
     large = replace(
-        small, gray=cv2.resize(small.gray, order), depth=cv2.resize(small.depth, order, interpolation=cv2.INTER_NEAREST),
+        small, gray=cv2.resize(small.gray, order), depth=cv2.resize(small.depth, order, interpolation=nearest),
         intrinsics=camera.scale_intrinsics(small.intrinsics, SIZE, (2 * SIZE[0], 2 * SIZE[1])),
     )  # fmt: skip
     assert large.gray.size > 2**15  # OpenCV's limit of a row
