@@ -2,7 +2,7 @@
 
 Inliers: kept pixels within 2 % (synthetic) or 5 % (real) of the true depth. Completeness: kept part of the pixels with
 true depth. Kinect depth is a noisy sensor's, without values at edges and on shiny or far surfaces: these pixels are not
-scored. "tracked": poses, scale and range are the tracker's, and each map is scaled by its median ratio to the truth.
+scored; nor are those of icl_nuim's files that are wrong along edges (30 % off their surroundings) and in the far. "tracked": poses, scale and range are the tracker's, and each map is scaled by its median ratio to the truth.
 With true poses the range comes from coarse depth made from the truth with holes, noise and outliers (depth_data.py).
 """
 
