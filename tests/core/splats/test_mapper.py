@@ -10,6 +10,7 @@ import torch
 
 from mvsgs_core import geometry
 from mvsgs_core.evaluation.image_metrics import psnr
+from mvsgs_core.splats import training
 from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.insertion import InsertionConfig
 from mvsgs_core.splats.keyframes import PosedView
@@ -240,3 +241,16 @@ def test_images_are_kept_for_a_bounded_number_of_keyframes_spread_over_the_run()
     shift = np.stack([view.world_from_cam for view in views])
     shift[:, 0, 3] += 1.0
     assert mapper.correct(np.arange(10), shift, np.ones(10)) == len(mapper.state)
+
+
+def test_gradients_that_are_not_finite_are_counted_and_the_map_stays_finite(monkeypatch: pytest.MonkeyPatch) -> None:
+    def with_one_bad_pixel(color: torch.Tensor, *others: object) -> torch.Tensor:
+        pixel = color[24, 32, 0]
+        return color.mean() + (pixel - pixel.detach()).abs().sqrt()  # 0, with a derivative of NaN
+
+    monkeypatch.setattr(training, "ges_loss", with_one_bad_pixel)
+    mapper = mapped(tiny_views()[:2], replace(CONFIG, iterations=4, refinement=0))
+    assert mapper.log.counts["refused_gradients"] > 0
+    assert any("gradients" in text for text in mapper.log.warnings)
+    for name in PARAMETERS:
+        assert torch.isfinite(getattr(mapper.state.splats, name)).all()
