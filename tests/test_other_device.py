@@ -1,0 +1,98 @@
+"""What runs on a GPU, on a pretended one: no step mixes devices, and what comes back is in main memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from bench import networks
+from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
+from mvsgs_core.mvs.interface import CostOptions, SmoothOptions
+from mvsgs_core.mvs.torch_backend import TorchBackend
+from mvsgs_core.splats.density_control import DensityConfig
+from mvsgs_core.splats.losses import LossConfig
+from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.splats.preview import preview_arrays
+from mvsgs_core.splats.training import SkipConfig, TrainingConfig
+from tests.core.fusion.test_consistency import view
+from tests.core.mvs.test_backends import SIZE, problem
+from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from tests.pretend_device import DEVICE, PretendDevice
+
+
+def test_the_pretended_device_mixes_with_no_other() -> None:
+    with PretendDevice():
+        here, there = torch.ones(3), torch.ones(3, device=DEVICE)
+        assert (there + torch.tensor(2.0)).sum().item() == 9.0
+        with pytest.raises(RuntimeError, match="two devices"):
+            here + there
+        with pytest.raises((RuntimeError, TypeError)):
+            there.numpy()
+        leaf = there.clone().requires_grad_()
+        (leaf * leaf).sum().backward()
+        assert leaf.grad is not None
+        assert leaf.grad.device.type == DEVICE
+        assert (leaf.grad.cpu() + here).tolist() == [3.0] * 3
+
+
+@pytest.mark.parametrize("name", [name for name in networks.CASES if "LPIPS" not in name])
+def test_networks(name: str) -> None:
+    with torch.no_grad(), PretendDevice():
+        _, work = networks.CASES[name](64, 64, DEVICE)
+        work()
+
+
+def test_stereo_equals_that_of_the_cpu() -> None:
+    p = problem()
+    surface = (p["reference"], p["neighbors"], p["warps"], np.full(SIZE, 0.22, np.float32), CostOptions())
+    results = []
+    with PretendDevice():
+        for backend in (TorchBackend(DEVICE), TorchBackend("cpu")):
+            cost = backend.cost_volume(**p, hypotheses=5, options=CostOptions(radius=2, best=2))
+            choice = backend.semi_global(cost, p["reference"], p["first"], p["step"], SmoothOptions())
+            results.append([cost, *vars(choice).values(), backend.view_correlation(*surface)])
+    for there, here in zip(*results, strict=True):
+        np.testing.assert_array_equal(there, here)
+
+
+def test_fusion_equals_that_of_the_cpu() -> None:
+    results = []
+    with PretendDevice():
+        for device in (DEVICE, "torch"):
+            fusion = DepthFusion(FusionConfig(device=device, threads=1, round_trip=True))
+            found = [one for k in range(5) for one in fusion.add(view(k, 0.1 * k, 0.005))]
+            results.append([one.depth for one in [*found, *fusion.flush()]])
+    assert len(results[0]) == 5
+    np.testing.assert_array_equal(*results)
+
+
+@pytest.mark.parametrize("mode", ["adaptive", "relocate"])
+def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
+    config = MapperConfig(
+        iterations=4, refinement=1, sh_degree=1, device=DEVICE,
+        training=TrainingConfig(
+            backend="reference", exposure=True, poses=True, pose_visits=0, betas=True, density="exact",
+            loss=LossConfig(),
+        ),
+        skipping=SkipConfig(tiles=True, tiles_every=2, coarse_to_fine=True, coarse_visits=1),
+        density_control=DensityConfig(every=3, mode=mode),
+    )  # fmt: skip
+    views = [posed_view(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(3)]
+    with PretendDevice():
+        mapper = OnlineMapper(config)
+        for one in views:
+            mapper.add_view(one)
+        while mapper.step():
+            pass
+        moved = views[1].world_from_cam.copy()
+        moved[0, 3] += 0.2
+        assert mapper.correct(np.array([1]), moved[None], np.array([1.1])) > 0
+        mapper.refine(0, 1)
+        preview = preview_arrays(mapper, 50)
+        final = mapper.snapshot()
+    assert mapper.state.splats.means.device.type == DEVICE
+    assert all(isinstance(array, np.ndarray) for array in preview.values())
+    assert all(tensor.device.type == "cpu" for tensor in final.splats.tensors().values())
+    assert np.isfinite(final.splats.means.numpy()).all()
+    assert isinstance(final.exposures, np.ndarray)
