@@ -1,0 +1,96 @@
+"""The depth benchmark's own logic: scores, fronts, variants, and what is not scored."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.depth import SECTIONS, SMALL, map_section
+from bench.depth_calibration import reliability
+from bench.depth_curves import Point, settings
+from bench.depth_data import Scene, coarse_grid, without_ragged_edges
+from bench.depth_parts import part_variants, skip_variants
+from bench.depth_run import scaled_to, score
+from mvsgs_core.fusion.fusion import FusionConfig
+from mvsgs_core.mvs.cascade import CascadeConfig
+
+
+def scene(truth: np.ndarray) -> Scene:
+    return Scene("made up", [], [], [truth, None], 0.05)
+
+
+def test_scores_count_what_is_kept_and_what_is_right() -> None:
+    truth = np.full((2, 5), 2.0, np.float32)
+    truth[0, 0] = 0.0  # unknown: not scored
+    depth = truth.copy()
+    depth[1] = [2.05, 2.2, 3.0, 0.0, 0.0]
+    found = score([depth, depth], scene(truth))
+    assert found.completeness == pytest.approx(7 / 9)
+    assert found.inliers == pytest.approx(5 / 7)
+    assert found.outliers == pytest.approx(1 / 7)
+    assert found.relative_error == pytest.approx((0.025 + 0.1 + 0.5) / 7)
+    assert score([3 * depth, depth], scene(truth), align=True).inliers == found.inliers
+    assert score([np.zeros_like(depth), depth], scene(truth)).completeness == 0
+
+
+def test_a_map_is_scaled_by_its_median_ratio() -> None:
+    truth = np.array([[1.0, 2.0, 4.0, 0.0]], np.float32)
+    depth = np.array([[0.5, 1.0, 2.0, 7.0]], np.float32)
+    np.testing.assert_allclose(scaled_to(depth, truth)[truth > 0], truth[truth > 0])
+    assert not scaled_to(np.zeros_like(depth), truth).any()
+
+
+def test_wrong_depths_along_edges_are_not_scored_but_edges_are() -> None:
+    depth = np.full((40, 40), 5.0, np.float32)
+    depth[:, 20:] = 2.0
+    depth[:, 19] = 0.3  # a line of nonsense
+    depth[30:, :10] = 0.009
+    clean = without_ragged_edges(depth)
+    assert not clean[:30, 19].any()
+    assert not clean[33:, :8].any()
+    assert (clean[:25, 2:18] == 5.0).all()
+    assert (clean[:25, 22:] == 2.0).all()
+
+
+def test_the_front() -> None:
+    good, slow, other = (Point("c", "p", s, i, c) for s, i, c in ((1.0, 0.9, 0.7), (2.0, 0.9, 0.6), (0.5, 0.8, 0.7)))
+    assert good.beats(slow)
+    assert not slow.beats(good)
+    assert not good.beats(other)
+    assert not other.beats(good)
+    assert not good.beats(good)
+    assert good.right == pytest.approx(0.63)
+
+
+def test_every_variant_and_point_changes_something() -> None:
+    plain = (CascadeConfig(area=SMALL), FusionConfig())
+    for variant in (*part_variants(SMALL).values(), *skip_variants(SMALL).values()):
+        assert variant != plain
+    for points in settings(SMALL).values():
+        assert all(point != plain[0] for point in points.values())
+
+
+def test_reliability_of_honest_and_of_boastful_confidences() -> None:
+    rng = np.random.default_rng(0)
+    probability = rng.random(20000)
+    honest, curve = reliability(probability, rng.random(20000) < probability)
+    boastful, _ = reliability(probability, rng.random(20000) < 0.5 * probability)
+    assert honest < 0.03
+    assert boastful > 0.2
+    assert sum(share for *_, share in curve) == pytest.approx(1.0)
+
+
+def test_the_simulated_grid_is_sparse_noisy_and_partly_wrong() -> None:
+    grid, weight = coarse_grid(np.full((240, 320), 2.0, np.float32), seed=1)
+    known = grid[grid > 0]
+    assert np.array_equal(weight > 0, grid > 0)
+    assert 0.4 < len(known) / grid.size < 0.6
+    assert np.median(known) == pytest.approx(0.5, rel=0.03)
+    assert 0.0 < np.mean(np.abs(known - 0.5) > 0.25) < 0.06
+
+
+def test_sections_have_names_and_the_map_says_where_its_figures_come_from() -> None:
+    assert {"quality", "tracked", "peers", "photos", "skips", "curves", "failures", "calibration"} <= set(SECTIONS)
+    rows = map_section(None)  # type: ignore[arg-type]
+    assert rows
+    assert all("bench.ablation" in row.name for row in rows)
