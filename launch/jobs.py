@@ -88,10 +88,22 @@ def _check_nodes(graph: Graph) -> None:
     for name, slot in graph.slots.items():
         if slot.placement.external:
             continue
+        _check_device(name, slot.config.get("device"))
         try:
             slot.node.check(make_config(slot.node, slot.config))
         except (OSError, ValueError) as error:
             raise GraphError(f"{name}: {error}") from error
+
+
+def _check_device(slot: str, device: Any) -> None:
+    """A GPU that a slot asks for by itself, not by the global `device`, must be there."""
+    if not isinstance(device, str) or not device.startswith("cuda"):
+        return
+    import torch  # takes a second to load
+
+    there, number = torch.cuda.device_count(), device.partition(":")[2] or "0"
+    if not number.isdigit() or int(number) >= there:
+        raise GraphError(f"{slot}.device={device}: this machine has {there} CUDA devices; use {slot}.device=cpu")
 
 
 def _prepare_output(graph: Graph) -> Path:

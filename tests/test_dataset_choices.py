@@ -56,6 +56,15 @@ def test_every_choice_lists_all_options_of_its_format() -> None:
     assert synthetic == (explicit | {f.name for f in dataclasses.fields(Difficulties)}) - own
 
 
+@pytest.mark.parametrize("device", ["cuda:63", "cuda:first"])
+def test_a_missing_gpu_of_one_slot_is_refused_too(
+    device: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = OmegaConf.create(compose([f"mvs.device={device}", f"output={tmp_path / 'out'}"]).resolved)
+    assert run(Job(config, [], {"dataset": "synthetic"}, None)) == 2
+    assert f"error: mvs.device={device}: this machine has" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("choice", ["tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "player"])
 @pytest.mark.parametrize("path", [None, "/nowhere/at/all"])
 def test_a_missing_path_is_refused_before_a_process_starts(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -15,9 +17,11 @@ from mvsgs_core.splats.losses import LossConfig
 from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.splats.preview import preview_arrays
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig
+from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
 from tests.core.fusion.test_consistency import view
 from tests.core.mvs.test_backends import SIZE, problem
 from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from tests.core.tracking.test_torch_adjustment import noisy
 from tests.pretend_device import DEVICE, PretendDevice
 
 
@@ -65,6 +69,15 @@ def test_fusion_equals_that_of_the_cpu() -> None:
             results.append([one.depth for one in [*found, *fusion.flush()]])
     assert len(results[0]) == 5
     np.testing.assert_array_equal(*results)
+
+
+def test_bundle_adjustment_equals_that_of_the_cpu() -> None:
+    graph, solver = noisy(k=4, m=20), Solver(steps=2, robust="cauchy", robust_scale=1.5, tolerance=0.0)
+    with PretendDevice():
+        there, here = (adjust(graph, dataclasses.replace(solver, device=device)) for device in (DEVICE, "torch"))
+    assert there.steps == here.steps > 0
+    np.testing.assert_array_equal(there.cam_from_world, here.cam_from_world)
+    np.testing.assert_array_equal(there.inverse_depth, here.inverse_depth)
 
 
 @pytest.mark.parametrize("mode", ["adaptive", "relocate"])
