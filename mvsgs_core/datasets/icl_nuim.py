@@ -22,7 +22,8 @@ LAYOUT = Layout(
 )
 # Published as fy = -480: the renderer's y axis points up. Turning it down mirrors camera AND world, see `_mirror`.
 _PUBLISHED = Lens((481.2, 480.0, 319.5, 239.5), (480, 640))
-_DEPTH = DepthFormat(per_unit=5000.0)
+# below 0.1 m: the noise that the noisy variant's depth maps also have where nothing is known
+_DEPTH = DepthFormat(per_unit=5000.0, invalid=tuple(range(500)))
 _FRAME_RATE = 30.0
 _Y_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
 

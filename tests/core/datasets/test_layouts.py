@@ -109,6 +109,16 @@ def test_icl_nuim(tmp_path: Path) -> None:
     np.testing.assert_allclose(items[3].depth, 2.0)
 
 
+def test_noise_where_nothing_is_known_is_no_depth(tmp_path: Path) -> None:
+    """The noisy variant's maps have 1 to 3 centimeters there."""
+    folder = write_icl_nuim(tmp_path, 2)
+    write_depth(folder / "depth/1.png", 145)
+    items = list(open_dataset("icl_nuim", path=folder))
+    assert items[0].depth is not None
+    assert (items[0].depth > 0).all()
+    assert items[1].depth is None or not items[1].depth.any()
+
+
 def test_depth_of_another_shape_is_left_out(tmp_path: Path) -> None:
     folder = write_icl_nuim(tmp_path, 3)
     write_depth(folder / "depth/1.png", 10000, (48, 48))
