@@ -22,7 +22,7 @@ class SkippingMvs(Mvs):
 
     @dataclass
     class Config(Mvs.Config):
-        skip_explained: float = 0.95  # share of a keyframe's pixels that the map must explain
+        skip_explained: float = 0.8  # share of a keyframe's pixels that the map must explain
         tolerance: float = 12.0  # gray levels that a pixel and the map's may differ
 
     config: Config

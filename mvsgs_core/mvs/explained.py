@@ -16,9 +16,9 @@ from mvsgs_core.mvs.warp import apply_warp, relative_warp
 class ExplainChoice:
     """When a keyframe needs no stereo."""
 
-    share: float = 0.95  # of its pixels that the map must explain
+    share: float = 0.8  # of its pixels that the map must explain
     tolerance: float = 12.0  # gray levels that a pixel and the map's may differ, after one shift for the exposure
-    views: int = 3  # newest renders of the map that are looked at
+    views: int = 8  # newest renders of the map that are looked at
     area: int = 80 * 60  # pixels that are compared, aspect kept
 
 
