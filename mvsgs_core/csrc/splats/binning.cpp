@@ -63,11 +63,10 @@ void sort_by_depth(Frame& frame, size_t count) {
     if (order != frame.order.data()) std::memcpy(frame.order.data(), order, count * sizeof(uint32_t));
 }
 
-// The pairs of one splat, in the order of tile rows and columns.
+// The pairs of one splat, in the order of tile rows and columns; in place of its slot each has its tile.
 class TileWalk {
    public:
-    TileWalk(Frame& frame, const bool* mask, std::vector<Pair>& pairs, std::vector<uint32_t>& tiles)
-        : frame_(frame), mask_(mask), pairs_(pairs), tiles_(tiles) {}
+    TileWalk(Frame& frame, const bool* mask, std::vector<Pair>& pairs) : frame_(frame), mask_(mask), pairs_(pairs) {}
 
     void visit(uint32_t id) {
         const Camera& camera = frame_.camera;
@@ -114,28 +113,33 @@ class TileWalk {
         return root(maximum(f.reach - f.pitch_v_squared * dy * dy, Lanes{})) * f.inverse_pitch_u;
     }
 
-    // The pairs of one row of tiles, from the first and last block columns of its four rows of blocks.
+    // The pairs of one row of tiles, from the first and last block columns of its four rows of blocks: sixteen tiles at
+    // a time, 64 columns, a bit each.
     void pair(uint32_t id, int tile_row, const int32_t (&from)[kLanes], const int32_t (&to)[kLanes], int row) {
         const int first = std::min(std::min(from[row], from[row + 1]), std::min(from[row + 2], from[row + 3])) >> 2;
         const int last = std::max(std::max(to[row], to[row + 1]), std::max(to[row + 2], to[row + 3])) >> 2;
-        for (int x = first; x <= last; ++x) {
-            uint32_t blocks = 0;
+        for (int start = first; start <= last; start += 16) {
+            uint64_t columns[4];
             for (int k = 0; k < 4; ++k) {
-                const int begin = std::clamp(from[row + k] - 4 * x, 0, 4);
-                const int end = std::clamp(to[row + k] - 4 * x + 1, 0, 4);
-                blocks |= uint32_t(std::max(0, (1 << end) - (1 << begin))) << (4 * k);
+                const int begin = std::max(from[row + k] - 4 * start, 0), end = std::min(to[row + k] - 4 * start, 63);
+                columns[k] = begin <= end ? ~uint64_t(0) >> (63 - end) & ~uint64_t(0) << begin : 0;
             }
-            const uint32_t tile = uint32_t(tile_row * frame_.tiles_x + x);
-            if (!blocks || (mask_ && !mask_[tile])) continue;
-            pairs_.push_back({id, 0, uint16_t(blocks)});
-            tiles_.push_back(tile);
+            for (int x = start; x <= std::min(last, start + 15); ++x) {
+                uint32_t blocks = 0;
+                for (int k = 0; k < 4; ++k) {
+                    blocks |= uint32_t(columns[k] & 15) << (4 * k);
+                    columns[k] >>= 4;
+                }
+                const uint32_t tile = uint32_t(tile_row * frame_.tiles_x + x);
+                if (!blocks || (mask_ && !mask_[tile])) continue;
+                pairs_.push_back({id, tile, uint16_t(blocks)});
+            }
         }
     }
 
     Frame& frame_;
     const bool* mask_;
     std::vector<Pair>& pairs_;
-    std::vector<uint32_t>& tiles_;
 };
 
 // Projects all splats; the depth keys and ids of those seen, in the order of their index, go to `frame`.
@@ -180,18 +184,13 @@ void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int 
     // Each chunk of the depth order lists its pairs; counts by (chunk, tile) then give every pair its place.
     const int chunks = threads;
     const size_t tiles = size_t(frame.tiles_x) * frame.tiles_y;
-    if (frame.chunk_pairs.size() < size_t(chunks)) {
-        frame.chunk_pairs.resize(chunks);
-        frame.chunk_tiles.resize(chunks);
-    }
+    if (frame.chunk_pairs.size() < size_t(chunks)) frame.chunk_pairs.resize(chunks);
     uint32_t* counts = frame.chunk_counts.resize(chunks * tiles);
 #pragma omp parallel for num_threads(threads) schedule(static, 1)
     for (int chunk = 0; chunk < chunks; ++chunk) {
         std::vector<Pair>& pairs = frame.chunk_pairs[chunk];
-        std::vector<uint32_t>& pair_tiles = frame.chunk_tiles[chunk];
         pairs.clear();
-        pair_tiles.clear();
-        TileWalk walk(frame, tile_mask, pairs, pair_tiles);
+        TileWalk walk(frame, tile_mask, pairs);
         const size_t end = seen * (chunk + 1) / chunks;
         for (size_t i = seen * chunk / chunks; i < end; ++i) {
             const uint32_t soon = frame.order[std::min(i + kAhead, end - 1)];
@@ -204,7 +203,7 @@ void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int 
         }
         uint32_t* own = counts + chunk * tiles;
         std::fill(own, own + tiles, 0u);
-        for (const uint32_t tile : pair_tiles) ++own[tile];
+        for (const Pair& pair : pairs) ++own[pair.slot];
     }
     uint32_t total = 0;
     frame.tile_begin.resize(tiles + 1);
@@ -227,7 +226,7 @@ void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int 
         uint32_t* own = counts + chunk * tiles;
         const std::vector<Pair>& pairs = frame.chunk_pairs[chunk];
         for (size_t i = 0; i < pairs.size(); ++i)
-            frame.pairs[own[frame.chunk_tiles[chunk][i]]++] = {pairs[i].splat, before + uint32_t(i), pairs[i].blocks};
+            frame.pairs[own[pairs[i].slot]++] = {pairs[i].splat, before + uint32_t(i), pairs[i].blocks};
     }
 }
 

@@ -116,7 +116,6 @@ struct Frame {
     Buffer<Footprint> footprints;    // by splat index
     Buffer<uint32_t> order, order_scratch, depth_keys, depth_keys_scratch;
     std::vector<std::vector<Pair>> chunk_pairs;
-    std::vector<std::vector<uint32_t>> chunk_tiles;
     Buffer<uint32_t> chunk_counts;   // (chunks, tiles)
     Buffer<Pair> pairs;              // by tile, front to back
     Buffer<uint32_t> tile_begin;     // (tiles + 1)
