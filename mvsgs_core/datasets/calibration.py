@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
@@ -23,11 +24,11 @@ def lens_from_option(
     if isinstance(intrinsics, str):
         if intrinsics != "auto":
             raise ValueError(f"intrinsics is null, [fx, fy, cx, cy] or auto, got {intrinsics!r}")
-        lens = guess_lens(size)
+        lens = replace(guess_lens(size), distortion=tuple(float(v) for v in distortion))
         return lens, [
             f"intrinsics are a guess: {lens.intrinsics[0]:.0f} pixels focal length for {size[1]}x{size[0]} (65 degrees "
-            "across the longer side), no distortion; tracker=dense estimates the focal length, a calibration "
-            "(dataset.intrinsics=[fx,fy,cx,cy]) is better"
+            f"across the longer side), {'the given' if lens.distorted else 'no'} distortion; tracker=dense estimates "
+            "the focal length, a calibration (dataset.intrinsics=[fx,fy,cx,cy]) is better"
         ]
     values = [float(v) for v in intrinsics]
     if len(values) != 4:
@@ -47,9 +48,9 @@ def lens_for_images(
     lens = read_exif_lens(images[0]) if intrinsics == "auto" else None
     if lens is None or lens.size != size:
         return lens_from_option(intrinsics, distortion, size)
-    return lens, [
+    return replace(lens, distortion=tuple(float(v) for v in distortion)), [
         f"intrinsics are from EXIF: focal length {lens.intrinsics[0]:.0f} pixels for {size[1]}x{size[0]}, good to a "
-        "few percent, distortion unknown"
+        f"few percent, distortion {'as given' if len(distortion) else 'unknown'}"
     ]
 
 

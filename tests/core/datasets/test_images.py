@@ -224,6 +224,9 @@ def test_without_calibration_it_says_what_to_do(tmp_path: Path) -> None:
     guessed = open_dataset("images", path=tmp_path, intrinsics="auto", size=[24, 32])
     assert "are a guess" in guessed.warnings[0]
     assert all(item.intrinsics_guessed for item in guessed)
+    bent = open_dataset("images", path=tmp_path, intrinsics="auto", distortion=[0.2, 0.0, 0.0, 0.0], size=[24, 32])
+    assert "the given distortion" in bent.warnings[0]
+    assert next(iter(bent)).intrinsics[0] != next(iter(guessed)).intrinsics[0], "undistortion zooms in"
     known = open_dataset("images", path=tmp_path, intrinsics=[50, 50, 31.5, 23.5])
     assert not any(item.intrinsics_guessed for item in known)
     for bad in ("guess", [1, 2, 3], [-1, 1, 1, 1]):
