@@ -6,6 +6,8 @@ frame's number; features carry the number, so that a correlation lookup tells wh
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -47,7 +49,7 @@ class Oracle(DroidNet):
         self.random = np.random.default_rng(0)
         self.update = self._update  # type: ignore[assignment]
 
-    def __setattr__(self, name: str, value: object) -> None:
+    def __setattr__(self, name: str, value: Any) -> None:
         if name == "update" and not isinstance(value, torch.nn.Module):
             self.__dict__["_modules"].pop("update", None)
             object.__setattr__(self, name, value)

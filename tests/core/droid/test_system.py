@@ -107,8 +107,8 @@ def test_noise_of_the_network_is_averaged(tracked: tuple[DroidSlam, list[Update]
 
 
 def test_the_same_stream_gives_the_same_poses() -> None:
-    paths = [run(CONFIG, frames=range(20))[0].path().world_from_cam for _ in range(2)]
-    np.testing.assert_array_equal(*paths)
+    first, second = (run(CONFIG, frames=range(20))[0].path().world_from_cam for _ in range(2))
+    np.testing.assert_array_equal(first, second)
 
 
 def test_a_short_stream_starts_by_force() -> None:
