@@ -39,7 +39,7 @@ def test_small_images_do_not_bend_the_map() -> None:
 
 
 def test_a_map_that_few_points_hold_says_so() -> None:
-    items = synthetic(frames=60, size=(120, 160), textureless=2)
+    items = synthetic(frames=40, size=(120, 160), textureless=2)
     tracker, _, _ = track(items, TrackerConfig(area=160 * 120))
     assert any("few matches" in warning for warning in tracker.stats.warnings)
     assert tracker.stats.counts["matches of a pair of keyframes, median"] < 150
