@@ -147,7 +147,7 @@ class ImageLoss(torch.autograd.Function):
         gradient = torch.empty_like(x)
         on_a, on_p, on_r = x.new_empty(3, height, length).unbind(0)
         similar, different = x.new_empty(2, grid[0] * grid[1]).unbind(0)
-        block = {"ROWS": ROWS, "COLUMNS": COLUMNS}
+        block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "enable_fp_fusion": True}
         similarity[grid](x, y, taps, on_a, on_p, on_r, similar, height, length, **block)
         share = 1.0 / x.numel()
         loss_gradient[grid](
