@@ -27,8 +27,8 @@ _DEPTH_CAMERA = Lens((585.0, 585.0, 320.0, 240.0), (480, 640))  # published, and
 # on RedKitchen it is within 1% of the focal length of least epipolar error (585 has a 1.6 times larger median), and
 # depth edges lie on image edges for a color camera this far to the right of the depth camera (maker: 0.025).
 # Depth points put into other images by the true poses, fitted together with principal point, camera to camera pose,
-# distortion, shutter, and focal length or scale of depth, end at 524 to 532 from 525; from 540 and 585 at 536 and 573, still
-# on the way down, at a larger cost. A tracker's path lies closer to the true one with 585: that is not explained.
+# distortion, shutter, and focal length or scale of depth, end at 524 to 532 from 525; from 540 and 585 at 536 and 573,
+# still on the way down, at a larger cost. A tracker's path lies closer to the true one with 585: that is not explained.
 _COLOR_CAMERA = Lens((525.0, 525.0, 320.0, 240.0), (480, 640))
 _BASELINE = 0.021  # meters
 _FRAME_RATE = 30.0  # the set has no timestamps
