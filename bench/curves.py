@@ -31,6 +31,7 @@ CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point 
         "1 stage": (f"mvs.stages=[{_COARSE}]",),
         "3 stages": (f"mvs.stages=[{_COARSEST},{_MIDDLE},{_FINE}]",),
     },
+    "depth_fusion.confidence": {f"{c}": (f"depth_fusion.confidence={c}",) for c in (0.2, 0.4, 0.8)},
     "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 60, 120, 240)},
     "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200, 38400)},
     "mapper.max_splats": {f"{n // 1000}k": (f"mapper.max_splats={n}",) for n in (10000, 20000, 40000)},

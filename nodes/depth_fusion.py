@@ -98,7 +98,7 @@ class DepthFusion(FusionNode):
         relative: float = 0.02  # relative depth difference that still agrees
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
         least_views: int = 3  # views that must agree, the reference counted
-        confidence: float = 0.7  # least confidence of a kept pixel
+        confidence: float = 0.6  # least confidence of a kept pixel
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
         threads: int | None = None  # of the C++ kernels; null: all
 

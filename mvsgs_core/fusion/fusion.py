@@ -31,7 +31,7 @@ class FusionConfig:
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
     least_views: int = 3  # views that must agree, the reference counted
-    confidence: float = 0.7  # least confidence of a kept pixel
+    confidence: float = 0.6  # least confidence of a kept pixel
     device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda"
     threads: int | None = None  # of the C++ kernels; None: all
 
