@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import re
 import shutil
 import sys
@@ -23,6 +22,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bench import pivot
 from bench.runs import ROOT, commit, machine
 
 RECORDED = ROOT / "bench" / "recorded"
@@ -61,17 +61,7 @@ class Record:
         origin = f"`{self.command}`{repeated}; commit {self.commit}; {self.machine}; {self.date}"
         folder = RECORDED.relative_to(ROOT)
         plots = [f"![{plot}]({folder}/{plot})" for plot in self.plots]
-        return "\n\n".join([origin, self.table.strip() or self._plain_table(), *plots])
-
-    def _plain_table(self) -> str:
-        goals = any(row["goal"] for row in self.rows)
-        lines = ["| | value | goal | met |", "|---|---:|---|---|"] if goals else ["| | value |", "|---|---:|"]
-        for row in self.rows:
-            cells = [_escape(row["name"]), _value(row)]
-            if goals:
-                cells += [_escape(row["goal"]), {True: "yes", False: "**no**", None: ""}[row["met"]]]
-            lines.append("| " + " | ".join(cells) + " |")
-        return "\n".join(lines)
+        return "\n\n".join([origin, self.table.strip() or pivot.markdown(self.rows), *plots])
 
 
 def merge(runs: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -106,28 +96,6 @@ def render(text: str, folder: Path = RECORDED) -> str:
         return f"{match[1]}\n{body}\n\n{match[3]}"
 
     return _BLOCK.sub(block, text)
-
-
-def _value(row: dict[str, Any]) -> str:
-    value = row["value"]
-    if value is None:
-        return "–"
-    if isinstance(value, str):
-        return _escape(value)
-    text = _number(float(value))
-    if row.get("spread") is not None:
-        text += f" ± {_number(float(row['spread']))}"
-    return f"{text} {row['unit']}".strip()
-
-
-def _number(value: float) -> str:
-    if not math.isfinite(value):
-        return str(value)
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def _escape(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;")
 
 
 def read_rows(files: Iterable[Path]) -> list[list[dict[str, Any]]]:

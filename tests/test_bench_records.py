@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bench import compare, record
+from bench import compare, pivot, record
 
 
 def row(name: str, value: Any, unit: str = "", goal: str = "", met: bool | None = None) -> dict[str, Any]:
@@ -37,11 +37,35 @@ def test_records_are_rendered_between_their_markers_only(tmp_path: Path) -> None
     text = "before\n" + block.format("quick/transport", "old\n") + "after\n" + block.format("x", "")
     once = record.render(text, tmp_path)
     assert once.startswith("before\n<!-- bench:quick/transport -->\n\n`python -m bench.transport`, 2 runs; commit ")
-    assert "| latency \\| 99 % | 1.5 ± 0.5 ms | &lt;= 3 | yes |" in once
+    assert "| latency \\| 99 % | 1.5 ± 0.5 ms | &lt;= 3 |" in once
     assert "old" not in once
     assert "\nafter\n" in once
     assert "Not recorded yet" in once
     assert record.render(once, tmp_path) == once
+
+
+def test_figures_that_subjects_share_stand_side_by_side() -> None:
+    rows = [row(f"{s}: error", 1.0 + k, "cm", "<= 2", k < 2) for k, s in enumerate(("room", "desk", "loop"))]
+    rows += [row(f"{s}: keyframes", 20 + k, f"of {100 + k}") for k, s in enumerate(("room", "desk", "loop"))]
+    rows += [row("loop: closed", "yes"), row("all: seconds", 3.0, "s", "<= 4", True)]
+    text = pivot.markdown(rows)
+    assert "|  | error, cm (goal &lt;= 2) | keyframes |" in text
+    assert "| room | 1 | 20 of 100 |" in text
+    assert "| loop | **3** | 22 of 102 |" in text
+    assert "| loop: closed | yes |  |" in text
+    assert "| all: seconds | 3 s | &lt;= 4 |" in text
+    assert text.endswith("Bold: misses its goal.")
+
+
+def test_a_table_has_fewer_columns_than_lines_and_every_row_once() -> None:
+    rows = [row(f"{s}: f{k}", k) for s in "abc" for k in range(5)] + [
+        row(f"{s}: g{k}", k) for s in "def" for k in (0, 1)
+    ]
+    text = pivot.markdown(rows)
+    assert "|  | a | b | c |" in text
+    assert "| f4 | 4 | 4 | 4 |" in text
+    assert "|  | g0 | g1 |" in text
+    assert text.count("|") == 5 * 7 + 4 * 5
 
 
 def test_a_benchmarks_own_table_and_plots_are_kept(tmp_path: Path) -> None:
