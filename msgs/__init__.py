@@ -111,6 +111,7 @@ class Poses:
     index: Annotated[np.ndarray, "int64 K"]
     world_from_cam: Annotated[np.ndarray, "float64 K 4 4"]
     scale: Annotated[np.ndarray, "float64 K"]
+    segment: Annotated[np.ndarray, "int32 K"] | None = None  # Keyframe.segment now: a loop joins two; None: as sent
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,8 @@ def encode(
             if field not in _DEFAULTS[name] or value != _DEFAULTS[name][field]:
                 scalars[field] = value
         elif value is None and spec.optional:
-            scalars[field] = None
+            if field not in _DEFAULTS[name]:  # programs from before the field was there read the message, too
+                scalars[field] = None
         else:
             if not isinstance(value, np.ndarray):
                 raise CodecError(f"{where} is a {type(value).__name__}, not an array")

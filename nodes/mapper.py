@@ -30,8 +30,9 @@ class Mapper(Node):
     Without `realtime` every keyframe gets all its iterations before the next is added, whatever the timing: a slow
     mapper holds the senders back, and the result is the same in one process as in many.
 
-    Parts of the stream between which tracking was lost share no frame of reference: each gets a map of its own, and
-    the one with the most keyframes is refined and sent.
+    Parts of the stream between which tracking was lost share no frame of reference: each gets a map of its own. Where
+    Poses say that a loop joined two, so are their maps; of those that stay apart, the one with the most keyframes is
+    refined and sent.
     """
 
     @dataclass
@@ -77,14 +78,17 @@ class Mapper(Node):
         self.stats.counts, self.stats.skipped = self._log.counts, self._log.skipped
         self.stats.seconds, self.stats.warnings = self._log.seconds, self._log.warnings
         self._by_segment: dict[int, OnlineMapper] = {}
+        self._segment_of: dict[int, int] = {}  # by keyframe, as the newest Poses that named it say
         self._last_preview = 0.0
 
     def on_view(self, view: View) -> Iterator[Preview | MapView]:
-        self._enter(view.segment)
+        # sent on its way before its segment was joined: by keyframe and not by number, as the pose is corrected so, too
+        segment = self._segment_of.get(view.index, view.segment)
+        self._enter(segment)
         if self.config.map_views:
             while not self.config.realtime and self.mapper.step():  # as add_view would
                 pass
-            yield from self._map_view(view.segment)
+            yield from self._map_view(segment)
         self.mapper.add_view(
             PosedView(
                 index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
@@ -97,6 +101,9 @@ class Mapper(Node):
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
         for mapper in self._by_segment.values() or [self.mapper]:
             mapper.correct(poses.index, poses.world_from_cam, poses.scale)
+        if poses.segment is not None:
+            self._segment_of.update(zip(poses.index.tolist(), poses.segment.tolist()))
+            self._join()
         yield from ()
 
     def on_idle(self) -> list[Preview] | None:
@@ -112,6 +119,7 @@ class Mapper(Node):
         while self.mapper.step():
             pass
         self._choose_largest()
+        self.stats.values["segments_apart"] = len(self._by_segment)
         yield self._map(refined=False)
         for done in range(self.config.refinement):
             self.mapper.refine(done, self.config.refinement)
@@ -130,8 +138,23 @@ class Mapper(Node):
         if segment not in self._by_segment:
             while self.mapper.step():  # what the part before is owed
                 pass
-            self._by_segment[segment] = OnlineMapper(self._core_config, self._log)
+            self._by_segment[segment] = OnlineMapper(self._core_config, self._log, self.mapper.corrections)
         self.mapper = self._by_segment[segment]
+
+    def _join(self) -> None:
+        """Joins the maps of segments whose keyframes now belong to another one; the tracker joins whole segments."""
+        for old, part in list(self._by_segment.items()):
+            new = {self._segment_of.get(view.index, old) for view in part.views} - {old}
+            if not new:
+                continue
+            del self._by_segment[old]
+            whole = self._by_segment.setdefault(new.pop(), part)  # nothing of the other one may have come yet
+            if whole is part:
+                continue
+            whole.join(part)
+            if self.mapper is part:
+                self.mapper = whole
+            self.stats.count("segments_joined")
 
     def _choose_largest(self) -> None:
         parts = list(self._by_segment.values())

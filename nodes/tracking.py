@@ -77,7 +77,10 @@ class TrackerNode(Node, ABC):
 
     def _poses(self, correction: Correction) -> Poses:
         self._revision += 1
-        return Poses(self._revision, correction.index, correction.world_from_cam, correction.scale.astype(np.float64))
+        return Poses(
+            self._revision, correction.index, correction.world_from_cam, correction.scale.astype(np.float64),
+            correction.segment,
+        )  # fmt: skip
 
     def _report(self) -> None:
         stats = self._core.stats

@@ -69,7 +69,7 @@ def with_header(data: bytes, change: Any) -> bytes:
     assert len(header) <= header_length + 64
     body = data[:8] + struct.pack("<I", len(header)) + data[12:start] + header
     rest = -(-(start + header_length) // 64) * 64
-    return body.ljust(rest, b"\0") + data[rest:]
+    return body.ljust(-(-len(body) // 64) * 64, b"\0") + data[rest:]
 
 
 @pytest.mark.parametrize("message_type", MESSAGES, ids=lambda t: t.__name__)
@@ -91,8 +91,14 @@ def test_a_default_is_left_out_and_comes_back() -> None:
     for message in (plain, guessed):
         assert decode(encode(message)).message.intrinsics_guessed == message.intrinsics_guessed
     preview = example(msgs.Preview, absent=True)
-    shorter = with_header(bytes(encode(preview)), lambda c: c["scalars"].pop("keyframe_poses"))
-    assert decode(shorter).message.keyframe_poses is None  # as a sender of before these fields has it
+    nil = with_header(bytes(encode(preview)), lambda c: c["scalars"].__setitem__("keyframe_poses", None))
+    for data in (encode(preview), nil):
+        assert decode(data).message.keyframe_poses is None
+    poses = Poses(1, np.zeros(1, np.int64), np.zeros((1, 4, 4)), np.ones(1))
+    assert b"segment" not in bytes(encode(poses))  # readers of before this field take it
+    assert decode(encode(poses)).message.segment is None
+    joined = decode(encode(replace(poses, segment=np.array([3], np.int32)))).message
+    assert joined.segment.tolist() == [3]
     wrong = with_header(bytes(encode(guessed)), lambda c: c["scalars"].__setitem__("intrinsics_guessed", 1))
     refused(wrong, "must be bool")
 

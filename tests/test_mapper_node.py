@@ -112,6 +112,38 @@ def test_parts_between_which_tracking_was_lost_do_not_mix_and_the_largest_is_sen
     assert node.stats.counts["views"] == 5
 
 
+def test_the_maps_of_segments_that_a_loop_joins_become_one() -> None:
+    node = Mapper(settings())
+    for index, segment in [(0, 0), (1, 0), (2, 1), (3, 1)]:
+        list(node.on_view(view_message(index, index / 5, segment=segment)))
+    parts = [len(mapper.state) for mapper in node._by_segment.values()]
+    moved = np.stack([pose_on_arc(k / 5) for k in (2, 3, 4)])
+    moved[:, :3, 3] += [0.5, 0.0, 0.0]
+    joined = np.zeros(3, np.int32)
+    list(node.on_poses(Poses(1, np.array([2, 3, 4]), moved, np.full(3, 2.0), joined)))
+    assert len(node.mapper.state) == sum(parts)
+    list(node.on_view(view_message(4, 0.8, segment=1)))  # on its way when its segment was joined
+    list(node.on_view(view_message(5, 1.0, segment=0)))
+    before, after = list(node.on_end())
+    assert before.keyframes.tolist() == after.keyframes.tolist() == [0, 1, 2, 3, 4, 5]
+    assert set(after.anchors.tolist()) >= {0, 2}
+    np.testing.assert_allclose(after.world_from_cam[2:5], moved)
+    assert after.scale.tolist() == [1.0, 1.0, 2.0, 2.0, 2.0, 1.0]
+    assert (node.stats.counts["segments_joined"], node.stats.values["segments_apart"]) == (1, 1)
+    assert not node.stats.warnings
+
+
+def test_a_segment_of_which_only_poses_are_known_yet_waits_for_its_views() -> None:
+    node = Mapper(settings())
+    list(node.on_view(view_message(2, 0.4, segment=1)))
+    zero = np.zeros(1, np.int32)
+    list(node.on_poses(Poses(1, np.array([2]), pose_on_arc(0.4)[None], np.ones(1), zero)))
+    list(node.on_view(view_message(3, 0.6, segment=0)))
+    list(node.on_view(view_message(4, 0.8, segment=2)))
+    assert [len(mapper.views) for mapper in node._by_segment.values()] == [2, 1]
+    assert "segments_joined" not in node.stats.counts
+
+
 def test_a_preview_is_capped_and_relative_to_the_origin() -> None:
     node = Mapper(settings(preview_splats=100))
     node.config.preview_period = 1e-9

@@ -66,6 +66,13 @@ class TrainingView:
         """Frees what only the training needs; pose, scale and exposure stay."""
         self.levels, self.valid, self.tile_error = [], None, None
 
+    def rescale(self, factor: float) -> None:
+        """Lengths in a unit of 1 / `factor` of what it was; the moments follow, a gradient is divided by `factor`."""
+        self.median_depth *= factor
+        self.pose_delta[:3, 3] *= factor
+        self.pose_moments[0, :3] /= factor
+        self.pose_moments[1, :3] /= factor**2
+
     def record(self, loss: float) -> None:
         """Takes in the loss of a full-resolution iteration."""
         self.visits_full += 1

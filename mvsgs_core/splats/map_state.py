@@ -57,6 +57,20 @@ class MapState:
         self.screen_views = torch.cat([self.screen_views, zeros])
 
     @torch.no_grad()
+    def take_over(self, other: MapState) -> None:
+        """Adds all splats of another map with their moments, ages, anchors and gradients; `other` stays as it is."""
+        values = {}
+        for name in PARAMETERS:
+            values[name] = torch.cat([getattr(s.splats, name).detach() for s in (self, other)])
+            self.first[name] = torch.cat([self.first[name], other.first[name]])
+            self.second[name] = torch.cat([self.second[name], other.second[name]])
+        self.splats = _leaves(values)
+        self.steps = torch.cat([self.steps, other.steps])
+        self.anchors = torch.cat([self.anchors, other.anchors])
+        self.screen_gradient = torch.cat([self.screen_gradient, other.screen_gradient])
+        self.screen_views = torch.cat([self.screen_views, other.screen_views])
+
+    @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
         """Drops the splats where `mask` (N,) bool is False."""
         self.splats = _leaves({name: getattr(self.splats, name).detach()[mask] for name in PARAMETERS})

@@ -91,7 +91,13 @@ class MapperLog:
 class OnlineMapper:
     """Builds the map: `add_view`, then `step` while there is something owed, `correct` at any time, `refine` last."""
 
-    def __init__(self, config: MapperConfig | None = None, log: MapperLog | None = None) -> None:
+    def __init__(
+        self,
+        config: MapperConfig | None = None,
+        log: MapperLog | None = None,
+        corrections: dict[int, tuple[np.ndarray, float]] | None = None,
+    ) -> None:
+        """log, corrections (world_from_cam (4, 4), scale; by keyframe): what mappers of one stream share."""
         self.config = config or MapperConfig()
         self.state = MapState((self.config.sh_degree + 1) ** 2, torch.device(self.config.device))
         self.views: list[TrainingView] = []
@@ -102,7 +108,7 @@ class OnlineMapper:
         self.origin: np.ndarray | None = None  # (3,) float64 world position of the first keyframe
         self.unit: float | None = None  # median depth of the first keyframe that has depth, world units
         self.global_rate = 1.0  # factor on all learning rates: falls during refinement
-        self._latest: dict[int, tuple[np.ndarray, float]] = {}  # corrected poses and scales by keyframe
+        self.corrections = {} if corrections is None else corrections  # newest pose and scale of each keyframe
         self._generator = torch.Generator().manual_seed(self.config.seed)
 
     @property
@@ -127,8 +133,8 @@ class OnlineMapper:
             return 0
         depth = self._checked_depth(view)
         pose, scale = np.asarray(view.world_from_cam, dtype=np.float64), view.scale
-        if view.index in self._latest:
-            pose, scale = self._latest[view.index]
+        if view.index in self.corrections:
+            pose, scale = self.corrections[view.index]
             depth = depth * np.float32(scale / view.scale)
         if self.origin is None:
             self.origin = pose[:3, 3].copy()
@@ -143,6 +149,7 @@ class OnlineMapper:
         added.world_from_cam, added.scale, added.median_depth = pose, scale, median / (self.unit or 1.0)
         added.fixed = not self.views
         self.views.append(added)
+        self._with_image.append(added)
         self._bound_images()
         if added.valid is not None:
             self.log.refuse(
@@ -189,14 +196,13 @@ class OnlineMapper:
             if not (np.isfinite(pose).all() and np.isfinite(s) and s > 0):
                 self.log.refuse("poses", 1, "a corrected pose that is not finite was refused")
                 continue
-            self._latest[key] = (pose, s)
+            self.corrections[key] = (pose, s)
             view = by_index.get(key)
             if view is None:
                 continue
             similarity = Similarity.between(view.local_from_cam, self._local(pose), s / view.scale)
             view.world_from_cam, view.local_from_cam = pose, self._local(pose)
-            view.median_depth *= s / view.scale
-            view.pose_delta[:3, 3] *= s / view.scale
+            view.rescale(s / view.scale)
             view.scale = s
             if similarity.moves(max(view.median_depth, 1e-6)):
                 moved[key] = similarity
@@ -206,6 +212,37 @@ class OnlineMapper:
             count = move_with_anchors(self.state, moved)
         self.log.count("corrected_keyframes", len(moved))
         return count
+
+    def join(self, other: OnlineMapper) -> None:
+        """Takes over the map of another part of the stream, of the same configuration, whose poses `correct` brought
+        into this one's frame of reference.
+
+        Splats, keyframes, moments, exposures, pose steps and what is owed go on as they were, in this mapper's origin
+        and unit; `other` is of no use afterward.
+        """
+        if other.origin is None:
+            return
+        if self.origin is None:
+            self.origin = other.origin
+        if self.unit is None and other.unit is not None:
+            self.unit = other.unit
+            for view in self.views:
+                view.local_from_cam = self._local(view.world_from_cam)
+        unit, other_unit = self.unit or 1.0, other.unit or 1.0
+        change = Similarity(other_unit / unit, np.eye(3), (other.origin - self.origin) / unit)
+        with self.log.time("joining"):
+            move_with_anchors(other.state, dict.fromkeys(other.state.anchors.unique().tolist(), change))
+            self.state.take_over(other.state)
+        for view in other.views:
+            view.local_from_cam = self._local(view.world_from_cam)
+            view.rescale(change.scale)
+            view.fixed = view.fixed and not self.views  # one holds the frame of reference
+        self.views = sorted(self.views + other.views, key=lambda view: view.index)
+        self._with_image = sorted(self._with_image + other._with_image, key=lambda view: view.index)
+        self._bound_images()
+        self.schedule.forget()
+        self.schedule.owe(other.schedule.drop())
+        self.iterations += other.iterations
 
     def render(self, view: TrainingView, level: int = 0) -> Render:
         """The map from a keyframe's pose, without gradients."""
@@ -227,24 +264,24 @@ class OnlineMapper:
         return sum(level.numel() for view in self._with_image for level in view.levels)
 
     def _bound_images(self) -> None:
-        """Lets go the image of the keyframe whose neighbors in time are closest, where there are too many.
+        """Lets go the images of the keyframes whose neighbors in time are closest, where there are too many.
 
-        The newest ones, which the local half trains on, stay. Its splats stay, and move with its pose.
+        The newest ones, which the local half trains on, stay. Their splats stay, and move with their poses.
         """
-        self._with_image.append(self.views[-1])
-        last = len(self._with_image) - max(1, self.config.window)
-        if len(self._with_image) <= self.config.max_keyframes or last < 2:
-            return
-        order = [view.index for view in self._with_image]
-        k = min(range(1, last), key=lambda k: order[k + 1] - order[k - 1])
-        self._with_image.pop(k).drop_images()
-        self.schedule.forget()
-        self.log.refuse(
-            "images",
-            1,
-            f"more than {self.config.max_keyframes} keyframes (max_keyframes): images of "
-            "older ones are thinned out and no longer trained on",
-        )
+        while len(self._with_image) > self.config.max_keyframes:
+            last = len(self._with_image) - max(1, self.config.window)
+            if last < 2:
+                return
+            order = [view.index for view in self._with_image]
+            k = min(range(1, last), key=lambda k: order[k + 1] - order[k - 1])
+            self._with_image.pop(k).drop_images()
+            self.schedule.forget()
+            self.log.refuse(
+                "images",
+                1,
+                f"more than {self.config.max_keyframes} keyframes (max_keyframes): images of "
+                "older ones are thinned out and no longer trained on",
+            )
 
     def _train(self, view: TrainingView, refining: bool = False) -> None:
         config = self.config

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -38,6 +38,7 @@ class Correction:
     index: np.ndarray  # (K,) int64
     world_from_cam: np.ndarray  # (K, 4, 4) float64
     scale: np.ndarray  # (K,) float64: depths now over depths when the keyframe was first told
+    segment: np.ndarray | None = None  # (K,) int32 part of the map that it belongs to now; None: there is only one
 
 
 @dataclass
@@ -46,29 +47,37 @@ class _Told:
     scale: float
     inverse_depth: np.ndarray  # when first told
     known: np.ndarray
+    segment: int
 
 
 class Publisher:
-    """tolerance: of the median depth (positions), radians (rotations) and share (scales) that counts as a change."""
+    """tolerance: of the median depth (positions), radians (rotations) and share (scales) that counts as a change.
 
-    def __init__(self, graph: Keyframes, tolerance: float) -> None:
+    segment_of: the part of the map that a keyframe belongs to; None where the tracker has only one.
+    """
+
+    def __init__(self, graph: Keyframes, tolerance: float, segment_of: Callable[[int], int] | None = None) -> None:
         self.graph = graph
         self.tolerance = tolerance
+        self.segment_of = segment_of
+        self.highest_segment = 0  # that was ever told: a number is not given twice
         self._told: dict[int, _Told] = {}
 
     def tell(self, index: int) -> None:
         """A keyframe was sent as it is now, with scale 1."""
         keyframe = self.graph.keyframes[index]
         self._told[index] = _Told(
-            self.graph.world_from_cam(index), 1.0, keyframe.inverse_depth.copy(), keyframe.triangulated.copy()
-        )
+            self.graph.world_from_cam(index), 1.0, keyframe.inverse_depth.copy(), keyframe.triangulated.copy(),
+            self._segment(index),
+        )  # fmt: skip
+        self.highest_segment = max(self.highest_segment, self._segment(index))
 
     @property
     def told(self) -> set[int]:
         return set(self._told)
 
     def corrections(self, everything: bool = False) -> Correction | None:
-        """Every keyframe that moved noticeably since it was last told; None where none did."""
+        """Every keyframe that moved noticeably, or joined another segment, since it was last told; None: none did."""
         moved = []
         for index, told in self._told.items():
             if index not in self.graph.keyframes:
@@ -76,17 +85,23 @@ class Publisher:
             pose, scale = self.graph.world_from_cam(index), self._scale(index, told)
             shift = np.linalg.norm(pose[:3, 3] - told.world_from_cam[:3, 3]) / self.graph.keyframes[index].median_depth
             turn = np.linalg.norm(pose[:3, :3] - told.world_from_cam[:3, :3]) / np.sqrt(2.0)
-            if everything or max(shift, turn, abs(np.log(scale / told.scale))) > self.tolerance:
+            moves = max(shift, turn, abs(np.log(scale / told.scale))) > self.tolerance
+            if everything or moves or told.segment != self._segment(index):
                 moved.append((index, pose, scale))
         if not moved:
             return None
         for index, pose, scale in moved:
             self._told[index].world_from_cam, self._told[index].scale = pose, scale
+            self._told[index].segment = self._segment(index)
         return Correction(
             np.array([m[0] for m in moved], np.int64),
             np.stack([m[1] for m in moved]),
             np.array([m[2] for m in moved], np.float64),
+            None if self.segment_of is None else np.array([self._segment(m[0]) for m in moved], np.int32),
         )
+
+    def _segment(self, index: int) -> int:
+        return 0 if self.segment_of is None else self.segment_of(index)
 
     def _scale(self, index: int, told: _Told) -> float:
         keyframe = self.graph.keyframes[index]

@@ -183,7 +183,7 @@ class Tracker:
         self.loops = LoopCloser(self.graph, self.local_map, config.loop)
         self.recovery = Recovery(self.graph, self.matcher, self.loops.retrieval, config.recovery, config.front_end)
         self.back_end = BackEnd(self.graph, self.local_map, config.back_end, config.threads)
-        self.publisher = Publisher(self.graph, config.tolerance)
+        self.publisher = Publisher(self.graph, config.tolerance, lambda index: self.keyframe(index).segment)
 
     def _begin(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """First keyframe of a segment that has not started yet."""
@@ -344,7 +344,7 @@ class Tracker:
             return self._begin(frame, record)
         if self.recovery.hopeless:
             self.started = False
-            self.segment = 1 + max(k.segment for k in self._keyframes())
+            self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self._keyframes()))
             told = self._settle() if self._held else ()
             return Update(self._begin(frame, record).state, told)
         return Update(record.state)

@@ -29,13 +29,15 @@ def test_a_lost_segment_is_joined_by_a_loop() -> None:
     items = out_and_back()
     tracker = Tracker()
     told: dict[int, int] = {}  # segment of each keyframe when it was told
-    states, joined_at, moved = [], None, set()
+    states, joined_at, moved, told_last = [], None, set(), {}
     for item in items:
         update = tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
         states.append(update.state)
         told |= {index: tracker.keyframe(index).segment for index in update.keyframes}
         if update.correction is not None:
             moved |= set(update.correction.index.tolist()) if joined_at is None else set()
+            assert update.correction.segment is not None
+            told_last |= dict(zip(update.correction.index.tolist(), update.correction.segment.tolist()))
         if joined_at is None and tracker.stats.counts.get("segments joined"):
             joined_at = item.index
             assert update.correction is not None
@@ -48,7 +50,10 @@ def test_a_lost_segment_is_joined_by_a_loop() -> None:
     assert min(second) > BEFORE + COVERED
     assert joined_at is not None
     assert second <= moved | {joined_at}, "the second segment must be told where it lies in the first"
+    assert all(told_last[index] == 0 for index in second), "receivers must hear of the join"
+    assert tracker.publisher.highest_segment == 1  # so that a later loss does not give the number again
     assert set(path.segment[path.keyframe]) == {0}
+    assert set(path.segment[np.isfinite(path.world_from_cam).all(axis=(1, 2))]) == {0}  # one map for the evaluator
     assert not any("segments" in warning for warning in tracker.stats.warnings)
     posed = np.isfinite(path.world_from_cam).all(axis=(1, 2))
     assert posed[: BEFORE - 1].all()

@@ -1,0 +1,91 @@
+"""Two maps of one stream become one: nothing that a keyframe sees changes, and training goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from mvsgs_core import geometry
+from mvsgs_core.splats.map_state import PARAMETERS
+from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.splats.training import TrainingConfig
+from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+
+SIZE = (24, 32)
+CONFIG = MapperConfig(
+    iterations=6,
+    window=2,
+    max_keyframes=5,
+    sh_degree=1,
+    training=TrainingConfig(poses=True, pose_visits=1, exposure=True),
+)
+AWAY = geometry.se3_exp(np.array([0.0, 0.0, -60.0, 0.0, np.pi, 0.0]))  # behind the back of the other's cameras
+OTHER_FRAME = geometry.se3_exp(np.array([300.0, -7.0, 20.0, 0.3, 0.2, -0.9]))  # as if begun anew, elsewhere
+
+
+def mapped(indices: list[int], frame: np.ndarray, unit: float, corrections: dict) -> OnlineMapper:
+    mapper = OnlineMapper(CONFIG, corrections=corrections)
+    for index in indices:
+        view = posed_view(index, pose_on_arc(index / 8), SIZE, unit=unit)
+        mapper.add_view(replace(view, world_from_cam=frame @ view.world_from_cam))
+    while mapper.step():
+        pass
+    return mapper
+
+
+def test_every_keyframe_sees_after_the_join_what_it_saw_before() -> None:
+    corrections: dict = {}
+    first, second = mapped([0, 1, 6], np.eye(4), 1.0, corrections), mapped([3, 4], OTHER_FRAME, 0.4, corrections)
+    seen = {view.index: (part, part.render(view)) for part in (first, second) for view in part.views}
+    moments = torch.cat([part.state.first["opacity_logits"] for part in (first, second)])
+    ages = torch.cat([part.state.steps for part in (first, second)])
+    exposures = {view.index: view.exposure.clone() for part in (first, second) for view in part.views}
+    iterations = first.iterations + second.iterations
+    assert first.origin is not None
+    assert first.unit is not None
+    assert second.unit is not None
+    origin = first.origin.copy()
+
+    poses = np.stack([AWAY @ pose_on_arc(index / 8) for index in (3, 4)])
+    second.correct(np.array([3, 4]), poses, np.full(2, 2.5))
+    first.join(second)
+
+    assert [view.index for view in first.views] == [0, 1, 3, 4, 6]
+    assert [view.fixed for view in first.views] == [True, False, False, False, False]
+    np.testing.assert_array_equal(first.origin, origin)
+    assert first.iterations == iterations == 30
+    for view in first.views:
+        before, after = seen[view.index][1], first.render(view)
+        assert before.opacity.mean() > 0.5
+        torch.testing.assert_close(after.color, before.color, atol=2e-3, rtol=0)
+        ratio = second.unit / first.unit * 2.5 if view.index in (3, 4) else 1.0
+        torch.testing.assert_close(after.depth, before.depth * ratio, atol=0.02, rtol=0)
+        torch.testing.assert_close(view.exposure, exposures[view.index])
+    torch.testing.assert_close(first.state.first["opacity_logits"], moments)
+    assert torch.equal(first.state.steps, ages)
+    for name in PARAMETERS:
+        assert first.state.first[name].shape == getattr(first.state.splats, name).shape
+
+    first.add_view(posed_view(7, pose_on_arc(7 / 8), SIZE))  # beyond the number of images that are kept
+    while first.step():
+        pass
+    assert sum(bool(view.levels) for view in first.views) == 5
+    assert all(bool(torch.isfinite(value).all()) for value in first.state.detached().tensors().values())
+
+
+def test_maps_that_have_no_depth_or_no_keyframe_yet_are_joined() -> None:
+    corrections: dict = {}
+    empty, blind = OnlineMapper(CONFIG, corrections=corrections), OnlineMapper(CONFIG, corrections=corrections)
+    blind.add_view(replace(posed_view(0, pose_on_arc(0.0), SIZE), depth=np.zeros(SIZE, np.float32)))
+    full = mapped([1, 2], np.eye(4), 3.0, corrections)
+    seen = [full.render(view).color for view in full.views]
+    blind.join(empty)
+    blind.join(full)
+    empty.join(blind)
+    assert [view.index for view in empty.views] == [0, 1, 2]
+    assert (empty.unit, len(empty.state)) == (full.unit, len(full.state))
+    for view, before in zip(empty.views[1:], seen):
+        torch.testing.assert_close(empty.render(view).color, before, atol=2e-3, rtol=0)
+    np.testing.assert_allclose(empty.snapshot().world_from_cam[0], pose_on_arc(0.0), atol=1e-12)
