@@ -1,13 +1,15 @@
 """Where the points of one image lie in another: one interface, several methods.
 
 `LucasKanade` is the tracker's own: subpixel, needs a guess. `DenseInverseSearch` gives guesses from frame to frame,
-`FeatureFlow` where motion is large. Another one (a network) is named in the configuration as "module:Class".
+`FeatureFlow` where motion is large; both are off by a pixel or more and know of no lost point, which no start-up
+survives: as flows of the tracker they come refined and verified (`RefinedFlow`). Another one (a network) is named in
+the configuration as "module:Class".
 """
 
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -33,7 +35,8 @@ class Matches:
 
 
 class Flow(Protocol):
-    needs_color: bool
+    @property
+    def needs_color(self) -> bool: ...
 
     def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
         """points of `a` (N, 2) and where they are expected in `b` (N, 2)."""
@@ -119,6 +122,31 @@ class FeatureFlow:
         return Matches(target, np.isfinite(target[:, 0]).astype(np.float64))
 
 
+@dataclass
+class RefinedFlow:
+    """`coarse` finds the points without the tracker's guess, Lucas-Kanade refines and verifies them."""
+
+    coarse: Flow
+    refinement: LucasKanade = field(default_factory=LucasKanade)
+
+    @property
+    def needs_color(self) -> bool:
+        return self.coarse.needs_color
+
+    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
+        return self.refinement.match(a, b, points, self.coarse.match(a, b, points, guess).target)
+
+
+def refined_inverse_search(preset: str = "fast") -> RefinedFlow:
+    """DIS is off by a pixel or two: refined from half size on."""
+    return RefinedFlow(DenseInverseSearch(preset), LucasKanade(start_level=1))
+
+
+def refined_features(neighbors: int = 3) -> RefinedFlow:
+    """What features around a point do is off by the parallax between them: refined from quarter size on."""
+    return RefinedFlow(FeatureFlow(neighbors), LucasKanade(start_level=2))
+
+
 def spread(
     points: np.ndarray, displacement: np.ndarray, queries: np.ndarray, neighbors: int = 5, radius: float = 1e6
 ) -> np.ndarray:
@@ -143,8 +171,8 @@ def sample_field(field: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 FLOWS = {
     "lucas_kanade": "mvsgs_core.tracking.flow:LucasKanade",
-    "dis": "mvsgs_core.tracking.flow:DenseInverseSearch",
-    "features": "mvsgs_core.tracking.flow:FeatureFlow",
+    "dis": "mvsgs_core.tracking.flow:refined_inverse_search",
+    "features": "mvsgs_core.tracking.flow:refined_features",
     "raft_small": "mvsgs_core.networks.raft_flow:RefinedRaftFlow",
 }
 
@@ -166,7 +194,10 @@ __all__ = [
     "Flow",
     "LucasKanade",
     "Matches",
+    "RefinedFlow",
     "make_flow",
+    "refined_features",
+    "refined_inverse_search",
     "sample_field",
     "spread",
 ]

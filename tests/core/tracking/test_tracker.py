@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
+from mvsgs_core.tracking.flow import FLOWS
 from mvsgs_core.tracking.frames import State
+from mvsgs_core.tracking.tracker import TrackerConfig
 from tests.core.tracking.sequences import ate, synthetic, track, tracked_room
 from tests.shared_data import shared
 
@@ -22,6 +25,17 @@ def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:
     assert sorted(told) == sorted(set(told)) == path.index[path.keyframe].tolist()
     assert 8 <= len(told) <= 30
     assert tracker.stats.warnings == []
+
+
+@pytest.mark.parametrize("flow", sorted(FLOWS.keys() - {"raft_small"}))  # a network: `bench.learned` tracks with it
+def test_every_choice_of_flow_without_weights_starts_and_tracks(flow: str) -> None:
+    items = synthetic(frames=80)[:28]
+    tracker, path, updates = track(items, TrackerConfig(flow=flow))
+    assert any(update.keyframes for update in updates[: len(items)]), tracker.starter.reason
+    assert tracker.stats.warnings == []
+    assert (path.state == State.TRACKED).all()
+    error, length = ate(path, items)
+    assert error < 0.003 * length
 
 
 def test_depths_agree_with_the_truth() -> None:
