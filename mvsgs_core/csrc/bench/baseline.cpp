@@ -8,10 +8,12 @@
 #include <chrono>
 #include <cmath>
 
-#include "splats/shading.hpp"
+#include "bench/plain_projection.hpp"
 
 namespace splats {
 namespace {
+
+using namespace plain;
 
 struct Flat {
     float u, v, depth, a, b, c;  // inverse covariance

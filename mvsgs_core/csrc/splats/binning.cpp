@@ -1,46 +1,94 @@
-// From the map to lists of splats by tile, front to back: one stable depth sort for the view, then a counting
-// distribution to the tiles. The lists do not depend on the number of threads.
+// From the map to lists of splats by tile, front to back: the pairs of splats and tiles in the order of the splats, one
+// stable depth sort of the splats, then a counting distribution to the tiles. The lists do not depend on the number of
+// threads.
 #include <omp.h>
 
-#include <cmath>
 #include <cstring>
 
 #include "splats/shading.hpp"
+#include "splats/tile_walk.hpp"
 
 namespace splats {
 namespace {
 
-constexpr size_t kAhead = 12;     // splats fetched early: the depth order jumps through memory
-constexpr float kMargin = 0.01f;  // px, so that rounding never cuts a pixel off the ellipse
+constexpr size_t kAhead = 12;  // splats fetched early: the depth order jumps through memory
 
-// False if the splat's box misses the image.
-bool place(const Camera& camera, const Parameters& p, const Projection& r, ScreenSplat& s, Footprint& f) {
-    const float opacity = r.sigmoid * r.compensation;
-    const float twice_log = 2.0f * std::log(larger(opacity * 255.0f, 1.0f));
-    f.reach = p.exact ? smaller(std::pow(twice_log, 2.0f / r.beta), kMaxReach) : twice_log;
-    const float half_width = std::sqrt(f.reach * r.xx);
-    f.half_height = std::sqrt(f.reach * r.yy);
-    s.radius = 0.0f;
-    if (!(r.u + half_width >= 0 && r.u - half_width <= camera.width - 1)) return false;
-    if (!(r.v + f.half_height >= 0 && r.v - f.half_height <= camera.height - 1)) return false;
-    s.radius = larger(half_width, f.half_height);
-    const double whole_x = std::nearbyint(r.u), whole_y = std::nearbyint(r.v);
-    s.whole_x = float(whole_x);
-    s.whole_y = float(whole_y);
-    s.part_x = float(r.u - whole_x);
-    s.part_y = float(r.v - whole_y);
-    s.shear = r.xy / r.yy;
-    const float pitch_u = std::sqrt(r.yy / r.determinant), pitch_v = 1.0f / std::sqrt(r.yy);
-    f.turn = r.xy * std::sqrt(f.reach / r.xx);
-    f.inverse_pitch_u = std::sqrt(r.determinant / r.yy);
-    f.pitch_v_squared = 1.0f / r.yy;
+// Splats on the image and their footprints; depth is 0 where nothing is seen.
+SPLATS_INLINE void place(const Camera& camera, const Parameters& p, int64_t first, int count, ScreenSplat* out,
+                         Footprints& f, int64_t& refused) {
+    Projection r;
+    project(camera, p, first, count, r);
+    refused += r.refused;
+    const Lanes log2_opacity = log2_of_positive(maximum(r.sigmoid * r.compensation, all(1e-30f)));
+    const Lanes twice_log = 2.0f * 0.6931471805599453f * maximum(log2_opacity - kLog2MinAlpha, Lanes{});
+    Lanes reach = twice_log;
+    if (p.exact) {
+        const Lanes power = 2.0f * log2_of_positive(maximum(twice_log, all(1e-30f))) / r.beta;
+        reach = minimum(exponential(0.6931471805599453f * power), all(kMaxReach));
+    }
+    const Lanes half_width = root(reach * r.xx), half_height = root(reach * r.yy);
+    const Lanes u = r.whole_u + r.part_u, v = r.whole_v + r.part_v;
+    const Lanes left = u - half_width, right = u + half_width, top = v - half_height, bottom = v + half_height;
+    const Mask seen = r.seen & at_least(right, 0.0f) & at_most(left, float(camera.width - 1)) & at_least(bottom, 0.0f) &
+                      at_most(top, float(camera.height - 1));
+    const Lanes inverse_yy = 1.0f / r.yy, pitch_v = root(inverse_yy), pitch_u = root(r.yy / r.determinant);
+    const Lanes shear = r.xy * inverse_yy;
+    store(u, f.center_x);
+    store(v, f.center_y);
+    store(shear, f.shear);
+    store(half_height, f.half_height);
+    store(r.xy * root(reach / r.xx), f.turn);
+    store(1.0f / pitch_u, f.inverse_pitch_u);
+    store(inverse_yy, f.pitch_v_squared);
+    store(reach, f.reach);
+    store(maximum(left - kMargin, Lanes{}), f.left);
+    store(minimum(right + kMargin, all(float(camera.width - 1))), f.right);
+    store(maximum(top - kMargin, Lanes{}), f.top);
+    store(minimum(bottom + kMargin, all(float(camera.height - 1))), f.bottom);
+
+    Shading shading;
+    shade(p, first, count, r, shading);
     const float unit = p.exact ? 1.0f : kSqrtHalfLog2e;
-    s.pitch_u = unit * pitch_u;
-    s.pitch_v = unit * pitch_v;
-    s.log2_opacity = std::log2(opacity);
-    s.half_beta = 0.5f * r.beta;
-    s.depth = r.z;
-    return true;
+    Lanes rows[16] = {r.whole_u, r.whole_v, r.part_u, r.part_v, unit * pitch_u, shear, unit * pitch_v, log2_opacity,
+                      maximum(shading.raw[0], Lanes{}), maximum(shading.raw[1], Lanes{}),
+                      maximum(shading.raw[2], Lanes{}), where(seen, r.z), 0.5f * r.beta,
+                      where(seen, maximum(half_width, half_height)), Lanes{}, Lanes{}};
+    transpose(rows);
+    std::memcpy(out, rows, size_t(count) * sizeof(ScreenSplat));
+}
+
+// Projects one chunk of splats, finds their tiles; spans count from the chunk's first pair.
+void fill_chunk(Frame& frame, const Parameters& p, const bool* mask, size_t chunk, int64_t& refused) {
+    PairList& pairs = frame.chunk_pairs[chunk];
+    pairs.count = 0;
+    TileWalk walk(frame, mask, pairs);
+    const size_t end = std::min(size_t(p.count), (chunk + 1) * kChunk);
+    for (size_t first = chunk * kChunk; first < end; first += kLanes) {
+        const int count = int(std::min(size_t(kLanes), end - first));
+        ScreenSplat* splats = frame.splats.data() + first;
+        Footprints footprints;
+        place(frame.camera, p, int64_t(first), count, splats, footprints, refused);
+        for (int i = 0; i < count; ++i) {
+            const uint32_t before = pairs.count;
+            if (splats[i].radius > 0.0f) walk.visit(footprints, i);
+            frame.spans[first + i] = {before, pairs.count - before};
+            // positive: bits sort as the values do
+            frame.depth_keys[first + i] = std::bit_cast<uint32_t>(splats[i].depth);
+        }
+    }
+}
+
+// Moves the depth keys of the splats seen to the front, with their indices beside them; returns how many.
+size_t gather_seen(Frame& frame, size_t count) {
+    uint32_t *keys = frame.depth_keys.data(), *order = frame.order.resize(count);
+    size_t seen = 0;
+    for (size_t i = 0; i < count; ++i) {
+        const uint32_t key = keys[i];
+        keys[seen] = key;
+        order[seen] = uint32_t(i);
+        seen += key != 0;
+    }
+    return seen;
 }
 
 // Stable least-significant-digit radix sort of positive floats by their bits, 11 bits at a time.
@@ -63,171 +111,79 @@ void sort_by_depth(Frame& frame, size_t count) {
     if (order != frame.order.data()) std::memcpy(frame.order.data(), order, count * sizeof(uint32_t));
 }
 
-// The pairs of one splat, in the order of tile rows and columns; in place of its slot each has its tile.
-class TileWalk {
-   public:
-    TileWalk(Frame& frame, const bool* mask, std::vector<Pair>& pairs) : frame_(frame), mask_(mask), pairs_(pairs) {}
-
-    void visit(uint32_t id) {
-        const Camera& camera = frame_.camera;
-        const ScreenSplat& s = frame_.splats[id];
-        const Footprint& f = frame_.footprints[id];
-        const float center_y = s.whole_y + s.part_y, center_x = s.whole_x + s.part_x;
-        const float top = larger(std::ceil(center_y - f.half_height - kMargin), 0.0f);
-        const float bottom = smaller(std::floor(center_y + f.half_height + kMargin), float(camera.height - 1));
-        if (!(top <= bottom)) return;
-        const int first_row = int(top) / 16 * 4, last_row = int(bottom) / 4;  // from the first row of a tile
-        for (int start = first_row; start <= last_row; start += kLanes) {
-            // sixteen rows of blocks at once: how far left and right the ellipse reaches within each
-            const Lanes rows = float(4 * start) + 4.0f * kRows;
-            const Lanes low = rows - center_y, high = low + 3.0f;
-            const Lanes height = all(f.half_height), turn = all(f.turn);
-            const Lanes right_y = within(within(turn, low, high), -height, height);
-            const Lanes left_y = within(within(-turn, low, high), -height, height);
-            Lanes right = center_x + kMargin + s.shear * right_y + half_span(f, right_y);
-            Lanes left = center_x - kMargin + s.shear * left_y - half_span(f, left_y);
-            right = minimum(right, all(float(camera.width - 1)));
-            left = minimum(maximum(left, Lanes{}), all(float(camera.width)));
-            const Ints empty = (low > f.half_height + kMargin) | (high < -f.half_height - kMargin) |
-                               (rows < top - 3.0f) | (rows > bottom) | (right < left);
-            // pixel columns: left is rounded up, right down; neither is negative
-            const Ints cut = toward_zero(left);
-            const Ints first = cut - (left > to_floats(cut));
-            const Ints last = toward_zero(maximum(right, Lanes{}));
-            const Ints none = empty | (last < first);
-            alignas(64) int32_t from[kLanes], to[kLanes];
-            store(choose(none, Ints{} + kFar, first >> 2), from);
-            store(choose(none, Ints{} - 1, last >> 2), to);
-            const int end = std::min(kLanes, last_row - start + 1);
-            for (int row = 0; row < end; row += 4) pair(id, (start + row) >> 2, from, to, row);
-        }
+// Lets spans count from the first pair of all, and puts the chunks' lists into one.
+void join_chunks(Frame& frame, size_t count, size_t chunks, int threads) {
+    std::vector<uint32_t> begin(chunks + 1, 0);
+    for (size_t chunk = 0; chunk < chunks; ++chunk) begin[chunk + 1] = begin[chunk] + frame.chunk_pairs[chunk].count;
+    frame.pair_count = begin[chunks];
+    frame.listed_tiles.resize(begin[chunks]);
+    frame.listed_blocks.resize(begin[chunks]);
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (size_t chunk = 0; chunk < chunks; ++chunk) {
+        const PairList& pairs = frame.chunk_pairs[chunk];
+        for (size_t i = chunk * kChunk; i < std::min(count, (chunk + 1) * kChunk); ++i)
+            frame.spans[i].first += begin[chunk];
+        if (!pairs.count) continue;
+        std::memcpy(frame.listed_tiles.data() + begin[chunk], pairs.tiles.data(), pairs.count * sizeof(uint32_t));
+        std::memcpy(frame.listed_blocks.data() + begin[chunk], pairs.blocks.data(), pairs.count * sizeof(uint16_t));
     }
-
-   private:
-    static constexpr int kFar = 1 << 23;  // beyond every column of pixels
-    static constexpr Lanes kRows = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-
-    SPLATS_INLINE Lanes within(Lanes value, Lanes low, Lanes high) { return minimum(maximum(value, low), high); }
-
-    SPLATS_INLINE Lanes half_span(const Footprint& f, Lanes dy) {
-        return root(maximum(f.reach - f.pitch_v_squared * dy * dy, Lanes{})) * f.inverse_pitch_u;
-    }
-
-    // The pairs of one row of tiles, from the first and last block columns of its four rows of blocks: sixteen tiles at
-    // a time, 64 columns, a bit each.
-    void pair(uint32_t id, int tile_row, const int32_t (&from)[kLanes], const int32_t (&to)[kLanes], int row) {
-        const int first = std::min(std::min(from[row], from[row + 1]), std::min(from[row + 2], from[row + 3])) >> 2;
-        const int last = std::max(std::max(to[row], to[row + 1]), std::max(to[row + 2], to[row + 3])) >> 2;
-        for (int start = first; start <= last; start += 16) {
-            uint64_t columns[4];
-            for (int k = 0; k < 4; ++k) {
-                const int begin = std::max(from[row + k] - 4 * start, 0), end = std::min(to[row + k] - 4 * start, 63);
-                columns[k] = begin <= end ? ~uint64_t(0) >> (63 - end) & ~uint64_t(0) << begin : 0;
-            }
-            for (int x = start; x <= std::min(last, start + 15); ++x) {
-                uint32_t blocks = 0;
-                for (int k = 0; k < 4; ++k) {
-                    blocks |= uint32_t(columns[k] & 15) << (4 * k);
-                    columns[k] >>= 4;
-                }
-                const uint32_t tile = uint32_t(tile_row * frame_.tiles_x + x);
-                if (!blocks || (mask_ && !mask_[tile])) continue;
-                pairs_.push_back({id, tile, uint16_t(blocks)});
-            }
-        }
-    }
-
-    Frame& frame_;
-    const bool* mask_;
-    std::vector<Pair>& pairs_;
-};
-
-// Projects all splats; the depth keys and ids of those seen, in the order of their index, go to `frame`.
-size_t project_all(Frame& frame, const Parameters& p, int threads) {
-    const size_t count = size_t(p.count);
-    frame.splats.resize(count);
-    frame.footprints.resize(count);
-    uint32_t *keys = frame.depth_keys.resize(count), *order = frame.order.resize(count);
-    int64_t refused = 0;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 512) reduction(+ : refused)
-    for (size_t i = 0; i < count; ++i) {
-        ScreenSplat& s = frame.splats[i];
-        Projection r;
-        const Fate fate = project(frame.camera, p, int64_t(i), r);
-        refused += fate == Fate::kRefused;
-        s.radius = 0.0f;
-        s.slot = s.slot_count = 0;
-        if (fate != Fate::kSeen || !place(frame.camera, p, r, s, frame.footprints[i])) continue;
-        Shading shading;
-        shade(p, int64_t(i), r, shading);
-        s.red = larger(shading.raw[0], 0.0f);
-        s.green = larger(shading.raw[1], 0.0f);
-        s.blue = larger(shading.raw[2], 0.0f);
-    }
-    frame.refused = refused;
-    size_t seen = 0;
-    for (size_t i = 0; i < count; ++i) {
-        if (frame.splats[i].radius <= 0.0f) continue;
-        std::memcpy(&keys[seen], &frame.splats[i].depth, sizeof(float));  // positive: bits sort as the values do
-        order[seen++] = uint32_t(i);
-    }
-    return seen;
 }
 
-}  // namespace
-
-void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int threads) {
-    const size_t seen = project_all(frame, parameters, threads);
-    frame.visible_count = int64_t(seen);
-    sort_by_depth(frame, seen);
-
-    // Each chunk of the depth order lists its pairs; counts by (chunk, tile) then give every pair its place.
-    const int chunks = threads;
+// Every thread takes a part of the depth order; counts by (part, tile) give every pair its place.
+void distribute(Frame& frame, size_t seen, int parts) {
     const size_t tiles = size_t(frame.tiles_x) * frame.tiles_y;
-    if (frame.chunk_pairs.size() < size_t(chunks)) frame.chunk_pairs.resize(chunks);
-    uint32_t* counts = frame.chunk_counts.resize(chunks * tiles);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-    for (int chunk = 0; chunk < chunks; ++chunk) {
-        std::vector<Pair>& pairs = frame.chunk_pairs[chunk];
-        pairs.clear();
-        TileWalk walk(frame, tile_mask, pairs);
-        const size_t end = seen * (chunk + 1) / chunks;
-        for (size_t i = seen * chunk / chunks; i < end; ++i) {
-            const uint32_t soon = frame.order[std::min(i + kAhead, end - 1)];
-            __builtin_prefetch(&frame.splats[soon], 1);
-            __builtin_prefetch(&frame.footprints[soon]);
-            ScreenSplat& s = frame.splats[frame.order[i]];
-            s.slot = uint32_t(pairs.size());
-            walk.visit(frame.order[i]);
-            s.slot_count = uint32_t(pairs.size()) - s.slot;
+    uint32_t* counts = frame.chunk_counts.resize(parts * tiles);
+    const auto visit = [&](int part, auto each) {
+        const size_t end = seen * (part + 1) / parts;
+        for (size_t i = seen * part / parts; i < end; ++i) {
+            const SlotSpan soon = frame.spans[frame.order[std::min(i + kAhead, end - 1)]];
+            __builtin_prefetch(frame.listed_tiles.data() + soon.first);
+            __builtin_prefetch(frame.listed_blocks.data() + soon.first);
+            const uint32_t id = frame.order[i];
+            const SlotSpan span = frame.spans[id];
+            for (uint32_t slot = span.first; slot < span.first + span.count; ++slot) each(id, slot);
         }
-        uint32_t* own = counts + chunk * tiles;
+    };
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+    for (int part = 0; part < parts; ++part) {
+        uint32_t* own = counts + part * tiles;
         std::fill(own, own + tiles, 0u);
-        for (const Pair& pair : pairs) ++own[pair.slot];
+        visit(part, [&](uint32_t, uint32_t slot) { ++own[frame.listed_tiles[slot]]; });
     }
     uint32_t total = 0;
     frame.tile_begin.resize(tiles + 1);
     for (size_t tile = 0; tile < tiles; ++tile) {
         frame.tile_begin[tile] = total;
-        for (int chunk = 0; chunk < chunks; ++chunk) total += std::exchange(counts[chunk * tiles + tile], total);
+        for (int part = 0; part < parts; ++part) total += std::exchange(counts[part * tiles + tile], total);
     }
     frame.tile_begin[tiles] = total;
-    frame.pair_count = total;
     frame.pairs.resize(total);
-#pragma omp parallel for num_threads(threads) schedule(static, 1)
-    for (int chunk = 0; chunk < chunks; ++chunk) {
-        uint32_t before = 0;
-        for (int k = 0; k < chunk; ++k) before += uint32_t(frame.chunk_pairs[k].size());
-        const size_t end = seen * (chunk + 1) / chunks;
-        for (size_t i = seen * chunk / chunks; before && i < end; ++i) {
-            __builtin_prefetch(&frame.splats[frame.order[std::min(i + kAhead, end - 1)]], 1);
-            frame.splats[frame.order[i]].slot += before;
-        }
-        uint32_t* own = counts + chunk * tiles;
-        const std::vector<Pair>& pairs = frame.chunk_pairs[chunk];
-        for (size_t i = 0; i < pairs.size(); ++i)
-            frame.pairs[own[pairs[i].slot]++] = {pairs[i].splat, before + uint32_t(i), pairs[i].blocks};
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+    for (int part = 0; part < parts; ++part) {
+        uint32_t* own = counts + part * tiles;
+        visit(part, [&](uint32_t id, uint32_t slot) {
+            frame.pairs[own[frame.listed_tiles[slot]]++] = {id, slot, frame.listed_blocks[slot]};
+        });
     }
+}
+
+}  // namespace
+
+void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int threads) {
+    const size_t count = size_t(parameters.count), chunks = (count + kChunk - 1) / kChunk;
+    frame.splats.resize(count);
+    frame.spans.resize(count);
+    frame.depth_keys.resize(count);
+    if (frame.chunk_pairs.size() < chunks) frame.chunk_pairs.resize(chunks);
+    int64_t refused = 0;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : refused)
+    for (size_t chunk = 0; chunk < chunks; ++chunk) fill_chunk(frame, parameters, tile_mask, chunk, refused);
+    frame.refused = refused;
+    join_chunks(frame, count, chunks, threads);
+    const size_t seen = gather_seen(frame, count);
+    frame.visible_count = int64_t(seen);
+    sort_by_depth(frame, seen);
+    distribute(frame, seen, threads);
 }
 
 }  // namespace splats

@@ -14,6 +14,7 @@
 
 namespace splats {
 
+constexpr size_t kChunk = 1024;        // splats that a thread takes at once; sums by chunk do not depend on the threads
 constexpr int kTile = 16;              // pixels; 16 blocks of 4x4, one vector each
 constexpr float kBlur = 0.3f;          // px^2 on the diagonal of the image covariance
 constexpr float kMaxAlpha = 0.99f;
@@ -87,15 +88,19 @@ struct alignas(64) ScreenSplat {
     float red, green, blue, depth;
     float half_beta;
     float radius;        // px, 0 = not visible
-    uint32_t slot;       // first of the splat's pairs
-    uint32_t slot_count;
+    float unused[2];
 };
 
-// The ellipse alpha = 1/255: where it ends on a row is shear dy +- sqrt(reach - pitch_v^2 dy^2) / pitch_u.
-struct Footprint {
-    float half_height;  // of the box, px
-    float turn;         // dy at which the ellipse reaches furthest right
-    float inverse_pitch_u, pitch_v_squared, reach;
+// The slots of a splat's pairs.
+struct SlotSpan {
+    uint32_t first, count;
+};
+
+// Pairs of some splats with the tiles they touch, in the order of the splats.
+struct PairList {
+    std::vector<uint32_t> tiles;
+    std::vector<uint16_t> blocks;
+    uint32_t count = 0;
 };
 
 struct Pair {
@@ -113,10 +118,12 @@ struct Frame {
     int64_t evaluated = 0;    // densities of the last forward pass, lanes off the ellipse included
     int64_t contributed = 0;  // of those, pairs of splat and pixel that got color; counted with the weights only
     Buffer<ScreenSplat> splats;      // by splat index
-    Buffer<Footprint> footprints;    // by splat index
+    Buffer<SlotSpan> spans;          // by splat index
     Buffer<uint32_t> order, order_scratch, depth_keys, depth_keys_scratch;
-    std::vector<std::vector<Pair>> chunk_pairs;
-    Buffer<uint32_t> chunk_counts;   // (chunks, tiles)
+    std::vector<PairList> chunk_pairs;  // of kChunk splats each
+    Buffer<uint32_t> listed_tiles;   // of all pairs, by slot
+    Buffer<uint16_t> listed_blocks;
+    Buffer<uint32_t> chunk_counts;   // (threads, tiles)
     Buffer<Pair> pairs;              // by tile, front to back
     Buffer<uint32_t> tile_begin;     // (tiles + 1)
     Buffer<Lanes> slots;             // by splat: sums of one pair each

@@ -30,6 +30,19 @@ SPLATS_INLINE void store(const Vector& vector, Scalar (&values)[kLanes]) {
 }
 SPLATS_INLINE Lanes all(float value) { return Lanes{} + value; }
 
+// Lane i is values[i * stride]; the last of `count` again where there are no more.
+SPLATS_INLINE Lanes strided(const float* values, int64_t stride, int count) {
+    alignas(64) float lane[kLanes];
+    if (count == kLanes) {
+        for (int i = 0; i < kLanes; ++i) lane[i] = values[i * stride];
+    } else {
+        for (int i = 0; i < kLanes; ++i) lane[i] = values[(i < count ? i : count - 1) * stride];
+    }
+    return lanes(lane);
+}
+SPLATS_INLINE Ints smaller(const Ints& a, const Ints& b) { return choose(a < b, a, b); }
+SPLATS_INLINE Ints larger(const Ints& a, const Ints& b) { return choose(a < b, b, a); }
+
 constexpr int kTogether = sizeof(Group) / sizeof(Lanes);
 // The lanes that `of` gives for 0, 1, ... as one group.
 template <class Of>
@@ -55,6 +68,19 @@ SPLATS_INLINE Wide log2_of_positive(const Wide& x) {
     p = p * f - 7.213635760e-01f;
     p = p * f + 1.442696447e+00f;
     return p * f + to_floats(exponent);
+}
+
+// e^x, relative error 2e-7 + 1e-7 |x|, limited to the powers of two from -126 to 127. Minimax polynomial of degree 5.
+SPLATS_INLINE Lanes exponential(const Lanes& x) {
+    const Lanes limited = minimum(maximum(x, all(-87.3f)), all(88.0f));
+    const Ints whole = toward_zero(limited * 1.4426950408889634f + 128.5f) - 128;
+    const Lanes f = limited * 1.4426950408889634f - to_floats(whole);
+    Lanes p = 1.327647199e-03f * f + 9.675541334e-03f;
+    p = p * f + 5.550713273e-02f;
+    p = p * f + 2.402211972e-01f;
+    p = p * f + 6.931469671e-01f;
+    p = p * f + 1.000000072f;
+    return as_floats(as_bits(p) + (whole << 23));
 }
 
 // The sums over the lanes of sixteen totals, in one vector: lane kSumLane[i] holds the sum of v[i].

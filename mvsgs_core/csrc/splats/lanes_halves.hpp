@@ -85,6 +85,35 @@ SPLATS_INLINE float largest(const Halves<Half>& v) {
     return largest(maximum(v.low, v.high));
 }
 
+// v[i], lane j <-> v[j], lane i.
+SPLATS_INLINE void transpose(Lanes (&v)[16]) {
+    alignas(64) float values[16][16], turned_values[16][16];
+    std::memcpy(values, v, sizeof(values));
+    for (int i = 0; i < 16; ++i)
+        for (int j = 0; j < 16; ++j) turned_values[j][i] = values[i][j];
+    std::memcpy(v, turned_values, sizeof(values));
+}
+
+// Every lane of a run of four with the run's lane k.
+template <int k, class Half>
+SPLATS_INLINE Halves<Half> spread(const Halves<Half>& v) {
+    return {spread<k>(v.low), spread<k>(v.high)};
+}
+
+// Appends the lanes with `blocks` to both lists, which have room for sixteen; returns how many these are.
+SPLATS_INLINE uint32_t append(const Ints& blocks, const Ints& tiles, uint16_t* blocks_list, uint32_t* tiles_list) {
+    alignas(64) uint32_t some[16], at[16];
+    std::memcpy(some, &blocks, sizeof(some));
+    std::memcpy(at, &tiles, sizeof(at));
+    uint32_t found = 0;
+    for (int i = 0; i < 16; ++i) {
+        blocks_list[found] = uint16_t(some[i]);
+        tiles_list[found] = at[i];
+        found += some[i] != 0;
+    }
+    return found;
+}
+
 // Appends to `list` the numbers i < count of the masks that have `bit`; returns how many. Both end in room for sixteen.
 SPLATS_INLINE uint32_t list_with_bit(const uint16_t* masks, uint32_t count, int bit, uint32_t* list) {
     uint32_t found = 0;

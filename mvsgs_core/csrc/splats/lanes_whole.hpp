@@ -135,6 +135,48 @@ SPLATS_INLINE float largest(Lanes v) {
     return maximum(v, turned<1>(v))[0];
 }
 
+// v[i] and v[j] with bit `Bit` of i clear and of j set: halves of runs of 2 `Bit` lanes trade places.
+template <int Bit>
+SPLATS_INLINE void trade(Lanes& a, Lanes& b) {
+#define SPLATS_FROM(i) (i & Bit ? 16 + (i ^ Bit) : i)
+#define SPLATS_TO(i) (i & Bit ? 16 + i : (i ^ Bit))
+#define SPLATS_EACH(f) f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7), f(8), f(9), f(10), f(11), f(12), f(13), f(14), f(15)
+    const Lanes low = __builtin_shufflevector(a, b, SPLATS_EACH(SPLATS_FROM));
+    b = __builtin_shufflevector(a, b, SPLATS_EACH(SPLATS_TO));
+    a = low;
+#undef SPLATS_EACH
+#undef SPLATS_TO
+#undef SPLATS_FROM
+}
+template <int Bit>
+SPLATS_INLINE void trade_all(Lanes (&v)[16]) {
+    for (int i = 0; i < 16; ++i)
+        if (!(i & Bit)) trade<Bit>(v[i], v[i | Bit]);
+}
+// v[i], lane j <-> v[j], lane i.
+SPLATS_INLINE void transpose(Lanes (&v)[16]) {
+    trade_all<8>(v);
+    trade_all<4>(v);
+    trade_all<2>(v);
+    trade_all<1>(v);
+}
+
+// Every lane of a run of four with the run's lane k.
+template <int k>
+SPLATS_INLINE Ints spread(Ints v) {
+    return __builtin_shufflevector(v, v, k, k, k, k, 4 + k, 4 + k, 4 + k, 4 + k, 8 + k, 8 + k, 8 + k, 8 + k, 12 + k,
+                                   12 + k, 12 + k, 12 + k);
+}
+
+// Appends the lanes with `blocks` to both lists, which have room for sixteen; returns how many these are.
+SPLATS_INLINE uint32_t append(Ints blocks, Ints tiles, uint16_t* blocks_list, uint32_t* tiles_list) {
+    const Mask some = _mm512_test_epi32_mask((__m512i)blocks, (__m512i)blocks);
+    const __m512i packed = _mm512_maskz_compress_epi32(some, (__m512i)blocks);
+    _mm256_storeu_si256((__m256i*)blocks_list, _mm512_maskz_cvtepi32_epi16(kAll, packed));
+    _mm512_storeu_si512(tiles_list, _mm512_maskz_compress_epi32(some, (__m512i)tiles));
+    return uint32_t(__builtin_popcount(some));
+}
+
 // Appends to `list` the numbers i < count of the masks that have `bit`; returns how many. Both end in room for sixteen.
 SPLATS_INLINE uint32_t list_with_bit(const uint16_t* masks, uint32_t count, int bit, uint32_t* list) {
     const __m512i wanted = _mm512_set1_epi32(1 << bit);

@@ -94,9 +94,9 @@ void weights(const Pass& pass, Out weight_sum, Out weight_max) {
     const Frame& frame = *pass.frame;
     const size_t count = weight_sum.shape(0);
     for (size_t i = 0; i < count; ++i) {
-        const ScreenSplat& s = frame.splats[i];
+        const SlotSpan span = frame.spans[i];
         float sum = 0.0f, most = 0.0f;
-        for (uint32_t k = s.slot; k < s.slot + s.slot_count; ++k) {
+        for (uint32_t k = span.first; k < span.first + span.count; ++k) {
             sum += frame.weight_slots[2 * size_t(k)];
             most = std::max(most, frame.weight_slots[2 * size_t(k) + 1]);
         }

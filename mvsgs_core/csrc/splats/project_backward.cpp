@@ -1,8 +1,7 @@
-// From a splat's sums over its pairs to its parameters and the pose, by the chain rule through projection.hpp.
-// Sums run in a fixed order, so the result does not depend on the number of threads.
+// From the sums of splats over their pairs to their parameters and the pose, by the chain rule through projection.hpp:
+// sixteen splats at a time. Sums run in a fixed order, so the result does not depend on the number of threads.
 #include <omp.h>
 
-#include <cmath>
 #include <cstring>
 
 #include "splats/shading.hpp"
@@ -11,36 +10,43 @@ namespace splats {
 namespace {
 
 constexpr float kLn2 = 0.6931471805599453f;
-constexpr size_t kAhead = 4;      // splats whose slots are fetched early
-constexpr size_t kChunk = 1024;  // splats whose share of the pose gradient is summed together
+constexpr size_t kAhead = 32;  // slots fetched early
 
 struct SplatGradient {
-    float mean[3], log_scale[3], quaternion[4], opacity_logit, beta, screen[2];
-    double rotation[3][3], center[3];
+    Lanes mean[3], log_scale[3], quaternion[4], opacity_logit, beta, screen[2];
+    Lanes sh[48];                   // by base and color
+    Lanes rotation[3][3], offset[3];  // shares of the pose's gradient
 };
 
 struct ImageGradient {
-    float u, v;        // of the mean, px
-    float xx, xy, yy;  // of the covariance as a full symmetric matrix
-    float depth, log_opacity, beta, color[3];
+    Lanes u, v;        // of the mean, px
+    Lanes xx, xy, yy;  // of the covariance as a full symmetric matrix
+    Lanes depth, log_opacity, beta, color[3];
 };
 
-ImageGradient on_image(const Frame& frame, const ScreenSplat& s) {
-    Lanes total{};
-    for (uint32_t i = 0; i < s.slot_count; ++i) total += frame.slots[s.slot + i];
-    const float unit = frame.exact ? 1.0f : kSqrtHalfLog2e;
-    const float first = -0.5f / unit, second = -0.5f / (unit * unit);
-    const float u = first * total[kSumLane[kU]], v = first * total[kSumLane[kV]];
-    const float uu = second * total[kSumLane[kUU]], uv = second * total[kSumLane[kUV]];
-    const float vv = second * total[kSumLane[kVV]];
-    const float a = s.pitch_u / unit, b = s.pitch_v / unit, k = s.shear;
+ImageGradient on_image(const Frame& frame, size_t first, int count) {
+    Lanes total[16] = {}, screen[16] = {};
+    for (int i = 0; i < count; ++i) {
+        const SlotSpan span = frame.spans[first + i];
+        __builtin_prefetch(frame.slots.data() + span.first + kAhead);
+        for (uint32_t k = 0; k < span.count; ++k) total[i] += frame.slots[span.first + k];
+    }
+    std::memcpy(screen, frame.splats.data() + first, size_t(count) * sizeof(ScreenSplat));
+    transpose(total);
+    transpose(screen);
+    const Lanes a = screen[4], k = screen[5], b = screen[6];  // pitch_u, shear, pitch_v
+    const float unit = frame.exact ? 1.0f : kSqrtHalfLog2e, second = -0.5f / (unit * unit);
+    const Lanes u = -0.5f / unit * total[kSumLane[kU]], v = -0.5f / unit * total[kSumLane[kV]];
+    const Lanes uu = second * total[kSumLane[kUU]], uv = second * total[kSumLane[kUV]];
+    const Lanes vv = second * total[kSumLane[kVV]];
+    const Lanes pitch_u = a * (1.0f / unit), pitch_v = b * (1.0f / unit);
     ImageGradient g;
-    g.u = -2 * a * u;
-    g.v = 2 * a * k * u - 2 * b * v;
-    g.xx = -a * a * uu;
-    g.xy = a * a * k * uu - a * b * uv;
-    g.yy = -(a * a * k * k * uu - 2 * a * b * k * uv + b * b * vv);
-    g.beta = frame.exact ? -0.25f * kLn2 * total[kSumLane[kBeta]] : 0.0f;
+    g.u = -2.0f * pitch_u * u;
+    g.v = 2.0f * pitch_u * k * u - 2.0f * pitch_v * v;
+    g.xx = -pitch_u * pitch_u * uu;
+    g.xy = pitch_u * pitch_u * k * uu - pitch_u * pitch_v * uv;
+    g.yy = -(pitch_u * pitch_u * k * k * uu - 2.0f * pitch_u * pitch_v * k * uv + pitch_v * pitch_v * vv);
+    g.beta = (frame.exact ? -0.25f * kLn2 : 0.0f) * total[kSumLane[kBeta]];
     g.depth = total[kSumLane[kDepth]];
     g.log_opacity = total[kSumLane[kAlpha]];
     g.color[0] = total[kSumLane[kRed]];
@@ -49,48 +55,74 @@ ImageGradient on_image(const Frame& frame, const ScreenSplat& s) {
     return g;
 }
 
-void to_quaternion(const Projection& r, const float (&d)[3][3], float* out) {
-    const float a = r.unit[0], b = r.unit[1], c = r.unit[2], e = r.unit[3];
-    const float g[4] = {
-        2 * (-e * d[0][1] + c * d[0][2] + e * d[1][0] - b * d[1][2] - c * d[2][0] + b * d[2][1]),
-        2 * (c * (d[0][1] + d[1][0]) + e * (d[0][2] + d[2][0]) - 2 * b * (d[1][1] + d[2][2]) + a * (d[2][1] - d[1][2])),
-        2 * (b * (d[0][1] + d[1][0]) + e * (d[1][2] + d[2][1]) - 2 * c * (d[0][0] + d[2][2]) + a * (d[0][2] - d[2][0])),
-        2 * (b * (d[0][2] + d[2][0]) + c * (d[1][2] + d[2][1]) - 2 * e * (d[0][0] + d[1][1]) + a * (d[1][0] - d[0][1])),
+SPLATS_INLINE void to_quaternion(const Projection& r, const Lanes (&d)[3][3], Lanes (&out)[4]) {
+    const Lanes a = r.unit[0], b = r.unit[1], c = r.unit[2], e = r.unit[3];
+    const Lanes g[4] = {
+        2.0f * (c * d[0][2] - e * d[0][1] + e * d[1][0] - b * d[1][2] - c * d[2][0] + b * d[2][1]),
+        2.0f * (c * (d[0][1] + d[1][0]) + e * (d[0][2] + d[2][0]) - 2.0f * b * (d[1][1] + d[2][2]) +
+                a * (d[2][1] - d[1][2])),
+        2.0f * (b * (d[0][1] + d[1][0]) + e * (d[1][2] + d[2][1]) - 2.0f * c * (d[0][0] + d[2][2]) +
+                a * (d[0][2] - d[2][0])),
+        2.0f * (b * (d[0][2] + d[2][0]) + c * (d[1][2] + d[2][1]) - 2.0f * e * (d[0][0] + d[1][1]) +
+                a * (d[1][0] - d[0][1])),
     };
-    const float along = g[0] * a + g[1] * b + g[2] * c + g[3] * e;
+    const Lanes along = g[0] * a + g[1] * b + g[2] * c + g[3] * e;
     for (int k = 0; k < 4; ++k) out[k] = (g[k] - r.unit[k] * along) * r.inverse_norm;
 }
 
 // Adds the gradient of sqrt(sharp / determinant), the antialiased opacity factor, to that of the axes.
-void add_compensation(const Projection& r, float on_log, float (&axes)[2][3]) {
-    if (!(r.compensation > kMinCompensation)) return;
-    const float xx = r.xx - kBlur, yy = r.yy - kBlur;
-    const float on_sharp = 0.5f * on_log * (1.0f / r.sharp - 1.0f / r.determinant);
-    const float on_trace = -0.5f * on_log * kBlur / r.determinant;
+SPLATS_INLINE void add_compensation(const Projection& r, const Lanes& on_log, Lanes (&axes)[2][3]) {
+    const Mask moves = at_least(r.compensation - kMinCompensation, 1e-9f);
+    const Lanes xx = r.xx - kBlur, yy = r.yy - kBlur;
+    const Lanes on_sharp = where(moves, 0.5f * on_log * (1.0f / r.sharp - 1.0f / r.determinant));
+    const Lanes on_trace = where(moves, -0.5f * kBlur * on_log / r.determinant);
     for (int k = 0; k < 3; ++k) {
-        const float s = r.axes[0][k], t = r.axes[1][k];
-        axes[0][k] += 2 * on_sharp * (s * yy - t * r.xy) + 2 * on_trace * s;
-        axes[1][k] += 2 * on_sharp * (t * xx - s * r.xy) + 2 * on_trace * t;
+        const Lanes s = r.axes[0][k], t = r.axes[1][k];
+        axes[0][k] += 2.0f * on_sharp * (s * yy - t * r.xy) + 2.0f * on_trace * s;
+        axes[1][k] += 2.0f * on_sharp * (t * xx - s * r.xy) + 2.0f * on_trace * t;
     }
 }
 
-void splat_backward(const Frame& frame, const Parameters& p, int64_t i, const ImageGradient& g, SplatGradient& out,
-                    float* sh_gradient) {
-    const Camera& camera = frame.camera;
-    Projection r;
-    if (project(camera, p, i, r) != Fate::kSeen) return;
-    out.opacity_logit = g.log_opacity * (1.0f - r.sigmoid);
-    out.beta = r.beta_inside ? g.beta : 0.0f;
-    out.screen[0] = g.u * 0.5f * camera.width;
-    out.screen[1] = g.v * 0.5f * camera.height;
+// Color to the coefficients and to the place; returns the gradient of the offset in world coordinates.
+SPLATS_INLINE void shade_backward(const Parameters& p, int64_t first, int count, const Projection& r,
+                                  const ImageGradient& g, SplatGradient& out, Lanes (&on_offset)[3]) {
+    Shading shading;
+    shade(p, first, count, r, shading);
+    const int used = (p.degree + 1) * (p.degree + 1), width = 3 * p.bases;
+    Lanes weight[16], on_color[3];
+    for (int c = 0; c < 3; ++c) on_color[c] = where(at_least(shading.raw[c], 0.0f), g.color[c]);
+    for (int b = 0; b < used; ++b)
+        for (int c = 0; c < 3; ++c) out.sh[3 * b + c] = shading.basis[b] * on_color[c];
+    for (int k = 0; k < 3; ++k) on_offset[k] = Lanes{};
+    if (p.degree == 0) return;
+    const float* sh = p.sh + width * first;
+    for (int b = 0; b < used; ++b) {
+        weight[b] = strided(sh + 3 * b, width, count) * on_color[0];
+        weight[b] += strided(sh + 3 * b + 1, width, count) * on_color[1];
+        weight[b] += strided(sh + 3 * b + 2, width, count) * on_color[2];
+    }
+    const Lanes(&d)[3] = shading.direction;
+    Lanes on_direction[3];
+    harmonics_gradient(p.degree, d[0], d[1], d[2], weight, on_direction);
+    const Lanes along = on_direction[0] * d[0] + on_direction[1] * d[1] + on_direction[2] * d[2];
+    for (int k = 0; k < 3; ++k) on_offset[k] = (on_direction[k] - d[k] * along) * shading.inverse_distance;
+}
 
-    float axes[2][3];
+// All that `out` has, garbage in the lanes that are not seen.
+SPLATS_INLINE void splats_backward(const Camera& camera, const Parameters& p, int64_t first, int count,
+                                   const Projection& r, const ImageGradient& g, SplatGradient& out) {
+    out.opacity_logit = g.log_opacity * (1.0f - r.sigmoid);
+    out.beta = where(r.beta_inside, g.beta);
+    out.screen[0] = g.u * (0.5f * camera.width);
+    out.screen[1] = g.v * (0.5f * camera.height);
+
+    Lanes axes[2][3];
     for (int k = 0; k < 3; ++k) {
-        axes[0][k] = 2 * (g.xx * r.axes[0][k] + g.xy * r.axes[1][k]);
-        axes[1][k] = 2 * (g.xy * r.axes[0][k] + g.yy * r.axes[1][k]);
+        axes[0][k] = 2.0f * (g.xx * r.axes[0][k] + g.xy * r.axes[1][k]);
+        axes[1][k] = 2.0f * (g.xy * r.axes[0][k] + g.yy * r.axes[1][k]);
     }
     if (p.antialiased) add_compensation(r, g.log_opacity, axes);
-    float rotation[3][3], to_image[2][3] = {};
+    Lanes rotation[3][3], to_image[2][3] = {};
     for (int k = 0; k < 3; ++k) {
         out.log_scale[k] = axes[0][k] * r.axes[0][k] + axes[1][k] * r.axes[1][k];
         for (int row = 0; row < 3; ++row) {
@@ -101,97 +133,125 @@ void splat_backward(const Frame& frame, const Parameters& p, int64_t i, const Im
     }
     to_quaternion(r, rotation, out.quaternion);
 
-    const float inverse_z = 1.0f / r.z, jx = camera.fx * inverse_z, jy = camera.fy * inverse_z;
-    float on_jx = 0, on_jy = 0, on_slope_x = 0, on_slope_y = 0;
+    const Lanes inverse_z = 1.0f / r.z, jx = camera.fx * inverse_z, jy = camera.fy * inverse_z;
+    Lanes on_jx{}, on_jy{}, toward_x{}, toward_y{};
     for (int k = 0; k < 3; ++k) {
         const float wz = float(camera.rotation[k][2]);
         on_jx += to_image[0][k] * r.to_image[0][k];
         on_jy += to_image[1][k] * r.to_image[1][k];
-        on_slope_x -= jx * to_image[0][k] * wz;
-        on_slope_y -= jy * to_image[1][k] * wz;
+        toward_x += to_image[0][k] * wz;
+        toward_y += to_image[1][k] * wz;
     }
-    float point[3] = {g.u * jx, g.v * jy, g.depth - (on_jx + on_jy) * inverse_z};
-    point[2] -= (g.u * jx * r.x + g.v * jy * r.y) * inverse_z;
-    if (r.inside_x) {
-        point[0] += on_slope_x * inverse_z;
-        point[2] -= on_slope_x * r.slope_x * inverse_z;
-    }
-    if (r.inside_y) {
-        point[1] += on_slope_y * inverse_z;
-        point[2] -= on_slope_y * r.slope_y * inverse_z;
-    }
-
-    Shading shading;
-    shade(p, i, r, shading);
-    const int used = (p.degree + 1) * (p.degree + 1);
-    const float* sh = p.sh + 3 * p.bases * i;
-    float weight[16], on_direction[3], on_color[3];
-    for (int c = 0; c < 3; ++c) on_color[c] = shading.raw[c] >= 0.0f ? g.color[c] : 0.0f;
-    for (int b = 0; b < used; ++b) {
-        weight[b] = 0;
-        for (int c = 0; c < 3; ++c) {
-            sh_gradient[3 * b + c] = shading.basis[b] * on_color[c];
-            weight[b] += sh[3 * b + c] * on_color[c];
-        }
-    }
-    harmonics_gradient(p.degree, shading.direction[0], shading.direction[1], shading.direction[2], weight,
-                       on_direction);
-    const float along = on_direction[0] * shading.direction[0] + on_direction[1] * shading.direction[1] +
-                        on_direction[2] * shading.direction[2];
+    const Lanes on_slope_x = where(r.inside_x, -jx * toward_x), on_slope_y = where(r.inside_y, -jy * toward_y);
+    const Lanes on_u = g.u * jx, on_v = g.v * jy;
+    const Lanes point[3] = {on_u + on_slope_x * inverse_z, on_v + on_slope_y * inverse_z,
+                            g.depth - (on_jx + on_jy + on_u * r.x + on_v * r.y + on_slope_x * r.slope_x +
+                                       on_slope_y * r.slope_y) * inverse_z};
+    Lanes on_offset[3];
+    shade_backward(p, first, count, r, g, out, on_offset);
     for (int k = 0; k < 3; ++k) {
-        const double turned = (on_direction[k] - shading.direction[k] * along) * shading.inverse_distance;
-        const double offset = point[0] * camera.rotation[k][0] + point[1] * camera.rotation[k][1] +
-                              point[2] * camera.rotation[k][2] + turned;
-        out.mean[k] = float(offset);
-        out.center[k] = -offset;
-        out.rotation[k][0] = r.offset[k] * point[0] + jx * to_image[0][k];
-        out.rotation[k][1] = r.offset[k] * point[1] + jy * to_image[1][k];
-        out.rotation[k][2] = r.offset[k] * point[2] - jx * r.slope_x * to_image[0][k] - jy * r.slope_y * to_image[1][k];
+        const double(&turn)[3] = camera.rotation[k];
+        out.mean[k] = point[0] * float(turn[0]) + point[1] * float(turn[1]) + point[2] * float(turn[2]) + on_offset[k];
+        out.offset[k] = out.mean[k];
+        const Lanes on_x = jx * to_image[0][k], on_y = jy * to_image[1][k];
+        out.rotation[k][0] = r.offset[k] * point[0] + on_x;
+        out.rotation[k][1] = r.offset[k] * point[1] + on_y;
+        out.rotation[k][2] = r.offset[k] * point[2] - r.slope_x * on_x - r.slope_y * on_y;
     }
 }
 
-bool all_finite(const SplatGradient& g, const float* sh, int count) {
-    return finite(g.mean, 3) && finite(g.log_scale, 3) && finite(g.quaternion, 4) && finite(&g.opacity_logit, 1) &&
-           finite(&g.beta, 1) && finite(g.screen, 2) && finite(sh, count);
+// Lane i to values[i * stride].
+SPLATS_INLINE void scatter(const Lanes& lanes, float* values, size_t stride, int count) {
+    alignas(64) float lane[kLanes];
+    store(lanes, lane);
+    for (int i = 0; i < count; ++i) values[i * stride] = lane[i];
+}
+
+// Sums of the pose's gradient, lane by lane in float64.
+struct PoseSum {
+    alignas(64) double lanes[12][kLanes] = {};
+
+    void add(int entry, const Lanes& share) {
+        alignas(64) float values[kLanes];
+        store(share, values);
+        for (int i = 0; i < kLanes; ++i) lanes[entry][i] += values[i];
+    }
+};
+
+// Clears every lane but those of `good`; for all that is finite or not seen, for what is not finite spreads otherwise.
+template <int Count>
+SPLATS_INLINE void keep(const Mask& good, Lanes (&values)[Count], int count = Count) {
+    for (int k = 0; k < count; ++k) values[k] = where(good, values[k]);
+}
+template <int Count>
+SPLATS_INLINE void find_bad(const Lanes (&values)[Count], Ints& bad, int count = Count) {
+    for (int k = 0; k < count; ++k) bad = bad | not_finite(as_bits(values[k]));
+}
+
+// The gradients of up to sixteen splats; returns how many are refused, as they are not finite.
+int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int count, Gradients& out, PoseSum& pose) {
+    const int used = 3 * (p.degree + 1) * (p.degree + 1);
+    const size_t width = 3 * size_t(p.bases);
+    float has_pairs[kLanes] = {};
+    for (int i = 0; i < count; ++i) has_pairs[i] = float(frame.spans[first + i].count != 0);
+    const Mask in_tiles = at_least(lanes(has_pairs), 0.5f);
+    std::memset(out.sh + width * first, 0, width * size_t(count) * sizeof(float));
+    SplatGradient g;
+    int64_t refused = 0;
+    if (any(in_tiles)) {
+        Projection r;
+        project(frame.camera, p, int64_t(first), count, r);
+        splats_backward(frame.camera, p, int64_t(first), count, r, on_image(frame, first, count), g);
+        const Mask seen = in_tiles & r.seen;
+        Ints bad{};
+        const Lanes others[2] = {g.opacity_logit, g.beta};
+        find_bad(g.mean, bad);
+        find_bad(g.log_scale, bad);
+        find_bad(g.quaternion, bad);
+        find_bad(others, bad);
+        find_bad(g.screen, bad);
+        find_bad(g.sh, bad, used);
+        const Mask good = seen & without_sign(bad);
+        refused = splats::count(seen) - splats::count(good);
+        keep(good, g.mean);
+        keep(good, g.log_scale);
+        keep(good, g.quaternion);
+        keep(good, g.screen);
+        keep(good, g.sh, used);
+        g.opacity_logit = where(good, g.opacity_logit);
+        g.beta = where(good, g.beta);
+        for (int k = 0; k < 3; ++k) {
+            for (int j = 0; j < 3; ++j) pose.add(4 * k + j, where(good, g.rotation[k][j]));
+            pose.add(4 * k + 3, -where(good, g.offset[k]));
+        }
+        for (int k = 0; k < used; ++k) scatter(g.sh[k], out.sh + width * first + k, width, count);
+    } else {
+        g = SplatGradient{};
+    }
+    for (int k = 0; k < 3; ++k) scatter(g.mean[k], out.means + 3 * first + k, 3, count);
+    for (int k = 0; k < 3; ++k) scatter(g.log_scale[k], out.log_scales + 3 * first + k, 3, count);
+    for (int k = 0; k < 4; ++k) scatter(g.quaternion[k], out.quaternions + 4 * first + k, 4, count);
+    for (int k = 0; k < 2; ++k) scatter(g.screen[k], out.screen + 2 * first + k, 2, count);
+    scatter(g.opacity_logit, out.opacity_logits + first, 1, count);
+    scatter(g.beta, out.betas + first, 1, count);
+    return refused;
 }
 
 }  // namespace
 
 void project_backward(Frame& frame, const Parameters& p, Gradients& out, int threads) {
     const size_t count = size_t(p.count), chunks = (count + kChunk - 1) / kChunk;
-    const size_t width = 3 * size_t(p.bases), used = 3 * size_t((p.degree + 1) * (p.degree + 1));
-    std::vector<double> pose(12 * chunks, 0.0);
+    std::vector<double> pose(12 * chunks);
     int64_t refused = 0;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : refused)
     for (size_t chunk = 0; chunk < chunks; ++chunk) {
-        for (size_t i = chunk * kChunk; i < std::min(count, (chunk + 1) * kChunk); ++i) {
-            const ScreenSplat &s = frame.splats[i], &soon = frame.splats[std::min(i + kAhead, count - 1)];
-            for (uint32_t k = 0; k < std::min(soon.slot_count, 8u); ++k)
-                __builtin_prefetch(&frame.slots[soon.slot + k]);
-            SplatGradient g{};
-            float* sh = out.sh + width * i;
-            if (s.slot_count) {
-                splat_backward(frame, p, int64_t(i), on_image(frame, s), g, sh);
-                std::memset(sh + used, 0, (width - used) * sizeof(float));
-                if (all_finite(g, sh, int(used))) {
-                    for (int k = 0; k < 3; ++k) {
-                        for (int j = 0; j < 3; ++j) pose[12 * chunk + 4 * k + j] += g.rotation[k][j];
-                        pose[12 * chunk + 4 * k + 3] += g.center[k];
-                    }
-                } else {
-                    ++refused;
-                    g = SplatGradient{};
-                    std::memset(sh, 0, width * sizeof(float));
-                }
-            } else {
-                std::memset(sh, 0, width * sizeof(float));
-            }
-            std::memcpy(out.means + 3 * i, g.mean, sizeof(g.mean));
-            std::memcpy(out.log_scales + 3 * i, g.log_scale, sizeof(g.log_scale));
-            std::memcpy(out.quaternions + 4 * i, g.quaternion, sizeof(g.quaternion));
-            std::memcpy(out.screen + 2 * i, g.screen, sizeof(g.screen));
-            out.opacity_logits[i] = g.opacity_logit;
-            out.betas[i] = g.beta;
+        PoseSum sums;
+        const size_t end = std::min(count, (chunk + 1) * kChunk);
+        for (size_t first = chunk * kChunk; first < end; first += kLanes)
+            refused += backward_of(frame, p, first, int(std::min(size_t(kLanes), end - first)), out, sums);
+        for (int k = 0; k < 12; ++k) {
+            pose[12 * chunk + k] = 0.0;
+            for (const double value : sums.lanes[k]) pose[12 * chunk + k] += value;
         }
     }
     std::fill(out.pose, out.pose + 12, 0.0);

@@ -91,6 +91,16 @@ SPLATS_INLINE Part turned(Part v) {
 }
 #endif
 
+// Every lane of a run of four with the run's lane k.
+template <int k>
+SPLATS_INLINE IntPart spread(IntPart v) {
+#if defined(__AVX2__)
+    return __builtin_shufflevector(v, v, k, k, k, k, 4 + k, 4 + k, 4 + k, 4 + k);
+#else
+    return __builtin_shufflevector(v, v, k, k, k, k);
+#endif
+}
+
 SPLATS_INLINE float sum(Part v) {
     if constexpr (kPart == 8) v += turned<4>(v);
     v += turned<2>(v);
