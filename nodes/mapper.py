@@ -124,6 +124,7 @@ class Mapper(Node):
         for done in range(self.config.refinement):
             self.mapper.refine(done, self.config.refinement)
         self._report()
+        self._check()
         if self.config.output is not None:
             path = Path(self.config.output) / "map.ply"
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -172,6 +173,14 @@ class Mapper(Node):
         self.stats.values["iterations"] = self.mapper.iterations
         self.stats.values["iterations_owed"] = self.mapper.schedule.owed
         self.stats.values["image_bytes"] = self.mapper.image_bytes
+
+    def _check(self) -> None:
+        found = self.mapper.self_check()
+        if found is None:
+            return
+        self.stats.values |= {"keyframe_psnr": found.psnr, "image_noise": found.noise}
+        if found.warning:
+            self.stats.warn(found.warning)
 
     def _map(self, refined: bool) -> SplatMap:
         final = self.mapper.snapshot()

@@ -34,6 +34,7 @@ from mvsgs_core.splats.map_state import MapState
 from mvsgs_core.splats.optimizer import LearningRates
 from mvsgs_core.splats.rasterizer import Render, rasterize
 from mvsgs_core.splats.schedule import Schedule
+from mvsgs_core.splats.self_check import SelfCheck, check
 from mvsgs_core.splats.snapshot import Snapshot, snapshot
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
 
@@ -253,6 +254,11 @@ class OnlineMapper:
                 backend=self.config.training.backend, exposure=view.exposure if self.config.training.exposure else None,
                 antialiased=self.config.training.antialiased, threads=self.config.training.threads,
             )  # fmt: skip
+
+    def self_check(self, most: int = 20) -> SelfCheck | None:
+        """How well the map explains its keyframes, `most` of them, spread over the stream; None without any."""
+        views = self._with_image[:: -(-len(self._with_image) // most) or 1]
+        return check([(self.render(v).color.clamp(0.0, 1.0).cpu().numpy(), v.target(0).cpu().numpy()) for v in views])
 
     def snapshot(self) -> Snapshot:
         """The map in world units, relative to its origin."""

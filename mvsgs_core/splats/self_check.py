@@ -1,0 +1,74 @@
+"""How well a finished map explains the images it was made of, and what keeps it from it. No truth is needed for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mvsgs_core.evaluation.image_metrics import psnr
+
+LEAST_PSNR = 25.0  # dB; a static map of sharp, steady images is above this
+MOST_EXPOSURE_GAIN = 1.5  # dB that one gain and offset an image and channel may bring before exposure is to blame
+LEAST_STEADY_PSNR = 22.0  # dB that they must reach: a render of something else gains by them, too
+MOST_NOISE = 6.0  # of 255
+_SECOND_DERIVATIVE = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
+
+
+@dataclass(frozen=True)
+class SelfCheck:
+    """Medians over the pairs; `noise` of 255."""
+
+    psnr: float  # dB
+    steady_psnr: float  # dB, after the gain and offset an image and channel that fit best
+    noise: float
+
+    @property
+    def warning(self) -> str | None:
+        """What to tell the user; None where the map explains its images."""
+        if self.psnr >= LEAST_PSNR:
+            return None
+        causes = []
+        if self.steady_psnr > max(LEAST_STEADY_PSNR, self.psnr + MOST_EXPOSURE_GAIN):
+            causes.append(f"exposure changes (without: {self.steady_psnr:.1f} dB; mapper.exposure=true models it)")
+        if self.noise > MOST_NOISE:
+            causes.append(f"noise of {self.noise:.0f} of 255")
+        known = " and ".join(causes) or "motion, blur, wrong poses or too few iterations"
+        return (
+            f"the map renders its own keyframes at {self.psnr:.1f} dB only ({LEAST_PSNR:g} expected): the images hold "
+            f"what a static map cannot explain, here {known}"
+        )
+
+
+def check(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> SelfCheck | None:
+    """Of (render, image) pairs, (H, W, 3) float in 0..1; None without any."""
+    if not pairs:
+        return None
+    return SelfCheck(
+        float(np.median([psnr(render, image) for render, image in pairs])),
+        float(np.median([psnr(_fitted(render, image), image) for render, image in pairs])),
+        float(np.median([noise_of(image) for _, image in pairs])),
+    )
+
+
+def noise_of(image: np.ndarray) -> float:
+    """Standard deviation of an image's noise, of 255.
+
+    The second derivative in both directions leaves noise and hardly any structure; the median of its size looks past
+    the corners that remain (after Immerkaer, "Fast noise variance estimation", 1996).
+    """
+    residual = cv2.filter2D(image.astype(np.float32), cv2.CV_32F, _SECOND_DERIVATIVE)[1:-1, 1:-1]
+    return float(255.0 * np.median(np.abs(residual)) / (0.6745 * np.sqrt((_SECOND_DERIVATIVE**2).sum())))
+
+
+def _fitted(render: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """The render under the gain and offset of each channel that bring it closest to the image."""
+    fitted = np.empty_like(render)
+    for channel in range(3):
+        x, y = render[..., channel].ravel().astype(np.float64), image[..., channel].ravel().astype(np.float64)
+        spread = x.var()
+        gain = float(((x - x.mean()) * (y - y.mean())).mean() / spread) if spread > 0.0 else 0.0
+        fitted[..., channel] = gain * (render[..., channel] - x.mean()) + y.mean()
+    return fitted

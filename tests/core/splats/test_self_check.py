@@ -1,0 +1,61 @@
+"""What a map says of itself: how well it explains its images, and why not better."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mvsgs_core.splats.self_check import SelfCheck, check, noise_of
+
+
+def picture(seed: int = 0) -> np.ndarray:
+    """(96, 128, 3) in 0.2..0.8: smooth structure, and edges."""
+    generator = np.random.default_rng(seed)
+    image = cv2.resize(generator.random((8, 10, 3)).astype(np.float32), (128, 96), interpolation=cv2.INTER_CUBIC)
+    image[30:60, 40:90] = 0.9
+    return np.clip(0.2 + 0.6 * image, 0.0, 1.0).astype(np.float32)
+
+
+def known(found: SelfCheck | None) -> SelfCheck:
+    assert found is not None
+    return found
+
+
+def test_a_map_without_keyframes_says_nothing() -> None:
+    assert check([]) is None
+
+
+def test_a_good_map_gets_no_warning() -> None:
+    image = picture()
+    found = known(check([(image + np.float32(0.01), image)]))
+    assert found.psnr == pytest.approx(40.0, abs=0.1)
+    assert found.warning is None
+
+
+def test_noise_is_measured_and_blamed() -> None:
+    generator = np.random.default_rng(1)
+    pairs = [
+        (picture(k), picture(k) + generator.normal(0.0, 20.0 / 255.0, (96, 128, 3)).astype(np.float32)) for k in (1, 2)
+    ]
+    found = known(check(pairs))
+    assert found.noise == pytest.approx(20.0, rel=0.1)
+    assert noise_of(picture()) < 2.0
+    assert found.warning is not None
+    assert "noise of 20 of 255" in found.warning
+    assert "exposure" not in found.warning
+
+
+def test_exposure_is_blamed_where_a_gain_and_an_offset_bring_the_render_to_the_image() -> None:
+    found = known(check([(picture(), 0.7 * picture() + 0.02)]))
+    assert found.psnr < 25.0
+    assert found.steady_psnr > 60.0
+    assert found.warning is not None
+    assert "exposure changes" in found.warning
+    assert "mapper.exposure=true" in found.warning
+
+
+def test_other_errors_are_told_without_a_guess() -> None:
+    found = known(check([(np.roll(picture(), 30, axis=1), picture())]))
+    assert found.warning is not None
+    assert "motion, blur, wrong poses or too few iterations" in found.warning
