@@ -54,7 +54,10 @@ SPLATS_INLINE void place(const Camera& camera, const Parameters& p, int64_t firs
                       maximum(shading.raw[2], Lanes{}), where(seen, r.z), 0.5f * r.beta,
                       where(seen, maximum(half_width, half_height)), Lanes{}, Lanes{}};
     transpose(rows);
-    std::memcpy(out, rows, size_t(count) * sizeof(ScreenSplat));
+    if (count == kLanes)
+        std::memcpy(out, rows, sizeof(rows));  // of a size known: no call
+    else
+        std::memcpy(out, rows, size_t(count) * sizeof(ScreenSplat));
 }
 
 // Projects one chunk of splats, finds their tiles; spans count from the chunk's first pair.
@@ -148,7 +151,11 @@ void distribute(Frame& frame, size_t seen, int parts) {
     for (int part = 0; part < parts; ++part) {
         uint32_t* own = counts + part * tiles;
         std::fill(own, own + tiles, 0u);
-        visit(part, [&](uint32_t, uint32_t slot) { ++own[frame.listed_tiles[slot]]; });
+        const auto add = [&](uint32_t slot) { ++own[frame.listed_tiles[slot]]; };
+        if (parts == 1)  // in whatever order
+            for (uint32_t slot = 0; slot < uint32_t(frame.pair_count); ++slot) add(slot);
+        else
+            visit(part, [&](uint32_t, uint32_t slot) { add(slot); });
     }
     uint32_t total = 0;
     frame.tile_begin.resize(tiles + 1);

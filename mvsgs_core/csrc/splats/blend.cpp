@@ -8,6 +8,8 @@
 namespace splats {
 namespace {
 
+constexpr uint32_t kAhead = 32;  // pairs whose splat is fetched early
+
 // What a thread keeps of the tile at hand.
 struct Workspace {
     std::vector<Placed> placed;         // of every pair; behind them one that is seen nowhere
@@ -18,7 +20,7 @@ struct Workspace {
     int64_t evaluated = 0, contributed = 0;
 
     void take(const Frame& frame, const Tile& tile, bool weights) {
-        const uint32_t count = tile.end - tile.begin;
+        const uint32_t count = tile.end - tile.begin, last = uint32_t(frame.pair_count) - 1;
         if (placed.size() < count + 1) {
             placed.resize(count + count / 2 + 64);
             hits.resize(placed.size());
@@ -26,8 +28,7 @@ struct Workspace {
             list.resize(placed.size() + kLanes);
         }
         for (uint32_t i = 0; i < count; ++i) {
-            const uint32_t soon = std::min(tile.begin + i + 8, tile.end - 1);
-            __builtin_prefetch(&frame.splats[frame.pairs[soon].splat]);
+            __builtin_prefetch(&frame.splats[frame.pairs[std::min(tile.begin + i + kAhead, last)].splat]);
             const Pair& pair = frame.pairs[tile.begin + i];
             placed[i] = Placed(frame.splats[pair.splat], tile);
             touched[i] = pair.blocks;
@@ -88,9 +89,20 @@ PixelSums blend_block(const Tile& tile, int block, Workspace& work) {
     return sums;
 }
 
+// Brings what the tile's pixels are written to closer while its splats are blended.
+void fetch(const Frame& frame, const Tile& tile, const Images<float>& images) {
+    for (int row = 0; row < tile.height; ++row) {
+        const size_t first = size_t(tile.y + row) * frame.camera.width + tile.x;
+        for (int k = 0; k < 3; ++k) __builtin_prefetch(images.color + 3 * first + kTile * k, 1);
+        __builtin_prefetch(images.depth + first, 1);
+        __builtin_prefetch(images.opacity + first, 1);
+    }
+}
+
 template <bool Exact, bool Weights>
 void blend_tile(Frame& frame, const Tile& tile, const Images<float>& images, Workspace& work) {
     work.take(frame, tile, Weights);
+    fetch(frame, tile, images);
     for (int block = 0; block < kBlocks; ++block) {
         const BlockSpan span(tile, block);
         if (span.columns <= 0 || span.rows <= 0) continue;

@@ -9,6 +9,8 @@
 namespace splats {
 namespace {
 
+constexpr uint32_t kAhead = 20;  // pairs whose splat and slot are fetched early
+
 struct Target {
     Lanes transmittance, behind;
     Lanes red, green, blue, depth, covered;  // gradients of the sums over weights
@@ -38,6 +40,25 @@ void load(const Frame& frame, const Tile& tile, const Images<const float>& image
             t.covered = on_opacity - t.depth * read_plane(frame, span, image.depth);
         }
     }
+}
+
+// Brings what lies under the tile to the right closer; it is next, most often.
+void fetch_next(const Tile& tile, int width, const float* color, const float* gradient) {
+    if (tile.x + 2 * kTile > width) return;
+    for (int row = 0; row < tile.height; ++row) {
+        const size_t first = 3 * (size_t(tile.y + row) * width + tile.x + kTile);
+        for (size_t at = first; at < first + 3 * kTile; at += 16) {
+            __builtin_prefetch(color + at);
+            __builtin_prefetch(gradient + at);
+        }
+    }
+}
+
+// The same for the splat of a pair, and for its slot.
+SPLATS_INLINE void fetch(const Frame& frame, uint32_t index) {
+    const Pair& pair = frame.pairs[std::min(index, uint32_t(frame.pair_count) - 1)];
+    __builtin_prefetch(&frame.splats[pair.splat]);
+    __builtin_prefetch(&frame.slots[pair.slot], 1);
 }
 
 // A splat on a block, as its density leaves it to the sums.
@@ -159,7 +180,7 @@ void exact_tile(Frame& frame, const Tile& tile, Targets& targets, const BlockPix
         batch.pairs = batch.visits = 0;
         for (; index < tile.end && batch.visits < Batch::kVisits; ++index) {
             const Pair pair = frame.pairs[index];
-            __builtin_prefetch(&frame.splats[frame.pairs[std::min(index + 8, tile.end - 1)].splat]);
+            fetch(frame, index + kAhead);
             if (pair.blocks)
                 batch.add(frame.splats[pair.splat], tile, pair);
             else
@@ -177,8 +198,7 @@ template <bool Depth>
 void gaussian_tile(Frame& frame, const Tile& tile, Targets& targets, const BlockPixels& pixels) {
     for (uint32_t index = tile.begin; index < tile.end; ++index) {
         const Pair pair = frame.pairs[index];
-        __builtin_prefetch(&frame.splats[frame.pairs[std::min(index + 8, tile.end - 1)].splat]);
-        __builtin_prefetch(&frame.slots[frame.pairs[std::min(index + 8, tile.end - 1)].slot], 1);
+        fetch(frame, index + kAhead);
         if (!pair.blocks) {
             frame.slots[pair.slot] = Lanes{};
             continue;
@@ -202,6 +222,7 @@ void backward_all(Frame& frame, const Images<const float>& image, const Images<c
             const Tile tile(frame, index);
             if (tile.begin == tile.end) continue;
             load<Depth>(frame, tile, image, gradient, targets);
+            fetch_next(tile, frame.camera.width, image.color, gradient.color);
             if constexpr (Exact)
                 exact_tile<Depth>(frame, tile, targets, pixels, batch);
             else

@@ -10,7 +10,7 @@ namespace splats {
 namespace {
 
 constexpr float kLn2 = 0.6931471805599453f;
-constexpr size_t kAhead = 32;  // slots fetched early
+constexpr size_t kAhead = 96;  // slots fetched early
 
 struct SplatGradient {
     Lanes mean[3], log_scale[3], quaternion[4], opacity_logit, beta, screen[2];
@@ -28,10 +28,15 @@ ImageGradient on_image(const Frame& frame, size_t first, int count) {
     Lanes total[16] = {}, screen[16] = {};
     for (int i = 0; i < count; ++i) {
         const SlotSpan span = frame.spans[first + i];
-        __builtin_prefetch(frame.slots.data() + span.first + kAhead);
-        for (uint32_t k = 0; k < span.count; ++k) total[i] += frame.slots[span.first + k];
+        for (uint32_t k = 0; k < span.count; ++k) {
+            __builtin_prefetch(frame.slots.data() + span.first + k + kAhead);
+            total[i] += frame.slots[span.first + k];
+        }
     }
-    std::memcpy(screen, frame.splats.data() + first, size_t(count) * sizeof(ScreenSplat));
+    if (count == kLanes)
+        std::memcpy(screen, frame.splats.data() + first, sizeof(screen));  // of a size known: no call
+    else
+        std::memcpy(screen, frame.splats.data() + first, size_t(count) * sizeof(ScreenSplat));
     transpose(total);
     transpose(screen);
     const Lanes a = screen[4], k = screen[5], b = screen[6];  // pitch_u, shear, pitch_v
