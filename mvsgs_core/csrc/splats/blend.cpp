@@ -89,8 +89,9 @@ PixelSums blend_block(const Tile& tile, int block, Workspace& work) {
     return sums;
 }
 
-// Brings what the tile's pixels are written to closer while its splats are blended.
-void fetch(const Frame& frame, const Tile& tile, const Images<float>& images) {
+// Brings what the tile's pixels are written to closer while its splats are blended. Inlined: GCC drops calls of
+// functions that do nothing but this.
+SPLATS_INLINE void fetch(const Frame& frame, const Tile& tile, const Images<float>& images) {
     for (int row = 0; row < tile.height; ++row) {
         const size_t first = size_t(tile.y + row) * frame.camera.width + tile.x;
         for (int k = 0; k < 3; ++k) __builtin_prefetch(images.color + 3 * first + kTile * k, 1);

@@ -169,7 +169,10 @@ SPLATS_INLINE void splats_backward(const Camera& camera, const Parameters& p, in
 SPLATS_INLINE void scatter(const Lanes& lanes, float* values, size_t stride, int count) {
     alignas(64) float lane[kLanes];
     store(lanes, lane);
-    for (int i = 0; i < count; ++i) values[i * stride] = lane[i];
+    if (count == kLanes)
+        for (int i = 0; i < kLanes; ++i) values[i * stride] = lane[i];
+    else
+        for (int i = 0; i < count; ++i) values[i * stride] = lane[i];
 }
 
 // Sums of the pose's gradient, lane by lane in float64.
