@@ -11,6 +11,7 @@ from mvsgs_core.tracking import tracker as core
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.front_end import FrontEndConfig
+from mvsgs_core.tracking.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.starting import StartingConfig
 from nodes.tracking import TrackerNode
@@ -34,7 +35,8 @@ class Tracker(TrackerNode):
         global_edges: int = 6  # of each keyframe in the global bundle adjustment
         readout: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
         loops: bool = True  # old keyframes are looked for by appearance
-        saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
+        known_flow: float = 0.15  # of the width: no keyframe is made for a view this near to an old one; 0: always
+        known_from: int = 64  # keyframes of a map: a smaller one takes every view
         tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
         device: str = "cpu"  # of bundle adjustment: cpu (C++), cuda or cuda:0 (PyTorch), auto (CUDA if there is one)
         threads: int | None = None  # of the C++ kernels; null: 1
@@ -59,7 +61,7 @@ class Tracker(TrackerNode):
                 starting=StartingConfig(keyframes=c.start_keyframes),
                 readout=c.readout,
                 loops=c.loops,
-                saturation=c.saturation,
+                known_ground=KnownGroundConfig(keyframes=c.known_from, flow=c.known_flow),
             )
         )
 

@@ -45,14 +45,16 @@ class LocalMap:
         keyframe = Keyframe(image, cam_from_world, inverse_depth, np.zeros(len(inverse_depth)), segment)
         earlier = self.members(segment)
         self.graph.add(keyframe)
-        recent = earlier[-self.config.recent :]
+        recent, proximity = earlier[-self.config.recent :], self.config.proximity
+        if not set(matches) <= set(recent):  # the camera was followed from an old keyframe: the newest are elsewhere
+            recent, proximity = sorted(matches), proximity + self.config.recent - len(matches)
         for index in recent:
             if index in matches:
                 self.graph.connect(index, image.index, matches[index], self.config.min_share)
             else:
                 self.match_edge(index, image.index)
             self.match_edge(image.index, index)
-        for index in self.nearby(image.index, earlier[: -self.config.recent], self.config.proximity):
+        for index in self.nearby(image.index, [i for i in earlier if i not in recent], proximity):
             self.match_edge(image.index, index)
             self.match_edge(index, image.index)
         return keyframe
@@ -102,10 +104,10 @@ class LocalMap:
         flow = np.where(inside, np.hypot(to_u - u, to_v - v), 0.0).sum(axis=1) / np.maximum(seen, 1)
         return {c: float(f) for c, f, n in zip(candidates, flow, seen) if n > min_overlap * len(some)}
 
-    def from_pose(self, pose: np.ndarray, segment: int, limit: float) -> list[int]:
-        """Keyframes whose points would move less than `limit` pixels to a camera at this pose (4, 4), nearest first."""
+    def from_pose(self, pose: np.ndarray, candidates: list[int], limit: float) -> list[int]:
+        """Those whose points would move less than `limit` pixels to a camera at this pose (4, 4), nearest first."""
         flows = {}
-        for index in self.members(segment):
+        for index in candidates:
             keyframe = self.graph.keyframes[index]
             # A cheap bound first: the optical axes must nearly agree.
             if float(keyframe.cam_from_world[2, :3] @ pose[2, :3]) < 0.9:

@@ -25,6 +25,7 @@ from mvsgs_core.tracking.frames import FrameRecord, Path, State, compact, solve_
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
+from mvsgs_core.tracking.known_ground import KnownGround, KnownGroundConfig
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from mvsgs_core.tracking.loop_closure import LoopCloser, LoopConfig
 from mvsgs_core.tracking.matcher import Matcher
@@ -42,7 +43,6 @@ class TrackerConfig:
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
     loops: bool = True  # look for old keyframes by appearance
     readout: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated
-    saturation: int = 3  # keyframes that see the same from the same place: no further one is made there
     texture: float = 0.05  # share of the cells that must be textured for an image to be of any use
     matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is told
     threads: int = 1
@@ -54,6 +54,7 @@ class TrackerConfig:
     loop: LoopConfig = field(default_factory=LoopConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     back_end: BackEndConfig = field(default_factory=BackEndConfig)
+    known_ground: KnownGroundConfig = field(default_factory=KnownGroundConfig)
 
 
 @dataclass(frozen=True)
@@ -182,6 +183,7 @@ class Tracker:
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, config.threads)
         self.loops = LoopCloser(self.graph, self.local_map, config.loop)
         self.recovery = Recovery(self.graph, self.matcher, self.loops.retrieval, config.recovery, config.front_end)
+        self.known_ground = KnownGround(self.graph, self.local_map, config.known_ground, config.threads)
         self.back_end = BackEnd(self.graph, self.local_map, config.back_end, config.threads)
         self.publisher = Publisher(self.graph, config.tolerance, lambda index: self.keyframe(index).segment)
 
@@ -239,11 +241,10 @@ class Tracker:
         assert step.localization is not None
         record.state = State.TRACKED
         pose = step.localization.cam_from_world
-        if not self.front_end.wants_keyframe(step, self.config.front_end.keyframe_flow):
-            return Update(State.TRACKED)
-        if self._known_here(frame, pose):
-            return Update(State.TRACKED)
         reference = self.front_end.reference.index
+        limit = self.known_ground.limit(reference, self.config.front_end.keyframe_flow)
+        if not self.front_end.wants_keyframe(step, limit) or self._known_here(frame, pose, reference):
+            return Update(State.TRACKED)
         with self.stats.time("local map"):
             self.local_map.insert(frame, pose, self.segment, {reference: step.matches})
         with self.stats.time("local bundle adjustment"):
@@ -258,6 +259,7 @@ class Tracker:
             record.state = State.DEGENERATE
             self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
         self.stats.count("keyframes")
+        self.known_ground.made(frame.index)
         self._since = 0
         if len(self.graph.keyframes) in READOUT_AGAIN:
             self.calibration.estimate_readout(self.local_map.members(self.segment)[-12:])
@@ -288,20 +290,15 @@ class Tracker:
     def _unknown_focal(self) -> FocalConfig | None:
         return None if self.calibration.settled else self.config.focal
 
-    def _known_here(self, frame: TrackingImage, pose: np.ndarray) -> bool:
-        """Enough keyframes already see this from here: the nearest becomes the reference again."""
-        assert self.graph is not None
-        limit = 0.5 * self.config.front_end.keyframe_flow * frame.size[1]
-        close = self.local_map.from_pose(pose, self.segment, limit)
-        if len(close) < self.config.saturation:
+    def _known_here(self, frame: TrackingImage, pose: np.ndarray, reference: int) -> bool:
+        """An old keyframe sees this: it becomes the reference, and no further one is made."""
+        with self.stats.time("known ground"):
+            known = self.known_ground.find(frame, pose, reference)
+        if known is None:
             return False
-        nearest = self.graph.keyframes[close[0]].image
-        guess, _ = self.graph.predict_pose(close[0], pose)
-        matches, share = self.matcher.match(nearest, frame, guess, 0.0)
-        if share < self.config.front_end.keyframe_share:
-            return False
-        self.front_end.resume(nearest, frame, matches, pose)
-        self.stats.skip("keyframes where enough are")
+        image = self.keyframe(known.index).image
+        self.front_end.resume(image, frame, known.matches, known.localization.cam_from_world)
+        self.stats.skip("keyframes on known ground")
         return True
 
     def _close_loops(self, index: int) -> None:

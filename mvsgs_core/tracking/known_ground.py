@@ -1,0 +1,118 @@
+"""Known ground: where old keyframes already see what the camera sees, one of them is followed and none is added.
+
+So a camera that stays in a room stops to grow the graph: keyframes fill the space of views once, then only gaps in it.
+Nothing is removed afterwards, so every keyframe that was ever told keeps its corrections.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core.tracking.bundle_adjustment import Solver
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.local_map import LocalMap
+from mvsgs_core.tracking.localization import Localization, localize
+
+
+@dataclass(frozen=True)
+class KnownGroundConfig:
+    keyframes: int = 64  # of a map: smaller ones take every view, each makes them more accurate; 0: from the start
+    flow: float = 0.15  # of the width: a view nearer to an old keyframe than this is known; 0: none ever is
+    age: int = 12  # references since a keyframe was made, before it counts as old: the local window, and its baselines
+    candidates: int = 2  # old keyframes that are tried, the nearest first
+    share: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new
+    inliers: float = 0.8  # of its matches, within 2 pixels of one pose
+    agreement: float = 2.0  # pixels, median between where the map says its points are and where they are: more is drift
+
+
+@dataclass(frozen=True)
+class KnownView:
+    """An old keyframe that sees what a frame sees."""
+
+    index: int
+    matches: Matches  # of its points, in the frame
+    localization: Localization  # of the frame
+
+
+class KnownGround:
+    def __init__(self, graph: KeyframeGraph, local_map: LocalMap, config: KnownGroundConfig, threads: int) -> None:
+        self.graph = graph
+        self.local_map = local_map
+        self.config = config
+        self.solver = Solver(steps=8, robust_scale=1.0, threads=threads)
+        self.followed: int | None = None  # the old keyframe that is the reference now
+        self._references = 0  # how many keyframes were the reference, one after the other
+        self._made: dict[int, int] = {}  # by keyframe: the value of `_references` then
+
+    def made(self, index: int) -> None:
+        """A keyframe was made and is the reference now."""
+        self._made[index] = self._references
+        self._refer(None)
+
+    def limit(self, reference: int, usual: float) -> float:
+        """Median flow, as a share of the width, at which another keyframe is needed; usual: that of a young one."""
+        return max(usual, self.config.flow) if reference == self.followed else usual
+
+    def find(self, frame: TrackingImage, pose: np.ndarray, reference: int) -> KnownView | None:
+        """The old keyframe to follow from this frame on, whose pose (4, 4) was found against the reference.
+
+        None where the view is new, or where the map contradicts itself: then a keyframe has to tie the two parts.
+        """
+        segment = self.graph.keyframes[reference].segment
+        if self.config.flow == 0 or len(self.local_map.members(segment)) < self.config.keyframes:
+            return None
+        old = [index for index in sorted(self._tied_to(reference)) if self._is_old(index, segment)]
+        near = self.local_map.from_pose(pose, old, self.config.flow * frame.size[1])
+        for index in near[: self.config.candidates]:
+            found = self._verify(frame, pose, index)
+            if found is not None:
+                self._refer(index)
+                return found
+            self._release(index)
+        return None
+
+    def _verify(self, frame: TrackingImage, pose: np.ndarray, index: int) -> KnownView | None:
+        expected, _ = self.graph.predict_pose(index, pose)
+        keyframe = self.graph.keyframes[index]
+        matches, share = self.local_map.matcher.match(keyframe.image, frame, expected, 0.0)
+        seen = matches.alive & keyframe.triangulated
+        if share < self.config.share or not seen.any():
+            return None
+        apart = np.linalg.norm(expected + self.graph.readout * frame.shutter(expected) - matches.target, axis=1)[seen]
+        if not np.median(apart) < self.config.agreement:
+            return None
+        found = localize(self.graph, {index: matches}, pose, self.solver)
+        if found.failure or found.inliers < self.config.inliers:
+            return None
+        return KnownView(index, matches, found)
+
+    def _is_old(self, index: int, segment: int) -> bool:
+        return (
+            self.graph.keyframes[index].segment == segment
+            and self._references - self._made.get(index, 0) >= self.config.age
+        )
+
+    def _tied_to(self, reference: int) -> set[int]:
+        """Keyframes at most two edges away, the reference left out: what is not tied to it may have drifted."""
+        reached = {reference}
+        for _ in range(2):
+            reached |= {n for a, b in self.graph.edges if a in reached or b in reached for n in (a, b)}
+        return reached - {reference}
+
+    def _refer(self, index: int | None) -> None:
+        if self.followed is not None:
+            self._release(self.followed)
+        self.followed = index
+        self._references += 1
+
+    def _release(self, index: int) -> None:
+        """Forgets the pyramid of an old image again; what still needs it computes it anew."""
+        if index in self.graph.keyframes:
+            self.graph.keyframes[index].image.release()
+
+
+__all__ = ["KnownGround", "KnownGroundConfig", "KnownView"]
