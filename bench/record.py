@@ -110,13 +110,13 @@ def read_rows(files: Iterable[Path]) -> list[list[dict[str, Any]]]:
 
 
 def record(name: str, files: list[Path], command: str, made_in: Path | None = None, folder: Path = RECORDED) -> Record:
-    """Merges the runs in `files`, takes table.md, *.svg and *.png from `made_in`, saves and returns the record."""
+    """Merges the runs in `files`, takes table.md and *.svg from `made_in`, saves and returns the record."""
     rows = merge(read_rows(files))
     table, plots = "", []
     if made_in is not None:
         own = made_in / "table.md"
         table = own.read_text() if own.exists() else ""
-        for plot in sorted([*made_in.glob("*.svg"), *made_in.glob("*.png")]):
+        for plot in sorted(made_in.glob("*.svg")):
             plots.append(f"{name}_{plot.name}")
             (folder / plots[-1]).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(plot, folder / plots[-1])
@@ -130,7 +130,7 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("name", nargs="?", help="such as transport, or quick/transport")
     parser.add_argument("files", nargs="*", type=Path, help="rows, from --json")
     parser.add_argument("--command", help="how they were made; default: python -m bench.NAME")
-    parser.add_argument("--from", type=Path, dest="made_in", help="folder of the run, for table.md, *.svg and *.png")
+    parser.add_argument("--from", type=Path, dest="made_in", help="folder of the run, for table.md and *.svg")
     options = parser.parse_args(arguments)
     if options.name:
         if not options.files:
