@@ -49,9 +49,10 @@ SPLATS_INLINE void harmonics_gradient(int degree, const Lanes& x, const Lanes& y
         const float d = 0.3731763325901154f, e = 1.445305721320277f;
         const Lanes xx = x * x, yy = y * y, zz = z * z;
         gx += 6.0f * a * x * y * weight[9] + b * y * z * weight[10] - 2.0f * c * x * y * weight[11] -
-              6.0f * d * x * z * weight[12] + c * (4.0f * zz - 3.0f * xx - yy) * weight[13] + 2.0f * e * x * z * weight[14] +
-              3.0f * a * (xx - yy) * weight[15];
-        gy += 3.0f * a * (xx - yy) * weight[9] + b * x * z * weight[10] + c * (4.0f * zz - xx - 3.0f * yy) * weight[11] -
+              6.0f * d * x * z * weight[12] + c * (4.0f * zz - 3.0f * xx - yy) * weight[13] +
+              2.0f * e * x * z * weight[14] + 3.0f * a * (xx - yy) * weight[15];
+        gy += 3.0f * a * (xx - yy) * weight[9] + b * x * z * weight[10] +
+              c * (4.0f * zz - xx - 3.0f * yy) * weight[11] -
               6.0f * d * y * z * weight[12] - 2.0f * c * x * y * weight[13] - 2.0f * e * y * z * weight[14] -
               6.0f * a * x * y * weight[15];
         gz += b * x * y * weight[10] + 8.0f * c * y * z * weight[11] + 3.0f * d * (2.0f * zz - xx - yy) * weight[12] +

@@ -151,8 +151,9 @@ SPLATS_INLINE void project(const Camera& camera, const Parameters& p, int64_t fi
     for (int k = 0; k < 3; ++k) {
         r.scale[k] = exponential(strided(p.log_scales + 3 * first + k, 3, count));
         for (int row = 0; row < 2; ++row)
-            r.axes[row][k] = r.scale[k] * (r.to_image[row][0] * r.rotation[0][k] + r.to_image[row][1] * r.rotation[1][k] +
-                                           r.to_image[row][2] * r.rotation[2][k]);
+            r.axes[row][k] =
+                r.scale[k] * (r.to_image[row][0] * r.rotation[0][k] + r.to_image[row][1] * r.rotation[1][k] +
+                              r.to_image[row][2] * r.rotation[2][k]);
     }
     const Lanes(&s)[3] = r.axes[0], (&t)[3] = r.axes[1];
     const Lanes xx = s[0] * s[0] + s[1] * s[1] + s[2] * s[2], yy = t[0] * t[0] + t[1] * t[1] + t[2] * t[2];

@@ -31,7 +31,8 @@ class TileWalk {
     // Appends the pairs of the splat in lane i.
     SPLATS_INLINE_MEMBER void visit(const Footprints& f, int i) {
         if (!(f.top[i] <= f.bottom[i] && f.left[i] <= f.right[i])) return;
-        const int first_row = int(f.top[i]) / kTile * 4, last_row = int(f.bottom[i]) / 4;  // from the first row of a tile
+        // rows of blocks, from the first of a tile
+        const int first_row = int(f.top[i]) / kTile * 4, last_row = int(f.bottom[i]) / 4;
         const int first_tile = int(f.left[i]) / kTile, last_tile = int(f.right[i]) / kTile;
         for (int start = first_row; start <= last_row; start += kLanes) {
             Ints first, last;
