@@ -35,7 +35,7 @@ class Tracker(TrackerNode):
         global_edges: int = 6  # of each keyframe in the global bundle adjustment
         readout: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
         loops: bool = True  # old keyframes are looked for by appearance
-        known_flow: float = 0.15  # of the width: no keyframe is made for a view this near to an old one; 0: always
+        known_flow: float = 0.13  # of the width: no keyframe is made for a view this near to an old one; 0: always
         known_from: int = 64  # keyframes of a map: a smaller one takes every view
         tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
         device: str = "cpu"  # of bundle adjustment: cpu (C++), cuda or cuda:0 (PyTorch), auto (CUDA if there is one)

@@ -21,7 +21,7 @@ from mvsgs_core.tracking.localization import Localization, localize
 @dataclass(frozen=True)
 class KnownGroundConfig:
     keyframes: int = 64  # of a map: smaller ones take every view, each makes them more accurate; 0: from the start
-    flow: float = 0.15  # of the width: a view nearer to an old keyframe than this is known; 0: none ever is
+    flow: float = 0.13  # of the width: a view nearer to an old keyframe than this is known; 0: none ever is
     age: int = 12  # references since a keyframe was made, before it counts as old: the local window, and its baselines
     candidates: int = 2  # old keyframes that are tried, the nearest first
     share: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new

@@ -26,6 +26,6 @@ def test_a_second_round_makes_few_keyframes_and_is_as_accurate() -> None:
     assert (path.state == State.TRACKED).all()
     assert tracker.publisher.told == set(path.index[path.keyframe].tolist()), "no keyframe that was told is taken back"
     error, length = ate(path, items)
-    assert error < 0.0015 * length
-    again, _ = ate(path, items, path.index >= ROUND)
-    assert again < 0.003 * length / 2.0, "of the round that has hardly a keyframe of its own"
+    assert error < 0.0003 * length
+    again, length = ate(path, items, path.index >= ROUND)
+    assert again < 0.0006 * length, "of the round that has hardly a keyframe of its own"
