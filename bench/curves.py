@@ -32,6 +32,7 @@ CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point 
         "3 stages": (f"mvs.stages=[{_COARSEST},{_MIDDLE},{_FINE}]",),
     },
     "depth_fusion.confidence": {f"{c}": (f"depth_fusion.confidence={c}",) for c in (0.2, 0.4, 0.8)},
+    "depth_fusion.least_views": {"2": ("depth_fusion.least_views=2",)},
     "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 60, 120, 240)},
     "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200, 38400)},
     "mapper.max_splats": {f"{n // 1000}k": (f"mapper.max_splats={n}",) for n in (10000, 20000, 40000)},
