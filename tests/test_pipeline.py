@@ -119,9 +119,8 @@ def test_a_tracker_from_outside_the_repository(tmp_path: Path) -> None:
 
 
 def test_a_missing_sequence_is_explained(tmp_path: Path) -> None:
-    failed = run_all(tmp_path, "dataset=tum", "dataset.path=nowhere", expect=1)
-    assert "dataset failed: FileNotFoundError" in failed.stderr
-    assert "nowhere" in failed.stderr
+    failed = run_all(tmp_path, "dataset=tum", "dataset.path=nowhere", expect=2)  # before a process starts
+    assert "error: dataset: nowhere is missing" in failed.stderr
     assert "rgb.txt" in failed.stderr  # the layout that is expected
 
 

@@ -139,7 +139,8 @@ def test_a_foreign_frame_is_named_and_the_next_one_is_read(ipc: str, opened: Cal
             xpub.send(bad)
             with pytest.raises(CodecError, match="ipc"):
                 reader.receive(5)
-        keyframe = Keyframe(*vars(frame(0)).values(), np.eye(4), 1.0, *[np.ones((2, 2), np.float32)] * 2, 0)
+        f, grid = frame(0), np.ones((2, 2), np.float32)
+        keyframe = Keyframe(f.index, f.timestamp, f.image, f.intrinsics, np.eye(4), 1.0, grid, grid, 0)
         xpub.send(encode(keyframe, delivery=NEWEST))
         with pytest.raises(CodecError, match="'Keyframe' where Frame or End"):
             reader.receive(5)
