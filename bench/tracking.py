@@ -157,7 +157,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
         for name in chosen if options.colmap and whole else []:
             if CASES[name].peer_stride and not CASES[name].hard and CASES[name].there:
                 peers[name] = beside.submit(tracking_peers.solve_case, name, place / "colmap")
-        memory = beside.submit(tracking_memory.follow, options.frames) if whole and not options.only else None
+        long = whole and (not options.only or "memory" in options.only)
+        memory = beside.submit(tracking_memory.follow, options.frames) if long else None
         for name in chosen:
             rows += rows_of_case(name, CASES[name], options)
         if options.curve and whole:
@@ -193,7 +194,7 @@ def parts(options: argparse.Namespace) -> list[Row]:
 def arguments(parser: argparse.ArgumentParser) -> Any:
     flag = argparse.BooleanOptionalAction
     parser.add_argument("--runs", type=int, default=3, help="of every sequence")
-    parser.add_argument("--only", nargs="*", help="names of sequences")
+    parser.add_argument("--only", nargs="*", help="names of sequences, memory")
     parser.add_argument("--colmap", action=flag, default=True, help="pycolmap on the same frames (one core, minutes)")
     parser.add_argument("--curve", action=flag, default=True, help="run time against error over the main settings")
     parser.add_argument("--frames", type=int, default=2000, help="of the run whose memory is measured, more than 500")
