@@ -112,9 +112,12 @@ def sgbm(reference: StereoView, neighbor: StereoView, search: SearchRange) -> np
     if shift > 0:  # the neighbor lies on the other side: matched from it, or mirrored
         images = [np.ascontiguousarray(i[:, ::-1]) for i in images]
     least = max(0, int(abs(shift) * search.low) - 1)
-    count = int(np.ceil((abs(shift) * search.high - least + 2) / 16)) * 16
+    wanted = int(np.ceil((abs(shift) * search.high - least + 2) / 16)) * 16
+    count = min(max(16, wanted), (images[0].shape[1] - least - 1) // 16 * 16)
+    if count < 16:  # rectification of a camera that moved forward stretches the images: nothing fits, OpenCV would throw
+        return np.zeros((height, width), np.float32)
     matcher = cv2.StereoSGBM.create(
-        minDisparity=least, numDisparities=max(16, count), blockSize=5, P1=8 * 25, P2=32 * 25, disp12MaxDiff=1,
+        minDisparity=least, numDisparities=count, blockSize=5, P1=8 * 25, P2=32 * 25, disp12MaxDiff=1,
         uniquenessRatio=10, speckleWindowSize=50, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     disparity = matcher.compute(images[0], images[1]).astype(np.float32) / 16.0
