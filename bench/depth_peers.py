@@ -114,7 +114,7 @@ def sgbm(reference: StereoView, neighbor: StereoView, search: SearchRange) -> np
     least = max(0, int(abs(shift) * search.low) - 1)
     wanted = int(np.ceil((abs(shift) * search.high - least + 2) / 16)) * 16
     count = min(max(16, wanted), (images[0].shape[1] - least - 1) // 16 * 16)
-    if count < 16:  # rectification of a camera that moved forward stretches the images: nothing fits, OpenCV would throw
+    if count < 16:  # a camera that moved forward: rectification stretches the images, and OpenCV would throw
         return np.zeros((height, width), np.float32)
     matcher = cv2.StereoSGBM.create(
         minDisparity=least, numDisparities=count, blockSize=5, P1=8 * 25, P2=32 * 25, disp12MaxDiff=1,
