@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.depth_calibration import calibration_rows
+from bench.depth_ceiling import ceiling_rows
 from bench.depth_curves import curve_rows
 from bench.depth_data import SHARED, SOURCES, Scene, load_scene
 from bench.depth_failures import failure_rows
@@ -105,6 +106,15 @@ def polished_section(options: argparse.Namespace) -> list[Row]:
             Row(f"{name}, polished poses: inliers, aligned", aligned.inliers),
             Row(f"{name}, polished poses: completeness", as_they_are.completeness),
         ]
+    return rows
+
+
+def ceiling_section(options: argparse.Namespace) -> list[Row]:
+    """What a stereo without fault could reach with the dataset's poses, and with the tracker's."""
+    rows = ceiling_rows(load_scene("room", SMALL, QUICK if options.quick else None), SMALL, tracked=False)
+    for name in [] if options.quick else available(("redkitchen", "fr1_xyz")):
+        rows += ceiling_rows(load_scene(name, SMALL), SMALL, tracked=False)
+        rows += ceiling_rows(load_tracked(name, SMALL), SMALL, tracked=True)
     return rows
 
 
@@ -201,6 +211,7 @@ def map_section(options: argparse.Namespace) -> list[Row]:
 SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "quality": partial(quality_section, area=SMALL, tracked=False),
     "tracked": partial(quality_section, area=SMALL, tracked=True),
+    "ceiling": ceiling_section,
     "polished": polished_section,
     "large": partial(quality_section, area=LARGE, tracked=False),
     "large_tracked": partial(quality_section, area=LARGE, tracked=True),
