@@ -98,6 +98,7 @@ class View:
     confidence: Annotated[np.ndarray, "float32 h w"]  # 0 to 1
     normals: Annotated[np.ndarray, "float32 h w 3"]  # camera frame, toward the camera; 0 where depth is 0
     segment: int
+    unfiltered: Annotated[np.ndarray, "float32 h w"] | None = None  # refined depth before the filters; None: not sent
 
 
 @dataclass(frozen=True)

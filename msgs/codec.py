@@ -2,7 +2,7 @@
 
 Nothing in a frame is trusted: version, type, field names, dtypes, shapes, sizes, offsets and nesting are checked
 against the dataclasses of `msgs` before an array is made, so that a bad frame is a `CodecError` that says what is
-wrong with it, and never a crash or a large allocation. Decoded arrays are read-only views on the frame.
+wrong with it, and never a crash or a large allocation. Decoded arrays are read-only, the large ones views on the frame.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import msgs
 VERSION = 1
 RELIABLE = b"R"  # first byte of a frame, which readers subscribe to: every message ...
 NEWEST = b"N"  # ... or only the newest
+SMALL_BYTES = 4096  # an array up to this is copied: who keeps a pose does not keep its frame's images
 ALIGNMENT = 64  # bytes, of each array from the frame's start
 MAX_MESSAGE_BYTES = 256 * 2**20
 MAX_MAP_BYTES = 4 * 2**30  # a SplatMap: about 16 million splats with all their spherical harmonics
@@ -135,7 +136,8 @@ def encode(
 
 
 def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int | None = None) -> Decoded:
-    """The message of a frame (any bytes-like object). Its arrays are read-only views that keep the frame alive.
+    """The message of a frame (any bytes-like object). Its arrays are read-only; those over `SMALL_BYTES` are views that
+    keep the frame alive.
 
     `expect` restricts the types that are accepted. Raises CodecError for everything that `encode` would not write.
     """
@@ -272,7 +274,7 @@ def _array(
         raise CodecError(f"{where}: a bool is 0 or 1")
     if where.endswith(".timestamp") and not np.isfinite(array).all():
         raise CodecError(f"{where} is not finite")
-    if not array.flags.aligned:  # a small frame may lie anywhere in memory
+    if array.nbytes <= SMALL_BYTES or not array.flags.aligned:  # a small frame may lie anywhere in memory
         array = array.copy()
     array.flags.writeable = False
     return array, stop

@@ -19,8 +19,8 @@ The parameter's type declares the input, the yielded type the output. Hooks:
 - `check(cls, config)`: before any process starts, on the launcher's machine: raises OSError or ValueError, saying what
   to do, where it is plain that the node cannot run (its file is missing). Quick, and opens nothing.
 
-Arrays of a message that came from another process are read-only views that keep its whole frame in memory: copy
-what you change, and what is small and kept.
+Arrays of a message that came from another process are read-only, and those over 4 kB are views that keep its whole
+frame in memory: copy what you change, and what you keep of it.
 
 A node imports no socket and knows no topic: it is tested as `list(Tracker(config).on_frame(frame))`.
 """

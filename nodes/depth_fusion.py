@@ -81,6 +81,7 @@ class FusionNode(Node, ABC):
             confidence=found.confidence,
             normals=found.normals,
             segment=message.segment,
+            unfiltered=found.unfiltered,
         )
 
 

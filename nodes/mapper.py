@@ -93,6 +93,7 @@ class Mapper(Node):
             PosedView(
                 index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
                 depth=view.depth, scale=view.scale, confidence=view.confidence, normals=view.normals,
+                unfiltered=view.unfiltered,
             )
         )  # fmt: skip
         self._report()

@@ -111,6 +111,14 @@ def test_arrays_are_read_only_views_on_the_frame() -> None:
         image[0, 0, 0] = 1
 
 
+def test_who_keeps_a_small_array_does_not_keep_the_frame() -> None:
+    data = encode(frame())
+    intrinsics = decode(data).message.intrinsics
+    assert not np.shares_memory(intrinsics, np.frombuffer(data, np.uint8))
+    with pytest.raises(ValueError, match="read-only"):
+        intrinsics[0] = 1
+
+
 def test_a_frame_anywhere_in_memory_gives_aligned_arrays() -> None:
     message = example(Keyframe)
     data = bytearray(1) + encode(message)

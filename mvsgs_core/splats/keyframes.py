@@ -23,6 +23,7 @@ class PosedView:
     scale: float = 1.0  # cumulative scale of the map that pose and depth are in
     confidence: np.ndarray | None = None  # (h, w) 0 to 1
     normals: np.ndarray | None = None  # (h, w, 3), camera frame, 0 where unknown
+    unfiltered: np.ndarray | None = None  # (h, w) float32 depth before the filters, 0 where unknown
 
 
 @dataclass
