@@ -1,4 +1,8 @@
-"""Memory of every process of a run, sampled while it works."""
+"""Memory of every process of a run, sampled while it works.
+
+What grows with the length of a stream shows between its first and its last frame. Start-up before, refinement and
+scoring after it are in the peak.
+"""
 
 from __future__ import annotations
 
@@ -50,8 +54,19 @@ def _resident(launcher: int) -> dict[str, float]:
     return found
 
 
+def stream(log: str, samples: Samples) -> tuple[float, float]:
+    """First and last second of the stream, by the source's log and the samples of its process."""
+    times = {}
+    for line in log.splitlines():
+        clock, phase = line.split()[:2]
+        hours, minutes, seconds = clock.split(":")
+        times[phase] = 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+    waited = (times["running"] - times["starting"]) % 86400
+    return samples["dataset"][0][0] + waited, samples["dataset"][-1][0]
+
+
 def growth(samples: list[tuple[float, float]]) -> float:
-    """Median of the last tenth of the time over the median of the third tenth: the start loads and fills windows."""
+    """Median of the last tenth of the samples over the median of the third tenth: the start fills windows."""
     memory = np.array([megabytes for _, megabytes in samples])
     tenth = max(1, len(memory) // 10)
     return float(np.median(memory[-tenth:]) / np.median(memory[2 * tenth : 3 * tenth]))
@@ -61,13 +76,19 @@ def flat_rows(name: str, output: Path, samples: Samples | None) -> list[Row]:
     """Peak and growth of each process, and memory.svg in `output`. None: the samples of an earlier run there."""
     if samples is None:
         samples = json.loads((output / "memory.json").read_text())
+    start, end = stream((output / "0" / "logs" / "dataset.log").read_text(), samples)
     rows, series = [], []
     for node, taken in samples.items():
-        if len(taken) < 10:
+        streaming = [sample for sample in taken if start <= sample[0] <= end]
+        if len(streaming) < 10:
             continue
         times, memory = np.array(taken).T
         rows.append(Row(f"{name}: {node}, peak memory", float(memory.max()), "MB"))
-        rows.append(at_most(f"{name}: {node}, memory at the end over that after a quarter", growth(taken), "x", GROWTH))
+        rows.append(
+            at_most(
+                f"{name}: {node}, memory at the stream's end over that after a quarter", growth(streaming), "x", GROWTH
+            )
+        )
         series.append(svg.Series(node, times, memory))
     plots.write(output / "memory.svg", svg.plot(series, "time, s", "resident memory, MB", width=900, height=360))
     return rows

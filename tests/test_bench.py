@@ -264,6 +264,8 @@ def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
     grows = [(float(t), 100.0 + t) for t in range(100)]
     assert memory.growth(flat) == 1.0
     assert memory.growth(grows) > 1.4
+    log = "23:59:58.000 starting\n23:59:58.100 waiting\n00:00:01.500 running\n00:01:00.000 ending\n00:01:00.010 done\n"
+    assert memory.stream(log, {"dataset": flat}) == (3.5, 99.0)
 
 
 def test_offline_splatting_of_sparse_points_gets_better() -> None:
