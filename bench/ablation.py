@@ -22,7 +22,7 @@ SCENES = ("room", "tum_fr1_xyz", "redkitchen")
 TABLE_III = ("A", "B", "C", "D")
 SKIPS = (  # the unexplored mask is what C is without
     "no_skips", "all_skips", "no_skip_converged", "skip_tiles", "coarse_to_fine", "no_selective", "no_voxel",
-    "no_map_voxel", "map_voxel_strict", "realtime", "every_frame",
+    "no_map_voxel", "map_voxel_strict", "no_fill", "realtime", "every_frame",
 )  # fmt: skip
 OTHERS = (
     "no_density_control", "relocate", "exact", "ges_scale", "ges_loss", "harmonics", "exposure", "refine_poses",

@@ -32,7 +32,7 @@ from bench.table import Row, main
 from mvsgs_core.splats import optimizer, ssim
 from mvsgs_core.splats.keyframes import PosedView, training_view
 from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.mapper import MapperLog
+from mvsgs_core.splats.mapper_log import MapperLog
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.rasterizer import rasterize
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once

@@ -16,7 +16,7 @@ from mvsgs_core.splats import density_control, optimizer
 from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
 from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.mapper import MapperLog
+from mvsgs_core.splats.mapper_log import MapperLog
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.optimizer import LearningRates
 from mvsgs_core.splats.rasterizer import rasterize

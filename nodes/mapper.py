@@ -54,6 +54,7 @@ class Mapper(Node):
         voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
         map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
         map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another
+        fill: int = 4  # pixels: cells that get one splat of unfiltered depth where the map stays empty; 0: off
         density_control: str = "adaptive"  # adaptive, relocate or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls
@@ -260,7 +261,7 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
         rates=LearningRates(),
         insertion=InsertionConfig(
             unexplored=config.unexplored, unexplored_psnr=config.unexplored_psnr, voxel=config.voxel,
-            map_voxel=config.map_voxel, map_voxel_error=config.map_voxel_error,
+            map_voxel=config.map_voxel, map_voxel_error=config.map_voxel_error, fill=config.fill,
         ),
         density_control=DensityConfig(mode=config.density_control, max_splats=config.max_splats),
     )  # fmt: skip

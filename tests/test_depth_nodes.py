@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -148,6 +150,15 @@ def test_passthrough_sends_depth_as_it_came() -> None:
     (view,) = node.on_depth(depth)
     np.testing.assert_array_equal(view.depth, depth.depth)
     np.testing.assert_array_equal(view.confidence, depth.confidence)
+
+
+def test_what_the_filters_reject_is_sent_beside_the_filtered_depth() -> None:
+    node = fusion(lag=0, window=0, refine=False, check=False, confidence=0.9)
+    depth = next(iter(CoarseDepth(CoarseDepth.Config(area=SIZE[0] * SIZE[1])).on_keyframe(keyframe(0))))
+    confidence = np.where(np.arange(depth.depth.shape[1]) < 20, 0.2, 1.0) * np.ones_like(depth.depth)
+    (view,) = node.on_depth(replace(depth, confidence=confidence.astype(np.float32)))
+    assert not view.depth[:, :20].any()
+    np.testing.assert_array_equal(view.unfiltered, depth.depth)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

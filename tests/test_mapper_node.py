@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -182,8 +183,17 @@ def test_launch_files_name_every_parameter(path: Path) -> None:
     assert given == {f.name for f in fields(Mapper.Config)}
 
 
+def test_unfiltered_depth_reaches_the_map() -> None:
+    node, message = Mapper(settings()), view_message(0, 0.5)
+    depth = message.depth.copy()
+    depth[:, :16] = 0.0
+    list(node.on_view(replace(message, depth=depth, unfiltered=message.depth)))
+    assert node.stats.counts["filled"] == 6 * 4
+
+
 def test_the_core_configuration_has_the_nodes_values() -> None:
-    config = mapper_config(settings(voxel=0.5, unexplored_psnr=33.0, density="exact", density_control="none"))
+    config = mapper_config(settings(fill=7, voxel=0.5, unexplored_psnr=33.0, density="exact", density_control="none"))
+    assert config.insertion.fill == 7
     assert config.insertion.voxel == 0.5
     assert config.insertion.unexplored_psnr == 33.0
     assert config.training.density == "exact"

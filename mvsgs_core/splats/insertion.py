@@ -30,6 +30,7 @@ class InsertionConfig:
     initial_scale: float = 0.5  # standard deviation in spacings of the points
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
+    fill: int = 4  # pixels, side of the cells that get one splat from unfiltered depth where the map is empty; 0: off
     min_confidence: float = 0.0  # of the depth, 0 to 1; views come filtered already
 
 

@@ -6,9 +6,6 @@ position, in units of its median depth, so that float32 holds wherever the world
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,8 +16,10 @@ from mvsgs_core.splats import density_control, optimizer
 from mvsgs_core.splats.camera_steps import center_exposures
 from mvsgs_core.splats.deformation import Similarity, move_with_anchors
 from mvsgs_core.splats.density_control import DensityConfig
+from mvsgs_core.splats.filling import fill_points
 from mvsgs_core.splats.insertion import (
     InsertionConfig,
+    Points,
     depth_colors,
     outliers,
     points_from_depth,
@@ -31,6 +30,7 @@ from mvsgs_core.splats.insertion import (
 )  # fmt: skip
 from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
 from mvsgs_core.splats.map_state import MapState
+from mvsgs_core.splats.mapper_log import MapperLog
 from mvsgs_core.splats.optimizer import LearningRates
 from mvsgs_core.splats.rasterizer import Render, rasterize
 from mvsgs_core.splats.schedule import Schedule
@@ -57,36 +57,6 @@ class MapperConfig:
     rates: LearningRates = field(default_factory=LearningRates)
     insertion: InsertionConfig = field(default_factory=InsertionConfig)
     density_control: DensityConfig = field(default_factory=DensityConfig)
-
-
-@dataclass
-class MapperLog:
-    """What was counted, timed and refused, for the report."""
-
-    counts: dict[str, float] = field(default_factory=dict)
-    skipped: dict[str, float] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-
-    def count(self, name: str, n: float = 1) -> None:
-        self.counts[name] = self.counts.get(name, 0) + n
-
-    def skip(self, what: str, n: float = 1) -> None:
-        self.skipped[what] = self.skipped.get(what, 0) + n
-
-    def refuse(self, name: str, n: float, text: str) -> None:
-        """Counts bad input or a bad step that did not reach the map, and warns once."""
-        self.count(f"refused_{name}", n)
-        if text not in self.warnings:
-            self.warnings.append(text)
-
-    @contextmanager
-    def time(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
 class OnlineMapper:
@@ -132,7 +102,7 @@ class OnlineMapper:
         if not (np.isfinite(view.world_from_cam).all() and np.isfinite(view.intrinsics).all() and view.scale > 0):
             self.log.refuse("views", 1, "a keyframe with a pose or intrinsics that are not finite was refused")
             return 0
-        depth = self._checked_depth(view)
+        depth = self._checked_depth(view.depth)
         pose, scale = np.asarray(view.world_from_cam, dtype=np.float64), view.scale
         if view.index in self.corrections:
             pose, scale = self.corrections[view.index]
@@ -158,6 +128,7 @@ class OnlineMapper:
             )
         with self.log.time("insertion"):
             inserted = self._insert(view, added, depth) if median > 0 else 0
+            inserted += self._fill(view, added, depth == 0)
         self.schedule.owe(self.config.iterations)
         self.log.count("inserted", inserted)
         self.log.count("views")
@@ -314,8 +285,7 @@ class OnlineMapper:
         valid = depth > 0
         if view.confidence is not None and config.min_confidence > 0:
             valid &= view.confidence >= config.min_confidence
-        if added.valid is not None:
-            valid &= camera.resize_image(added.valid[0].cpu().numpy().astype(np.float32), size) > 0.999
+        valid &= _valid_pixels(added, size)
         mask, standing_out = valid, np.zeros(size, dtype=bool)
         occupancy = config.map_voxel > 0 and len(self.state) > 0
         if (config.unexplored or occupancy) and len(self.state):
@@ -342,13 +312,37 @@ class OnlineMapper:
             before = len(points)
             points = voxel_filter(points, config.voxel * self.median_depth)
             self.log.skip("points_voxel_filter", before - len(points))
+        return self._append(points, added)
+
+    def _fill(self, view: PosedView, added: TrainingView, missing: np.ndarray) -> int:
+        """Adds sparse splats from the depth before the filters where it is `missing` (h, w) bool after them, and the
+        map shows nothing, what was just inserted included."""
+        config = self.config.insertion
+        if config.fill == 0 or view.unfiltered is None or self.unit is None:
+            return 0
+        size = (missing.shape[0], missing.shape[1])
+        empty = missing & _valid_pixels(added, size)
+        if len(self.state):
+            opacity = self.render(added, self._level_of(added, size)).opacity.cpu().numpy()
+            empty &= _resized(opacity < config.unexplored_opacity, size)
+        depth = self._checked_depth(view.unfiltered) * np.float32(added.scale / view.scale / self.unit)
+        confidence = np.ones(size, dtype=np.float32) if view.confidence is None else view.confidence
+        intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
+        colors = depth_colors(added.levels[0].cpu().numpy(), size)
+        filled = self._append(fill_points(depth, confidence, intrinsics, colors, empty, config.fill), added)
+        self.log.count("filled", filled)
+        return filled
+
+    def _append(self, points: Points, added: TrainingView) -> int:
+        """Makes splats of camera-frame points, as many as the map has room for; returns their number."""
         room = self.config.density_control.max_splats - len(self.state)
         if len(points) > room:
             self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
             points = points.first(max(0, room))
         new = splats_from_points(
-            points, added.local_from_cam, self.state.splats.sh.shape[1], self.config.training.density, config
-        )
+            points, added.local_from_cam, self.state.splats.sh.shape[1], self.config.training.density,
+            self.config.insertion,
+        )  # fmt: skip
         self.state.append(new, torch.full((len(points),), added.index, dtype=torch.int64))
         return len(points)
 
@@ -362,11 +356,18 @@ class OnlineMapper:
         local[:3, 3] = (local[:3, 3] - self.origin) / (self.unit or 1.0)
         return local
 
-    def _checked_depth(self, view: PosedView) -> np.ndarray:
-        bad = ~np.isfinite(view.depth) | (view.depth < 0)
+    def _checked_depth(self, depth: np.ndarray) -> np.ndarray:
+        bad = ~np.isfinite(depth) | (depth < 0)
         if bad.any():
             self.log.refuse("depths", int(bad.sum()), "depths that are not finite or negative were left out")
-        return np.where(bad, 0.0, view.depth).astype(np.float32)
+        return np.where(bad, 0.0, depth).astype(np.float32)
+
+
+def _valid_pixels(view: TrainingView, size: tuple[int, int]) -> np.ndarray:
+    """Pixels (h, w) bool of the depth map whose color is known."""
+    if view.valid is None:
+        return np.ones(size, dtype=bool)
+    return np.asarray(camera.resize_image(view.valid[0].cpu().numpy().astype(np.float32), size) > 0.999)
 
 
 def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
