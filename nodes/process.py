@@ -25,6 +25,7 @@ import msgs
 from msgs import End, Message
 from nodes import Node, is_source
 from nodes.addresses import PeerLost, load_keys
+from nodes.freed_memory import FreedMemory
 from nodes.inbox import Inbox, Reader
 from nodes.parameters import make_config
 from nodes.runner import Runner, merge_stats, own_stats, stats_of
@@ -120,12 +121,14 @@ class _Process:
     def _answers(self, runner: Runner, inbox: Inbox) -> Iterator[Message]:
         """What a node makes of its inputs, and of the time when none waits."""
         idle = False  # background work is left
+        freed = FreedMemory()
         awaited = [reader for reader, given in zip(self._readers, self._spec.inputs, strict=True) if not given.feedback]
         while not all(reader.ended for reader in awaited):
             received = inbox.receive(0.0 if idle else POLL)
             if received is not None:
                 idle = True
                 yield from runner.handle(received[1])
+                freed.give_back()
             elif idle:
                 produced = runner.idle()
                 idle = produced is not None

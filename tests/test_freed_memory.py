@@ -1,0 +1,32 @@
+import ctypes
+
+import numpy as np
+import pytest
+
+from nodes.freed_memory import PERIOD, FreedMemory
+from nodes.status import rss
+
+HAS_TRIM = hasattr(ctypes.CDLL(None), "malloc_trim")
+
+
+def test_memory_is_given_back_once_a_period() -> None:
+    now = [100.0]
+    freed = FreedMemory(lambda: now[0])
+    assert not freed.give_back()
+    now[0] += PERIOD
+    assert freed.give_back() == HAS_TRIM
+    assert not freed.give_back()
+
+
+@pytest.mark.skipif(not HAS_TRIM, reason="this C library has no malloc_trim")
+def test_what_was_freed_between_blocks_that_are_kept_goes_back_to_the_system() -> None:
+    blocks = [np.ones(100_000, np.uint8) for _ in range(1000)]  # under glibc's smallest threshold: all on the heap
+    kept = blocks[::10]
+    del blocks
+    held = rss()
+    now = [0.0]
+    freed = FreedMemory(lambda: now[0])
+    now[0] = PERIOD
+    assert freed.give_back()
+    assert rss() < held - 50e6
+    assert len(kept) == 100
