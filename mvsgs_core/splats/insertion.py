@@ -31,6 +31,7 @@ class InsertionConfig:
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
     fill: int = 4  # pixels, side of the cells that get one splat from unfiltered depth where the map is empty; 0: off
+    fill_opacity: float = 0.4  # of these: doubtful ones must be outshone by what comes later, 0 to 1
     min_confidence: float = 0.0  # of the depth, 0 to 1; views come filtered already
 
 
@@ -145,12 +146,17 @@ def unoccupied(positions: np.ndarray, means: np.ndarray, edge: float) -> np.ndar
 
 
 def splats_from_points(
-    points: Points, world_from_cam: np.ndarray, sh_bases: int, density: str, config: InsertionConfig
+    points: Points,
+    world_from_cam: np.ndarray,
+    sh_bases: int,
+    density: str,
+    config: InsertionConfig,
+    opacity: float | None = None,
 ) -> Splats:
     """Splats in the world frame of `world_from_cam` (4, 4), float32 tensors on the CPU.
 
-    Standard deviations are `initial_scale` spacings, `flatten` of that along a known normal. The shape starts as a
-    Gaussian: beta = 2, or b = 0 for density "ges_scale".
+    opacity: of all; None: `initial_opacity`. Standard deviations are `initial_scale` spacings, `flatten` of that along
+    a known normal. The shape starts as a Gaussian: beta = 2, or b = 0 for density "ges_scale".
     """
     count = len(points)
     rotation, translation = world_from_cam[:3, :3], world_from_cam[:3, 3]
@@ -159,7 +165,7 @@ def splats_from_points(
     known = np.linalg.norm(normals, axis=1) > 0.5
     log_scales = np.repeat(np.log(np.maximum(points.spacing * config.initial_scale, 1e-30))[:, None], 3, axis=1)
     log_scales[known, 2] += np.log(config.flatten)
-    opacity = min(max(config.initial_opacity, 1e-4), 1.0 - 1e-4)
+    opacity = min(max(config.initial_opacity if opacity is None else opacity, 1e-4), 1.0 - 1e-4)
     sh = np.zeros((count, sh_bases, 3))
     sh[:, 0] = (points.colors - 0.5) / C0
     return Splats(

@@ -312,7 +312,7 @@ class OnlineMapper:
             before = len(points)
             points = voxel_filter(points, config.voxel * self.median_depth)
             self.log.skip("points_voxel_filter", before - len(points))
-        return self._append(points, added)
+        return self._append(points, added, config.initial_opacity)
 
     def _fill(self, view: PosedView, added: TrainingView, missing: np.ndarray) -> int:
         """Adds sparse splats from the depth before the filters where it is `missing` (h, w) bool after them, and the
@@ -329,11 +329,12 @@ class OnlineMapper:
         confidence = np.ones(size, dtype=np.float32) if view.confidence is None else view.confidence
         intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
         colors = depth_colors(added.levels[0].cpu().numpy(), size)
-        filled = self._append(fill_points(depth, confidence, intrinsics, colors, empty, config.fill), added)
+        points = fill_points(depth, confidence, intrinsics, colors, empty, config.fill)
+        filled = self._append(points, added, config.fill_opacity)
         self.log.count("filled", filled)
         return filled
 
-    def _append(self, points: Points, added: TrainingView) -> int:
+    def _append(self, points: Points, added: TrainingView, opacity: float) -> int:
         """Makes splats of camera-frame points, as many as the map has room for; returns their number."""
         room = self.config.density_control.max_splats - len(self.state)
         if len(points) > room:
@@ -341,7 +342,7 @@ class OnlineMapper:
             points = points.first(max(0, room))
         new = splats_from_points(
             points, added.local_from_cam, self.state.splats.sh.shape[1], self.config.training.density,
-            self.config.insertion,
+            self.config.insertion, opacity,
         )  # fmt: skip
         self.state.append(new, torch.full((len(points),), added.index, dtype=torch.int64))
         return len(points)
