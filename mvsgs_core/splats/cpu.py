@@ -1,9 +1,13 @@
-"""The C++ rasterizer behind PyTorch's autograd: tensors go in as they lie in memory, nothing is copied."""
+"""The C++ rasterizer behind PyTorch's autograd: tensors go in as they lie in memory, nothing is copied.
+
+They go as NumPy views: a tensor's own exchange protocol takes several microseconds of Python each.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -27,21 +31,21 @@ class _Rasterize(torch.autograd.Function):
         depth, opacity = torch.empty(height, width), torch.empty(height, width)
         radii = torch.empty(len(means))
         passed = native.load("splats").forward(
-            *parameters,
-            pose=pose.detach().contiguous(),
+            *(parameter.numpy() for parameter in parameters),
+            pose=pose.detach().contiguous().numpy(),
             intrinsics=view.intrinsics,
             near=view.near,
             background=view.background,
             exact=view.density == "exact",
             antialiased=view.antialiased,
             degree=view.degree,
-            tile_mask=view.tile_mask,
+            tile_mask=None if view.tile_mask is None else view.tile_mask.numpy(),
             weights=view.weights,
             threads=view.threads,
-            color=color,
-            depth=depth,
-            opacity=opacity,
-            radii=radii,
+            color=color.numpy(),
+            depth=depth.numpy(),
+            opacity=opacity.numpy(),
+            radii=radii.numpy(),
         )
         extra.update(passed=passed, radii=radii)
         ctx.passed, ctx.view, ctx.report = passed, view, extra["backward"]
@@ -53,31 +57,32 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         *parameters, color, depth, opacity = ctx.saved_tensors
-        on_color, on_depth, on_opacity = (None if g is None else g.contiguous() for g in gradients)
+        on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous().numpy() for g in gradients)
         results = [torch.empty_like(parameter) for parameter in parameters]
         on_screen = torch.empty(len(parameters[0]), 2)
         on_pose = torch.zeros(4, 4, dtype=torch.float64)
+        on_means, on_log_scales, on_quaternions, on_opacity_logits, on_sh, on_betas = (r.numpy() for r in results)
         ctx.report.refused = native.load("splats").backward(
             ctx.passed,
-            *parameters,
-            color=color,
-            depth=depth,
-            opacity=opacity,
-            color_gradient=torch.zeros_like(color) if on_color is None else on_color,
+            *(parameter.numpy() for parameter in parameters),
+            color=color.numpy(),
+            depth=depth.numpy(),
+            opacity=opacity.numpy(),
+            color_gradient=np.zeros(color.shape, np.float32) if on_color is None else on_color,
             depth_gradient=on_depth,
             opacity_gradient=on_opacity,
             threads=ctx.view.threads,
-            on_means=results[0],
-            on_log_scales=results[1],
-            on_quaternions=results[2],
-            on_opacity_logits=results[3],
-            on_sh=results[4],
-            on_betas=results[5],
-            on_screen=on_screen,
-            on_pose=on_pose,
+            on_means=on_means,
+            on_log_scales=on_log_scales,
+            on_quaternions=on_quaternions,
+            on_opacity_logits=on_opacity_logits,
+            on_sh=on_sh,
+            on_betas=on_betas,
+            on_screen=on_screen.numpy(),
+            on_pose=on_pose.numpy(),
         )
-        *shared, on_betas = results
-        return (*shared, on_betas if ctx.view.density == "exact" else None, on_screen, on_pose, None, None)
+        *shared, of_betas = results
+        return (*shared, of_betas if ctx.view.density == "exact" else None, on_screen, on_pose, None, None)
 
 
 def render(splats: Splats, view: View) -> Render:
@@ -94,7 +99,7 @@ def render(splats: Splats, view: View) -> Render:
     weight_sum = weight_max = None
     if view.weights:
         weight_sum, weight_max = torch.empty(count), torch.empty(count)
-        native.load("splats").weights(extra["passed"], weight_sum, weight_max)
+        native.load("splats").weights(extra["passed"], weight_sum.numpy(), weight_max.numpy())
     return Render(
         color=color,
         depth=depth,

@@ -46,8 +46,8 @@ class _ImageLoss(torch.autograd.Function):
     ) -> Tensor:  # fmt: skip
         gradient = torch.empty(image.shape)
         l1, similarity = native.load("splats").image_loss(
-            image.detach().contiguous(), target.detach().contiguous(), pixel_weight, l1_weight, ssim_weight,
-            gradient, threads,
+            image.detach().contiguous().numpy(), target.detach().contiguous().numpy(),
+            None if pixel_weight is None else pixel_weight.numpy(), l1_weight, ssim_weight, gradient.numpy(), threads,
         )  # fmt: skip
         ctx.save_for_backward(gradient)
         return torch.tensor(l1 + ssim_weight * (1.0 - similarity), dtype=torch.float32)

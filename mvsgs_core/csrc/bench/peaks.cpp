@@ -10,7 +10,14 @@ namespace splats {
 namespace {
 
 constexpr int kStreams = 4;  // independent chains of densities, to hide latency
-constexpr int kChains = 12;  // of products: more than latency times throughput, fewer than registers
+#if defined(__AVX512F__)
+constexpr int kRegisters = 1;  // of a `Lanes`
+#elif defined(__AVX2__)
+constexpr int kRegisters = 2;
+#else
+constexpr int kRegisters = 4;
+#endif
+constexpr int kChains = 12 / kRegisters;  // of products: more than latency times throughput, fewer than registers
 
 // The compiler may not leave out what led to `value`.
 template <class Value>

@@ -61,7 +61,7 @@ SPLATS_INLINE void place(const Camera& camera, const Parameters& p, int64_t firs
 }
 
 // Projects one chunk of splats, finds their tiles; spans count from the chunk's first pair.
-void fill_chunk(Frame& frame, const Parameters& p, const bool* mask, size_t chunk, int64_t& refused) {
+void fill_chunk(Frame& frame, const Parameters& p, const bool* mask, size_t chunk, float* radii, int64_t& refused) {
     PairList& pairs = frame.chunk_pairs[chunk];
     pairs.count = 0;
     TileWalk walk(frame, mask, pairs);
@@ -75,6 +75,7 @@ void fill_chunk(Frame& frame, const Parameters& p, const bool* mask, size_t chun
             const uint32_t before = pairs.count;
             if (splats[i].radius > 0.0f) walk.visit(footprints, i);
             frame.spans[first + i] = {before, pairs.count - before};
+            radii[first + i] = splats[i].radius;
             // positive: bits sort as the values do
             frame.depth_keys[first + i] = std::bit_cast<uint32_t>(splats[i].depth);
         }
@@ -139,6 +140,7 @@ void distribute(Frame& frame, size_t seen, int parts) {
     const auto visit = [&](int part, auto each) {
         const size_t end = seen * (part + 1) / parts;
         for (size_t i = seen * part / parts; i < end; ++i) {
+            __builtin_prefetch(frame.spans.data() + frame.order[std::min(i + 2 * kAhead, end - 1)]);
             const SlotSpan soon = frame.spans[frame.order[std::min(i + kAhead, end - 1)]];
             __builtin_prefetch(frame.listed_tiles.data() + soon.first);
             __builtin_prefetch(frame.listed_blocks.data() + soon.first);
@@ -176,7 +178,7 @@ void distribute(Frame& frame, size_t seen, int parts) {
 
 }  // namespace
 
-void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int threads) {
+void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, float* radii, int threads) {
     const size_t count = size_t(parameters.count), chunks = (count + kChunk - 1) / kChunk;
     frame.splats.resize(count);
     frame.spans.resize(count);
@@ -184,7 +186,7 @@ void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int 
     if (frame.chunk_pairs.size() < chunks) frame.chunk_pairs.resize(chunks);
     int64_t refused = 0;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : refused)
-    for (size_t chunk = 0; chunk < chunks; ++chunk) fill_chunk(frame, parameters, tile_mask, chunk, refused);
+    for (size_t chunk = 0; chunk < chunks; ++chunk) fill_chunk(frame, parameters, tile_mask, chunk, radii, refused);
     frame.refused = refused;
     join_chunks(frame, count, chunks, threads);
     const size_t seen = gather_seen(frame, count);

@@ -13,8 +13,7 @@ constexpr uint32_t kAhead = 32;  // pairs whose splat is fetched early
 // What a thread keeps of the tile at hand.
 struct Workspace {
     std::vector<Placed> placed;         // of every pair; behind them one that is seen nowhere
-    std::vector<uint16_t> touched;      // of every pair: blocks that the ellipse touches
-    std::vector<uint16_t> hits;         // of every pair: blocks that got color
+    std::vector<uint16_t> blocks;       // of every pair: blocks that the ellipse touches and that aren't full before it
     std::vector<uint32_t> list;         // pairs that touch the block at hand
     std::vector<Lanes> weight_sum, weight_max;
     int64_t evaluated = 0, contributed = 0;
@@ -23,16 +22,14 @@ struct Workspace {
         const uint32_t count = tile.end - tile.begin, last = uint32_t(frame.pair_count) - 1;
         if (placed.size() < count + 1) {
             placed.resize(count + count / 2 + 64);
-            hits.resize(placed.size());
-            touched.resize(placed.size() + kLanes);
+            blocks.resize(placed.size() + kLanes);
             list.resize(placed.size() + kLanes);
         }
         for (uint32_t i = 0; i < count; ++i) {
             __builtin_prefetch(&frame.splats[frame.pairs[std::min(tile.begin + i + kAhead, last)].splat]);
             const Pair& pair = frame.pairs[tile.begin + i];
             placed[i] = Placed(frame.splats[pair.splat], tile);
-            touched[i] = pair.blocks;
-            hits[i] = 0;
+            blocks[i] = pair.blocks;
         }
         placed[count] = Placed{};
         placed[count].log2_opacity = 2.0f * kLog2MinAlpha;
@@ -43,7 +40,7 @@ struct Workspace {
 
     // Lists the pairs that touch `block`, filled up to whole groups; returns how many touch it.
     uint32_t find(uint32_t count, int block) {
-        const uint32_t found = list_with_bit(touched.data(), count, block, list.data());
+        const uint32_t found = list_with_bit(blocks.data(), count, block, list.data());
         for (int i = 0; i < kTogether; ++i) list[found + i] = count;
         return found;
     }
@@ -58,15 +55,14 @@ PixelSums blend_block(const Tile& tile, int block, Workspace& work) {
     const uint32_t found = work.find(tile.end - tile.begin, block);
     const BlockPixels pixels;
     const Lanes x = pixels.x[block & 3], y = pixels.y[block >> 2];
-    for (uint32_t first = 0; first < found; first += kTogether) {
-        if (!any(at_least(ahead, kMinTransmittance))) break;
+    uint32_t first = 0;
+    for (; first < found && any(at_least(ahead, kMinTransmittance)); first += kTogether) {
         const uint32_t* list = work.list.data() + first;
         const Placed* placed = work.placed.data();
         const Densities<Exact> densities([&](int i) -> const Placed& { return placed[list[i]]; },
                                          [&](int) { return x; }, [&](int) { return y; });
         Lanes alphas[kTogether];
         store(minimum(densities.alpha, Group{} + kMaxAlpha), alphas);
-        work.evaluated += kLanes * kTogether;
         for (int i = 0; i < kTogether; ++i) {
             const Placed& s = placed[list[i]];
             const Mask counted = at_least(ahead, kMinTransmittance);
@@ -77,15 +73,15 @@ PixelSums blend_block(const Tile& tile, int block, Workspace& work) {
             sums.green += s.green * weight;
             sums.blue += s.blue * weight;
             sums.depth += s.depth * weight;
-            const Mask hit = at_least(weight, kTiny);
-            work.hits[list[i]] |= uint16_t(any(hit)) << block;
             if constexpr (Weights) {
                 work.weight_sum[list[i]] += weight;
                 work.weight_max[list[i]] = maximum(work.weight_max[list[i]], weight);
-                work.contributed += count(hit);
+                work.contributed += count(at_least(weight, kTiny));
             }
         }
     }
+    work.evaluated += kLanes * first;
+    for (; first < found; ++first) work.blocks[work.list[first]] &= uint16_t(~(1 << block));
     return sums;
 }
 
@@ -111,7 +107,7 @@ void blend_tile(Frame& frame, const Tile& tile, const Images<float>& images, Wor
     }
     for (uint32_t i = 0; i < tile.end - tile.begin; ++i) {
         Pair& pair = frame.pairs[tile.begin + i];
-        pair.blocks = work.hits[i];
+        pair.blocks = work.blocks[i];
         if constexpr (Weights) {
             frame.weight_slots[2 * size_t(pair.slot)] = sum(work.weight_sum[i]);
             frame.weight_slots[2 * size_t(pair.slot) + 1] = largest(work.weight_max[i]);

@@ -106,7 +106,8 @@ struct PairList {
 struct Pair {
     uint32_t splat;
     uint32_t slot;    // place in the order by splat: where the backward pass leaves this pair's sums
-    uint16_t blocks;  // which of the tile's 4x4 blocks the ellipse touches; after blending: which got color
+    uint16_t blocks;  // which of the tile's 4x4 blocks the ellipse touches; after blending: of those, which it found
+                      // not yet full
 };
 
 struct Frame {
@@ -136,8 +137,9 @@ struct Gradients {
     int64_t refused = 0;
 };
 
-// Projects and orders the splats and pairs them with the tiles they touch. tile_mask may be null.
-void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, int threads);
+// Projects and orders the splats and pairs them with the tiles they touch. tile_mask may be null; radii (N), px, are 0
+// where nothing is seen.
+void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, float* radii, int threads);
 
 // Blends all tiles; color (H, W, 3), depth (H, W), opacity (H, W). weights: fill frame.weight_slots as well.
 void blend(Frame& frame, bool weights, float* color, float* depth, float* opacity, int threads);

@@ -40,6 +40,21 @@ SPLATS_INLINE Lanes strided(const float* values, int64_t stride, int count) {
     }
     return lanes(lane);
 }
+// v[k], lane i is values[i * Count + k], as above.
+template <int Count>
+SPLATS_INLINE void load_rows(const float* values, int count, Lanes (&v)[Count]) {
+    if (count == kLanes) return deinterleave(values, v);
+    for (int k = 0; k < Count; ++k) v[k] = strided(values + k, Count, count);
+}
+// values[i * Count + k] becomes lane i of v[k], for `count` lanes.
+template <int Count>
+SPLATS_INLINE void store_rows(const Lanes (&v)[Count], float* values, int count) {
+    if (count == kLanes) return interleave(v, values);
+    alignas(64) float lane[Count][kLanes];
+    std::memcpy(lane, v, sizeof(lane));
+    for (int i = 0; i < count; ++i)
+        for (int k = 0; k < Count; ++k) values[i * Count + k] = lane[k][i];
+}
 SPLATS_INLINE Ints smaller(const Ints& a, const Ints& b) { return choose(a < b, a, b); }
 SPLATS_INLINE Ints larger(const Ints& a, const Ints& b) { return choose(a < b, b, a); }
 

@@ -94,6 +94,22 @@ SPLATS_INLINE void transpose(Lanes (&v)[16]) {
     std::memcpy(v, turned_values, sizeof(values));
 }
 
+// v[k], lane i becomes values[i * Count + k]; and the way back.
+template <int Count>
+SPLATS_INLINE void deinterleave(const float* values, Lanes (&v)[Count]) {
+    alignas(64) float lane[Count][16];
+    for (int i = 0; i < 16; ++i)
+        for (int k = 0; k < Count; ++k) lane[k][i] = values[i * Count + k];
+    std::memcpy(v, lane, sizeof(lane));
+}
+template <int Count>
+SPLATS_INLINE void interleave(const Lanes (&v)[Count], float* values) {
+    alignas(64) float lane[Count][16];
+    std::memcpy(lane, v, sizeof(lane));
+    for (int i = 0; i < 16; ++i)
+        for (int k = 0; k < Count; ++k) values[i * Count + k] = lane[k][i];
+}
+
 // Every lane of a run of four with the run's lane k.
 template <int k, class Half>
 SPLATS_INLINE Halves<Half> spread(const Halves<Half>& v) {

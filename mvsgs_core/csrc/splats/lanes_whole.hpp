@@ -161,6 +161,58 @@ SPLATS_INLINE void transpose(Lanes (&v)[16]) {
     trade_all<1>(v);
 }
 
+// Numbers 0 to 15 of one vector and 16 to 31 of a second, for each lane one.
+struct Picks {
+    alignas(64) int32_t at[16];
+};
+template <class Of>
+constexpr Picks picks(Of of) {
+    Picks result{};
+    for (int i = 0; i < 16; ++i) result.at[i] = of(i);
+    return result;
+}
+SPLATS_INLINE Lanes pick(const Lanes& a, const Picks& from, const Lanes& b) {
+    return (Lanes)_mm512_permutex2var_ps((__m512)a, _mm512_load_si512(from.at), (__m512)b);
+}
+
+// v[k], lane i becomes values[i * Count + k], vector after vector.
+template <int Count, int K, int J = 1>
+SPLATS_INLINE Lanes deinterleaved(const Lanes& before, const float* values) {
+    static constexpr Picks kPicks = picks([](int i) {
+        const int from = (Count * i + K) / 16, place = (Count * i + K) % 16;
+        return from == J ? 16 + place : J == 1 ? place : i;
+    });
+    const Lanes both = pick(before, kPicks, (Lanes)_mm512_loadu_ps(values + 16 * J));
+    if constexpr (J + 1 < Count)
+        return deinterleaved<Count, K, J + 1>(both, values);
+    else
+        return both;
+}
+template <int Count, int K = 0>
+SPLATS_INLINE void deinterleave(const float* values, Lanes (&v)[Count]) {
+    v[K] = deinterleaved<Count, K>((Lanes)_mm512_loadu_ps(values), values);
+    if constexpr (K + 1 < Count) deinterleave<Count, K + 1>(values, v);
+}
+
+// The way back.
+template <int Count, int M, int J = 1>
+SPLATS_INLINE Lanes interleaved(const Lanes& before, const Lanes (&v)[Count]) {
+    static constexpr Picks kPicks = picks([](int i) {
+        const int from = (16 * M + i) % Count, place = (16 * M + i) / Count;
+        return from == J ? 16 + place : J == 1 ? place : i;
+    });
+    const Lanes both = pick(before, kPicks, v[J]);
+    if constexpr (J + 1 < Count)
+        return interleaved<Count, M, J + 1>(both, v);
+    else
+        return both;
+}
+template <int Count, int M = 0>
+SPLATS_INLINE void interleave(const Lanes (&v)[Count], float* values) {
+    _mm512_storeu_ps(values + 16 * M, (__m512)interleaved<Count, M>(v[0], v));
+    if constexpr (M + 1 < Count) interleave<Count, M + 1>(v, values);
+}
+
 // Every lane of a run of four with the run's lane k.
 template <int k>
 SPLATS_INLINE Ints spread(Ints v) {

@@ -62,9 +62,8 @@ std::unique_ptr<Pass> forward(In means, In log_scales, In quaternions, In opacit
     if (!tile_mask.is_none()) mask = nb::cast<Array<const bool>>(tile_mask);
     {
         const nb::gil_scoped_release released;
-        bin(frame, p, mask.is_valid() ? mask.data() : nullptr, thread_count(threads));
+        bin(frame, p, mask.is_valid() ? mask.data() : nullptr, radii.data(), thread_count(threads));
         blend(frame, weights, color.data(), depth.data(), opacity.data(), thread_count(threads));
-        for (int64_t i = 0; i < p.count; ++i) radii.data()[i] = frame.splats[i].radius;
     }
     return pass;
 }

@@ -203,7 +203,8 @@ int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int c
     float has_pairs[kLanes] = {};
     for (int i = 0; i < count; ++i) has_pairs[i] = float(frame.spans[first + i].count != 0);
     const Mask in_tiles = at_least(lanes(has_pairs), 0.5f);
-    std::memset(out.sh + width * first, 0, width * size_t(count) * sizeof(float));
+    float* on_sh = out.sh + width * first;
+    if (p.bases > 1) std::memset(on_sh, 0, width * size_t(count) * sizeof(float));
     SplatGradient g;
     int64_t refused = 0;
     if (any(in_tiles)) {
@@ -232,14 +233,16 @@ int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int c
             for (int j = 0; j < 3; ++j) pose.add(4 * k + j, where(good, g.rotation[k][j]));
             pose.add(4 * k + 3, -where(good, g.offset[k]));
         }
-        for (int k = 0; k < used; ++k) scatter(g.sh[k], out.sh + width * first + k, width, count);
+        if (p.bases > 1)
+            for (int k = 0; k < used; ++k) scatter(g.sh[k], on_sh + k, width, count);
     } else {
         g = SplatGradient{};
     }
-    for (int k = 0; k < 3; ++k) scatter(g.mean[k], out.means + 3 * first + k, 3, count);
-    for (int k = 0; k < 3; ++k) scatter(g.log_scale[k], out.log_scales + 3 * first + k, 3, count);
-    for (int k = 0; k < 4; ++k) scatter(g.quaternion[k], out.quaternions + 4 * first + k, 4, count);
-    for (int k = 0; k < 2; ++k) scatter(g.screen[k], out.screen + 2 * first + k, 2, count);
+    if (p.bases == 1) store_rows(reinterpret_cast<const Lanes(&)[3]>(g.sh), on_sh, count);
+    store_rows(g.mean, out.means + 3 * first, count);
+    store_rows(g.log_scale, out.log_scales + 3 * first, count);
+    store_rows(g.quaternion, out.quaternions + 4 * first, count);
+    store_rows(g.screen, out.screen + 2 * first, count);
     scatter(g.opacity_logit, out.opacity_logits + first, 1, count);
     scatter(g.beta, out.betas + first, 1, count);
     return refused;

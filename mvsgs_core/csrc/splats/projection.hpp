@@ -127,9 +127,10 @@ SPLATS_INLINE void rotation_of(const Lanes (&unit)[4], Lanes (&out)[3][3]) {
 
 // The splats from `first`, `count` of them, at most sixteen; lanes that are not `seen` hold anything.
 SPLATS_INLINE void project(const Camera& camera, const Parameters& p, int64_t first, int count, Projection& r) {
-    Lanes mean[3], q[4], raw_x, raw_y;
-    for (int k = 0; k < 3; ++k) mean[k] = strided(p.means + 3 * first + k, 3, count);
-    for (int k = 0; k < 4; ++k) q[k] = strided(p.quaternions + 4 * first + k, 4, count);
+    Lanes mean[3], q[4], log_scale[3], raw_x, raw_y;
+    load_rows(p.means + 3 * first, count, mean);
+    load_rows(p.quaternions + 4 * first, count, q);
+    load_rows(p.log_scales + 3 * first, count, log_scale);
     const Lanes squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
     const Mask usable = finite_splats(p, first, count) & at_least(squared, kMinQuaternion * kMinQuaternion);
     const Mask ahead = usable & locate(camera, mean, r, raw_x, raw_y);
@@ -149,7 +150,7 @@ SPLATS_INLINE void project(const Camera& camera, const Parameters& p, int64_t fi
         r.to_image[1][k] = jy * (wy - r.slope_y * wz);
     }
     for (int k = 0; k < 3; ++k) {
-        r.scale[k] = exponential(strided(p.log_scales + 3 * first + k, 3, count));
+        r.scale[k] = exponential(log_scale[k]);
         for (int row = 0; row < 2; ++row)
             r.axes[row][k] =
                 r.scale[k] * (r.to_image[row][0] * r.rotation[0][k] + r.to_image[row][1] * r.rotation[1][k] +

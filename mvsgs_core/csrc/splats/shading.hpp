@@ -26,6 +26,12 @@ SPLATS_INLINE void shade(const Parameters& p, int64_t first, int count, const Pr
     harmonics(p.degree, s.direction[0], s.direction[1], s.direction[2], s.basis);
     const int used = (p.degree + 1) * (p.degree + 1), width = 3 * p.bases;
     for (int c = 0; c < 3; ++c) s.raw[c] = all(0.5f);
+    if (p.bases == 1) {
+        Lanes sh[3];
+        load_rows(p.sh + 3 * first, count, sh);
+        for (int c = 0; c < 3; ++c) s.raw[c] += s.basis[0] * sh[c];
+        return;
+    }
     for (int b = 0; b < used; ++b)
         for (int c = 0; c < 3; ++c) s.raw[c] += s.basis[b] * strided(p.sh + width * first + 3 * b + c, width, count);
 }

@@ -44,6 +44,12 @@ def test_full_pixels_end() -> None:
     assert_agree(opaque, (40, 56), BACKEND)
 
 
+@pytest.mark.parametrize("bases", [1, 4])
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 47])
+def test_groups_of_sixteen_splats_and_the_rest(count: int, bases: int) -> None:
+    assert_agree(random_splats(count, bases), (40, 56), BACKEND)
+
+
 def test_needles_and_discs() -> None:
     splats = random_splats(150, log_scale=-3.0)
     splats.log_scales[:50, 0] += 4.0
