@@ -92,14 +92,14 @@ class DepthFusion(FusionNode):
     class Config:
         lag: int = 2  # keyframes after the reference that are waited for
         window: int = 4  # keyframes before the reference that may be neighbors
-        neighbors: int = 4  # depth maps that a reference is checked with
+        neighbors: int = 6  # depth maps that a reference is checked with
         refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
         sigma: float = 0.01  # relative depth: width of the support
         check: bool = True  # geometric consistency
         relative: float = 0.02  # relative depth difference that still agrees
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
-        least_views: int = 3  # views that must agree, the reference counted
-        confidence: float = 0.6  # least confidence of a kept pixel
+        least_views: int = 2  # views that must agree, the reference counted
+        confidence: float = 0.75  # least confidence of a kept pixel
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
         threads: int | None = None  # of the C++ kernels; null: all
 

@@ -8,11 +8,15 @@ import numpy as np
 from mvsgs_core.fusion.interface import Fused
 
 # Logistic regression on `features_of`, by `python -m bench.depth_calibration`.
-WEIGHTS = np.array([-0.981, 1.16, 1.546, -0.759, -0.123, 1.309, 0.074, -1.097, -1.354])
+WEIGHTS = np.array([-0.166, 1.031, 1.539, -0.665, -0.351, -0.29, 1.424, 0.779, -0.826, -1.02])
 
 
-def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray) -> np.ndarray:
-    """(F, H, W) float32, the first all ones, of stereo's confidence and the number of agreeing neighbors (H, W)."""
+def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, seeing: np.ndarray) -> np.ndarray:
+    """(F, H, W) float32, the first all ones.
+
+    From stereo's confidence, the number of neighbors that agree, and of those that have a depth there at all, each
+    (H, W): that few agree where few look, at the image's border or behind an edge, doesn't speak against a depth.
+    """
     around = cv2.blur(confidence, (9, 9))  # errors come in patches
     agreeing = cv2.blur((consistent >= 2).astype(np.float32), (5, 5))
     # Windows make a near surface grow over what lies behind it: its rim, close to something farther, is doubtful.
@@ -27,6 +31,7 @@ def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray) ->
             np.sqrt(fused.support),
             fused.violation,
             consistent.astype(np.float32),
+            np.maximum(seeing.astype(np.float32) - consistent, 0.0),
             around,
             agreeing,
             4.0 * rim,

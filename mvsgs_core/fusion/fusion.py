@@ -14,6 +14,8 @@ from mvsgs_core.fusion.interface import FusionBackend
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.views import DepthView, warps_between
 
+ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
+
 
 @dataclass(frozen=True)
 class FusionConfig:
@@ -21,7 +23,7 @@ class FusionConfig:
 
     lag: int = 2  # keyframes after the reference that are waited for
     window: int = 4  # keyframes before the reference that may be neighbors
-    neighbors: int = 4  # depth maps that a reference is checked with
+    neighbors: int = 6  # depth maps that a reference is checked with
     refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
     sigma: float = 0.01  # relative depth: width of the support
     violation: float = 1.0  # weight of free-space violations against support
@@ -30,8 +32,8 @@ class FusionConfig:
     relative: float = 0.02  # relative depth difference that still agrees
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
-    least_views: int = 3  # views that must agree, the reference counted
-    confidence: float = 0.6  # least confidence of a kept pixel
+    least_views: int = 2  # views that must agree, the reference counted
+    confidence: float = 0.75  # least confidence of a kept pixel
     device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda"
     threads: int | None = None  # of the C++ kernels; None: all
 
@@ -144,7 +146,8 @@ def fuse(reference: DepthView, neighbors: list[DepthView], config: FusionConfig,
             depth, depths, there, back, config.relative, config.pixels, config.round_trip
         )
         if config.refine:
-            evidence = features_of(fused, confidence, consistent)
+            seeing = backend.consistent_views(depth, depths, there, back, ANY_DEPTH, config.pixels, False)
+            evidence = features_of(fused, confidence, consistent, seeing)
             confidence = np.where(depth > 0, probability_of_inlier(evidence), 0.0).astype(np.float32)
     keep = depth > 0
     sure = confidence >= config.confidence

@@ -117,6 +117,21 @@ def test_the_wrong_pose_of_one_neighbor_does_not_get_through() -> None:
     assert np.mean(np.abs(result.depth - truth)[kept] > 0.05 * truth[kept]) < 0.02
 
 
+def test_few_agreeing_neighbors_count_against_a_depth_only_where_others_see_another() -> None:
+    """One neighbor agrees and nobody else looks; or one agrees and two see another depth there."""
+    reference, agreeing = view(0, 0.0), view(1, 0.05)
+    others = [view(2, -0.05), view(3, 0.1)]
+    for other in others:
+        other.depth[:, :28] = 0.0
+        other.depth[:, 28:] *= 0.8
+    found = fuse(reference, [agreeing, *others], CONFIG, NativeFusionBackend(1))
+    truth = true_depth(look(0.0), SIZE)
+    right = np.abs(found.unfiltered - truth) < 0.02 * truth
+    unseen, contested = found.confidence[8:32, 8:22], found.confidence[8:32, 34:48][right[8:32, 34:48]]
+    assert np.median(unseen) > np.median(contested) + 0.1
+    assert (found.depth[8:32, 8:22] > 0).mean() > 0.6
+
+
 def test_fewer_neighbors_than_asked_for_is_said() -> None:
     fusion = DepthFusion(CONFIG)
     assert list(fusion.add(view(0, 0.0))) == []
