@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core import native
-from mvsgs_core.mvs.interface import Backend, Choice, CostOptions, SmoothOptions
+from mvsgs_core.mvs.interface import Backend, Choice, ChooseOptions, CostOptions, SmoothOptions
 
 
 class NativeBackend:
@@ -42,6 +42,26 @@ class NativeBackend:
                 options.break_steps, options.temperature, options.paths, threads=self._threads,
             )
         )  # fmt: skip
+
+    def surface_costs(
+        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, surfaces: np.ndarray,
+        options: CostOptions, needed: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        return np.asarray(
+            self._kernels.surface_costs(
+                reference, neighbors, warps, surfaces, options.radius, options.best, options.noise, options.contrast,
+                threads=self._threads, needed=needed,
+            )
+        )  # fmt: skip
+
+    def choose_surface(
+        self, cost: np.ndarray, surfaces: np.ndarray, reference: np.ndarray, options: ChooseOptions
+    ) -> tuple[np.ndarray, np.ndarray]:
+        best, gap = self._kernels.choose_surface(
+            cost, surfaces, reference, options.small_jump, options.large_jump, options.edge, options.apart,
+            threads=self._threads,
+        )  # fmt: skip
+        return np.asarray(best), np.asarray(gap)
 
     def view_correlation(
         self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 # Logistic regression on `Evidence.features`, by `python -m bench.depth_calibration`.
-WEIGHTS = np.array([-0.982, 1.114, 0.517, 1.908, 0.099, -0.241, -0.016, 3.149, -1.666])
+WEIGHTS = np.array([-1.614, 1.131, 0.351, 1.401, 0.366, -0.45, 0.027, 2.215, -1.068, 2.015])
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class Evidence:
     texture: np.ndarray  # gray levels: local contrast of the reference
     margin: np.ndarray  # of the last stage: how much worse other hypotheses are
     bend: np.ndarray  # relative change of inverse depth to the median around: high at jumps and where depth is noise
+    gap: np.ndarray  # how much worse other surfaces around the pixel are
 
     @staticmethod
     def of(
@@ -33,6 +34,7 @@ class Evidence:
         relative_pixel: np.ndarray,
         gray: np.ndarray,
         inverse_depth: np.ndarray,
+        gap: np.ndarray,
     ) -> Evidence:
         """From ZNCC of each view (N, H, W), -2 where not seen, and maps (H, W)."""
         ordered = np.sort(np.clip(correlation, 0.0, 1.0), axis=0)[::-1]
@@ -48,6 +50,7 @@ class Evidence:
             texture=np.sqrt(variance),
             margin=margin,
             bend=np.abs(cv2.medianBlur(inverse_depth, 5) / np.maximum(inverse_depth, 1e-9) - 1.0),
+            gap=gap,
         )
 
     def features(self) -> np.ndarray:
@@ -63,6 +66,7 @@ class Evidence:
                 np.log(1.0 + self.texture),
                 np.clip(self.margin, 0.0, 0.5),
                 np.clip(cv2.blur(self.bend, (5, 5)) / 0.02, 0.0, 2.0),
+                np.sqrt(np.clip(self.gap, 0.0, 1.0)),
             ]
         ).astype(np.float32)
 

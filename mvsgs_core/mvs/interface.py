@@ -33,6 +33,16 @@ class SmoothOptions:
 
 
 @dataclass(frozen=True)
+class ChooseOptions:
+    """Semi-global smoothing over arbitrary surfaces."""
+
+    small_jump: float  # cost per inverse depth between neighboring pixels
+    large_jump: float  # the most that they pay
+    edge: float  # gray levels that halve these
+    apart: float  # inverse depth: a surface farther than this from another is not the same
+
+
+@dataclass(frozen=True)
 class Choice:
     """What a stage found, each (H, W)."""
 
@@ -64,6 +74,20 @@ class Backend(Protocol):
     def semi_global(
         self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
     ) -> Choice: ...
+
+    def surface_costs(
+        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, surfaces: np.ndarray,
+        options: CostOptions, needed: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """(H, D, W) costs of surfaces (D, H, W): each pixel's window follows the surface around it."""
+
+    def choose_surface(
+        self, cost: np.ndarray, surfaces: np.ndarray, reference: np.ndarray, options: ChooseOptions
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W) int32: which of the surfaces (D, H, W) with costs (H, D, W) each pixel lies on; and (H, W) float32:
+
+        how much worse the best surface is, in mean path cost, that is not the same, at most 1.
+        """
 
     def view_correlation(
         self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,

@@ -10,6 +10,7 @@ import numpy as np
 from mvsgs_core.mvs.confidence import Evidence, probability_of_inlier
 from mvsgs_core.mvs.hypotheses import SearchRange, certainty, fill_uncertain, upsample_surface
 from mvsgs_core.mvs.interface import Backend, Choice, CostOptions, SmoothOptions
+from mvsgs_core.mvs.rims import RimChoice, settle_rims
 from mvsgs_core.mvs.skipping import SkipChoice, keep_settled, settled_tiles, tiles_in_cells
 from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.mvs.warp import parallax, relative_warp
@@ -43,6 +44,7 @@ class StereoConfig:
     temperature: float = 0.02  # cost
     paths: int = 8  # 4 or 8
     fill: bool = True  # between stages, where matching says nothing, from the surroundings
+    rims: RimChoice | None = field(default_factory=RimChoice)
     skips: SkipChoice = field(default_factory=SkipChoice)
 
     def cost_options(self, stage: Stage) -> CostOptions:
@@ -129,10 +131,16 @@ def estimate_depth(
     size = (surface.shape[0], surface.shape[1])
     warps = _warps(reference, neighbors, last.scale)
     gray = reference.gray(last.scale)
-    correlation = backend.view_correlation(
-        gray, _stack(neighbors, last.scale), warps.astype(np.float32), surface, config.cost_options(last)
-    )
+    images = _stack(neighbors, last.scale)
+    options = config.cost_options(last)
     moved = float(np.median([parallax(w, size, middle) for w in warps]))
+    gap = np.zeros(size, dtype=np.float32)
+    if config.rims is not None:
+        pixel = 1.0 / max(moved, 1e-12)
+        surface, gap = settle_rims(
+            surface, gray, images, warps.astype(np.float32), pixel, options, config.rims, backend
+        )
+    correlation = backend.view_correlation(gray, images, warps.astype(np.float32), surface, options)
     evidence = Evidence.of(
         correlation=correlation,
         probability=choice.probability,
@@ -141,6 +149,7 @@ def estimate_depth(
         relative_pixel=1.0 / np.maximum(moved * surface, 1e-9),
         gray=gray,
         inverse_depth=surface,
+        gap=gap,
     )
     known = _enlarge(in_range.astype(np.float32), size) > 0.5
     known &= np.isfinite(surface) & (surface > 0.5 * search.low)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.mvs.interface import TILE, Choice, CostOptions, SmoothOptions
+from mvsgs_core.mvs.interface import TILE, Choice, ChooseOptions, CostOptions, SmoothOptions
 
 _MANY = 1e9
 
@@ -32,13 +34,27 @@ class TorchBackend:
         options: CostOptions,
         needed: np.ndarray | None = None,
     ) -> np.ndarray:
+        start, interval = self._on(first), self._on(step)
+        surfaces = (start + k * interval for k in range(hypotheses))
+        return self._sweep(reference, neighbors, warps, surfaces, hypotheses, options, needed)
+
+    @torch.no_grad()
+    def surface_costs(
+        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, surfaces: np.ndarray,
+        options: CostOptions, needed: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        return self._sweep(reference, neighbors, warps, iter(self._on(surfaces)), len(surfaces), options, needed)
+
+    def _sweep(
+        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, surfaces: Iterator[Tensor], count: int,
+        options: CostOptions, needed: np.ndarray | None,
+    ) -> np.ndarray:  # fmt: skip
+        """(H, D, W) costs of `count` surfaces (H, W)."""
         windows = _Windows(self._on(reference), options)
         images, transforms = self._on(neighbors), self._on(warps)
-        start, interval = self._on(first), self._on(step)
         best = min(options.best, len(images))
-        cost = torch.empty((first.shape[0], hypotheses, first.shape[1]), device=self.device)
-        for k in range(hypotheses):
-            surface = start + k * interval
+        cost = torch.empty((reference.shape[0], count, reference.shape[1]), device=self.device)
+        for k, surface in enumerate(surfaces):
             correlation = torch.stack([windows.correlate(i, t, surface) for i, t in zip(images, transforms)])
             each = (1.0 - correlation).clamp(0.0, 1.0)
             cost[:, k] = torch.topk(each, best, dim=0, largest=False).values.mean(dim=0)
@@ -46,6 +62,23 @@ class TorchBackend:
             tiles = torch.from_numpy(needed).to(self.device).repeat_interleave(TILE[0], 0).repeat_interleave(TILE[1], 2)
             cost[tiles[: cost.shape[0], :, : cost.shape[2]] == 0] = 1.0
         return cost.cpu().numpy()
+
+    @torch.no_grad()
+    def choose_surface(
+        self, cost: np.ndarray, surfaces: np.ndarray, reference: np.ndarray, options: ChooseOptions
+    ) -> tuple[np.ndarray, np.ndarray]:
+        volume, heights, gray = self._on(cost), self._on(surfaces).permute(1, 0, 2), self._on(reference)
+        total = torch.zeros_like(volume)
+        sideways = (volume.permute(2, 1, 0), heights.permute(2, 1, 0), gray.T)
+        for reverse in (False, True):
+            for shift in (0, 1, -1):
+                total += _surface_path(volume, heights, gray, shift, reverse, options)
+            total += _surface_path(*sideways, 0, reverse, options).permute(2, 1, 0)
+        total /= 8.0
+        lowest, best = total.min(dim=1)
+        chosen = heights.gather(1, best[:, None])
+        worse = torch.where((heights - chosen).abs() > options.apart, total - lowest[:, None], torch.ones_like(total))
+        return best.to(torch.int32).cpu().numpy(), worse.amin(dim=1).clamp(max=1.0).cpu().numpy()
 
     @torch.no_grad()
     def view_correlation(
@@ -162,6 +195,29 @@ def _path(
             value = cost[y] + torch.minimum(same, moved) - base
         result[y] = value
         previous, lowest, before = value, value.min(dim=0).values, y
+    return result
+
+
+def _surface_path(
+    cost: Tensor, heights: Tensor, gray: Tensor, shift: int, reverse: bool, options: ChooseOptions
+) -> Tensor:
+    """Path costs (R, D, C) of one direction over surfaces (R, D, C): see `_path`."""
+    rows, _, columns = cost.shape
+    result = torch.empty_like(cost)
+    order = range(rows - 1, -1, -1) if reverse else range(rows)
+    source = torch.arange(columns, device=cost.device) - shift
+    inside, source = (source >= 0) & (source < columns), source.clamp(0, columns - 1)
+    before: int | None = None
+    for y in order:
+        result[y] = cost[y]
+        if before is not None:
+            relax = 1.0 / (1.0 + (gray[y] - gray[before][source]).abs() / options.edge)
+            apart = (heights[y][:, None] - heights[before][:, source][None]).abs()
+            jump = (options.small_jump * apart).clamp(max=options.large_jump) * relax
+            least = result[before].amin(dim=0)
+            moved = (result[before][:, source][None] + jump).amin(dim=1) - least[source]
+            result[y] += torch.where(inside, moved, torch.zeros_like(moved))
+        before = y
     return result
 
 

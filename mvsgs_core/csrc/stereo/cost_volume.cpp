@@ -200,11 +200,17 @@ void runs_of(const std::uint8_t* needed, int tiles, int width, std::vector<Colum
     }
 }
 
-}  // namespace
+// Hypothesis k of a pixel: first[k stride] + k factor step, of maps (H, W).
+struct Hypotheses {
+    const float* first;
+    std::size_t stride;
+    const float* step;
+    float factor;
+};
 
-void cost_volume(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
-                 int nh, int nw, const float* first, const float* step, const std::uint8_t* needed,
-                 const CostOptions& o, float* cost) {
+// cost (H, D, W) of the hypotheses: see cost_volume.
+void sweep(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views, int nh,
+           int nw, const Hypotheses& h, const std::uint8_t* needed, const CostOptions& o, float* cost) {
     const int best = std::min({o.best, views, kMaxBest});
     const float share = 1.0f / static_cast<float>(best);
     const int bands = (height + kBand - 1) / kBand, tiles = (width + kTileColumns - 1) / kTileColumns;
@@ -230,8 +236,8 @@ void cost_volume(const float* reference, int height, int width, const float* nei
                     std::fill(s.best.begin(), s.best.end(), 1.0f);
                     for (int n = 0; n < views; ++n) {
                         warp_rows(neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n], begin, end,
-                                  width, run.wider(o.radius, width), o.radius, first, step, static_cast<float>(k),
-                                  s.sample.data(), s.seen.data());
+                                  width, run.wider(o.radius, width), o.radius, h.first + k * h.stride, h.step,
+                                  h.factor * static_cast<float>(k), s.sample.data(), s.seen.data());
                         for (int y = y0; y < y1; ++y) {
                             correlate_row(windows, y, y0, begin, height, run, o.noise, s, s.value.data());
                             insert_cost(s.value.data(), width, run, best,
@@ -252,6 +258,23 @@ void cost_volume(const float* reference, int height, int width, const float* nei
             }
         }
     }
+}
+
+}  // namespace
+
+void cost_volume(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
+                 int nh, int nw, const float* first, const float* step, const std::uint8_t* needed,
+                 const CostOptions& o, float* cost) {
+    sweep(reference, height, width, neighbors, warps, views, nh, nw, {first, 0, step, 1.0f}, needed, o, cost);
+}
+
+void surface_costs(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
+                   int nh, int nw, const float* surfaces, const std::uint8_t* needed,
+                   const CostOptions& o, float* cost) {
+    const std::size_t pixels = static_cast<std::size_t>(height) * width;
+    const std::vector<float> step(pixels, 0.0f);
+    sweep(reference, height, width, neighbors, warps, views, nh, nw, {surfaces, pixels, step.data(), 0.0f}, needed, o,
+          cost);
 }
 
 void view_correlation(const float* reference, int height, int width, const float* neighbors, const Warp* warps,

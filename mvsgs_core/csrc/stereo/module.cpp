@@ -31,6 +31,12 @@ void same_size(const Image& a, const Image& b) {
     require(a.shape(0) == b.shape(0) && a.shape(1) == b.shape(1), "maps of the reference must have its size");
 }
 
+void require_tiles(const std::optional<Tiles>& needed, std::size_t h, std::size_t d, std::size_t w) {
+    require(!needed || (needed->shape(0) == (h + stereo::kTileRows - 1) / stereo::kTileRows && needed->shape(1) == d &&
+                        needed->shape(2) == (w + stereo::kTileColumns - 1) / stereo::kTileColumns),
+            "needed must be (tile rows, D, tile columns)");
+}
+
 template <typename T, std::size_t N>
 nb::ndarray<nb::numpy, T> allocate(const std::size_t (&shape)[N]) {
     std::size_t size = 1;
@@ -49,9 +55,7 @@ nb::ndarray<nb::numpy, float> cost_volume(Image reference, Stack neighbors, Warp
     require(neighbors.shape(1) >= 2 && neighbors.shape(2) >= 2, "neighbor images need at least 2x2 pixels");
     require(hypotheses >= 1 && radius >= 0 && radius <= 16 && best >= 1, "bad hypotheses, radius or best");
     const std::size_t h = reference.shape(0), w = reference.shape(1), d = static_cast<std::size_t>(hypotheses);
-    require(!needed || (needed->shape(0) == (h + stereo::kTileRows - 1) / stereo::kTileRows && needed->shape(1) == d &&
-                        needed->shape(2) == (w + stereo::kTileColumns - 1) / stereo::kTileColumns),
-            "needed must be (tile rows, D, tile columns)");
+    require_tiles(needed, h, d, w);
     auto cost = allocate<float>({h, d, w});
     const stereo::CostOptions options{hypotheses, radius, best, noise, contrast, thread_count(threads)};
     {
@@ -62,6 +66,45 @@ nb::ndarray<nb::numpy, float> cost_volume(Image reference, Stack neighbors, Warp
                             step.data(), needed ? needed->data() : nullptr, options, cost.data());
     }
     return cost;
+}
+
+nb::ndarray<nb::numpy, float> surface_costs(Image reference, Stack neighbors, Warps warps, Stack surfaces, int radius,
+                                            int best, float noise, float contrast, int threads,
+                                            std::optional<Tiles> needed) {
+    require(surfaces.shape(1) == reference.shape(0) && surfaces.shape(2) == reference.shape(1),
+            "surfaces must be (D, H, W)");
+    require(neighbors.shape(0) == warps.shape(0) && neighbors.shape(0) > 0, "one warp per neighbor, at least one");
+    require(neighbors.shape(1) >= 2 && neighbors.shape(2) >= 2, "neighbor images need at least 2x2 pixels");
+    require(surfaces.shape(0) >= 1 && radius >= 0 && radius <= 16 && best >= 1, "bad surfaces, radius or best");
+    const std::size_t h = reference.shape(0), w = reference.shape(1), d = surfaces.shape(0);
+    require_tiles(needed, h, d, w);
+    auto cost = allocate<float>({h, d, w});
+    const stereo::CostOptions options{static_cast<int>(d), radius, best, noise, contrast, thread_count(threads)};
+    {
+        nb::gil_scoped_release release;
+        stereo::surface_costs(reference.data(), static_cast<int>(h), static_cast<int>(w), neighbors.data(),
+                              reinterpret_cast<const stereo::Warp*>(warps.data()), static_cast<int>(neighbors.shape(0)),
+                              static_cast<int>(neighbors.shape(1)), static_cast<int>(neighbors.shape(2)),
+                              surfaces.data(), needed ? needed->data() : nullptr, options, cost.data());
+    }
+    return cost;
+}
+
+nb::tuple choose_surface(Stack cost, Stack surfaces, Image reference, float small_jump, float large_jump, float edge,
+                         float apart, int threads) {
+    const std::size_t h = reference.shape(0), w = reference.shape(1), d = surfaces.shape(0);
+    require(surfaces.shape(1) == h && surfaces.shape(2) == w && d >= 1, "surfaces must be (D, H, W)");
+    require(cost.shape(0) == h && cost.shape(1) == d && cost.shape(2) == w, "cost must be (H, D, W)");
+    require(edge > 0, "edge must be positive");
+    auto best = allocate<std::int32_t>({h, w});
+    auto gap = allocate<float>({h, w});
+    const stereo::ChooseOptions options{small_jump, large_jump, edge, apart, thread_count(threads)};
+    {
+        nb::gil_scoped_release release;
+        stereo::choose_surface(cost.data(), surfaces.data(), static_cast<int>(d), static_cast<int>(h),
+                               static_cast<int>(w), reference.data(), options, best.data(), gap.data());
+    }
+    return nb::make_tuple(best, gap);
 }
 
 nb::ndarray<nb::numpy, float> view_correlation(Image reference, Stack neighbors, Warps warps, Image inverse_depth,
@@ -175,6 +218,10 @@ MVSGS_EXPAND(MVSGS_MODULE, m) {
     m.attr("TILE") = nb::make_tuple(stereo::kTileRows, stereo::kTileColumns);
     m.def("view_correlation", &view_correlation, "reference"_a, "neighbors"_a, "warps"_a, "inverse_depth"_a,
           "radius"_a, "noise"_a, "contrast"_a, "threads"_a = 0);
+    m.def("surface_costs", &surface_costs, "reference"_a, "neighbors"_a, "warps"_a, "surfaces"_a, "radius"_a, "best"_a,
+          "noise"_a, "contrast"_a, "threads"_a = 0, "needed"_a = nb::none());
+    m.def("choose_surface", &choose_surface, "cost"_a, "surfaces"_a, "reference"_a, "small_jump"_a, "large_jump"_a,
+          "edge"_a, "apart"_a, "threads"_a = 0);
     m.def("semi_global", &semi_global, "cost"_a, "reference"_a, "first"_a, "step"_a, "small_jump"_a, "large_jump"_a,
           "edge"_a, "break_steps"_a, "temperature"_a, "paths"_a, "threads"_a = 0);
     m.def("consistent_views", &consistent_views, "depth"_a, "neighbor_depths"_a, "warps"_a, "back"_a, "relative"_a,

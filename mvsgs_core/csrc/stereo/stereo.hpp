@@ -32,6 +32,11 @@ void cost_volume(const float* reference, int height, int width, const float* nei
                  int neighbor_height, int neighbor_width, const float* first, const float* step,
                  const std::uint8_t* needed, const CostOptions& options, float* cost);
 
+// cost (H, D, W) as above, of D surfaces (D, H, W): each pixel's window follows the surface around it.
+void surface_costs(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
+                   int neighbor_height, int neighbor_width, const float* surfaces, const std::uint8_t* needed,
+                   const CostOptions& options, float* cost);
+
 // correlation (N, H, W): ZNCC of each view at one inverse depth per pixel; -2 where the view does not see it.
 void view_correlation(const float* reference, int height, int width, const float* neighbors, const Warp* warps,
                       int views, int neighbor_height, int neighbor_width, const float* inverse_depth,
@@ -52,6 +57,19 @@ struct SmoothOptions {
 void semi_global(const float* cost, int height, int hypotheses, int width, const float* reference, const float* first,
                  const float* step, const SmoothOptions& options, float* index, float* probability, float* margin,
                  std::int32_t* best);
+
+struct ChooseOptions {
+    float small_jump;  // penalty per inverse depth between neighboring pixels
+    float large_jump;  // the most that they pay
+    float edge;        // gray levels: a step of this size in the image halves the penalties
+    float apart;       // inverse depth: a surface farther than this from another is not the same
+    int threads;
+};
+
+// best (H, W): which of the surfaces (D, H, W) with costs (H, D, W) each pixel lies on; gap (H, W): how much worse the
+// best surface is, in mean path cost, that is not the same, at most 1.
+void choose_surface(const float* cost, const float* surfaces, int count, int height, int width, const float* reference,
+                    const ChooseOptions& options, std::int32_t* best, float* gap);
 
 struct ConsistencyOptions {
     float relative;    // largest difference of depth, relative to the larger one

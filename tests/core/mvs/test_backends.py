@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core.mvs.backend import NativeBackend
-from mvsgs_core.mvs.interface import TILE, CostOptions, SmoothOptions
+from mvsgs_core.mvs.interface import TILE, ChooseOptions, CostOptions, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.mvs.warp import relative_warp
 from mvsgs_core.native import load
@@ -136,3 +136,58 @@ def test_bad_shapes_are_refused() -> None:
         NativeBackend(1).cost_volume(**{**p, "first": p["first"][:-1].copy()}, hypotheses=5, options=COST)
     with pytest.raises(ValueError, match="one warp per neighbor"):
         NativeBackend(1).cost_volume(**{**p, "warps": p["warps"][:1].copy()}, hypotheses=5, options=COST)
+
+
+def surfaces_of(p: dict[str, np.ndarray], count: int) -> np.ndarray:
+    return np.stack([p["first"] + k * p["step"] for k in range(count)])
+
+
+def test_the_cost_of_surfaces_is_that_of_a_sweep_through_them() -> None:
+    p = problem()
+    images = (p["reference"], p["neighbors"], p["warps"])
+    needed = np.ones((-(-SIZE[0] // TILE[0]), 5, -(-SIZE[1] // TILE[1])), np.uint8)
+    needed[1, :, 1] = 0
+    native = NativeBackend(2).surface_costs(*images, surfaces_of(p, 5), COST, needed)
+    np.testing.assert_allclose(native, NativeBackend(1).cost_volume(**p, hypotheses=5, options=COST, needed=needed))
+    twin = TorchBackend("cpu").surface_costs(*images, surfaces_of(p, 5), COST, needed)
+    assert np.mean(np.abs(native - twin) > 1e-3) < 2e-3
+    with pytest.raises(ValueError, match="surfaces"):
+        NativeBackend(1).surface_costs(*images, surfaces_of(p, 5)[:, 1:].copy(), COST)
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_choices_of_both_backends_agree(count: int) -> None:
+    p = problem()
+    rng = np.random.default_rng(4)
+    cost = rng.random((SIZE[0], count, SIZE[1]), dtype=np.float32)
+    surfaces = np.concatenate([surfaces_of(p, count)[:, :18], rng.permuted(surfaces_of(p, count)[:, 18:], axis=0)], 1)
+    options = ChooseOptions(small_jump=20.0, large_jump=0.6, edge=12.0, apart=0.03)
+    best, gap = NativeBackend(2).choose_surface(cost, surfaces, p["reference"], options)
+    twin, twin_gap = TorchBackend("cpu").choose_surface(cost, surfaces, p["reference"], options)
+    same = best == twin
+    assert same.mean() > 0.995  # near ties may fall to either side
+    np.testing.assert_allclose(gap[same], twin_gap[same], atol=2e-3)
+    again = NativeBackend(1).choose_surface(cost, surfaces, p["reference"], options)
+    np.testing.assert_array_equal(best, again[0])
+
+
+def test_choosing_a_surface_is_the_minimum_over_all_paths_of_a_line() -> None:
+    """On one row the horizontal path cost is a shortest path: enumerate them all."""
+    rng = np.random.default_rng(5)
+    width, count = 6, 4
+    cost = rng.random((1, count, width), dtype=np.float32)
+    surfaces = rng.random((count, 1, width), dtype=np.float32)
+    jump = np.minimum(0.8 * np.abs(surfaces[:, None, 0, 1:] - surfaces[None, :, 0, :-1]), 0.3)  # (to, from, x)
+    lines = []
+    for line, jumps in ((cost[0], jump), (cost[0, :, ::-1], jump.transpose(1, 0, 2)[:, :, ::-1])):
+        path = line.copy()
+        for x in range(1, width):
+            path[:, x] += (path[:, x - 1] + jumps[:, :, x - 1]).min(axis=1) - path[:, x - 1].min()
+        lines.append(path)
+    total = (lines[0] + lines[1][:, ::-1] + 6 * cost[0]) / 8  # up, down, aslant: a row alone
+    options = ChooseOptions(small_jump=0.8, large_jump=0.3, edge=12.0, apart=0.1)
+    best, gap = NativeBackend(1).choose_surface(cost, surfaces, np.zeros((1, width), np.float32), options)
+    np.testing.assert_array_equal(best[0], total.argmin(axis=0))
+    ahead = np.abs(surfaces[:, 0] - np.take_along_axis(surfaces[:, 0], best, axis=0)) > 0.1
+    expected = np.where(ahead, total - total.min(axis=0), 1.0).min(axis=0)
+    np.testing.assert_allclose(gap[0], expected, atol=1e-6)

@@ -1,0 +1,48 @@
+"""The surface of a pixel at an object's rim."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from mvsgs_core.mvs.backend import NativeBackend
+from mvsgs_core.mvs.hypotheses import SearchRange
+from mvsgs_core.mvs.interface import TILE
+from mvsgs_core.mvs.rims import continued_surfaces, differing_tiles
+from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
+from mvsgs_core.mvs.views import prepare_view
+from tests.core.mvs.plane_scene import look, render, true_depth
+
+SIZE = (96, 128)
+
+
+def test_a_plane_continues_itself_and_both_sides_of_a_jump_are_candidates() -> None:
+    v, u = np.mgrid[0:40, 0:60]
+    plane = (0.2 + 0.002 * u + 0.001 * v).astype(np.float32)
+    middle = continued_surfaces(plane, (3, 6))[:, 8:-8, 8:-8]
+    assert middle.shape[0] == 17
+    assert np.abs(middle - plane[8:-8, 8:-8]).max() < 1e-6
+    step = np.where(u < 30, plane, plane + 0.5).astype(np.float32)
+    around = continued_surfaces(step, (3,))[:, 20, 29:31]
+    for side in (plane[20, 29:31], plane[20, 29:31] + 0.5):
+        assert np.all(np.abs(around - side).min(axis=0) < 1e-4)
+    tiles = differing_tiles(continued_surfaces(step, (3,)), 0.1)
+    assert tiles.shape == (5, 9, 4)
+    assert set(np.flatnonzero(tiles.any(axis=(0, 1)))) == {26 // TILE[1], 33 // TILE[1]}
+
+
+def test_rims_of_a_box_come_out_sharper() -> None:
+    poses = [look(x) for x in (0.0, -0.3, -0.15, 0.15, 0.3)]
+    views = []
+    for k, pose in enumerate(poses):
+        image, intrinsics = render(pose, SIZE)
+        views.append(prepare_view(k, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2)))
+    truth = true_depth(poses[0], SIZE)
+    rim = cv2.dilate(truth, np.ones((9, 9))) > 1.2 * cv2.erode(truth, np.ones((9, 9)))
+    right = {}
+    for name, config in (("with", StereoConfig()), ("without", replace(StereoConfig(), rims=None))):
+        found = estimate_depth(views[0], views[1:], SearchRange(0.12, 0.8, "given"), config, NativeBackend(1))
+        right[name] = np.mean(np.abs(found.depth - truth)[rim] < 0.05 * truth[rim])
+    assert right["with"] > right["without"] + 0.02
