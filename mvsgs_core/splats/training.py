@@ -116,8 +116,6 @@ def train_once(
         return
     loss.backward()
     if render.backward.refused:
-        log.refuse("gradients", render.backward.refused, "gradients of splats that were not finite were taken as none")
-    if render.backward.refused:
         text = "gradients of splats that were not finite were set to 0 in the rasterizer's backward pass"
         log.refuse("gradients", render.backward.refused, text)
     if render.screen.grad is not None:

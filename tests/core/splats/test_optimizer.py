@@ -55,6 +55,25 @@ def test_kernel_equals_its_twin_over_many_steps() -> None:
         torch.testing.assert_close(kernel.second[name], twin.second[name], rtol=1e-4, atol=1e-20)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.6, 1.0])
+@pytest.mark.parametrize("bases", [1, 16])
+def test_few_and_many_of_a_block_with_bad_values_among_them(share: float, bases: int) -> None:
+    kernel, twin = random_state(300, bases=bases), random_state(300, bases=bases)
+    visible = torch.rand(300, generator=torch.Generator().manual_seed(3)) < share
+    visible[[7, 130]] = True
+    for state in (kernel, twin):
+        set_gradients(state, 1)
+        state.splats.means.grad[7, 1] = float("nan")  # type: ignore[index]
+        state.splats.sh.grad[~visible] = float("inf")  # type: ignore[index]  # nobody looks at these
+        state.second["quaternions"][130, 1] = float("inf")
+    refused = step(kernel, visible, all_groups(), 5000, threads=1)
+    assert refused == step_reference(twin, visible, all_groups(), 5000) == 2
+    assert torch.equal(kernel.steps, twin.steps)
+    for name in PARAMETERS:
+        torch.testing.assert_close(getattr(kernel.splats, name), getattr(twin.splats, name), rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(kernel.first[name], twin.first[name], rtol=1e-4, atol=1e-12)
+
+
 def test_a_fresh_splat_seen_every_time_follows_torch_adam() -> None:
     state = random_state(50)
     state.steps.zero_()
