@@ -56,7 +56,8 @@ class _ImageLoss(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, on_loss: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return gradient * on_loss, None, None, None, None, None
+        scaled = gradient if float(on_loss) == 1.0 else gradient * on_loss  # most often it is the loss itself
+        return scaled, None, None, None, None, None
 
 
 def chosen_backend(image: Tensor) -> str:

@@ -91,3 +91,14 @@ def test_shapes_that_do_not_fit() -> None:
         ssim.ssim(image, target[:7])
     with pytest.raises(ValueError, match="pixel_weight"):
         ssim.image_loss(image, target, l1_weight=1.0, ssim_weight=0.0, pixel_weight=torch.ones(9, 8))
+
+
+def test_a_second_backward_pass_and_a_scaled_loss() -> None:
+    g = torch.Generator().manual_seed(0)
+    image, target = (torch.rand(24, 30, 3, generator=g) for _ in range(2))
+    image.requires_grad_()
+    loss = ssim.image_loss(image, target, l1_weight=0.8, ssim_weight=0.2, threads=1)
+    (once,) = torch.autograd.grad(loss, image, retain_graph=True)
+    loss.backward(retain_graph=True)
+    (3.0 * loss).backward()
+    torch.testing.assert_close(image.grad, 4.0 * once)
