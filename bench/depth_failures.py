@@ -50,6 +50,9 @@ FAILURES: dict[str, Callable[[Scene], Scene]] = {
 }
 
 
+_FILTERS = ("confidence", "consistency", "rim", "speckle")
+
+
 def failure_rows(area: int, count: int | None) -> list[Row]:
     """Outliers (beyond 5 %) among the kept pixels, and how much each filter rejected."""
     room = load_scene("room", area, count)
@@ -63,11 +66,11 @@ def failure_rows(area: int, count: int | None) -> list[Row]:
         outliers = 0.0 if kept.completeness == 0 else 1.0 - kept.inliers
         rows.append(at_most(f"{name}: outliers of kept", outliers, "", 0.05))
         rows.append(Row(f"{name}: kept", kept.completeness))
-        rows.append(Row(f"{name}: rejected by confidence, consistency", _rejected(found)))
+        rows.append(Row(f"{name}: rejected by {', '.join(_FILTERS)}", _rejected(found)))
     return rows
 
 
 def _rejected(found: Run) -> str:
     pixels = sum(f.counts["pixels"] for f in found.fused)
-    parts = [sum(f.counts.get(f"rejected: {k}", 0.0) for f in found.fused) for k in ("confidence", "consistency")]
+    parts = [sum(f.counts.get(f"rejected: {k}", 0.0) for f in found.fused) for k in _FILTERS]
     return ", ".join(f"{p / pixels:.2f}" for p in parts)

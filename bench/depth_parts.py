@@ -40,7 +40,9 @@ def part_variants(area: int) -> dict[str, Variant]:
         "4 maps to check with": (base, replace(fusion, neighbors=4)),
         "round trip": (base, replace(fusion, round_trip=True)),
         "no confidence threshold": (base, replace(fusion, confidence=0.0)),
-        "no filter": (base, replace(fusion, confidence=0.0, check=False)),
+        "rims kept": (base, replace(fusion, rim=0)),
+        "speckles kept": (base, replace(fusion, speckle=0)),
+        "no filter": (base, replace(fusion, confidence=0.0, check=False, rim=0, speckle=0)),
     }
 
 

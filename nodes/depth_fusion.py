@@ -100,6 +100,8 @@ class DepthFusion(FusionNode):
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
         least_views: int = 2  # views that must agree, the reference counted
         confidence: float = 0.75  # least confidence of a kept pixel
+        rim: int = 3  # pixels: nothing is kept that close to something farther; 0: off
+        speckle: int = 100  # pixels: patches up to this size are not kept; 0: off
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
         threads: int | None = None  # of the C++ kernels; null: all
 
@@ -119,6 +121,8 @@ class DepthFusion(FusionNode):
                 round_trip=c.round_trip,
                 least_views=c.least_views,
                 confidence=c.confidence,
+                rim=c.rim,
+                speckle=c.speckle,
                 device=c.device,
                 threads=c.threads,
             )

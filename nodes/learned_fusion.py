@@ -51,6 +51,8 @@ class LearnedFusion(FusionNode):
                 round_trip=c.round_trip,
                 least_views=c.least_views,
                 confidence=c.confidence,
+                rim=0,  # the paper has neither
+                speckle=0,
                 device=c.device,
                 threads=c.threads,
             ),

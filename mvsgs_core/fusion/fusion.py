@@ -10,6 +10,7 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.fusion.backend import make_fusion_backend
 from mvsgs_core.fusion.confidence import features_of, probability_of_inlier
+from mvsgs_core.fusion.filters import not_on_rim, not_speckle
 from mvsgs_core.fusion.interface import FusionBackend
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.views import DepthView, warps_between
@@ -34,6 +35,8 @@ class FusionConfig:
     pixels: float = 1.0  # round trip: distance to where it started
     least_views: int = 2  # views that must agree, the reference counted
     confidence: float = 0.75  # least confidence of a kept pixel
+    rim: int = 3  # pixels: nothing is kept that close to something farther; 0: off
+    speckle: int = 100  # pixels: patches up to this size are not kept; 0: off
     device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda"
     threads: int | None = None  # of the C++ kernels; None: all
 
@@ -161,6 +164,11 @@ def fuse(reference: DepthView, neighbors: list[DepthView], config: FusionConfig,
         counts["rejected: consistency"] = float((keep & ~agreed).sum())
         keep = keep & agreed
     keep = keep & sure
+    off_rim = not_on_rim(np.where(keep, depth, 0.0), config.rim)
+    counts["rejected: rim"] = float((keep & ~off_rim).sum())
+    in_patch = not_speckle(np.where(off_rim, depth, 0.0), config.speckle, config.relative)
+    counts["rejected: speckle"] = float((off_rim & ~in_patch).sum())
+    keep = in_patch
     counts["kept"] = float(keep.sum())
     filtered = np.where(keep, depth, 0.0).astype(np.float32)
     normals = normals_of(filtered, reference.intrinsics)

@@ -1,0 +1,65 @@
+"""Filters of one depth map: rims of near surfaces, and small patches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core.fusion.backend import NativeFusionBackend
+from mvsgs_core.fusion.filters import not_on_rim, not_speckle
+from mvsgs_core.fusion.fusion import FusionConfig, fuse
+from tests.core.fusion.test_consistency import view
+
+
+def test_the_rim_of_the_near_surface_goes_and_what_lies_behind_stays() -> None:
+    depth = np.full((30, 40), 4.0, np.float32)
+    depth[:, :20] = 2.0
+    depth[:, 30:] = 0.0  # unknown: not farther
+    keep = not_on_rim(depth, 3)
+    assert keep[:, :17].all()
+    assert not keep[:, 17:20].any()
+    assert keep[:, 20:30].all()
+    assert not keep[:, 30:].any()
+    np.testing.assert_array_equal(not_on_rim(depth, 0), depth > 0)
+
+
+def test_a_slanted_surface_has_no_rim() -> None:
+    depth = np.tile(np.linspace(2.0, 3.0, 100, dtype=np.float32), (20, 1))
+    assert not_on_rim(depth, 3).all()
+
+
+def test_small_patches_go_at_any_scale_and_large_ones_stay() -> None:
+    for scale in (1e-3, 1.0, 1e4):
+        depth = np.zeros((40, 40), np.float32)
+        depth[:, :20] = np.linspace(2.0, 3.0, 20)  # steps of 2.5 % at most: one patch at a tolerance of 3 %
+        depth[5:8, 5:8] = 9.0  # in it, but apart
+        depth[20:24, 30:34] = 2.0
+        keep = not_speckle(scale * depth, 16, 0.03)
+        expected = depth > 0
+        expected[5:8, 5:8] = expected[20:24, 30:34] = False
+        np.testing.assert_array_equal(keep, expected)
+        np.testing.assert_array_equal(not_speckle(scale * depth, 15, 0.03)[20:24, 30:34], True)
+        np.testing.assert_array_equal(not_speckle(scale * depth, 0, 0.03), depth > 0)
+
+
+def test_a_map_without_depth_stays_without() -> None:
+    nothing = np.zeros((8, 8), np.float32)
+    assert not not_speckle(nothing, 100, 0.02).any()
+    assert not not_on_rim(nothing, 3).any()
+
+
+def test_fusion_counts_what_each_filter_rejects() -> None:
+    reference, neighbors = view(0, 0.0), [view(1, 0.05), view(2, -0.05), view(3, 0.1)]
+    reference.depth[:, 30:] = 0.0
+    for neighbor in neighbors:
+        neighbor.depth[:, 30:] = 0.0
+    config = FusionConfig(device="cpu", threads=1)
+    plain = fuse(reference, neighbors, FusionConfig(device="cpu", threads=1, rim=0, speckle=0), NativeFusionBackend(1))
+    huge = fuse(reference, neighbors, FusionConfig(device="cpu", threads=1, speckle=10**6), NativeFusionBackend(1))
+    default = fuse(reference, neighbors, config, NativeFusionBackend(1))
+    assert plain.counts["rejected: rim"] == plain.counts["rejected: speckle"] == 0
+    assert huge.counts["kept"] == 0
+    assert huge.counts["rejected: speckle"] > 0
+    for found in (plain, default):
+        rejected = sum(found.counts[f"rejected: {name}"] for name in ("rim", "speckle"))
+        sure = (found.unfiltered > 0) & (found.confidence >= config.confidence) & (found.consistent >= 1)
+        assert found.counts["kept"] == sure.sum() - rejected
