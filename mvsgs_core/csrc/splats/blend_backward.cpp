@@ -126,7 +126,7 @@ SPLATS_INLINE void sum_pair(const Placed& s, uint32_t blocks, Visits& visits, co
     slot = sums(total);
 }
 
-// Some pairs of a tile and the blocks that they colored: the exact density's long chain of operations takes several
+// Some pairs of a tile and the blocks that they may color: the exact density's long chain of operations takes several
 // blocks at once, of whichever splats.
 struct Batch {
     static constexpr int kVisits = 64;  // at the least: what they need stays in the first-level cache
