@@ -8,7 +8,7 @@ import numpy as np
 from mvsgs_core.fusion.interface import Fused
 
 # Logistic regression on `features_of`, by `python -m bench.depth_calibration`.
-WEIGHTS = np.array([-0.848, 1.112, 1.746, -0.634, -0.401, -0.319, 1.801, 0.727, -0.769, -0.736])
+WEIGHTS = np.array([-0.166, 1.031, 1.539, -0.665, -0.351, -0.29, 1.424, 0.779, -0.826, -1.02])
 
 
 def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, seeing: np.ndarray) -> np.ndarray:
