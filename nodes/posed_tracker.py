@@ -70,6 +70,11 @@ class PosedTracker(Node):
             yield self._keyframe(index)
         if self._truths or any(index not in self._path for index in self._frames):
             self.stats.warn("some frames came without ground truth, or ground truth without a frame")
+        if len(self._keyframes) < 2 <= len(self._path):
+            self.stats.warn(
+                f"the {len(self._path)} frames gave {len(self._keyframes)} keyframe, and depth needs two: the camera "
+                f"moves too little for tracker.keyframe_flow={self.config.keyframe_flow:g}; lower it"
+            )
         self._report()
         order = sorted(self._path)
         n = len(order)

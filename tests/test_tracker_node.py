@@ -142,6 +142,16 @@ def test_true_poses_come_with_depths_in_their_unit() -> None:
     assert path.index[path.keyframe].tolist() == [k.index for k in keyframes]
 
 
+def test_true_poses_that_hardly_move_say_what_to_lower() -> None:
+    frames, truths = messages(3)
+    node = PosedTracker()
+    for frame, truth in zip(frames, truths):
+        list(node.on_frame(frame))
+        list(node.on_ground_truth(truth))
+    list(node.on_end())
+    assert any("lower it" in warning for warning in node.stats.warnings)
+
+
 def test_the_order_of_the_two_topics_does_not_matter() -> None:
     frames, truths = messages(30)
     truth_first = run_posed([*truths, *frames])
