@@ -98,6 +98,14 @@ def score(depths: list[np.ndarray], scene: Scene, align: bool = False) -> Score:
     )
 
 
+def surest(found: Run, scene: Scene, completeness: float) -> list[np.ndarray]:
+    """The kept depths (H, W) of the highest confidence, so many that they are `completeness` of the true depths."""
+    sure = [np.where(f.depth > 0, f.confidence, 0.0) for f in found.fused]
+    pooled = np.concatenate([c[t > 0] for c, t in zip(sure, scene.truths, strict=True) if t is not None])
+    limit = np.quantile(pooled, 1.0 - completeness)
+    return [np.where(c >= limit, f.depth, 0).astype(np.float32) for c, f in zip(sure, found.fused, strict=True)]
+
+
 def scaled_to(depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """A map (H, W) with its median ratio to the truth divided out."""
     both = (truth > 0) & (depth > 0)

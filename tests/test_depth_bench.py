@@ -10,8 +10,8 @@ from bench.depth_calibration import reliability
 from bench.depth_curves import Point, settings
 from bench.depth_data import Scene, coarse_grid, without_ragged_edges
 from bench.depth_parts import part_variants, skip_variants
-from bench.depth_run import scaled_to, score
-from mvsgs_core.fusion.fusion import FusionConfig
+from bench.depth_run import Run, scaled_to, score, surest
+from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
 
 
@@ -31,6 +31,15 @@ def test_scores_count_what_is_kept_and_what_is_right() -> None:
     assert found.relative_error == pytest.approx((0.025 + 0.1 + 0.5) / 7)
     assert score([3 * depth, depth], scene(truth), align=True).inliers == found.inliers
     assert score([np.zeros_like(depth), depth], scene(truth)).completeness == 0
+
+
+def test_the_surest_are_those_of_the_highest_confidence_among_the_kept() -> None:
+    truth = np.ones((10, 10), np.float32)
+    confidence = np.arange(100, dtype=np.float32).reshape(10, 10) / 100
+    depth = np.where(confidence < 0.9, truth, 0)  # the surest tenth was rejected
+    fused = FusedDepth(None, depth, truth, confidence, np.zeros((10, 10, 3)), np.ones((10, 10)))  # type: ignore[arg-type]
+    chosen = surest(Run([], [fused, fused], 0.0, 0.0), scene(truth), 0.5)[0]
+    np.testing.assert_array_equal(chosen > 0, (confidence >= 0.4) & (confidence < 0.9))
 
 
 def test_a_map_is_scaled_by_its_median_ratio() -> None:
