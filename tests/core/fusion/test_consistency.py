@@ -14,7 +14,7 @@ from mvsgs_core.fusion.views import DepthView, warps_between
 from tests.core.mvs.plane_scene import intrinsics_of, look, true_depth
 
 SIZE = (40, 56)
-CONFIG = FusionConfig(device="cpu", threads=1, relative=0.01, confidence=0.75)  # few neighbors: none is very sure
+CONFIG = FusionConfig(device="cpu", threads=1, relative=0.01)
 
 
 def view(index: int, x: float, noise: float = 0.0, turn: float = 0.0) -> DepthView:
