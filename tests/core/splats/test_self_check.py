@@ -6,7 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mvsgs_core.splats.self_check import SelfCheck, check, noise_of
+from mvsgs_core import camera
+from mvsgs_core.datasets import open_dataset
+from mvsgs_core.splats.self_check import MOST_NOISE, SelfCheck, check, noise_of
+from tests.shared_data import shared
 
 
 def picture(seed: int = 0) -> np.ndarray:
@@ -44,6 +47,38 @@ def test_noise_is_measured_and_blamed() -> None:
     assert found.warning is not None
     assert "noise of 20 of 255" in found.warning
     assert "exposure" not in found.warning
+
+
+def test_noise_is_told_where_the_map_fits_it_too() -> None:
+    """As a map does with too few views: its keyframes look good, and others don't."""
+    generator = np.random.default_rng(2)
+
+    def fitted(level: float) -> SelfCheck:
+        image = picture() + generator.normal(0.0, level / 255.0, (96, 128, 3)).astype(np.float32)
+        return known(check([(image + np.float32(0.02), image)]))
+
+    noisy = fitted(12.0)
+    assert noisy.psnr > 30.0
+    assert noisy.noise_limit == pytest.approx(20.0 * np.log10(255.0 / 12.0), abs=0.7)
+    assert noisy.warning is not None
+    assert "noise of 12 of 255" in noisy.warning
+    assert f"{noisy.noise_limit:.1f} dB" in noisy.warning
+    assert fitted(4.0).warning is None
+    assert fitted(0.0).warning is None
+    assert known(check([(np.zeros((8, 8, 3)), np.zeros((8, 8, 3)))])).noise_limit == float("inf")
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"),
+    [("tum", "tum_fr1_xyz"), ("seven_scenes", "seven_scenes_redkitchen"), ("icl_nuim", "icl_nuim_of_kt0")],
+)
+def test_clean_real_video_raises_no_alarm_at_any_size(name: str, folder: str) -> None:
+    image = next(iter(open_dataset(name, path=shared(f"data/{folder}"), stop=1))).image
+    for size in ((480, 640), (180, 240), (120, 160)):
+        small = camera.resize_image(image, size).astype(np.float32) / 255.0
+        found = known(check([(small, small)]))
+        assert found.noise < 0.5 * MOST_NOISE
+        assert found.warning is None
 
 
 def test_exposure_is_blamed_where_a_gain_and_an_offset_bring_the_render_to_the_image() -> None:
