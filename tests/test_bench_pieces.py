@@ -1,0 +1,100 @@
+"""Long benchmarks in pieces: what ended is not run again, what is missing is said; the ablation covers every skip."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from bench import ablation
+from bench.pieces import Pieces
+from bench.runs import CONF, Matrix, Run
+from nodes.mapper import Mapper
+from nodes.mvs import Mvs
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Folders of the matrices that ran; a run only writes its reports."""
+    folders: list[str] = []
+
+    def run(self: Matrix, output: Path) -> list[Run]:
+        folders.append(output.name)
+        for number, name in enumerate(self.names()):
+            (output / str(number)).mkdir(parents=True, exist_ok=True)
+            (output / str(number) / "report.json").write_text(json.dumps({"name": name}))
+        return self.collect(output)
+
+    monkeypatch.setattr(Matrix, "run", run)
+    return folders
+
+
+def matrices(*names: str, overrides: tuple[str, ...] = ()) -> dict[str, Matrix]:
+    return {name: Matrix([name], seeds=[0, 1], overrides=overrides) for name in names}
+
+
+def test_a_resumed_benchmark_runs_only_what_is_missing(tmp_path: Path, ran: list[str]) -> None:
+    first = Pieces(tmp_path).runs(matrices("room"))
+    resumed = Pieces(tmp_path, resume=True)
+    both = resumed.runs(matrices("room", "fox"))
+    assert ran == ["room", "fox"]
+    assert [(r.scene, r.seed) for r in both] == [("room", 0), ("room", 1), ("fox", 0), ("fox", 1)]
+    assert [r.report for r in both[:2]] == [r.report for r in first]
+    assert resumed.note == ""
+    Pieces(tmp_path).runs(matrices("room"))
+    assert ran == ["room", "fox", "room"]  # a new measurement is one
+
+
+def test_a_piece_of_other_settings_or_one_that_was_cut_short_is_not_taken_for_done(
+    tmp_path: Path, ran: list[str]
+) -> None:
+    Pieces(tmp_path).runs(matrices("room"))
+    Pieces(tmp_path, resume=True).runs(matrices("room", overrides=("mapper.iterations=3",)))
+    assert ran == ["room", "room"]
+    (tmp_path / "room" / "piece.json").unlink()
+    assert Pieces(tmp_path, resume=True).runs(matrices("room"))
+    assert ran == ["room", "room", "room"]
+
+
+def test_what_did_not_run_and_other_commits_are_said(tmp_path: Path, ran: list[str]) -> None:
+    Pieces(tmp_path).runs(matrices("room"))
+    file = tmp_path / "room" / "piece.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "commit": "abc1234"}))
+    Pieces(tmp_path).runs(matrices("fox"))
+    late = Pieces(tmp_path, resume=True, minutes=0.0)
+    found = late.runs(matrices("room", "fox", "fountain"))
+    assert {r.scene for r in found} == {"room", "fox"}
+    assert late.missing == ["fountain"]
+    assert "Runs of the commits abc1234, " in late.note
+    assert "Not run yet: fountain" in late.note
+    assert Pieces(tmp_path, collect=True).runs(matrices("fountain")) == []
+    assert "fountain" not in ran
+
+
+def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
+    def keys(name: str) -> set[str]:
+        config = OmegaConf.to_container(OmegaConf.load(CONF / "variant" / f"{name}.yaml"))
+        assert isinstance(config, dict)
+        chosen = [key for choice in config.pop("defaults", []) if isinstance(choice, dict) for key in choice]
+        return {f"{slot}.{key}" for slot in config for key in config[slot]} | {k.split("/")[-1] for k in chosen}
+
+    switched = set().union(*(keys(name) for name in ablation.TABLE_III + ablation.SKIPS + ablation.OTHERS))
+    switches = {f"mapper.{f.name}" for f in dataclasses.fields(Mapper.Config) if isinstance(f.default, bool)}
+    switches |= {f"mvs.{f.name}" for f in dataclasses.fields(Mvs.Config) if f.name.startswith("skip_")}
+    assert {"mapper.skip_converged", "mvs.skip_cells", "mvs.skip_certain"} <= switches
+    assert switches <= switched
+    others = ("voxel", "map_voxel", "map_voxel_error", "fill", "density_control", "density", "loss", "sh_degree")
+    assert {f"mapper.{name}" for name in others} <= switched
+    assert {"mvs", "depth_fusion", "tracker", "tracker.still_flow", "tracker.readout"} <= switched
+
+
+def test_a_partial_ablation_shows_the_variants_it_has(tmp_path: Path) -> None:
+    runs = [Run("room", variant, seed, tmp_path, {"rendering": {"held_out": {"psnr": 20.0 + seed}}})
+            for variant in ("full", "A") for seed in (0, 1)]  # fmt: skip
+    text = ablation.table(runs, ["room", "fox"], ["A", "B"])
+    assert "| room | A |" in text
+    assert "| room | B |" not in text
+    assert "| fox | A |" not in text
