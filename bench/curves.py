@@ -1,41 +1,37 @@
 """Run time against error of whole runs, over the main settings one at a time: where the defaults stand.
 
 Each curve changes one setting and leaves the others at their defaults; the plot of a scene shows them all with the
-Pareto front (nothing else is both faster and better) and the default. Times are wall times from the first frame to the
-refined map, so they mean something on an idle machine only.
+Pareto front (nothing else is both faster and better) and the default. The default runs several times: half the range is
+the noise, and what beats it by more than that is named. Times are wall times from the first frame to the refined map,
+so they mean something on an idle machine only. Runs are kept by scene and curve: --resume runs only what is missing.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from bench import plots
+from bench import pieces, plots
 from bench.runs import Matrix, Run, Setting, figure, folder, stage_seconds
 from bench.table import Row, main
 
-# The cascade of the core with one stage more, one less: scale, step, hypotheses, radius, small_jump, large_jump
-_COARSE = "{scale: 2, step: 0.7, hypotheses: 128, radius: 3, small_jump: 0.3, large_jump: 2.0}"
+# The cascade of the core with one stage more: scale, step, hypotheses, radius, small_jump, large_jump
 _COARSEST = "{scale: 4, step: 0.7, hypotheses: 64, radius: 3, small_jump: 0.3, large_jump: 2.0}"
 _MIDDLE = "{scale: 2, step: 0.5, hypotheses: 15, radius: 3, small_jump: 0.1, large_jump: 0.8}"
 _FINE = "{scale: 1, step: 0.35, hypotheses: 11, radius: 3, small_jump: 0.05, large_jump: 0.4}"
 CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point and its overrides
-    "tracker.area": {f"{a // 1000}k": (f"tracker.area={a}",) for a in (19200, 38400, 153600)},
+    "tracker.area": {f"{a // 1000}k": (f"tracker.area={a}",) for a in (19200, 38400)},
     "tracker.window": {str(n): (f"tracker.window={n}",) for n in (6, 20)},
-    "mvs.area": {f"{a // 1000}k": (f"mvs.area={a}",) for a in (19200, 38400, 153600)},
+    "mvs.area": {f"{a // 1000}k": (f"mvs.area={a}",) for a in (9600, 19200)},
     "mvs.neighbors": {str(n): (f"mvs.neighbors={n}",) for n in (2, 6)},
-    "mvs.stages": {
-        "1 stage": (f"mvs.stages=[{_COARSE}]",),
-        "3 stages": (f"mvs.stages=[{_COARSEST},{_MIDDLE},{_FINE}]",),
-    },
-    "depth_fusion.confidence": {f"{c}": (f"depth_fusion.confidence={c}",) for c in (0.4, 0.6, 0.85)},
+    "mvs.stages": {"3 stages": (f"mvs.stages=[{_COARSEST},{_MIDDLE},{_FINE}]",)},
+    "depth_fusion.confidence": {f"{c}": (f"depth_fusion.confidence={c}",) for c in (0.6, 0.9)},
     "depth_fusion.least_views": {"3": ("depth_fusion.least_views=3",)},
-    "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 60, 120, 240)},
-    "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200, 38400)},
-    "mapper.max_splats": {f"{n // 1000}k": (f"mapper.max_splats={n}",) for n in (10000, 20000, 40000)},
+    "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 60, 120)},
+    "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200)},
+    "mapper.max_splats": {f"{n // 1000}k": (f"mapper.max_splats={n}",) for n in (10000, 20000)},
 }
 ERRORS = {  # what a curve is drawn over besides the held-out PSNR: path in the report, unit
     "ATE": ("trajectory.ate_percent", "% of the path"),
@@ -45,35 +41,63 @@ ERRORS = {  # what a curve is drawn over besides the held-out PSNR: path in the 
 
 @dataclass(frozen=True)
 class Point:
-    """One run: `label` on its `curve`; NaN where a figure is missing."""
+    """Runs of one setting: `label` on its `curve`, means; NaN where a figure is missing."""
 
     curve: str
     label: str
     seconds: float
     psnr: float
-    run: Run
+    run: Run  # the first of them
+    noise: tuple[float, float] = (0.0, 0.0)  # half the range of seconds and psnr over the runs; 0 of a single one
+
+    @property
+    def name(self) -> str:
+        return self.curve if self.curve == "default" else f"{self.curve} = {self.label}"
+
+    def beats(self, other: Point) -> bool:
+        """Better in one by more than the noise of both, and not worse in the other by more than that."""
+        # a single run's own noise is unknown: it is taken for as large as the other's
+        noise = [own + of_other if own > 0.0 else 2.0 * of_other for own, of_other in zip(self.noise, other.noise)]
+        faster, better = other.seconds - self.seconds, self.psnr - other.psnr
+        return (faster > noise[0] and better > -noise[1]) or (better > noise[1] and faster > -noise[0])
 
 
-def settings(curves: dict[str, dict[str, tuple[str, ...]]]) -> list[Setting]:
-    """All points and the default, as choices for a Matrix."""
-    found = [Setting("default")]
+def settings(curves: dict[str, dict[str, tuple[str, ...]]]) -> dict[str, list[Setting]]:
+    """All points by curve, and the default, as choices for Matrices."""
+    found = {"default": [Setting("default")]}
     for curve, points in curves.items():
-        found += [Setting(_name(curve, label), overrides) for label, overrides in points.items()]
+        found[curve] = [Setting(_name(curve, label), overrides) for label, overrides in points.items()]
     return found
 
 
-def points_of(runs: list[Run], curves: dict[str, dict[str, tuple[str, ...]]]) -> tuple[Point, list[Point]]:
-    """The default, and the others; runs of several seeds are averaged."""
+def points_of(runs: list[Run], curves: dict[str, dict[str, tuple[str, ...]]]) -> tuple[Point | None, list[Point]]:
+    """The default, None where it did not run, and the others that did; runs of several seeds are averaged."""
     by_setting: dict[str, list[Run]] = {}
     for run in runs:
         by_setting.setdefault(run.setting, []).append(run)
 
     def point(curve: str, label: str, name: str) -> Point:
         same = by_setting[name]
-        return Point(curve, label, _mean(same, "time.wall"), _mean(same, "rendering.held_out.psnr"), same[0])
+        (seconds, of_seconds), (psnr, of_psnr) = _mean(same, "time.wall"), _mean(same, "rendering.held_out.psnr")
+        return Point(curve, label, seconds, psnr, same[0], (of_seconds, of_psnr))
 
-    others = [point(curve, label, _name(curve, label)) for curve, points in curves.items() for label in points]
-    return point("default", "default", "default"), others
+    names = [(curve, label, _name(curve, label)) for curve, points in curves.items() for label in points]
+    others = [point(*names_of) for names_of in names if names_of[2] in by_setting]
+    return point("default", "default", "default") if "default" in by_setting else None, others
+
+
+def judgement(default: Point, others: list[Point]) -> str:
+    """By what the default is beaten, in words."""
+    noise = f"± {default.noise[0]:.1f} s and ± {default.noise[1]:.2f} dB over the default's runs"
+    found = [
+        f"{point.name} ({point.seconds - default.seconds:+.1f} s, {point.psnr - default.psnr:+.2f} dB)"
+        for point in others
+        if point.beats(default)
+    ]
+    if not any(default.noise):
+        return "The default ran once: what beats it by more than the noise is unknown."
+    by = ", ".join(found) if found else "nothing here"
+    return f"The default is beaten by more than the noise ({noise}) by {by}."
 
 
 def rows_of(scene: str, default: Point, others: list[Point]) -> list[Row]:
@@ -90,6 +114,10 @@ def rows_of(scene: str, default: Point, others: list[Point]) -> list[Row]:
         rows += [Row(f"{name}: {e}", figure(point.run.report, path), unit) for e, (path, unit) in ERRORS.items()]
         rows += [Row(f"{name}: {n}", stage_seconds(point.run.report, n), "s") for n in ("tracker", "mvs", "mapper")]
         rows.append(Row(f"{name}: on the front", "yes" if k in front else "no"))
+    rows.append(Row(f"{scene}: default: half the range of its wall times", default.noise[0], "s"))
+    rows.append(Row(f"{scene}: default: half the range of its held-out PSNR", default.noise[1], "dB"))
+    beating = [point.name for point in others if point.beats(default)] if any(default.noise) else ["unknown"]
+    rows.append(Row(f"{scene}: default: beaten by", ", ".join(beating) or "none"))
     return rows
 
 
@@ -109,9 +137,11 @@ def table(scene: str, default: Point, others: list[Point]) -> str:
             (figure(report, "depth.inlier_ratio"), 3), *((t, 1) for t in times), (figure(report, "map.splats"), 0),
         ]  # fmt: skip
         cells = ["–" if v is None or not np.isfinite(v) else f"{v:.{digits}f}" for v, digits in values]
-        name = "**default**" if point is default else f"{point.curve} = {point.label}"
-        lines.append("| " + " | ".join([name, *cells, "yes" if k in front else ""]) + " |")
-    return "\n".join(lines)
+        name = "**default**" if point is default else point.name
+        marks = ["yes"] if k in front else []
+        marks += ["beats the default"] if any(default.noise) and point.beats(default) else []
+        lines.append("| " + " | ".join([name, *cells, ", ".join(marks)]) + " |")
+    return "\n".join([*lines, "", judgement(default, others)])
 
 
 def picture(default: Point, others: list[Point]) -> str:
@@ -122,45 +152,58 @@ def picture(default: Point, others: list[Point]) -> str:
             (point.label, point.seconds, point.psnr)
         )
     ordered = {curve: sorted(entries, key=lambda entry: entry[1]) for curve, entries in series.items()}
-    return plots.front_plot(ordered, (default.seconds, default.psnr), "wall time, s", "held-out PSNR, dB")
+    return plots.front_plot(
+        ordered, (default.seconds, default.psnr), "wall time, s", "held-out PSNR, dB", noise=default.noise
+    )
 
 
 def _name(curve: str, label: str) -> str:
     return f"{curve}_{label}".replace(".", "_").replace(" ", "_")
 
 
-def _mean(runs: list[Run], path: str) -> float:
+def _mean(runs: list[Run], path: str) -> tuple[float, float]:
+    """And half the range; NaN and 0 where no run has that figure."""
     values = [v for v in (figure(run.report, path) for run in runs) if v is not None]
-    return float(np.mean(values)) if values else float("nan")
+    return (float(np.mean(values)), float(np.ptp(values) / 2)) if values else (float("nan"), 0.0)
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     scenes, overrides = options.scenes.split(","), list(options.overrides)
     curves = {name: CURVES[name] for name in (options.curves.split(",") if options.curves else CURVES)}
+    repeats = options.repeats
     if options.quick:
-        scenes, curves = scenes[:1], {"mapper.iterations": {"5": ("mapper.iterations=5",)}}
+        scenes, curves, repeats = scenes[:1], {"mapper.iterations": {"5": ("mapper.iterations=5",)}}, 1
         overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
-    matrix = Matrix(
-        scenes, seeds=[int(s) for s in options.seeds.split(",")], overrides=overrides, settings=settings(curves)
-    )
-    output = folder(options, "curves")
-    runs = matrix.collect(output) if options.collect else matrix.run(output)
+    seeds = [int(s) for s in options.seeds.split(",")]
+    made = pieces.Pieces.of(options, folder(options, "curves"))
+    matrices = {
+        f"{scene}/{curve}": Matrix(
+            [scene], seeds=range(max(repeats, len(seeds))) if curve == "default" else seeds, overrides=overrides,
+            settings=points,
+        )
+        for scene in scenes
+        for curve, points in settings(curves).items()
+    }  # fmt: skip
+    runs = made.runs(matrices)
     rows, tables = [], []
     for scene in scenes:
         default, others = points_of([run for run in runs if run.scene == scene], curves)
+        if default is None:
+            continue
         rows += rows_of(scene, default, others)
         tables.append(table(scene, default, others))
-        plots.write(output / f"{scene}.svg", picture(default, others))
-    (output / "table.md").write_text("\n\n".join(tables) + "\n")
+        plots.write(made.output / f"{scene}.svg", picture(default, others))
+    (made.output / "table.md").write_text("\n\n".join([*tables, made.note]).strip() + "\n")
+    print("\n\n".join([*tables, made.note]))
     return rows
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", default="room", help="comma separated")
+    parser.add_argument("--scenes", default="room,redkitchen", help="comma separated")
     parser.add_argument("--curves", help=f"comma separated; default all: {', '.join(CURVES)}")
     parser.add_argument("--seeds", default="0", help="comma separated; figures are means over them")
-    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
-    parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of the default, seeds 0, 1, ...: the noise")
+    pieces.arguments(parser)
     parser.add_argument("overrides", nargs="*", help="of every run: dataset.stop=60")
 
 

@@ -37,9 +37,16 @@ def pareto(cost: Sequence[float], gain: Sequence[float]) -> list[int]:
 
 
 def front_plot(
-    series: dict[str, list[tuple[str, float, float]]], default: tuple[float, float], x_label: str, y_label: str
+    series: dict[str, list[tuple[str, float, float]]],
+    default: tuple[float, float],
+    x_label: str,
+    y_label: str,
+    noise: tuple[float, float] = (0.0, 0.0),
 ) -> str:
-    """Points (label, x, y) by series; more y for less x is better. The front is dashed, the default ringed."""
+    """Points (label, x, y) by series; more y for less x is better. The front is dashed, the default ringed.
+
+    noise: of the default, half a range each: drawn as a box around it.
+    """
     points = [(x, y) for entries in series.values() for _, x, y in entries] + [default]
     xs, ys = (np.array(values, dtype=float) for values in zip(*points))
     finite = np.isfinite(xs) & np.isfinite(ys)
@@ -76,9 +83,15 @@ def front_plot(
         parts.append(f'<text x="{_WIDTH - _RIGHT + 27}" y="{legend}">{escape(name)}</text>')
     px, py = at(*default)
     parts.append(f'<circle cx="{px:.1f}" cy="{py:.1f}" r="7" fill="none" stroke="#c53030" stroke-width="2"/>')
+    if any(noise):
+        left, top = at(default[0] - noise[0], default[1] + noise[1])
+        size = f'width="{2 * (px - left):.1f}" height="{2 * (py - top):.1f}"'
+        parts.append(f'<rect x="{left:.1f}" y="{top:.1f}" {size} fill="#c53030" opacity=".15"/>')
     legend = _TOP + 12 + 17 * len(series)
     parts.append(f'<circle cx="{_WIDTH - _RIGHT + 17}" cy="{legend - 4}" r="5" fill="none" stroke="#c53030"/>')
     parts.append(f'<text x="{_WIDTH - _RIGHT + 27}" y="{legend}">default (dashed: the front)</text>')
+    if any(noise):
+        parts.append(f'<text x="{_WIDTH - _RIGHT + 27}" y="{legend + 15}">and its noise (box)</text>')
     parts.append(f'<text x="{_LEFT + wide / 2}" y="{_HEIGHT - 8}" text-anchor="middle">{escape(x_label)}</text>')
     middle = _TOP + high / 2
     turned = f'transform="rotate(-90 14 {middle})"'

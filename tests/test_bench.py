@@ -70,7 +70,8 @@ def test_every_variant_composes_and_changes_something_or_is_the_full_system(name
 def test_variants_and_curves_name_what_there_is(tmp_path: Path) -> None:
     assert set(ablation.TABLE_III + ablation.SKIPS + ablation.OTHERS) <= set(choices("variant"))
     assert {*ablation.SCENES, *stress.REAL} <= set(choices("scene"))
-    given = curves.settings(curves.CURVES) + [stress.setting(n, s) for n, w in stress.DIFFICULTIES.items() for s in w]
+    drawn = [setting for curve in curves.settings(curves.CURVES).values() for setting in curve]
+    given = drawn + [stress.setting(n, s) for n, w in stress.DIFFICULTIES.items() for s in w]
     matrix = Matrix(["room"], settings=given)
     matrix.check()
     matrix.write_settings(tmp_path)
@@ -226,7 +227,7 @@ def test_pareto_front_and_its_plot(tmp_path: Path) -> None:
 
 def test_curves_average_seeds_and_mark_the_front() -> None:
     chosen = {"mapper.iterations": {"15": ("mapper.iterations=15",), "90": ("mapper.iterations=90",)}}
-    names = [setting.name for setting in curves.settings(chosen)]
+    names = [setting.name for settings in curves.settings(chosen).values() for setting in settings]
     assert names == ["default", "mapper_iterations_15", "mapper_iterations_90"]
     runs = [
         Run("room", "full", s, Path("x"), report(p, w), n)
@@ -234,10 +235,37 @@ def test_curves_average_seeds_and_mark_the_front() -> None:
         for s in (0, 1)
     ]
     default, others = curves.points_of(runs, chosen)
+    assert default is not None
     front = {r.name: r.value for r in curves.rows_of("room", default, others) if "front" in r.name}
     assert list(front.values()) == ["yes", "yes", "no"]
     assert "**default**" in curves.table("room", default, others)
     assert curves.picture(default, others).startswith("<svg")
+
+
+def test_what_beats_the_default_by_more_than_the_noise_is_named() -> None:
+    chosen = {"a": {name: (f"mapper.window={k}",) for k, name in enumerate(("fast", "better", "noise", "slower"), 1)}}
+
+    def run(name: str, seed: int, wall: float, psnr: float) -> Run:
+        return Run("room", "full", seed, Path("x"), report(psnr, wall), name)
+
+    runs = [run("default", 0, 10.0, 25.0), run("default", 1, 10.4, 25.2)]
+    others = {"fast": (9.0, 25.0), "better": (10.3, 26.0), "noise": (9.9, 25.2), "slower": (12.0, 27.0)}
+    runs += [run(f"a_{name}", 0, *figures) for name, figures in others.items()]
+    default, points = curves.points_of(runs, chosen)
+    assert default is not None
+    assert default.noise == pytest.approx((0.2, 0.1))
+    assert [point.label for point in points if point.beats(default)] == ["fast", "better"]
+    text = curves.table("room", default, points)
+    assert "beaten by more than the noise (± 0.2 s and ± 0.10 dB over the default's runs) by a = fast (-1.2 s" in text
+    assert text.count("beats the default") == 2
+    assert {r.name: r.value for r in curves.rows_of("room", default, points)}["room: default: beaten by"] == (
+        "a = fast, a = better"
+    )
+    assert "noise (box)" in curves.picture(default, points)
+    once, _ = curves.points_of(runs[1:], chosen)
+    assert once is not None
+    assert "unknown" in curves.judgement(once, points)
+    assert curves.points_of(runs[2:], chosen)[0] is None
 
 
 def test_stress_passes_what_holds_or_says_that_it_does_not() -> None:
