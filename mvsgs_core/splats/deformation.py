@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from mvsgs_core import geometry
-from mvsgs_core.splats.map_state import MapState, replace_values
+from mvsgs_core.splats.map_state import MapState
 from mvsgs_core.splats.sh_rotation import sh_rotation
+
+CHUNK = 16384  # splats that are moved at once: matrices in float64 for each take three times what the map keeps of it
 
 
 @dataclass(frozen=True)
@@ -45,34 +47,38 @@ def move_with_anchors(state: MapState, similarities: dict[int, Similarity]) -> i
     if not similarities or len(state) == 0:
         return 0
     keys = sorted(similarities)
+    ordered = [similarities[key] for key in keys]
     lookup = torch.tensor(keys, dtype=torch.int64, device=state.device)
     position = torch.searchsorted(lookup, state.anchors).clamp(max=len(keys) - 1)
     chosen = torch.nonzero(lookup[position] == state.anchors)[:, 0]
-    which = position[chosen]
-    ordered = [similarities[key] for key in keys]
+    for some in chosen.split(CHUNK):
+        _move(state, some, position[some], ordered)
+    return len(chosen)
+
+
+def _move(state: MapState, chosen: Tensor, which: Tensor, ordered: list[Similarity]) -> None:
+    """Moves the splats `chosen` (M,), in place, each by the similarity `which` (M,) of `ordered`."""
     rotations = np.stack([s.rotation for s in ordered])
     scale = _rows([s.scale for s in ordered], which)
     rotation = _rows(rotations, which)
     translation = _rows([s.translation for s in ordered], which)
     turn = _rows(left_multiplication(geometry.quaternion_from_rotation(rotations)), which)
 
-    values = {name: value.clone() for name, value in vars(state.detached()).items()}
-    means = values["means"][chosen].to(torch.float64)
-    values["means"][chosen] = (scale[:, None] * _apply(rotation, means) + translation).to(torch.float32)
-    values["log_scales"][chosen] += scale.log().to(torch.float32)[:, None]
-    values["quaternions"][chosen] = _apply(turn, values["quaternions"][chosen].to(torch.float64)).to(torch.float32)
+    splats = state.detached()
+    means = splats.means[chosen].to(torch.float64)
+    splats.means[chosen] = (scale[:, None] * _apply(rotation, means) + translation).to(torch.float32)
+    splats.log_scales[chosen] += scale.log().to(torch.float32)[:, None]
+    splats.quaternions[chosen] = _apply(turn, splats.quaternions[chosen].to(torch.float64)).to(torch.float32)
 
     jacobian = rotation / scale[:, None, None]
     _move_moments(state, "means", chosen, jacobian)
     _move_moments(state, "quaternions", chosen, turn)
-    if values["sh"].shape[1] > 1:
-        harmonics = _rows([sh_rotation(r, values["sh"].shape[1]) for r in rotations], which)
-        values["sh"][chosen] = (harmonics @ values["sh"][chosen].to(torch.float64)).to(torch.float32)
+    if splats.sh.shape[1] > 1:
+        harmonics = _rows([sh_rotation(r, splats.sh.shape[1]) for r in rotations], which)
+        splats.sh[chosen] = (harmonics @ splats.sh[chosen].to(torch.float64)).to(torch.float32)
         first, second = state.first["sh"], state.second["sh"]
         first[chosen] = (harmonics @ first[chosen].to(torch.float64)).to(torch.float32)
         second[chosen] = (harmonics.square() @ second[chosen].to(torch.float64)).to(torch.float32)
-    replace_values(state, values)
-    return len(chosen)
 
 
 def left_multiplication(q: np.ndarray) -> np.ndarray:

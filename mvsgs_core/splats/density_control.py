@@ -76,14 +76,10 @@ def _adapt(state: MapState, config: DensityConfig, median_depth: float, generato
         dense[order[:room]] = True
     large = state.splats.log_scales.max(dim=1).values > math.log(config.split_scale * median_depth)
     clone, split = dense & ~large, dense & large
-    old = state.detached()
     _share_opacity(state, clone)
-    clones, clone_anchors, clone_steps = (
-        _clones(_select(old, clone), generator),
-        state.anchors[clone],
-        state.steps[clone],
-    )
-    halves = _halves(_select(old, split), generator)
+    clones = _clones(_select(state.detached(), clone), generator)
+    clone_anchors, clone_steps = state.anchors[clone], state.steps[clone]
+    halves = _halves(_select(state.detached(), split), generator)
     half_anchors = state.anchors[split].repeat(2)
     keep = ~(prune | split)
     state.keep(keep)

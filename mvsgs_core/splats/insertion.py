@@ -16,6 +16,8 @@ from mvsgs_core.splats.densities import neutral_beta
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.spherical_harmonics import C0
 
+CHUNK = 65536  # of the map's splats that are sorted into voxels at once, in float64
+
 
 @dataclass(frozen=True)
 class InsertionConfig:
@@ -136,13 +138,15 @@ def unoccupied(positions: np.ndarray, means: np.ndarray, edge: float) -> np.ndar
     low = positions.min(axis=0)
     cells = np.floor((positions - low) / edge).astype(np.int64)
     count = cells.max(axis=0) + 1
-    others = np.floor((means - low) / edge)
-    others = others[((others >= 0) & (others < count)).all(axis=1)].astype(np.int64)
 
     def key(cell: np.ndarray) -> np.ndarray:
         return (cell[:, 0] * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
 
-    return ~np.isin(key(cells), key(others))
+    taken = []
+    for some in np.array_split(means, -(-len(means) // CHUNK)):
+        others = np.floor((some - low) / edge)
+        taken.append(key(others[((others >= 0) & (others < count)).all(axis=1)].astype(np.int64)))
+    return ~np.isin(key(cells), np.concatenate(taken))
 
 
 def splats_from_points(

@@ -34,6 +34,13 @@ class MapState:
         return len(self.steps)
 
     @property
+    def bytes(self) -> int:
+        """Of all that is kept for the splats; gradients, which live for an iteration, are left out."""
+        kept = (self.splats.tensors(), self.first, self.second)
+        single = (self.steps, self.anchors, self.screen_gradient, self.screen_views)
+        return sum(t.nbytes for tensors in kept for t in tensors.values()) + sum(t.nbytes for t in single)
+
+    @property
     def device(self) -> torch.device:
         return self.steps.device
 
@@ -41,14 +48,14 @@ class MapState:
     def append(self, new: Splats, anchors: Tensor, steps: Tensor | None = None) -> None:
         """Adds splats with moments of zero. `steps`: their age; 0 unless they descend from older splats."""
         count = len(anchors)
-        values, first, second = {}, {}, {}
+        values = self._given_up()
         for name in PARAMETERS:
             added = getattr(new, name).detach().to(self.device)
             zeros = torch.zeros_like(added)
-            values[name] = torch.cat([getattr(self.splats, name).detach(), added])
-            first[name] = torch.cat([self.first[name], zeros])
-            second[name] = torch.cat([self.second[name], zeros])
-        self.splats, self.first, self.second = _leaves(values), first, second
+            values[name] = torch.cat([values[name], added])
+            self.first[name] = torch.cat([self.first[name], zeros])
+            self.second[name] = torch.cat([self.second[name], zeros])
+        self.splats = _leaves(values)
         age = torch.zeros(count, dtype=torch.int32, device=self.device) if steps is None else steps
         zeros = torch.zeros(count, device=self.device)
         self.steps = torch.cat([self.steps, age])
@@ -59,9 +66,9 @@ class MapState:
     @torch.no_grad()
     def take_over(self, other: MapState) -> None:
         """Adds all splats of another map with their moments, ages, anchors and gradients; `other` stays as it is."""
-        values = {}
+        values = self._given_up()
         for name in PARAMETERS:
-            values[name] = torch.cat([getattr(s.splats, name).detach() for s in (self, other)])
+            values[name] = torch.cat([values[name], getattr(other.splats, name).detach()])
             self.first[name] = torch.cat([self.first[name], other.first[name]])
             self.second[name] = torch.cat([self.second[name], other.second[name]])
         self.splats = _leaves(values)
@@ -73,9 +80,14 @@ class MapState:
     @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
         """Drops the splats where `mask` (N,) bool is False."""
-        self.splats = _leaves({name: getattr(self.splats, name).detach()[mask] for name in PARAMETERS})
-        self.first = {name: value[mask] for name, value in self.first.items()}
-        self.second = {name: value[mask] for name, value in self.second.items()}
+        if bool(mask.all()):
+            return
+        values = self._given_up()
+        for name in PARAMETERS:
+            values[name] = values[name][mask]
+            self.first[name] = self.first[name][mask]
+            self.second[name] = self.second[name][mask]
+        self.splats = _leaves(values)
         self.steps, self.anchors = self.steps[mask], self.anchors[mask]
         self.screen_gradient, self.screen_views = self.screen_gradient[mask], self.screen_views[mask]
 
@@ -101,6 +113,15 @@ class MapState:
     def reset_screen(self) -> None:
         self.screen_gradient.zero_()
         self.screen_views.zero_()
+
+    def _given_up(self) -> dict[str, Tensor]:
+        """The splats' tensors, held by nothing else: so that each is freed when a new one takes its place.
+
+        Growing all of them at once would need the whole map's memory a second time.
+        """
+        values = {name: value.detach() for name, value in self.splats.tensors().items()}
+        self.splats = _leaves({name: value.new_zeros((0, *value.shape[1:])) for name, value in values.items()})
+        return values
 
     def detached(self) -> Splats:
         """A view of the splats that no gradient reaches; shares memory."""

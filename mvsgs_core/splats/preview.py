@@ -9,6 +9,8 @@ from mvsgs_core.splats.mapper import OnlineMapper
 from mvsgs_core.splats.reference import rotation_matrices
 from mvsgs_core.splats.spherical_harmonics import C0
 
+CHUNK = 16384  # splats whose covariances are made at once: on the way they take several times their size
+
 
 def preview_arrays(mapper: OnlineMapper, limit: int) -> dict[str, np.ndarray]:
     """`render` (H, W, 3) uint8 and, for at most `limit` splats spread over the map, relative to its origin in world
@@ -17,14 +19,20 @@ def preview_arrays(mapper: OnlineMapper, limit: int) -> dict[str, np.ndarray]:
     final = mapper.state.detached()
     stride = max(1, -(-len(final) // limit))
     unit = mapper.unit or 1.0
-    axes = rotation_matrices(final.quaternions[::stride]) * (final.log_scales[::stride].exp() * unit)[:, None, :]
+    shapes = zip(final.quaternions[::stride].split(CHUNK), final.log_scales[::stride].split(CHUNK))
     return {
         "render": _bytes(render),
         "means": (final.means[::stride] * unit).cpu().numpy(),
-        "covariances": (axes @ axes.transpose(1, 2)).cpu().numpy(),
+        "covariances": torch.cat([_covariances(q, s, unit) for q, s in shapes]).cpu().numpy(),
         "colors": _bytes(0.5 + C0 * final.sh[::stride, 0]),
         "opacities": torch.sigmoid(final.opacity_logits[::stride]).cpu().numpy(),
     }
+
+
+def _covariances(quaternions: torch.Tensor, log_scales: torch.Tensor, unit: float) -> torch.Tensor:
+    """(N, 3, 3) in world units, of quaternions (N, 4) and log scales (N, 3)."""
+    axes = rotation_matrices(quaternions) * (log_scales.exp() * unit)[:, None, :]
+    return axes @ axes.transpose(1, 2)
 
 
 def _bytes(color: torch.Tensor) -> np.ndarray:

@@ -1,0 +1,100 @@
+"""Changing a large map takes little memory beyond the map's own: what a long run's memory is made of."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvsgs_core.splats.deformation import Similarity, move_with_anchors
+from mvsgs_core.splats.insertion import unoccupied
+from mvsgs_core.splats.map_state import MapState
+from mvsgs_core.splats.model import Splats
+
+COUNT = 200_000
+SIZE = COUNT * (3 * 15 * 4 + 4 + 8 + 4 + 4)  # bytes: values and moments, age, anchor, gradient, views
+MMAP_THRESHOLD = -3  # of mallopt, malloc.h
+RESET = Path("/proc/self/clear_refs")  # 5: the peak of the resident memory begins anew
+
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux" or not os.access(RESET, os.W_OK) or not hasattr(ctypes.CDLL(None), "malloc_trim"),
+    reason="peaks of resident memory are read as Linux with glibc gives them",
+)
+
+
+def splats(count: int) -> Splats:
+    shapes = [(count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count,)]
+    return Splats(*(torch.ones(shape) for shape in shapes))
+
+
+@pytest.fixture
+def state() -> MapState:
+    """Every page of it is resident."""
+    assert ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, 1 << 18) == 1
+    made = MapState(1, torch.device("cpu"))
+    made.append(splats(COUNT), torch.arange(COUNT) % 7)
+    for moments in (made.first, made.second):
+        for value in moments.values():
+            value.fill_(0.5)
+    return made
+
+
+def resident(kind: str) -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024.0 for line in lines if line.startswith(f"{kind}:"))
+
+
+def peak(work: Callable[[], object]) -> float:
+    """Bytes beyond those before. What is freed meanwhile goes back at once: no holes of the heap are counted."""
+    libc = ctypes.CDLL(None)
+    libc.malloc_trim(0)
+    assert libc.mallopt(MMAP_THRESHOLD, 1 << 18) == 1
+    try:
+        before = resident("VmRSS")
+        RESET.write_text("5")
+        work()
+        return resident("VmHWM") - before
+    finally:
+        libc.mallopt(MMAP_THRESHOLD, 1 << 25)  # what glibc comes to by itself, where large blocks come and go
+
+
+def test_a_map_knows_its_size(state: MapState) -> None:
+    assert state.bytes == SIZE
+    assert MapState(16, torch.device("cpu")).bytes == 0
+
+
+def test_growing_and_shrinking_replaces_one_tensor_after_the_other(state: MapState) -> None:
+    assert peak(lambda: state.append(splats(10), torch.zeros(10, dtype=torch.int64))) < 0.4 * SIZE
+    assert len(state) == COUNT + 10
+    assert state.splats.means.requires_grad
+    assert peak(lambda: state.keep(torch.arange(len(state)) % 100 > 0)) < 0.4 * SIZE
+    kept = state.splats.means
+    state.keep(torch.ones(len(state), dtype=torch.bool))
+    assert state.splats.means is kept
+
+
+def test_a_correction_moves_the_map_in_place(state: MapState) -> None:
+    turned = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
+    assert peak(lambda: move_with_anchors(state, dict.fromkeys(range(6), turned))) < 0.9 * SIZE
+    moved = state.splats.means.detach()
+    np.testing.assert_allclose(moved[-1 - (COUNT - 1) % 7].numpy(), [-1.0, 4.0, 5.0])
+    rest = moved[state.anchors == 6]
+    assert (rest == 1.0).all()
+    assert (moved[state.anchors < 6] == torch.tensor([-1.0, 4.0, 5.0])).all()
+
+
+def test_voxels_are_looked_up_in_parts() -> None:
+    generator = np.random.default_rng(0)
+    means = generator.random((COUNT, 3), dtype=np.float32)
+    positions = generator.random((5000, 3))
+    found: list[np.ndarray] = []
+    assert peak(lambda: found.append(unoccupied(positions, means, 0.02))) < 14e6  # at once: 18 MB
+    voxels = {tuple(cell) for cell in np.floor((means - positions.min(axis=0)) / 0.02).astype(int)}
+    cells = np.floor((positions - positions.min(axis=0)) / 0.02).astype(int)
+    np.testing.assert_array_equal(found[0], [tuple(cell) not in voxels for cell in cells])
