@@ -1,35 +1,40 @@
 """Other ways to the same result on the same frames, beside ours.
 
-Poses: COLMAP (pycolmap) with sequential matching on our keyframes and every 5th frame, calibration given. Map: an
-offline 3D Gaussian splatting of COLMAP's sparse points with COLMAP's poses, by our own rasterizer and optimizer. It is
-trained on the frames that are keyframes of ours and scored on our held-out frames (every 5th that is no keyframe): for
-as long as our mapper optimized, then twice as long and so on, until doubling the time gains less than 0.1 dB.
-Both run alone on all cores; our mapper shares them with the other nodes.
+Poses: COLMAP (pycolmap) with sequential matching, calibration given, on our keyframes, every 5th frame and one frame of
+two, at up to 512x384 pixels: more than our tracker looks at. Map: an offline 3D Gaussian splatting of COLMAP's sparse
+points with COLMAP's poses, by our own rasterizer and optimizer, at the size of our run. It is trained on the frames
+that are keyframes of ours and scored on our held-out frames (every 5th that is no keyframe): for as long as our mapper
+optimized, then twice as long and so on, until doubling the time gains less than 0.1 dB.
+Both run alone on all cores; our mapper shares them with the other nodes. What ended is kept for --resume.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
 
-from bench.colmap_poses import Model, reconstruct
+from bench import pieces
+from bench.colmap_poses import Model
 from bench.runs import Matrix, figure, folder, stage_seconds
 from bench.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.table import Row, main
+from bench.tracking_peers import Peer, solve
 from launch.placement import available_cores
 from msgs import GroundTruth
+from mvsgs_core.datasets import Item
 from mvsgs_core.evaluation import image_metrics, trajectory
 from mvsgs_core.evaluation.scoring import HELD_OUT_EVERY
 from mvsgs_core.splats.training import TrainingConfig
 from nodes.reader import Reader
 
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end
+STRIDE = 2  # of the frames that COLMAP gets besides our keyframes and every 5th
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,7 @@ class Ours:
     report: dict[str, Any]
     track: dict[str, list[Any]]
     frames: dict[int, GroundTruth]
+    settings: dict[str, Any] = field(default_factory=dict)  # of the reader
 
     @property
     def keyframes(self) -> list[int]:
@@ -70,21 +76,37 @@ class Trained:
     ssim: float
     splats: int
     iterations: int
+    asked: float  # seconds; the last iteration ends a little later
 
 
-def run_ours(scene: str, overrides: list[str], output: Path, collect: bool = False) -> Ours | None:
-    """None where the run failed: runs.log in `output` says why."""
+def run_ours(scene: str, overrides: list[str], output: Path, made: pieces.Pieces) -> Ours | None:
+    """None where the run failed, runs.log in `output` says why, or is not there yet."""
     matrix = Matrix([scene], overrides=[*overrides, "recorder=track", "evaluator.max_frames=2000"])
-    result = (matrix.collect(output) if collect else matrix.run(output))[0]
-    if result.report is None or not (result.folder / "track.json").exists():
+    runs = made.runs({str(output.relative_to(made.output)): matrix})
+    if not runs or runs[0].report is None or not (runs[0].folder / "track.json").exists():
         return None
-    config = OmegaConf.to_container(OmegaConf.load(result.folder / "config.yaml"))
+    config = OmegaConf.to_container(OmegaConf.load(runs[0].folder / "config.yaml"))
     assert isinstance(config, dict)
     known = set(vars(Reader.Config()))
     settings = {str(k): v for k, v in config["dataset"].items() if k in known}
+    track = json.loads((runs[0].folder / "track.json").read_text())
+    return Ours(runs[0].report, track, frames_of(settings), settings)
+
+
+def frames_of(settings: dict[str, Any]) -> dict[int, GroundTruth]:
     messages = Reader(Reader.Config(**settings)).run()
-    frames = {message.index: message for message in messages if isinstance(message, GroundTruth)}
-    return Ours(result.report, json.loads((result.folder / "track.json").read_text()), frames)
+    return {message.index: message for message in messages if isinstance(message, GroundTruth)}
+
+
+def solve_poses(ours: Ours, place: Path, threads: int, resume: bool) -> tuple[Peer, list[int]]:
+    """COLMAP's model, from the images as they come, and the frames that it got."""
+    known = {*ours.keyframes, *(i for i in ours.frames if i % HELD_OUT_EVERY == 0 or i % STRIDE == 0)}
+    if not resume:
+        (place / "images.sha256").unlink(missing_ok=True)  # what `solve` would know an earlier model by
+    place.mkdir(parents=True, exist_ok=True)
+    whole = frames_of({**ours.settings, "size": None})
+    items = [Item(i, whole[i].timestamp, whole[i].image, whole[i].intrinsics) for i in sorted(known)]
+    return solve(items, place, threads), sorted(known)
 
 
 def ate_percent(poses: dict[int, np.ndarray], ours: Ours, frames: list[int]) -> float | None:
@@ -116,19 +138,30 @@ def train(model: Model, ours: Ours, config: SparseConfig) -> Trained:
         color = fitted.render(view)
         scores.append((image_metrics.psnr(color, photograph), image_metrics.ssim(color, photograph)))
     psnr, ssim = np.mean(scores, axis=0) if scores else (np.nan, np.nan)
-    return Trained(fitted.seconds, float(psnr), float(ssim), len(fitted.state), fitted.iterations)
+    return Trained(fitted.seconds, float(psnr), float(ssim), len(fitted.state), fitted.iterations, config.seconds)
 
 
-def train_longer(model: Model, ours: Ours, longest: float, threads: int) -> list[Trained]:
-    """Equal time first, then doubled until the gain is small, to at most `longest` times as long."""
-    config = SparseConfig(seconds=ours.optimization, training=TrainingConfig(threads=threads))
-    results = [train(model, ours, config)]
-    while 2 * config.seconds <= longest * ours.optimization * 1.001:
-        config = replace(config, seconds=2 * config.seconds)
-        results.append(train(model, ours, config))
-        if results[-1].psnr - results[-2].psnr < GAIN:
-            break
+def train_longer(model: Model, ours: Ours, longest: float, threads: int, kept: Path) -> list[Trained]:
+    """Equal time first, then doubled until the gain is small, to at most `longest` times as long.
+
+    kept: a file of results, from which those of an earlier call, of the same times, are taken; new ones are added.
+    """
+    known = [Trained(**entry) for entry in json.loads(kept.read_text())] if kept.exists() else []
+    if known and not np.isclose(known[0].asked, ours.optimization):
+        known = []
+    results: list[Trained] = []
+    seconds = ours.optimization
+    while not converged(results) and seconds <= longest * ours.optimization * 1.001:
+        config = SparseConfig(seconds=seconds, training=TrainingConfig(threads=threads))
+        results.append(known[len(results)] if len(results) < len(known) else train(model, ours, config))
+        kept.write_text(json.dumps([asdict(result) for result in results]))
+        seconds *= 2
     return results
+
+
+def converged(results: list[Trained]) -> bool:
+    """The last doubling of the time gained less than `GAIN`."""
+    return len(results) > 1 and results[-1].psnr - results[-2].psnr < GAIN
 
 
 def pose_rows(scene: str, ours: Ours, model: Model, frames: list[int]) -> list[Row]:
@@ -154,9 +187,8 @@ def map_rows(scene: str, ours: Ours, model: Model, trained: list[Trained]) -> li
         Row(f"{scene}: map, ours: splats", figure(ours.report, "map.splats")),
         Row(f"{scene}: map, ours: iterations", figure(ours.report, "map.iterations")),
     ]
-    for before, result in zip([None, *trained], trained):
-        times = round(result.seconds / ours.optimization)
-        name = f"{scene}: map, COLMAP + splatting, " + ("equal time" if times == 1 else f"{times} times as long")
+    for doublings, (before, result) in enumerate(zip([None, *trained], trained)):
+        name = f"{scene}: map, COLMAP + splatting, " + (f"{2**doublings} times as long" if doublings else "equal time")
         rows += [
             Row(f"{name}: held-out PSNR", result.psnr, "dB"),
             Row(f"{name}: held-out SSIM", result.ssim),
@@ -167,32 +199,51 @@ def map_rows(scene: str, ours: Ours, model: Model, trained: list[Trained]) -> li
         ]
         if before is not None:
             rows.append(Row(f"{name}: gain by twice the time", result.psnr - before.psnr, "dB"))
+    if len(trained) > 1:
+        gain = trained[-1].psnr - trained[-2].psnr
+        name = f"{scene}: COLMAP + splatting, gain by the last doubling of its time"
+        rows.append(Row(name, gain, "dB", f"< {GAIN:g}: converged", converged(trained)))
     return rows
 
 
-def compare(scene: str, options: argparse.Namespace, overrides: list[str]) -> list[Row]:
-    place = folder(options, "peers") / scene
-    ours = run_ours(scene, overrides, place / "ours", options.collect)
+def protocol(scene: str, ours: Ours, peer: Peer, frames: list[int]) -> Row:
+    """What both had, as a row."""
+    height, width = next(iter(ours.frames.values())).image.shape[:2]
+    text = (
+        f"{len(ours.frames)} frames, maps of {len(ours.keyframes)} keyframes at {width}x{height}, scored on "
+        f"{len(ours.held_out)} held-out frames; COLMAP got {len(frames)} of the frames at {peer.size[1]}x{peer.size[0]}"
+    )
+    return Row(f"{scene}: protocol", text)
+
+
+def compare(scene: str, options: argparse.Namespace, overrides: list[str], made: pieces.Pieces) -> list[Row]:
+    place = made.output / scene
+    ours = run_ours(scene, overrides, place / "ours", made)
     if ours is None:
+        if f"{scene}/ours" in made.missing:
+            return []
         return [Row(f"{scene}: ours", f"failed: see {place / 'ours' / 'runs.log'}", "", "a report", False)]
-    frames = sorted({*ours.keyframes, *(i for i in ours.frames if i % HELD_OUT_EVERY == 0)})
     threads = options.threads or available_cores()
-    images = {i: ours.frames[i].image for i in frames}
-    model, problem = reconstruct(images, ours.frames[frames[0]].intrinsics, place / "colmap", threads)
-    if model is None:
-        return [Row(f"{scene}: COLMAP", problem)]
-    rows = pose_rows(scene, ours, model, frames)
+    resume = options.resume or options.collect
+    peer, frames = solve_poses(ours, place / "colmap", threads, resume)
+    rows = [protocol(scene, ours, peer, frames)]
+    if peer.model is None:
+        return [*rows, Row(f"{scene}: COLMAP", peer.why)]
+    rows += pose_rows(scene, ours, peer.model, frames)
+    kept = place / "trained.json"
+    if not resume:
+        kept.unlink(missing_ok=True)
     try:
-        trained = train_longer(model, ours, options.longest, threads)
+        trained = train_longer(peer.model, ours, options.longest, threads, kept)
     except ValueError as error:
         return [*rows, Row(f"{scene}: map, COLMAP + splatting", str(error))]
-    return rows + map_rows(scene, ours, model, trained)
+    return rows + map_rows(scene, ours, peer.model, trained)
 
 
 def markdown(rows: list[Row]) -> str:
     """A table of poses and one of maps, a line each scene and method, from rows named "scene: kind, method: figure"."""
     tables: dict[str, dict[tuple[str, str], dict[str, str]]] = {"poses": {}, "map": {}}
-    failures = []
+    others = []
     for row in rows:
         scene, method, *figure_name = row.name.split(": ", 2)
         kind, _, method = method.partition(", ")
@@ -200,7 +251,8 @@ def markdown(rows: list[Row]) -> str:
         if kind in tables and figure_name:
             tables[kind].setdefault((scene, method), {})[figure_name[0]] = f"{shown} {row.unit}".strip()
         else:
-            failures.append(f"{row.name}: {shown}")
+            verdict = f" ({row.goal}{'' if row.met else ': no'})" if row.goal else ""
+            others.append(f"{row.name}: {shown} {row.unit}".rstrip() + verdict)
     text = []
     for kind, lines in tables.items():
         names = list(dict.fromkeys(name for figures in lines.values() for name in figures))
@@ -208,7 +260,7 @@ def markdown(rows: list[Row]) -> str:
         for (scene, method), figures in lines.items():
             text.append(f"| {scene} | {method} | " + " | ".join(figures.get(name, "") for name in names) + " |")
         text.append("")
-    return "\n".join([*text, *failures]) + "\n"
+    return "\n".join([*text, "\n\n".join(others)]) + "\n"
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
@@ -217,17 +269,17 @@ def measure(options: argparse.Namespace) -> list[Row]:
     if options.quick:
         scenes, options.longest = scenes[:1], 1.0
         overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
-    rows = [row for scene in scenes for row in compare(scene, options, overrides)]
-    (folder(options, "peers") / "table.md").write_text(markdown(rows))
+    made = pieces.Pieces.of(options, folder(options, "peers"))
+    rows = [row for scene in scenes for row in compare(scene, options, overrides, made)]
+    (made.output / "table.md").write_text((markdown(rows) + made.note).strip() + "\n")
     return rows
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", default="room,tum_fr1_xyz,redkitchen", help="comma separated")
-    parser.add_argument("--longest", type=float, default=4.0, help="times our optimization's time, for the offline one")
+    parser.add_argument("--scenes", default="redkitchen,tum_fr1_xyz", help="comma separated")
+    parser.add_argument("--longest", type=float, default=8.0, help="times our optimization's time, for the offline one")
     parser.add_argument("--threads", type=int, help="of COLMAP and of the offline optimization; default: all cores")
-    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
-    parser.add_argument("--collect", action="store_true", help="our runs are in the folder already")
+    pieces.arguments(parser)
     parser.add_argument("overrides", nargs="*", help="of our runs: dataset.stop=100")
 
 

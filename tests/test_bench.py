@@ -215,6 +215,37 @@ def test_the_error_of_other_poses_is_taken_over_common_frames_after_alignment() 
     assert (ours.keyframes, ours.held_out, ours.optimization) == ([0, 3], [5], 3.0)
 
 
+def test_the_offline_map_is_trained_until_twice_the_time_brings_little(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores = {3.0: 20.0, 6.0: 22.0, 12.0: 22.5, 24.0: 22.55, 48.0: 30.0}
+    asked: list[float] = []
+
+    def train(model: Any, ours: peers.Ours, config: SparseConfig) -> peers.Trained:
+        asked.append(config.seconds)
+        return peers.Trained(config.seconds + 0.1, scores[config.seconds], 0.8, 10, 20, config.seconds)
+
+    monkeypatch.setattr(peers, "train", train)
+    ours = peers.Ours(report(), {"index": [], "keyframe": [], "world_from_cam": []}, {})
+    model = peers.Model(*(np.zeros(0) for _ in range(4)), {"mapping": 5.0}, 9.0)
+    kept = tmp_path / "trained.json"
+    cut_short = peers.train_longer(model, ours, 2.0, 1, kept)
+    assert not peers.converged(cut_short)
+    found = peers.train_longer(model, ours, 64.0, 1, kept)
+    assert asked == [3.0, 6.0, 12.0, 24.0]  # the first two once
+    assert peers.converged(found)
+    rows = {row.name: row for row in peers.map_rows("room", ours, model, found)}
+    assert rows["room: map, COLMAP + splatting, 8 times as long: gain by twice the time"].value == pytest.approx(0.05)
+    assert rows["room: COLMAP + splatting, gain by the last doubling of its time"].met
+    short = {row.name: row for row in peers.map_rows("room", ours, model, cut_short)}
+    assert not short["room: COLMAP + splatting, gain by the last doubling of its time"].met
+    text = peers.markdown(list(rows.values()))
+    assert text.endswith("gain by the last doubling of its time: 0.05 dB (< 0.1: converged)\n")
+    other = peers.Ours(report(time={"wall": 9.0, "stages": {"mapper": {"insertion": 6.0}}}), ours.track, {})
+    peers.train_longer(model, other, 1.0, 1, kept)
+    assert asked[-1] == 6.0  # results of another time are no start
+
+
 def test_pareto_front_and_its_plot(tmp_path: Path) -> None:
     assert plots.pareto([3.0, 1.0, 2.0, 4.0, np.nan], [9.0, 1.0, 0.5, 9.0, 99.0]) == [1, 0]
     svg = plots.front_plot({"area": [("a & b", 1.0, 2.0), ("c", 2.0, 3.0)]}, (2.0, 3.0), "s", "dB")
