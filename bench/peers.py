@@ -1,10 +1,10 @@
 """Other ways to the same result on the same frames, beside ours.
 
-Poses: COLMAP (pycolmap) with sequential matching, calibration given, on our keyframes, every 5th frame and one frame of
-two, at up to 512x384 pixels: more than our tracker looks at. Map: an offline 3D Gaussian splatting of COLMAP's sparse
-points with COLMAP's poses, by our own rasterizer and optimizer, at the size of our run. It is trained on the frames
-that are keyframes of ours and scored on our held-out frames (every 5th that is no keyframe): for as long as our mapper
-optimized, then twice as long and so on, until doubling the time gains less than 0.1 dB.
+Poses: COLMAP (pycolmap) with sequential matching, calibration given, on our keyframes, every 5th frame and a hundred
+evenly, at up to 512x384 pixels: more than our tracker looks at. Map: an offline 3D Gaussian splatting of COLMAP's
+sparse points with COLMAP's poses, by our own rasterizer and optimizer, at the size of our run. It is trained on the
+frames that are keyframes of ours and scored on our held-out frames (every 5th that is no keyframe): for as long as our
+mapper optimized, then twice as long and so on, until doubling the time gains less than 0.1 dB.
 Both run alone on all cores; our mapper shares them with the other nodes. What ended is kept for --resume.
 """
 
@@ -34,7 +34,7 @@ from mvsgs_core.splats.training import TrainingConfig
 from nodes.reader import Reader
 
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end
-STRIDE = 2  # of the frames that COLMAP gets besides our keyframes and every 5th
+EVENLY = 100  # frames that COLMAP gets, about, besides our keyframes and every 5th
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,8 @@ def frames_of(settings: dict[str, Any]) -> dict[int, GroundTruth]:
 
 def solve_poses(ours: Ours, place: Path, threads: int, resume: bool) -> tuple[Peer, list[int]]:
     """COLMAP's model, from the images as they come, and the frames that it got."""
-    known = {*ours.keyframes, *(i for i in ours.frames if i % HELD_OUT_EVERY == 0 or i % STRIDE == 0)}
+    stride = max(1, round(len(ours.frames) / EVENLY))
+    known = {*ours.keyframes, *(i for i in ours.frames if i % HELD_OUT_EVERY == 0 or i % stride == 0)}
     if not resume:
         (place / "images.sha256").unlink(missing_ok=True)  # what `solve` would know an earlier model by
     place.mkdir(parents=True, exist_ok=True)
