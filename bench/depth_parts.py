@@ -30,6 +30,7 @@ def part_variants(area: int) -> dict[str, Variant]:
         "no adaptive windows": changed(contrast=1e6),
         "4 paths": changed(paths=4),
         "no membrane": changed(fill=False),
+        "no choice at rims": changed(rims=None),
         "best 2 views": changed(best_views=2),
         "all 4 views": changed(best_views=4),
         "2 neighbors": (replace(base, neighbors=replace(base.neighbors, count=2)), fusion),
