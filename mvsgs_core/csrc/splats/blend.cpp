@@ -41,7 +41,7 @@ struct Workspace {
     // Lists the pairs that touch `block`, filled up to whole groups; returns how many touch it.
     uint32_t find(uint32_t count, int block) {
         const uint32_t found = list_with_bit(blocks.data(), count, block, list.data());
-        for (int i = 0; i < kTogether; ++i) list[found + i] = count;
+        for (int i = 0; i < kForward; ++i) list[found + i] = count;
         return found;
     }
 };
@@ -56,14 +56,14 @@ PixelSums blend_block(const Tile& tile, int block, Workspace& work) {
     const BlockPixels pixels;
     const Lanes x = pixels.x[block & 3], y = pixels.y[block >> 2];
     uint32_t first = 0;
-    for (; first < found && any(at_least(ahead, kMinTransmittance)); first += kTogether) {
+    for (; first < found && any(at_least(ahead, kMinTransmittance)); first += kForward) {
         const uint32_t* list = work.list.data() + first;
         const Placed* placed = work.placed.data();
-        const Densities<Exact> densities([&](int i) -> const Placed& { return placed[list[i]]; },
-                                         [&](int) { return x; }, [&](int) { return y; });
-        Lanes alphas[kTogether];
-        store(minimum(densities.alpha, Group{} + kMaxAlpha), alphas);
-        for (int i = 0; i < kTogether; ++i) {
+        const Densities<Exact, kForward> densities([&](int i) -> const Placed& { return placed[list[i]]; },
+                                                   [&](int) { return x; }, [&](int) { return y; });
+        Lanes alphas[kForward];
+        store<kForward>(minimum(densities.alpha, Group<kForward>{} + kMaxAlpha), alphas);
+        for (int i = 0; i < kForward; ++i) {
             const Placed& s = placed[list[i]];
             const Mask counted = at_least(ahead, kMinTransmittance);
             const Lanes weight = where(counted, ahead * alphas[i]);

@@ -129,8 +129,9 @@ SPLATS_INLINE void sum_pair(const Placed& s, uint32_t blocks, Visits& visits, co
 // Some pairs of a tile and the blocks that they may color: the exact density's long chain of operations takes several
 // blocks at once, of whichever splats.
 struct Batch {
+    using Several = Group<kBackward>;
     static constexpr int kVisits = 64;  // at the least: what they need stays in the first-level cache
-    static constexpr int kRoom = kVisits + kBlocks + kTogether;
+    static constexpr int kRoom = kVisits + kBlocks + kBackward;
 
     int pairs = 0, visits = 0;
     Placed placed[kVisits];
@@ -150,20 +151,21 @@ struct Batch {
     }
 
     void evaluate(const BlockPixels& pixels) {
-        for (int i = 0; i < kTogether; ++i) who[visits + i] = where[visits + i] = 0;
-        for (int first = 0; first < visits; first += kTogether) {
-            const Densities<true> d([&](int i) -> const Placed& { return placed[who[first + i]]; },
+        for (int i = 0; i < kBackward; ++i) who[visits + i] = where[visits + i] = 0;
+        for (int first = 0; first < visits; first += kBackward) {
+            const Densities<true, kBackward> d([&](int i) -> const Placed& { return placed[who[first + i]]; },
                                     [&](int i) { return pixels.x[where[first + i] & 3]; },
                                     [&](int i) { return pixels.y[where[first + i] >> 2]; });
-            const Group half_beta = group([&](int i) { return all(placed[who[first + i]].half_beta); });
-            const Group slope = half_beta * d.power * reciprocal(maximum(d.m, Group{} + kCenterM));
-            Lanes part[5][kTogether];
-            store(d.u, part[0]);
-            store(d.v, part[1]);
-            store(d.alpha, part[2]);
-            store(where_at_least(d.m, kCenterM, slope), part[3]);
-            store(d.power * d.log2_m, part[4]);
-            for (int i = 0; i < kTogether; ++i)
+            const Several half_beta =
+                group<kBackward>([&](int i) { return all(placed[who[first + i]].half_beta); });
+            const Several slope = half_beta * d.power * reciprocal(maximum(d.m, Several{} + kCenterM));
+            Lanes part[5][kBackward];
+            store<kBackward>(d.u, part[0]);
+            store<kBackward>(d.v, part[1]);
+            store<kBackward>(d.alpha, part[2]);
+            store<kBackward>(where_at_least(d.m, kCenterM, slope), part[3]);
+            store<kBackward>(d.power * d.log2_m, part[4]);
+            for (int i = 0; i < kBackward; ++i)
                 found[first + i] = {part[0][i], part[1][i], part[2][i], part[3][i], part[4][i]};
         }
     }

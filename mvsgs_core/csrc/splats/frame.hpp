@@ -7,6 +7,9 @@
 #include <cstdlib>
 #include <memory>
 #include <new>
+#if __has_include(<sys/mman.h>)
+#include <sys/mman.h>
+#endif
 #include <utility>
 #include <vector>
 
@@ -30,6 +33,19 @@ constexpr float kCenterM = 1e-6f;      // the exact density is flat below this m
 constexpr float kSqrtHalfLog2e = 0.8493218002880191f;  // sqrt(log2(e) / 2)
 constexpr float kHalfLog2e = 0.7213475204444817f;
 
+// At least so many bytes, aligned to cache lines; from huge pages where they are many: the walks go through all of it.
+inline void* take_memory(size_t bytes) {
+    constexpr size_t kHuge = size_t(1) << 21;
+    const size_t page = bytes >= kHuge ? kHuge : 64;
+    const size_t whole = (bytes + page - 1) / page * page;
+    void* memory = std::aligned_alloc(page, whole);
+    if (!memory) throw std::bad_alloc();
+#if defined(MADV_HUGEPAGE)
+    if (page == kHuge) madvise(memory, whole, MADV_HUGEPAGE);
+#endif
+    return memory;
+}
+
 // Grow-only memory without initialization, aligned to cache lines.
 template <class T>
 class Buffer {
@@ -38,7 +54,7 @@ class Buffer {
         if (count > capacity_) {
             release();
             capacity_ = count + count / 4 + 64;
-            data_ = static_cast<T*>(::operator new(capacity_ * sizeof(T), std::align_val_t(64)));
+            data_ = static_cast<T*>(take_memory(capacity_ * sizeof(T)));
         }
         return data_;
     }
@@ -53,7 +69,7 @@ class Buffer {
 
    private:
     void release() {
-        if (data_) ::operator delete(data_, std::align_val_t(64));
+        std::free(data_);
         data_ = nullptr;
         capacity_ = 0;
     }

@@ -58,16 +58,34 @@ SPLATS_INLINE void store_rows(const Lanes (&v)[Count], float* values, int count)
 SPLATS_INLINE Ints smaller(const Ints& a, const Ints& b) { return choose(a < b, a, b); }
 SPLATS_INLINE Ints larger(const Ints& a, const Ints& b) { return choose(a < b, b, a); }
 
-constexpr int kTogether = sizeof(Group) / sizeof(Lanes);
+// `Count` lanes that go in lockstep: 1, 2, 4, ...
+template <int Count>
+struct GroupOf {
+    using Type = Halves<typename GroupOf<Count / 2>::Type>;
+};
+template <>
+struct GroupOf<1> {
+    using Type = Lanes;
+};
+template <int Count>
+using Group = typename GroupOf<Count>::Type;
 // The lanes that `of` gives for 0, 1, ... as one group.
-template <class Of>
-SPLATS_INLINE Group group(Of of) {
-    if constexpr (kTogether == 4)
-        return halves(halves(of(0), of(1)), halves(of(2), of(3)));
+template <int Count, class Of>
+SPLATS_INLINE Group<Count> group(Of of, int first = 0) {
+    if constexpr (Count == 1)
+        return of(first);
     else
-        return of(0);
+        return halves(group<Count / 2>(of, first), group<Count / 2>(of, first + Count / 2));
 }
-SPLATS_INLINE void store(const Group& group, Lanes* first) { std::memcpy(first, &group, sizeof(group)); }
+template <int Count>
+SPLATS_INLINE void store(const Group<Count>& group, Lanes* first) {
+    if constexpr (Count == 1) {
+        *first = group;
+    } else {
+        store<Count / 2>(group.low, first);
+        store<Count / 2>(group.high, first + Count / 2);
+    }
+}
 
 // log2(x) of positive normal x: mantissa in [sqrt(1/2), sqrt(2)), log2(1 + f) = f P(f), P of degree 6 with a
 // relative error of 1e-6: enough for an exponent, where it changes alpha by less than 1e-6.

@@ -50,7 +50,7 @@ SPLATS_INLINE Lanes times_power(Lanes x, Lanes power) {  // of two
 
 namespace splats {
 
-using Group = Halves<Halves<Lanes>>;  // goes in lockstep
+constexpr int kForward = 4, kBackward = 4;  // how many go in lockstep
 
 template <class Half>
 SPLATS_INLINE Halves<Half> nearest(const Halves<Half>& x) {

@@ -50,20 +50,22 @@ SPLATS_INLINE Part root(Part x) {
 SPLATS_INLINE bool any(IntPart mask) { return (mask[0] | mask[1] | mask[2] | mask[3]) != 0; }
 #endif
 
-// Neighboring runs of `Width` lanes of `a` and of `b` are added; the runs of `a` and `b` then alternate.
+// trade: halves of runs of 2 `Bit` lanes trade places, the later one of `a` for the earlier one of `b`.
 // turned: every lane with the one `Width` lanes on.
 #if defined(__AVX2__)
-template <int Width>
-SPLATS_INLINE Part merge(Part a, Part b) {
-    if constexpr (Width == 4)
-        return __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11) +
-               __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
-    else if constexpr (Width == 2)
-        return __builtin_shufflevector(a, b, 0, 1, 8, 9, 4, 5, 12, 13) +
-               __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
-    else
-        return __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14) +
-               __builtin_shufflevector(a, b, 1, 9, 3, 11, 5, 13, 7, 15);
+template <int Bit>
+SPLATS_INLINE void trade(Part& a, Part& b) {
+    const Part from = a;
+    if constexpr (Bit == 4) {
+        a = __builtin_shufflevector(from, b, 0, 1, 2, 3, 8, 9, 10, 11);
+        b = __builtin_shufflevector(from, b, 4, 5, 6, 7, 12, 13, 14, 15);
+    } else if constexpr (Bit == 2) {
+        a = __builtin_shufflevector(from, b, 0, 1, 8, 9, 4, 5, 12, 13);
+        b = __builtin_shufflevector(from, b, 2, 3, 10, 11, 6, 7, 14, 15);
+    } else {
+        a = __builtin_shufflevector(from, b, 0, 8, 2, 10, 4, 12, 6, 14);
+        b = __builtin_shufflevector(from, b, 1, 9, 3, 11, 5, 13, 7, 15);
+    }
 }
 template <int Width>
 SPLATS_INLINE Part turned(Part v) {
@@ -75,12 +77,16 @@ SPLATS_INLINE Part turned(Part v) {
         return __builtin_shufflevector(v, v, 1, 0, 3, 2, 5, 4, 7, 6);
 }
 #else
-template <int Width>
-SPLATS_INLINE Part merge(Part a, Part b) {
-    if constexpr (Width == 2)
-        return __builtin_shufflevector(a, b, 0, 1, 4, 5) + __builtin_shufflevector(a, b, 2, 3, 6, 7);
-    else
-        return __builtin_shufflevector(a, b, 0, 4, 2, 6) + __builtin_shufflevector(a, b, 1, 5, 3, 7);
+template <int Bit>
+SPLATS_INLINE void trade(Part& a, Part& b) {
+    const Part from = a;
+    if constexpr (Bit == 2) {
+        a = __builtin_shufflevector(from, b, 0, 1, 4, 5);
+        b = __builtin_shufflevector(from, b, 2, 3, 6, 7);
+    } else {
+        a = __builtin_shufflevector(from, b, 0, 4, 2, 6);
+        b = __builtin_shufflevector(from, b, 1, 5, 3, 7);
+    }
 }
 template <int Width>
 SPLATS_INLINE Part turned(Part v) {

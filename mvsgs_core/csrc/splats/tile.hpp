@@ -67,23 +67,25 @@ struct Placed {
 };
 
 // Densities of a group of splats, each on a block.
-template <bool Exact>
+template <bool Exact, int Count>
 struct Densities {
-    Group u, v;
-    Group m, log2_m, power;  // of the exact density: power = m^(beta/2), with m limited from below
-    Group alpha;             // before it is clamped; 0 where it is below 1/255
+    using Wide = Group<Count>;
+
+    Wide u, v;
+    Wide m, log2_m, power;  // of the exact density: power = m^(beta/2), with m limited from below
+    Wide alpha;             // before it is clamped; 0 where it is below 1/255
 
     // at(i): the splat of place i in the group; x(i), y(i): its pixels.
     template <class At, class X, class Y>
     SPLATS_INLINE_MEMBER Densities(At at, X x, Y y) {
-        u = group([&](int i) { return at(i).u(x(i), y(i)); });
-        v = group([&](int i) { return at(i).v(y(i)); });
-        const Group log2_opacity = group([&](int i) { return all(at(i).log2_opacity); });
-        Group exponent;
+        u = group<Count>([&](int i) { return at(i).u(x(i), y(i)); });
+        v = group<Count>([&](int i) { return at(i).v(y(i)); });
+        const Wide log2_opacity = group<Count>([&](int i) { return all(at(i).log2_opacity); });
+        Wide exponent;
         if constexpr (Exact) {
             m = u * u + v * v;
-            log2_m = log2_of_positive(maximum(m, Group{} + kCenterM));
-            power = exp2_limited(group([&](int i) { return all(at(i).half_beta); }) * log2_m);
+            log2_m = log2_of_positive(maximum(m, Wide{} + kCenterM));
+            power = exp2_limited(group<Count>([&](int i) { return all(at(i).half_beta); }) * log2_m);
             exponent = log2_opacity - kHalfLog2e * power;
         } else {
             exponent = log2_opacity - u * u - v * v;
