@@ -72,10 +72,9 @@ def growth(samples: list[tuple[float, float]]) -> float:
     return float(np.median(memory[-tenth:]) / np.median(memory[2 * tenth : 3 * tenth]))
 
 
-def flat_rows(name: str, output: Path, samples: Samples | None) -> list[Row]:
-    """Peak and growth of each process, and memory.svg in `output`. None: the samples of an earlier run there."""
-    if samples is None:
-        samples = json.loads((output / "memory.json").read_text())
+def flat_rows(name: str, output: Path) -> list[Row]:
+    """Peak and growth of each process by the samples in `output`, and memory.svg there."""
+    samples: Samples = json.loads((output / "memory.json").read_text())
     start, end = stream((output / "0" / "logs" / "dataset.log").read_text(), samples)
     rows, series = [], []
     for node, taken in samples.items():

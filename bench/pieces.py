@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,10 @@ class Pieces:
     missing: list[str] = field(default_factory=list)  # names of the pieces that did not run
     _start: float = field(default_factory=time.monotonic)
 
-    def runs(self, matrices: dict[str, Matrix]) -> list[Run]:
+    def runs(self, matrices: dict[str, Matrix], run: Callable[[Matrix, Path], object] | None = None) -> list[Run]:
         """The runs of all matrices, by name of the piece, in their order; those of missing pieces are left out.
 
+        run: runs a matrix in a folder, to watch it, in place of Matrix.run.
         Raises ValueError for an unknown scene or variant, before anything runs.
         """
         for matrix in matrices.values():
@@ -44,11 +46,10 @@ class Pieces:
             place = self.output / name
             if done is None:
                 (place / "piece.json").unlink(missing_ok=True)
-                found += matrix.run(place)
+                (run or Matrix.run)(matrix, place)
                 done = {**asked(matrix), "commit": commit()}
                 (place / "piece.json").write_text(json.dumps(done, indent=1))
-            else:
-                found += matrix.collect(place)
+            found += matrix.collect(place)
             if done["commit"] not in self.commits:
                 self.commits.append(done["commit"])
         return found

@@ -3,14 +3,15 @@
 The synthetic room, 90 frames at 240x180, 12 iterations a keyframe and 60 at the end, with one difficulty at a time in
 three strengths; hard real sequences; repeated runs; a long run with the memory of every process; one core; a slow node.
 A run passes where it keeps a map and, if tracking or map are broken, says so itself: warnings or lost frames.
+Runs are kept by difficulty and group: --resume runs only what is missing.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
+from bench import pieces
 from bench.memory import flat_rows, sampled
 from bench.runs import Matrix, Run, Setting, figure, folder, said
 from bench.table import Row, at_most, main
@@ -27,6 +28,7 @@ DIFFICULTIES: dict[str, tuple[float, ...]] = {  # mild, hard, breaking: see mvsg
     "textureless": (1, 2, 4),
     "pure_rotation": (10, 20, 40),
     "motion_blur": (0.25, 0.5, 1.0),
+    "rolling_shutter": (0.25, 0.5, 1.0),
     "exposure": (0.5, 1.0, 2.0),
     "noise": (4, 12, 30),
     "gloss": (0.5, 1.0, 2.0),
@@ -119,13 +121,14 @@ def setting(difficulty: str, strength: float) -> Setting:
 
 def difficulties(options: argparse.Namespace, overrides: list[str], easy: Outcome, lines: list[str]) -> list[Row]:
     chosen = {"covered": (20,), "noise": (12,)} if options.quick else DIFFICULTIES
-    pairs = [(name, strength) for name, strengths in chosen.items() for strength in strengths]
-    matrix = Matrix(["room"], overrides=overrides, jobs=options.jobs, settings=[setting(*pair) for pair in pairs])
     rows = []
-    for (name, strength), run in zip(pairs, _go(matrix, options, "difficulties"), strict=True):
-        outcome = Outcome.of(run)
-        rows += rows_of(f"{name} {strength:g}", outcome, easy, same=name in SAME)
-        lines.append(_line(f"{name} {strength:g}", outcome, rows[-1]))
+    for name, strengths in chosen.items():
+        settings = [setting(name, strength) for strength in strengths]
+        matrix = Matrix(["room"], overrides=overrides, jobs=options.jobs, settings=settings)
+        for strength, run in zip(strengths, _go(matrix, options, f"difficulties/{name}")):  # none where it is missing
+            outcome = Outcome.of(run)
+            rows += rows_of(f"{name} {strength:g}", outcome, easy, same=name in SAME)
+            lines.append(_line(f"{name} {strength:g}", outcome, rows[-1]))
     return rows
 
 
@@ -142,6 +145,8 @@ def real(options: argparse.Namespace, lines: list[str]) -> list[Row]:
 def repeats(options: argparse.Namespace, overrides: list[str]) -> list[Row]:
     """Five runs, seeds 0 to 4: mean and half the range."""
     runs = [Outcome.of(run) for run in _go(Matrix(["room"], seeds=range(5), overrides=overrides), options, "repeats")]
+    if not runs:
+        return []
     rows = []
     for name, unit, values in (
         ("held-out PSNR", "dB", [r.psnr for r in runs]),
@@ -159,7 +164,10 @@ def repeats(options: argparse.Namespace, overrides: list[str]) -> list[Row]:
 
 def one_run(name: str, matrix: Matrix, options: argparse.Namespace, easy: Outcome) -> list[Row]:
     """A run that may be slow but must give what the easy one gives: nothing is lost on the way."""
-    outcome = Outcome.of(_go(matrix, options, name.replace(" ", "_"))[0])
+    runs = _go(matrix, options, name.replace(" ", "_"))
+    if not runs:
+        return []
+    outcome = Outcome.of(runs[0])
     times = (outcome.wall or float("inf")) / (easy.wall or float("nan"))
     difference = abs((outcome.psnr or 0.0) - (easy.psnr or 0.0))
     return [
@@ -174,17 +182,17 @@ def long_run(options: argparse.Namespace) -> list[Row]:
     frames = options.frames
     loop = (f"dataset.options.frames={frames}", "dataset.options.loop=true")
     matrix = Matrix(["room"], overrides=[*TINY, *loop])
-    output = folder(options, "stress") / "long"
-    samples = None if options.collect else sampled(matrix, output)
-    outcome = Outcome.of(matrix.collect(output)[0])
+    runs = options.made.runs({"long": matrix}, sampled)
+    if not runs:
+        return []
     name = f"{frames} frames"
-    rows = rows_of(name, outcome, None)
-    return rows + flat_rows(name, output, samples)
+    return rows_of(name, Outcome.of(runs[0]), None) + flat_rows(name, options.made.output / "long")
 
 
 def _go(matrix: Matrix, options: argparse.Namespace, name: str) -> list[Run]:
-    output = folder(options, "stress") / name
-    return matrix.collect(output) if options.collect else matrix.run(output)
+    """Nothing where the piece is missing."""
+    found: list[Run] = options.made.runs({name: matrix})
+    return found
 
 
 def _line(name: str, outcome: Outcome, verdict: Row) -> str:
@@ -210,7 +218,11 @@ def measure(options: argparse.Namespace) -> list[Row]:
         overrides += ["dataset.stop=70", "mapper.iterations=10", "mapper.refinement=30"]
     lines = ["| | ATE % | depth inliers | complete | held-out PSNR | tracked % | map | pass | it said |",
              "|---|---:|---:|---:|---:|---:|---|---|---|"]  # fmt: skip
-    easy = Outcome.of(_go(Matrix(["room"], overrides=overrides), options, "easy")[0])
+    options.made = pieces.Pieces.of(options, folder(options, "stress"))
+    runs = _go(Matrix(["room"], overrides=overrides), options, "easy")
+    if not runs:
+        raise SystemExit(f"the easy run, which the others are compared with, is not in {options.made.output}")
+    easy = Outcome.of(runs[0])
     rows = rows_of("nothing hard", easy, None)
     lines.append(_line("nothing hard", easy, rows[-1]))
     if "difficulties" in groups:
@@ -234,7 +246,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     for row in others:
         value = f"{row.value:.3g}" if isinstance(row.value, float) else str(row.value)
         lines.append(f"| {row.name} | {value} {row.unit} | {row.goal} | {row.met if row.met is not None else ''} |")
-    (folder(options, "stress") / "table.md").write_text("\n".join(lines) + "\n")
+    (options.made.output / "table.md").write_text("\n".join([*lines, "", options.made.note]).strip() + "\n")
     return rows + others
 
 
@@ -244,8 +256,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--jobs", type=int, default=1, help="difficulties and real sequences at once; times mean little"
     )
     parser.add_argument("--frames", type=int, default=2000, help="of the long run")
-    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
-    parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
+    pieces.arguments(parser)
     parser.add_argument("overrides", nargs="*", help="of every run: mapper.iterations=10")
 
 
