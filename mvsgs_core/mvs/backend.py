@@ -29,7 +29,7 @@ class NativeBackend:
         return np.asarray(
             self._kernels.cost_volume(
                 reference, neighbors, warps, first, step, hypotheses, options.radius, options.best, options.noise,
-                options.contrast, threads=self._threads, needed=needed,
+                options.contrast, options.level, options.level_range, threads=self._threads, needed=needed,
             )
         )  # fmt: skip
 
@@ -50,7 +50,7 @@ class NativeBackend:
         return np.asarray(
             self._kernels.surface_costs(
                 reference, neighbors, warps, surfaces, options.radius, options.best, options.noise, options.contrast,
-                threads=self._threads, needed=needed,
+                options.level, options.level_range, threads=self._threads, needed=needed,
             )
         )  # fmt: skip
 

@@ -12,12 +12,14 @@ TILE = (8, 16)  # (rows, columns) of the tiles that a sweep can leave out
 
 @dataclass(frozen=True)
 class CostOptions:
-    """Windowed ZNCC of a sweep."""
+    """Windowed ZNCC of a sweep, and a share of the difference of gray level."""
 
     radius: int = 2  # pixels: a window of 2 radius + 1
     best: int = 3  # views whose cost counts, of all
     noise: float = 1.5  # gray levels²: added to both variances
     contrast: float = 8.0  # gray levels: a pixel that differs so from the window's center counts 1 / e
+    level: float = 0.0  # share of the cost that is the difference of both windows' means; ZNCC doesn't see it
+    level_range: float = 20.0  # gray levels: that difference costs 1 from here on
 
 
 @dataclass(frozen=True)

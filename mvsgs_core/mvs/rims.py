@@ -6,13 +6,15 @@ narrow search around that surface does not find the way back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from mvsgs_core import camera
 from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, CostOptions
 from mvsgs_core.mvs.skipping import tile_counts
+from mvsgs_core.mvs.warp import apply_warp
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,9 @@ class RimChoice:
     rings: tuple[int, ...] = (3, 6)  # pixels: the surfaces so far away, in eight directions, are candidates
     small_jump: float = 0.3  # cost of a change of inverse depth that moves the point by a pixel
     large_jump: float = 1.0  # the most that a change costs
+    contrast: float = 5.0  # gray levels: what differs so from a window's center counts 1 / e in it
+    level: float = 0.3  # share of the cost that is the difference of gray level
+    level_range: float = 10.0  # gray levels: that difference costs 1 from here on
     least: float = 1.0  # pixels: tiles whose candidates differ less keep their depth
     edge: float = 12.0  # gray levels that halve these
 
@@ -33,26 +38,28 @@ def continued_surfaces(inverse_depth: np.ndarray, rings: tuple[int, ...]) -> np.
     found = [inverse_depth]
     for ring in rings:
         for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
-            u, v = ring * du, ring * dv
-            plane = smooth - np.float32(u) * slope_u - np.float32(v) * slope_v
-            found.append(_shifted(plane, u, v))
+            rows, away_v = _beside(ring * dv, smooth.shape[0])
+            columns, away_u = _beside(ring * du, smooth.shape[1])
+            there = (rows[:, None], columns[None])
+            found.append(smooth[there] - away_u[None] * slope_u[there] - away_v[:, None] * slope_v[there])
     return np.stack(found)
 
 
 def _slope(surface: np.ndarray, axis: int) -> np.ndarray:
     """(H, W) change a pixel along `axis`: the smaller difference of both sides, so that none reaches over a jump."""
-    step = np.diff(surface, axis=axis, prepend=np.take(surface, [0], axis), append=np.take(surface, [-1], axis))
-    before, after = (step[:, :-1], step[:, 1:]) if axis == 1 else (step[:-1], step[1:])
+    step = np.diff(surface, axis=axis)
+    # At the border there is one side only.
+    before = np.concatenate([np.take(step, [0], axis), step], axis)
+    after = np.concatenate([step, np.take(step, [-1], axis)], axis)
     smaller = np.where(np.abs(before) < np.abs(after), before, after)
     return np.asarray(cv2.medianBlur(np.ascontiguousarray(smaller, dtype=np.float32), 5))
 
 
-def _shifted(values: np.ndarray, u: int, v: int) -> np.ndarray:
-    """What lies `u` columns and `v` rows away, the border repeated."""
-    height, width = values.shape
-    padded = cv2.copyMakeBorder(values, max(-v, 0), max(v, 0), max(-u, 0), max(u, 0), cv2.BORDER_REPLICATE)
-    top, left = max(v, 0), max(u, 0)
-    return padded[top : top + height, left : left + width]
+def _beside(shift: int, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """(length,) where `shift` away lies, the last pixel where that is outside, and float32 how far away it is."""
+    here = np.arange(length)
+    there = np.clip(here + shift, 0, length - 1)
+    return there, (there - here).astype(np.float32)
 
 
 def settle_rims(
@@ -69,12 +76,34 @@ def settle_rims(
 
     `pixel` is the change of inverse depth that moves a point by a pixel.
     """
+    neighbors = at_level_of(reference, neighbors, warps, inverse_depth)
+    cost_options = replace(cost_options, contrast=choice.contrast, level=choice.level, level_range=choice.level_range)
+    options = ChooseOptions(choice.small_jump / pixel, choice.large_jump, choice.edge, pixel)
     surfaces = continued_surfaces(inverse_depth, choice.rings)
     tiles = differing_tiles(surfaces, choice.least * pixel)
     cost = backend.surface_costs(reference, neighbors, warps, surfaces, cost_options, tiles)
-    options = ChooseOptions(choice.small_jump / pixel, choice.large_jump, choice.edge, pixel)
     best, gap = backend.choose_surface(cost, surfaces, reference, options)
     return np.ascontiguousarray(np.take_along_axis(surfaces, best[None], axis=0)[0]), gap
+
+
+def at_level_of(
+    reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray, every: int = 4
+) -> np.ndarray:
+    """(N, h, w) float32: neighbors (N, h, w) with the median difference of gray level to the reference taken out.
+
+    A camera's exposure changes; of every fourth pixel at the surface found so far the median is hardly wrong.
+    """
+    u, v = (a[::every, ::every] for a in camera.pixel_grid(*inverse_depth.shape))
+    w = inverse_depth[::every, ::every].astype(np.float64)
+    height, width = neighbors.shape[1:]
+    levelled = []
+    for image, warp in zip(neighbors, warps, strict=True):
+        x, y, z = apply_warp(warp, u, v, w)
+        seen = (z > 1e-6) & (w > 0) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+        there = cv2.remap(image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+        difference = (reference[::every, ::every] - there)[seen]
+        levelled.append(image + np.float32(np.median(difference) if len(difference) else 0.0))
+    return np.stack(levelled)
 
 
 def differing_tiles(surfaces: np.ndarray, least: float) -> np.ndarray:

@@ -55,8 +55,7 @@ class TorchBackend:
         best = min(options.best, len(images))
         cost = torch.empty((reference.shape[0], count, reference.shape[1]), device=self.device)
         for k, surface in enumerate(surfaces):
-            correlation = torch.stack([windows.correlate(i, t, surface) for i, t in zip(images, transforms)])
-            each = (1.0 - correlation).clamp(0.0, 1.0)
+            each = torch.stack([windows.cost(i, t, surface, options) for i, t in zip(images, transforms)])
             cost[:, k] = torch.topk(each, best, dim=0, largest=False).values.mean(dim=0)
         if needed is not None:
             tiles = torch.from_numpy(needed).to(self.device).repeat_interleave(TILE[0], 0).repeat_interleave(TILE[1], 2)
@@ -129,8 +128,19 @@ class _Windows:
         columns = torch.nn.functional.unfold(image[None, None], side, padding=self.radius)
         return columns.reshape(side * side, height, width)
 
+    def cost(self, neighbor: Tensor, warp: Tensor, inverse_depth: Tensor, options: CostOptions) -> Tensor:
+        """(H, W) in [0, 1]: 1 - ZNCC, with a share of the difference of gray level; 1 where the pixel is not seen."""
+        correlation, mean = self._correlate(neighbor, warp, inverse_depth)
+        shape = (1.0 - correlation).clamp(0.0, 1.0)
+        apart = ((self.mean - mean).abs() / options.level_range).clamp(max=1.0)
+        return torch.where(correlation < -1.5, torch.ones_like(shape), shape + options.level * (apart - shape))
+
     def correlate(self, neighbor: Tensor, warp: Tensor, inverse_depth: Tensor) -> Tensor:
         """(H, W) ZNCC against a neighbor (h, w) warped by (12,); -2 where it does not see the pixel."""
+        return self._correlate(neighbor, warp, inverse_depth)[0]
+
+    def _correlate(self, neighbor: Tensor, warp: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
+        """ZNCC, and the mean gray level of the neighbor's window."""
         sample, seen = _sample(neighbor, warp, inverse_depth)
         shifted = self._neighborhood(sample)
         total = (self.weight * shifted).sum(dim=0)
@@ -138,7 +148,7 @@ class _Windows:
         product = (self.weighted * shifted).sum(dim=0)
         variance = (square - total**2).clamp(min=0.0) + self.noise
         correlation = (product - self.mean * total) / torch.sqrt(self.variance * variance)
-        return torch.where(seen, correlation, torch.full_like(correlation, -2.0))
+        return torch.where(seen, correlation, torch.full_like(correlation, -2.0)), total
 
 
 def _sample(image: Tensor, warp: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:

@@ -169,11 +169,16 @@ void correlate_row(const Windows& windows, int y, int y0, int begin, int height,
     }
 }
 
-// Keeps the `best` smallest costs of each pixel, ascending; slots is [best][width].
-void insert_cost(const float* ncc, int width, Columns columns, int best, float* slots) {
+// Costs of a row from its correlation and the mean gray levels of both windows; keeps the `best` smallest of each
+// pixel, ascending; slots is [best][width].
+void insert_cost(const float* ncc, const float* mean, const float* mean_there, int width, Columns columns,
+                 const CostOptions& o, int best, float* slots) {
+    const float level = o.level, sharpness = 1.0f / o.level_range;
 #pragma omp simd
     for (int x = columns.from; x < columns.to; ++x) {
-        float c = std::min(std::max(1.0f - ncc[x], 0.0f), 1.0f);
+        const float shape = std::min(std::max(1.0f - ncc[x], 0.0f), 1.0f);
+        const float apart = std::min(std::fabs(mean[x] - mean_there[x]) * sharpness, 1.0f);
+        float c = ncc[x] < -1.5f ? 1.0f : shape + level * (apart - shape);
         for (int j = 0; j < best; ++j) {
             float& slot = slots[static_cast<std::size_t>(j) * width + x];
             const float lower = std::min(slot, c);
@@ -240,7 +245,9 @@ void sweep(const float* reference, int height, int width, const float* neighbors
                                   h.factor * static_cast<float>(k), s.sample.data(), s.seen.data());
                         for (int y = y0; y < y1; ++y) {
                             correlate_row(windows, y, y0, begin, height, run, o.noise, s, s.value.data());
-                            insert_cost(s.value.data(), width, run, best,
+                            insert_cost(s.value.data(),
+                                        windows.mean.data() + static_cast<std::size_t>(y - y0) * width, s.sum.data(),
+                                        width, run, o, best,
                                         s.best.data() + static_cast<std::size_t>(y - y0) * width * best);
                         }
                     }

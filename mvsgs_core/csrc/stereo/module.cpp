@@ -48,16 +48,19 @@ nb::ndarray<nb::numpy, T> allocate(const std::size_t (&shape)[N]) {
 
 nb::ndarray<nb::numpy, float> cost_volume(Image reference, Stack neighbors, Warps warps, Image first, Image step,
                                           int hypotheses, int radius, int best, float noise,
-                                          float contrast, int threads, std::optional<Tiles> needed) {
+                                          float contrast, float level, float level_range, int threads,
+                                          std::optional<Tiles> needed) {
     same_size(reference, first);
     same_size(reference, step);
     require(neighbors.shape(0) == warps.shape(0) && neighbors.shape(0) > 0, "one warp per neighbor, at least one");
     require(neighbors.shape(1) >= 2 && neighbors.shape(2) >= 2, "neighbor images need at least 2x2 pixels");
     require(hypotheses >= 1 && radius >= 0 && radius <= 16 && best >= 1, "bad hypotheses, radius or best");
+    require(level >= 0 && level <= 1 && level_range > 0, "bad level");
     const std::size_t h = reference.shape(0), w = reference.shape(1), d = static_cast<std::size_t>(hypotheses);
     require_tiles(needed, h, d, w);
     auto cost = allocate<float>({h, d, w});
-    const stereo::CostOptions options{hypotheses, radius, best, noise, contrast, thread_count(threads)};
+    const stereo::CostOptions options{hypotheses, radius, best, noise, contrast, level,
+                                      level_range, thread_count(threads)};
     {
         nb::gil_scoped_release release;
         stereo::cost_volume(reference.data(), static_cast<int>(h), static_cast<int>(w), neighbors.data(),
@@ -69,17 +72,19 @@ nb::ndarray<nb::numpy, float> cost_volume(Image reference, Stack neighbors, Warp
 }
 
 nb::ndarray<nb::numpy, float> surface_costs(Image reference, Stack neighbors, Warps warps, Stack surfaces, int radius,
-                                            int best, float noise, float contrast, int threads,
-                                            std::optional<Tiles> needed) {
+                                            int best, float noise, float contrast, float level, float level_range,
+                                            int threads, std::optional<Tiles> needed) {
     require(surfaces.shape(1) == reference.shape(0) && surfaces.shape(2) == reference.shape(1),
             "surfaces must be (D, H, W)");
     require(neighbors.shape(0) == warps.shape(0) && neighbors.shape(0) > 0, "one warp per neighbor, at least one");
     require(neighbors.shape(1) >= 2 && neighbors.shape(2) >= 2, "neighbor images need at least 2x2 pixels");
     require(surfaces.shape(0) >= 1 && radius >= 0 && radius <= 16 && best >= 1, "bad surfaces, radius or best");
+    require(level >= 0 && level <= 1 && level_range > 0, "bad level");
     const std::size_t h = reference.shape(0), w = reference.shape(1), d = surfaces.shape(0);
     require_tiles(needed, h, d, w);
     auto cost = allocate<float>({h, d, w});
-    const stereo::CostOptions options{static_cast<int>(d), radius, best, noise, contrast, thread_count(threads)};
+    const stereo::CostOptions options{static_cast<int>(d), radius, best, noise, contrast, level,
+                                      level_range, thread_count(threads)};
     {
         nb::gil_scoped_release release;
         stereo::surface_costs(reference.data(), static_cast<int>(h), static_cast<int>(w), neighbors.data(),
@@ -115,7 +120,7 @@ nb::ndarray<nb::numpy, float> view_correlation(Image reference, Stack neighbors,
     require(radius >= 0 && radius <= 16, "bad radius");
     const std::size_t h = reference.shape(0), w = reference.shape(1), n = neighbors.shape(0);
     auto correlation = allocate<float>({n, h, w});
-    const stereo::CostOptions options{1, radius, 1, noise, contrast, thread_count(threads)};
+    const stereo::CostOptions options{1, radius, 1, noise, contrast, 0.0f, 1.0f, thread_count(threads)};
     {
         nb::gil_scoped_release release;
         stereo::view_correlation(reference.data(), static_cast<int>(h), static_cast<int>(w), neighbors.data(),
@@ -214,12 +219,14 @@ nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack
 MVSGS_EXPAND(MVSGS_MODULE, m) {
     using namespace nb::literals;
     m.def("cost_volume", &cost_volume, "reference"_a, "neighbors"_a, "warps"_a, "first"_a, "step"_a, "hypotheses"_a,
-          "radius"_a, "best"_a, "noise"_a, "contrast"_a, "threads"_a = 0, "needed"_a = nb::none());
+          "radius"_a, "best"_a, "noise"_a, "contrast"_a, "level"_a = 0.0f, "level_range"_a = 1.0f, "threads"_a = 0,
+          "needed"_a = nb::none());
     m.attr("TILE") = nb::make_tuple(stereo::kTileRows, stereo::kTileColumns);
     m.def("view_correlation", &view_correlation, "reference"_a, "neighbors"_a, "warps"_a, "inverse_depth"_a,
           "radius"_a, "noise"_a, "contrast"_a, "threads"_a = 0);
     m.def("surface_costs", &surface_costs, "reference"_a, "neighbors"_a, "warps"_a, "surfaces"_a, "radius"_a, "best"_a,
-          "noise"_a, "contrast"_a, "threads"_a = 0, "needed"_a = nb::none());
+          "noise"_a, "contrast"_a, "level"_a = 0.0f, "level_range"_a = 1.0f, "threads"_a = 0,
+          "needed"_a = nb::none());
     m.def("choose_surface", &choose_surface, "cost"_a, "surfaces"_a, "reference"_a, "small_jump"_a, "large_jump"_a,
           "edge"_a, "apart"_a, "threads"_a = 0);
     m.def("semi_global", &semi_global, "cost"_a, "reference"_a, "first"_a, "step"_a, "small_jump"_a, "large_jump"_a,

@@ -22,10 +22,13 @@ struct CostOptions {
     int best;         // number of views, of the best, whose cost is averaged
     float noise;      // variance added to both windows: what has less contrast than this does not correlate
     float contrast;   // gray levels: a window's pixel that differs this much from its center counts 1 / e
+    float level;        // share of the cost that is the difference of both windows' means, the rest is 1 - ZNCC
+    float level_range;  // gray levels: that difference costs 1 from here on
     int threads;
 };
 
-// cost (H, D, W) in [0, 1]: 1 - ZNCC, mean over the best views, 1 where a view does not see the hypothesis.
+// cost (H, D, W) in [0, 1]: 1 - ZNCC, with a share of the difference of gray level, mean over the best views, 1 where a
+// view does not see the hypothesis.
 // Hypothesis k of a pixel is first + k step: the window follows the surface first + k step, so it is as slanted as that.
 // needed (tile rows, D, tile columns), or null for all: elsewhere nothing is computed and the cost is 1.
 void cost_volume(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,

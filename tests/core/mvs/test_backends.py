@@ -49,6 +49,23 @@ def test_cost_volumes_of_both_backends_agree(radius: int) -> None:
     assert native.std() > 0.05
 
 
+def test_a_share_of_the_cost_is_the_difference_of_gray_level() -> None:
+    p = problem()
+    options = replace(COST, level=0.4, level_range=15.0)
+    native = NativeBackend(1).cost_volume(**p, hypotheses=9, options=options)
+    twin = TorchBackend("cpu").cost_volume(**p, hypotheses=9, options=options)
+    assert np.mean(np.abs(native - twin) > 1e-3) < 2e-3
+    assert native.min() >= 0
+    assert native.max() <= 1
+    # Against itself at no motion, ten gray levels brighter: ZNCC sees nothing, the level costs 0.4 * 10 / 15.
+    stays = np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None].astype(np.float32)
+    own = {**p, "neighbors": p["reference"][None] + 10.0, "warps": stays}
+    cost = NativeBackend(1).cost_volume(**own, hypotheses=1, options=replace(options, best=1, noise=1e-3))
+    np.testing.assert_allclose(cost[:, 0], 0.4 * 10.0 / 15.0, atol=2e-3)
+    with pytest.raises(ValueError, match="level"):
+        NativeBackend(1).cost_volume(**p, hypotheses=1, options=replace(COST, level=1.5))
+
+
 def test_tiles_that_are_not_needed_cost_one_and_the_others_stay() -> None:
     p = problem()
     rows, columns = (-(-size // tile) for size, tile in zip(SIZE, TILE, strict=True))

@@ -10,7 +10,7 @@ import numpy as np
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.interface import TILE
-from mvsgs_core.mvs.rims import continued_surfaces, differing_tiles
+from mvsgs_core.mvs.rims import at_level_of, continued_surfaces, differing_tiles
 from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
 from mvsgs_core.mvs.views import prepare_view
 from tests.core.mvs.plane_scene import look, render, true_depth
@@ -31,6 +31,19 @@ def test_a_plane_continues_itself_and_both_sides_of_a_jump_are_candidates() -> N
     tiles = differing_tiles(continued_surfaces(step, (3,)), 0.1)
     assert tiles.shape == (5, 9, 4)
     assert set(np.flatnonzero(tiles.any(axis=(0, 1)))) == {26 // TILE[1], 33 // TILE[1]}
+
+
+def test_the_level_of_another_exposure_is_taken_out_where_the_neighbor_sees_the_surface() -> None:
+    rng = np.random.default_rng(1)
+    reference = cv2.GaussianBlur(rng.normal(0, 60, SIZE).astype(np.float32), (9, 9), 2)
+    shift = 6.0 * 0.25  # pixels: a baseline along x, and an inverse depth
+    warp = np.concatenate([np.eye(3).ravel(), [6.0, 0.0, 0.0]])[None].astype(np.float32)
+    there = cv2.warpAffine(reference, np.array([[1.0, 0.0, shift], [0.0, 1.0, 0.0]]), SIZE[::-1])
+    there[:20] = 200.0  # something else stands in front of a fifth of it
+    level = at_level_of(reference, (there + 17.0)[None], warp, np.full(SIZE, 0.25, np.float32))
+    np.testing.assert_allclose(level[0], there, atol=0.5)
+    unseen = at_level_of(reference, there[None], warp, np.zeros(SIZE, np.float32))
+    np.testing.assert_array_equal(unseen[0], there)
 
 
 def test_rims_of_a_box_come_out_sharper() -> None:
