@@ -56,7 +56,10 @@ class GroundTruth:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A frame that the tracker keeps, with its pose and coarse inverse depth on the tracker's grid."""
+    """A frame that the tracker keeps, with its pose and coarse inverse depth on the tracker's grid.
+
+    The image is as a global shutter would have taken it, where the tracker knows the camera's rolling one.
+    """
 
     index: int
     timestamp: float  # seconds
@@ -126,6 +129,7 @@ class Trajectory:
     state: Annotated[np.ndarray, "uint8 N"]  # TrackingState
     segment: Annotated[np.ndarray, "int32 N"]
     focal_factor: float = 1.0  # by which the tracker multiplied the focal lengths of the frames, if they were guessed
+    readout: float = 0.0  # seconds of the rolling shutter that was taken out of the keyframes, first row to last
 
 
 @dataclass(frozen=True)

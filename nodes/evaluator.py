@@ -60,6 +60,7 @@ class Evaluator(Node):
             track.state,
             track.segment,
             track.focal_factor,
+            track.readout,
         )
         yield from ()
 
@@ -112,6 +113,7 @@ class Evaluator(Node):
             "Scored at native resolution, without exposure correction at test time. Keyframes are training views; "
             "held-out: every 5th frame that is no keyframe. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self.evaluation.lpips else 'not computed'}. "
+            f"{_shutter(self.evaluation.track)}"
             "ATE: RMSE of keyframe positions after Sim(3) alignment."
         )
 
@@ -147,6 +149,12 @@ def _finished(message: SplatMap) -> FinishedMap:
         {int(i): float(s) for i, s in zip(message.keyframes, message.scale)},
         sum(a.nbytes for a in arrays),
     )
+
+
+def _shutter(track: Track | None) -> str:
+    if track is None or track.readout == 0.0:
+        return ""
+    return f"Renders are rolled with the shutter that the tracker found ({1e3 * track.readout:.1f} ms a frame). "
 
 
 def _plain(value: Any) -> Any:

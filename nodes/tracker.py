@@ -13,6 +13,7 @@ from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
+from mvsgs_core.tracking.rolling_shutter import unrolled
 from mvsgs_core.tracking.starting import StartingConfig
 from nodes.tracking import TrackerNode
 
@@ -34,6 +35,7 @@ class Tracker(TrackerNode):
         steps: int = 5  # of the local bundle adjustment
         global_edges: int = 6  # of each keyframe in the global bundle adjustment
         readout: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
+        unroll: bool = True  # keyframes' images are sent as a global shutter would have taken them
         loops: bool = True  # old keyframes are looked for by appearance
         known_flow: float = 0.13  # of the width: no keyframe is made for a view this near to an old one; 0: always
         known_from: int = 64  # keyframes of a map: a smaller one takes every view
@@ -80,13 +82,19 @@ class Tracker(TrackerNode):
     def _focal_factor(self) -> float:
         return self._tracker.focal_factor
 
+    @property
+    def _readout(self) -> float:
+        return self._tracker.readout if self.config.unroll else 0.0
+
     def _keyframe(self, index: int) -> Keyframe:
         frame, keyframe = self._frames[index], self._tracker.keyframe(index)
         inverse_depth, weight = coarse_map(keyframe)
+        with self.stats.time("unrolling"):
+            image = unrolled(frame.image, keyframe.image, self._readout)
         return Keyframe(
             index=index,
             timestamp=frame.timestamp,
-            image=frame.image,
+            image=image,
             intrinsics=frame.intrinsics * [self._tracker.focal_factor, self._tracker.focal_factor, 1.0, 1.0],
             world_from_cam=geometry.inverse(keyframe.cam_from_world),
             scale=1.0,

@@ -50,6 +50,11 @@ class TrackerNode(Node, ABC):
         """Focal length found, over the one that was given."""
         return 1.0
 
+    @property
+    def _readout(self) -> float:
+        """Seconds of the rolling shutter that was taken out of the keyframes' images."""
+        return 0.0
+
     def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
         for update in self._core.finish():
             yield from self._send(update)
@@ -63,6 +68,7 @@ class TrackerNode(Node, ABC):
             state=path.state,
             segment=path.segment,
             focal_factor=self._focal_factor,
+            readout=self._readout,
         )
 
     def _send(self, update: Update) -> Iterator[Keyframe | Poses]:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import pytest
 
 import msgs
 from msgs import Frame, GroundTruth, Keyframe, Poses, TrackingState, Trajectory
+from mvsgs_core.datasets.synthetic import FPS, Synthetic
+from mvsgs_core.evaluation.image_metrics import psnr
 from mvsgs_core.tracking.frames import State
 from nodes import Node, handlers, outputs
 from nodes.posed_tracker import PosedTracker
@@ -175,3 +178,26 @@ def test_frames_without_a_true_pose_are_left_out_and_reported() -> None:
     assert np.isnan(path.world_from_cam[3]).all()
     assert path.state[3] == TrackingState.LOST
     assert any("without a true pose" in warning for warning in node.stats.warnings)
+
+
+@pytest.mark.parametrize("unroll", [True, False])
+def test_keyframes_are_as_a_global_shutter_would_have_taken_them(unroll: bool) -> None:
+    still, rolling = Synthetic(threads=1), Synthetic(threads=1, rolling_shutter=0.5)
+    node = Tracker(Tracker.Config(readout=0.5 / FPS, unroll=unroll))
+    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in (rolling[n] for n in range(30))]
+    sent = [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end())
+    (path,) = of_type(sent, Trajectory)
+    keyframes = of_type(sent, Keyframe)[1:]  # before the first one nothing has moved
+    assert len(keyframes) > 5
+    if not unroll:
+        assert path.readout == 0.0
+        assert all(k.image is frames[k.index].image for k in keyframes)
+        return
+    assert path.readout == 0.5 / FPS
+    gains = []
+    for keyframe in keyframes:
+        images = still[keyframe.index].image, keyframe.image, frames[keyframe.index].image
+        truth, ours, seen = (image[8:-8, 8:-8].astype(np.float32) / 255 for image in images)
+        gains.append(psnr(ours, truth) - psnr(seen, truth))
+    assert np.mean(gains) > 3.0, gains
+    assert min(gains) > 0.0, gains

@@ -16,6 +16,7 @@ from . import Item
 FPS = 20.0
 FOCAL = 0.8  # of the image's width: a field of view of 64 degrees
 SUB_FRAMES = 8  # averaged over one exposure
+STRIP = 8  # rows that are read out at once
 
 
 class Synthetic:
@@ -86,8 +87,9 @@ class Synthetic:
         if d.motion_blur > 0:
             # The exposure is centered on the frame's time, where pose and depth are exact.
             offsets = d.motion_blur * ((np.arange(SUB_FRAMES) + 0.5) / SUB_FRAMES - 0.5)
-            shots = [self._view(self.path.pose(n + o), self.intrinsics, self.size, n + o).color for o in offsets]
-            light = np.asarray(np.mean(shots, axis=0, dtype=np.float32))
+            light = np.asarray(np.mean([self._light(n + o) for o in offsets], axis=0, dtype=np.float32))
+        elif d.rolling_shutter > 0:
+            light = self._light(n)
         covered = d.covered > 0 and d.covered_start <= n < d.covered_start + d.covered
         return Item(
             index=index,
@@ -110,6 +112,19 @@ class Synthetic:
         pose[:3, 3] = (pose[:3, 3] - d.origin) / d.scale
         view = self.stage.renderer.render(pose, intrinsics, size, gloss=d.gloss, threads=self.threads)
         return Sensor(Difficulties(), self.seed).image(view.color, 0), view.depth * np.float32(d.scale)
+
+    def _light(self, s: float) -> np.ndarray:
+        """(H, W, 3) float32 of an instant; of a rolling shutter, whose middle row is read at frame s."""
+        readout, (height, width) = self.difficulties.rolling_shutter, self.size
+        if readout == 0:
+            return self._view(self.path.pose(s), self.intrinsics, self.size, s).color
+        strips = []
+        for top in range(0, height, STRIP):
+            rows = min(STRIP, height - top)
+            at = s + readout * ((top + (rows - 1) / 2) / height - 0.5)
+            lens = self.intrinsics - [0.0, 0.0, 0.0, top]
+            strips.append(self._view(self.path.pose(at), lens, (rows, width), at).color)
+        return np.concatenate(strips)
 
     def _view(self, pose: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], s: float) -> Rendering:
         d = self.difficulties

@@ -13,6 +13,7 @@ from mvsgs_core.evaluation import scoring, trajectory
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.frame_store import FrameStore
 from mvsgs_core.evaluation.lpips import Lpips
+from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
 from mvsgs_core.splats.model import Splats
 
 NEAR = 0.01  # of the typical depth: splats nearer to a camera are not drawn
@@ -51,6 +52,7 @@ class Track:
     state: np.ndarray
     segment: np.ndarray
     focal_factor: float = 1.0  # on the focal lengths of the frames, where they were guessed
+    readout: float = 0.0  # seconds of the rolling shutter
 
     @property
     def posed(self) -> np.ndarray:
@@ -135,6 +137,7 @@ class Evaluation:
         near = NEAR * finished.typical_depth()
         from_world = np.eye(4)
         from_world[:3, 3] = -finished.origin
+        moving = velocities(self.track.timestamp, self.track.world_from_cam, main)
         for k in np.flatnonzero(main & np.isin(self.track.index, list(self._intrinsics))):
             index = int(self.track.index[k])
             views.append(
@@ -145,6 +148,7 @@ class Evaluation:
                     self._intrinsics[index] * [self.track.focal_factor, self.track.focal_factor, 1.0, 1.0],
                     lambda index=index: self.photograph(index),  # type: ignore[misc]
                     near,
+                    Shutter(self.track.readout, moving[k]) if self.track.readout else None,
                 )
             )
         return views

@@ -12,6 +12,7 @@ import torch
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import image_metrics
 from mvsgs_core.evaluation.lpips import Lpips
+from mvsgs_core.evaluation.rolling_shutter import Shutter, rolled
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.rasterizer import rasterize
 
@@ -28,6 +29,7 @@ class View:
     intrinsics: np.ndarray  # (4,)
     photograph: Callable[[], np.ndarray]  # (H, W, 3) uint8, read when needed
     near: float  # nothing nearer is drawn, map units
+    shutter: Shutter | None = None  # how the photograph was read out; None: all rows at once
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,11 @@ class Score:
 
 
 def render_view(splats: Splats, density: str, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Color (H, W, 3) float32 in 0..1 and depth (H, W) float32 of the map seen from a view."""
+    """Color (H, W, 3) float32 in 0..1, as the view's shutter sees it, and depth (H, W) float32 of the map."""
     with torch.inference_mode():
         render = rasterize(splats, view.world_from_cam, view.intrinsics, size, density=density, near=view.near)
-    return render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
+    color, depth = render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
+    return color if view.shutter is None else rolled(color, depth, view.intrinsics, view.shutter), depth
 
 
 def score_view(splats: Splats, density: str, view: View, lpips: Lpips | None) -> Score:

@@ -25,6 +25,7 @@ class Difficulties:
     jump_start: int = 60  # first frame after the jump
     drop: float = 0.0  # share of frames lost at random, 0 to 1; their time stamps are missing
     motion_blur: float = 0.0  # exposure time as a share of the time between two frames, 0 to 1
+    rolling_shutter: float = 0.0  # readout, first row to last, as a share of the time between two frames, 0 to 1
     exposure: float = 0.0  # brightness drifts by up to so many stops up and down
     noise: float = 0.0  # standard deviation of the sensor's noise at mid gray, 8-bit levels
     gloss: float = 0.0  # strength of highlights, 1 is plausible: surfaces that change with the view
@@ -41,7 +42,7 @@ class Difficulties:
                 raise ValueError(f"{f.name}: {value} is negative; 0 is off")
         if self.scale <= 0:
             raise ValueError(f"scale: {self.scale} must be positive")
-        for name, limit in (("drop", 0.95), ("motion_blur", 1.0), ("textureless", 4)):
+        for name, limit in (("drop", 0.95), ("motion_blur", 1.0), ("rolling_shutter", 1.0), ("textureless", 4)):
             if getattr(self, name) > limit:
                 raise ValueError(f"{name}: {getattr(self, name)} is more than {limit}")
 

@@ -1,5 +1,7 @@
 """The readout time of a rolling shutter, from the matches alone: the one that bundle adjustment agrees with best.
 
+And images as a global shutter would have taken them: poses, stereo and the map are all of one moment.
+
 Rows of an image are taken one after the other. A point at row v that moves at w pixels a second was seen
 w * readout * (v / H - 1/2) from where a global shutter would have seen it in the middle of the readout; the graph moves
 all points back by that (first order in the readout). On hand-held Kinect sequences this is most of the error.
@@ -9,10 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import cv2
 import numpy as np
 
+from mvsgs_core.camera import pixel_grid
 from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
 
 LONGEST = 0.035  # seconds: most cameras need less than a frame at 30 a second
 LEAST_GAIN = 0.02  # of the robust cost: what a global shutter gains by chance is less
@@ -41,4 +46,22 @@ def estimate_readout(graph: KeyframeGraph, indices: Iterable[int], threads: int)
     return best if gain > LEAST_GAIN * costs[0] else 0.0
 
 
-__all__ = ["LONGEST", "estimate_readout"]
+def unrolled(image: np.ndarray, frame: TrackingImage, readout: float) -> np.ndarray:
+    """An image (H, W, 3) uint8 as a global shutter would have taken it in the middle of the readout.
+
+    frame: the same image as the tracker has it. The image itself is returned where its velocity is not known. Pixels
+    that were not seen repeat those at the border.
+    """
+    if readout == 0.0 or frame.velocity is None:
+        return image
+    height, width = image.shape[:2]
+    zoom = np.array([width / frame.size[1], height / frame.size[0]])
+    velocity = cv2.resize(frame.velocity * zoom.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    u, v = pixel_grid(height, width)
+    at = (np.dstack([u, v]) + velocity * (readout * (v / height - 0.5))[..., None]).astype(np.float32)
+    return np.asarray(
+        cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8
+    )
+
+
+__all__ = ["LONGEST", "estimate_readout", "unrolled"]

@@ -132,6 +132,11 @@ class Tracker:
         """What the focal lengths that came with the frames are to be multiplied with; 1 unless they were a guess."""
         return 1.0 if self.graph is None else self.calibration.focal_factor
 
+    @property
+    def readout(self) -> float:
+        """Seconds that the camera's rolling shutter needs for an image, as far as it is known; 0: global."""
+        return 0.0 if self.graph is None else self.graph.readout
+
     def finish(self) -> Iterator[Update]:
         """The stream has ended: a start by force if there was none, and the global bundle adjustment."""
         if self.graph is None:
