@@ -13,7 +13,7 @@ from mvsgs_core.datasets.files import Layout
 from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
-from mvsgs_core.geometry import rotation_from_quaternion
+from mvsgs_core.geometry import interpolate, rotation_from_quaternion
 
 LAYOUT = Layout(
     "TUM RGB-D",
@@ -37,8 +37,8 @@ class Tum(ImageSequence):
 
     camera: freiburg1, freiburg2, freiburg3; null reads it off `camera.txt`, the folder's name or the header of
     groundtruth.txt. intrinsics, distortion: of any other camera, instead.
-    max_difference: seconds between an image and the pose or depth map that goes with it. The nearest one counts, as in
-    the data set's own tools; a depth map goes to one image only.
+    max_difference: seconds between an image and the pose or depth map that goes with it. Between two poses that are
+    near enough it is interpolated, else the nearest one counts; a depth map goes to the one image nearest to it.
     crop: null zooms in on the undistorted image until no pixel is empty; a number keeps the published focal length,
     resizes to `size` plus that border and cuts it off (size=[384, 512], crop=8: the usual protocol).
     Raises FileNotFoundError and ValueError, which say what was expected.
@@ -149,11 +149,25 @@ def _poses(folder: Path, times: np.ndarray, max_difference: float) -> tuple[dict
     table = read_trajectory(path)
     if len(table) == 0:
         return {}, [f"{path.name} is empty: the trajectory is not scored"]
-    matched = nearest(times, table[:, 0], max_difference)
+    poses = {
+        i: _pose_at(times[i], table, j, max_difference) for i, j in nearest(times, table[:, 0], max_difference).items()
+    }
     notes = []
-    if len(matched) < len(times):
-        notes.append(f"{len(times) - len(matched)} of {len(times)} images have no true pose within {max_difference} s")
-    return {i: pose_from_row(table[j]) for i, j in matched.items()}, notes
+    if len(poses) < len(times):
+        notes.append(f"{len(times) - len(poses)} of {len(times)} images have no true pose within {max_difference} s")
+    return poses, notes
+
+
+def _pose_at(time: float, table: np.ndarray, closest: int, max_difference: float) -> np.ndarray:
+    """Half the time between two poses of motion capture is a millimeter, or a pixel, at the speed of a hand."""
+    other = closest + (1 if time > table[closest, 0] else -1)
+    if not 0 <= other < len(table) or not 0.0 < abs(table[other, 0] - time) <= max_difference:
+        return pose_from_row(table[closest])
+    span = table[other, 0] - table[closest, 0]
+    if span == 0.0:
+        return pose_from_row(table[closest])
+    share = (time - table[closest, 0]) / span
+    return interpolate(pose_from_row(table[closest]), pose_from_row(table[other]), share)
 
 
 def read_trajectory(path: Path) -> np.ndarray:

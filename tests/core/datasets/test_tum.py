@@ -157,3 +157,14 @@ def test_a_missing_path_says_layout_and_source(tmp_path: Path) -> None:
     for path in (None, tmp_path / "nowhere", tmp_path):
         with pytest.raises(FileNotFoundError, match=r"rgb\.txt(.|\n)*cvg\.cit\.tum\.de"):
             open_dataset("tum", path=path)
+
+
+def test_a_pose_between_two_of_motion_capture_is_interpolated(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "fr3")  # images at 0, 0.1, ...
+    rows = ["0.096 1 0 0 0 0 0 1", "0.106 2 0 0 0 0 0 1", "0.196 5 0 0 0 0 0 1", "0.5 9 0 0 0 0 0 1"]
+    (folder / "groundtruth.txt").write_text("\n".join(rows))
+    items = list(open_dataset("tum", path=folder))
+    assert items[0].world_from_cam is None
+    for item, x in ((items[1], 1.4), (items[2], 5.0)):  # the second one's other neighbor is too far away
+        assert item.world_from_cam is not None
+        assert item.world_from_cam[0, 3] == pytest.approx(x)
