@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import multiprocessing
 import os
 import sys
 from collections.abc import Callable
@@ -33,10 +34,8 @@ def splats(count: int) -> Splats:
     return Splats(*(torch.ones(shape) for shape in shapes))
 
 
-@pytest.fixture
-def state() -> MapState:
+def full_map() -> MapState:
     """Every page of it is resident."""
-    assert ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, 1 << 18) == 1
     made = MapState(1, torch.device("cpu"))
     made.append(splats(COUNT), torch.arange(COUNT) % 7)
     for moments in (made.first, made.second):
@@ -51,50 +50,75 @@ def resident(kind: str) -> float:
 
 
 def peak(work: Callable[[], object]) -> float:
-    """Bytes beyond those before. What is freed meanwhile goes back at once: no holes of the heap are counted."""
-    libc = ctypes.CDLL(None)
-    libc.malloc_trim(0)
-    assert libc.mallopt(MMAP_THRESHOLD, 1 << 18) == 1
-    try:
-        before = resident("VmRSS")
-        RESET.write_text("5")
-        work()
-        return resident("VmHWM") - before
-    finally:
-        libc.mallopt(MMAP_THRESHOLD, 1 << 25)  # what glibc comes to by itself, where large blocks come and go
+    """Bytes beyond those before."""
+    ctypes.CDLL(None).malloc_trim(0)
+    before = resident("VmRSS")
+    RESET.write_text("5")
+    work()
+    return resident("VmHWM") - before
 
 
-def test_a_map_knows_its_size(state: MapState) -> None:
-    assert state.bytes == SIZE
-    assert MapState(16, torch.device("cpu")).bytes == 0
+def alone(measure: Callable[[], list[float]]) -> list[float]:
+    """Runs in a new process, whose heap has no holes of other tests, and whose freed blocks go back at once."""
+    with multiprocessing.get_context("spawn").Pool(1, _free_at_once) as pool:
+        return pool.apply(measure)
 
 
-def test_growing_and_shrinking_replaces_one_tensor_after_the_other(state: MapState) -> None:
-    assert peak(lambda: state.append(splats(10), torch.zeros(10, dtype=torch.int64))) < 0.4 * SIZE
+def _free_at_once() -> None:
+    assert ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, 1 << 18) == 1
+    torch.set_num_threads(1)
+
+
+def _grow_and_shrink() -> list[float]:
+    state = full_map()
+    grown = peak(lambda: state.append(splats(10), torch.zeros(10, dtype=torch.int64)))
     assert len(state) == COUNT + 10
     assert state.splats.means.requires_grad
-    assert peak(lambda: state.keep(torch.arange(len(state)) % 100 > 0)) < 0.4 * SIZE
-    kept = state.splats.means
-    state.keep(torch.ones(len(state), dtype=torch.bool))
-    assert state.splats.means is kept
+    return [grown, peak(lambda: state.keep(torch.arange(len(state)) % 100 > 0))]
 
 
-def test_a_correction_moves_the_map_in_place(state: MapState) -> None:
+def _correct() -> list[float]:
+    state = full_map()
     turned = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
-    assert peak(lambda: move_with_anchors(state, dict.fromkeys(range(6), turned))) < 0.9 * SIZE
+    found = peak(lambda: move_with_anchors(state, dict.fromkeys(range(6), turned)))
     moved = state.splats.means.detach()
     np.testing.assert_allclose(moved[-1 - (COUNT - 1) % 7].numpy(), [-1.0, 4.0, 5.0])
     rest = moved[state.anchors == 6]
     assert (rest == 1.0).all()
     assert (moved[state.anchors < 6] == torch.tensor([-1.0, 4.0, 5.0])).all()
+    return [found]
 
 
-def test_voxels_are_looked_up_in_parts() -> None:
+def _look_up_voxels() -> list[float]:
     generator = np.random.default_rng(0)
     means = generator.random((COUNT, 3), dtype=np.float32)
     positions = generator.random((5000, 3))
     found: list[np.ndarray] = []
-    assert peak(lambda: found.append(unoccupied(positions, means, 0.02))) < 14e6  # at once: 18 MB
+    bytes_more = peak(lambda: found.append(unoccupied(positions, means, 0.02)))
     voxels = {tuple(cell) for cell in np.floor((means - positions.min(axis=0)) / 0.02).astype(int)}
     cells = np.floor((positions - positions.min(axis=0)) / 0.02).astype(int)
     np.testing.assert_array_equal(found[0], [tuple(cell) not in voxels for cell in cells])
+    return [bytes_more]
+
+
+def test_a_map_knows_its_size() -> None:
+    state = full_map()
+    assert state.bytes == SIZE
+    assert MapState(16, torch.device("cpu")).bytes == 0
+    kept = state.splats.means
+    state.keep(torch.ones(len(state), dtype=torch.bool))
+    assert state.splats.means is kept
+
+
+def test_growing_and_shrinking_replaces_one_tensor_after_the_other() -> None:
+    grown, shrunk = alone(_grow_and_shrink)
+    assert grown < 0.4 * SIZE
+    assert shrunk < 0.4 * SIZE
+
+
+def test_a_correction_moves_the_map_in_place() -> None:
+    assert alone(_correct)[0] < 0.9 * SIZE
+
+
+def test_voxels_are_looked_up_in_parts() -> None:
+    assert alone(_look_up_voxels)[0] < 14e6  # at once: 18 MB
