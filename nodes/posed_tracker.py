@@ -13,6 +13,7 @@ from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.posed import PosedConfig
 from mvsgs_core.tracking.posed import PosedTracker as Core
+from mvsgs_core.tracking.rolling_shutter import unrolled
 from nodes import Node
 
 
@@ -28,6 +29,7 @@ class PosedTracker(Node):
         recent: int = 3  # keyframes before a new one that it is matched with
         proximity: int = 3  # older keyframes that it is matched with
         steps: int = 5  # of the triangulation
+        readout: float = 0.0  # seconds of the camera's rolling shutter, 0 for a global one: true poses do not tell it
         threads: int | None = None  # of the C++ kernels; null: 1
 
     config: Config
@@ -39,6 +41,7 @@ class PosedTracker(Node):
             PosedConfig(
                 area=c.area,
                 flow=c.flow,
+                readout=c.readout,
                 threads=c.threads or 1,
                 front_end=FrontEndConfig(
                     still_flow=0.0, keyframe_flow=c.keyframe_flow, keyframe_share=c.keyframe_share
@@ -91,6 +94,7 @@ class PosedTracker(Node):
             keyframe=np.array([index in self._keyframes for index in order], bool).reshape(n),
             state=np.where(known, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8),
             segment=np.where(known, 0, -1).astype(np.int32),
+            readout=self.config.readout,
         )
 
     def _join(self, index: int) -> Iterator[Keyframe]:
@@ -113,11 +117,12 @@ class PosedTracker(Node):
         frame, pose = self._frames[index], self._path[index][1]
         assert pose is not None
         self._keyframes.add(index)
-        inverse_depth, weight = coarse_map(self._tracker.keyframe(index))
+        keyframe = self._tracker.keyframe(index)
+        inverse_depth, weight = coarse_map(keyframe)
         return Keyframe(
             index=index,
             timestamp=frame.timestamp,
-            image=frame.image,
+            image=unrolled(frame.image, keyframe.image, self.config.readout),
             intrinsics=frame.intrinsics,
             world_from_cam=np.asarray(pose, dtype=np.float64),
             scale=1.0,

@@ -180,24 +180,45 @@ def test_frames_without_a_true_pose_are_left_out_and_reported() -> None:
     assert any("without a true pose" in warning for warning in node.stats.warnings)
 
 
-@pytest.mark.parametrize("unroll", [True, False])
-def test_keyframes_are_as_a_global_shutter_would_have_taken_them(unroll: bool) -> None:
-    still, rolling = Synthetic(threads=1), Synthetic(threads=1, rolling_shutter=0.5)
-    node = Tracker(Tracker.Config(readout=0.5 / FPS, unroll=unroll))
-    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in (rolling[n] for n in range(30))]
-    sent = [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end())
-    (path,) = of_type(sent, Trajectory)
-    keyframes = of_type(sent, Keyframe)[1:]  # before the first one nothing has moved
+def rolling_messages(count: int) -> tuple[list[Frame], list[GroundTruth]]:
+    rolling = Synthetic(threads=1, rolling_shutter=0.5)
+    items = [rolling[n] for n in range(count)]
+    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in items]
+    return frames, [GroundTruth(i.index, i.timestamp, i.image, i.intrinsics, i.world_from_cam, None) for i in items]
+
+
+def check_global_shutter(keyframes: list[Keyframe], frames: list[Frame]) -> None:
+    still, gains = Synthetic(threads=1), []
     assert len(keyframes) > 5
-    if not unroll:
-        assert path.readout == 0.0
-        assert all(k.image is frames[k.index].image for k in keyframes)
-        return
-    assert path.readout == 0.5 / FPS
-    gains = []
-    for keyframe in keyframes:
+    for keyframe in keyframes[1:]:  # before the first one nothing has moved
         images = still[keyframe.index].image, keyframe.image, frames[keyframe.index].image
         truth, ours, seen = (image[8:-8, 8:-8].astype(np.float32) / 255 for image in images)
         gains.append(psnr(ours, truth) - psnr(seen, truth))
     assert np.mean(gains) > 3.0, gains
     assert min(gains) > 0.0, gains
+
+
+@pytest.mark.parametrize("unroll", [True, False])
+def test_keyframes_are_as_a_global_shutter_would_have_taken_them(unroll: bool) -> None:
+    frames, _ = rolling_messages(30)
+    node = Tracker(Tracker.Config(readout=0.5 / FPS, unroll=unroll))
+    sent = [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end())
+    (path,) = of_type(sent, Trajectory)
+    keyframes = of_type(sent, Keyframe)
+    if unroll:
+        assert path.readout == 0.5 / FPS
+        check_global_shutter(keyframes, frames)
+    else:
+        assert path.readout == 0.0
+        assert all(k.image is frames[k.index].image for k in keyframes)
+
+
+def test_keyframes_with_true_poses_are_as_a_global_shutter_would_have_taken_them() -> None:
+    frames, truths = rolling_messages(30)
+    node = PosedTracker(PosedTracker.Config(readout=0.5 / FPS))
+    sent: list[msgs.Message] = []
+    for frame, truth in zip(frames, truths, strict=True):
+        sent += [*node.on_frame(frame), *node.on_ground_truth(truth)]
+    sent += list(node.on_end())
+    assert sent[-1].readout == 0.5 / FPS  # type: ignore[union-attr]
+    check_global_shutter(of_type(sent, Keyframe), frames)
