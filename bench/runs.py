@@ -18,6 +18,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
+from mvsgs_core import native
+
 ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
 SHARED = Path(os.environ.get("MVSGS_SHARED", ROOT.parent / "shared"))
@@ -222,7 +224,8 @@ def machine() -> str:
         names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         model = names[0].split(":", 1)[1].strip() if names else model
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{model}, {cores} cores"
+    kernels = {"v4": "AVX-512", "v3": "AVX2", "generic": "generic kernels"}[native.instruction_sets()[0]]
+    return f"{model}, {cores} cores, {kernels}"
 
 
 def commit() -> str:
