@@ -154,7 +154,8 @@ def _finished(message: SplatMap) -> FinishedMap:
 def _shutter(track: Track | None) -> str:
     if track is None or track.readout == 0.0:
         return ""
-    return f"Renders are rolled with the shutter that the tracker found ({1e3 * track.readout:.1f} ms a frame). "
+    taken_out = f"{1e3 * track.readout:.1f} ms a frame"
+    return f"Renders are rolled with the shutter that the tracker took out of the keyframes ({taken_out}). "
 
 
 def _plain(value: Any) -> Any:

@@ -13,7 +13,7 @@ from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.posed import PosedConfig
 from mvsgs_core.tracking.posed import PosedTracker as Core
-from mvsgs_core.tracking.rolling_shutter import unrolled
+from mvsgs_core.tracking.rolling_shutter import checked_readout, unrolled
 from nodes import Node
 
 
@@ -37,6 +37,7 @@ class PosedTracker(Node):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c = self.config
+        checked_readout(c.readout)
         self._tracker = Core(
             PosedConfig(
                 area=c.area,

@@ -13,7 +13,7 @@ from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
-from mvsgs_core.tracking.rolling_shutter import unrolled
+from mvsgs_core.tracking.rolling_shutter import checked_readout, unrolled
 from mvsgs_core.tracking.starting import StartingConfig
 from nodes.tracking import TrackerNode
 
@@ -61,7 +61,7 @@ class Tracker(TrackerNode):
                 local_map=LocalMapConfig(window=c.window, recent=c.recent, proximity=c.proximity, steps=c.steps),
                 back_end=BackEndConfig(edges=c.global_edges),
                 starting=StartingConfig(keyframes=c.start_keyframes),
-                readout=c.readout,
+                readout=checked_readout(c.readout),
                 loops=c.loops,
                 known_ground=KnownGroundConfig(keyframes=c.known_from, flow=c.known_flow),
             )
@@ -91,6 +91,8 @@ class Tracker(TrackerNode):
         inverse_depth, weight = coarse_map(keyframe)
         with self.stats.time("unrolling"):
             image = unrolled(frame.image, keyframe.image, self._readout)
+        if self._readout and keyframe.image.velocity is None:
+            self.stats.count("keyframes with the rolling shutter still in: no velocity")
         return Keyframe(
             index=index,
             timestamp=frame.timestamp,

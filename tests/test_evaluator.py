@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from msgs import GroundTruth, SplatMap, TrackingState, Trajectory, View
 from mvsgs_core import geometry
+from mvsgs_core.evaluation.scoring import render_view
 from nodes.evaluator import Evaluator
 
 H, W, N, SCALE = 24, 32, 12, 0.5  # the estimate's unit is 2 true units
@@ -144,6 +146,24 @@ def test_frames_are_rendered_with_the_focal_length_that_the_tracker_found(evalua
     for view in evaluator.evaluation.views():
         np.testing.assert_array_equal(view.intrinsics, INTRINSICS * [1.25, 1.25, 1.0, 1.0])
     evaluator.evaluation.close()
+
+
+def test_renders_are_rolled_with_the_shutter_that_the_tracker_took_out(evaluator: Evaluator) -> None:
+    poses, index, none = _poses(), np.arange(N), np.zeros(N, np.int32)
+    poses[:, :3, 3] += ORIGIN
+    track = Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, readout=0.02)
+    list(evaluator.on_trajectory(track))
+    list(evaluator.on_splat_map(_splat_map(True)))
+    finished, view = evaluator.evaluation.maps[True], evaluator.evaluation.views()[5]
+    assert view.shutter is not None
+    assert view.shutter.readout == 0.02
+    moved = geometry.se3_log(geometry.inverse(poses[4]) @ poses[6])
+    np.testing.assert_allclose(view.shutter.velocity, moved * 15, atol=1e-7)
+    color, _ = render_view(finished.splats, finished.density, view, (H, W))
+    still, _ = render_view(finished.splats, finished.density, replace(view, shutter=None), (H, W))
+    assert np.abs(color - still).max() > 1e-3
+    list(evaluator.on_end())
+    assert "20.0 ms a frame" in evaluator.report["protocol"]
 
 
 def test_without_truth_the_figures_are_null(tmp_path: Path) -> None:

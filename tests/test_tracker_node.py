@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -222,3 +223,20 @@ def test_keyframes_with_true_poses_are_as_a_global_shutter_would_have_taken_them
     sent += list(node.on_end())
     assert sent[-1].readout == 0.5 / FPS  # type: ignore[union-attr]
     check_global_shutter(of_type(sent, Keyframe), frames)
+
+
+@pytest.mark.parametrize("node", [Tracker, PosedTracker])
+@pytest.mark.parametrize("readout", [25.0, -0.01, float("nan")])
+def test_a_readout_in_another_unit_is_refused(node: type[Tracker] | type[PosedTracker], readout: float) -> None:
+    with pytest.raises(ValueError, match=r"tracker\.readout=.*seconds.*0 to 0\.2"):
+        node(node.Config(readout=readout))  # type: ignore[arg-type]
+
+
+def test_a_keyframe_whose_shutter_stays_in_is_counted() -> None:
+    frames, _ = rolling_messages(30)
+    node = Tracker(Tracker.Config(readout=0.5 / FPS))
+    slow = [replace(f, timestamp=10 * f.timestamp) for f in frames]  # too far apart to know a velocity
+    keyframes = of_type([m for f in slow for m in node.on_frame(f)], Keyframe)
+    assert len(keyframes) > 5
+    assert all(k.image is frames[k.index].image for k in keyframes)
+    assert node.stats.counts["keyframes with the rolling shutter still in: no velocity"] == len(keyframes)

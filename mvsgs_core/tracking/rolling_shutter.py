@@ -14,12 +14,12 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from mvsgs_core.camera import pixel_grid
 from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 
 LONGEST = 0.035  # seconds: most cameras need less than a frame at 30 a second
+SLOWEST = 0.2  # seconds: a readout that is given and longer is a mistake, of the unit for one
 LEAST_GAIN = 0.02  # of the robust cost: what a global shutter gains by chance is less
 
 
@@ -55,13 +55,22 @@ def unrolled(image: np.ndarray, frame: TrackingImage, readout: float) -> np.ndar
     if readout == 0.0 or frame.velocity is None:
         return image
     height, width = image.shape[:2]
-    zoom = np.array([width / frame.size[1], height / frame.size[0]])
-    velocity = cv2.resize(frame.velocity * zoom.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    u, v = pixel_grid(height, width)
-    at = (np.dstack([u, v]) + velocity * (readout * (v / height - 0.5))[..., None]).astype(np.float32)
-    return np.asarray(
-        cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8
-    )
+    zoom = np.array([width / frame.size[1], height / frame.size[0]], np.float32)
+    velocity = cv2.resize(frame.velocity * zoom, (width, height), interpolation=cv2.INTER_LINEAR)
+    u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+    late = np.float32(readout) * (v / height - 0.5)
+    x, y = u + velocity[..., 0] * late, v + velocity[..., 1] * late
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-__all__ = ["LONGEST", "estimate_readout", "unrolled"]
+def checked_readout(readout: float | None) -> float | None:
+    """A readout that the user gave, None where it is to be estimated. Raises ValueError where it can't be one."""
+    if readout is not None and not 0.0 <= readout <= SLOWEST:
+        raise ValueError(
+            f"tracker.readout={readout:g}: it is the seconds from the first row to the last, 0 to {SLOWEST:g} "
+            "(25 milliseconds are 0.025), 0 for a global shutter"
+        )
+    return readout
+
+
+__all__ = ["LONGEST", "SLOWEST", "checked_readout", "estimate_readout", "unrolled"]
