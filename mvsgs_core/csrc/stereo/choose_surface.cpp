@@ -2,32 +2,16 @@
 //
 // What two neighboring pixels pay is the distance of their inverse depths, at most `large_jump`, not the distance of
 // indices: candidates of a pixel are extrapolated from around it and have no order.
-#include "stereo.hpp"
-
 #include <algorithm>
 #include <cmath>
 #include <cstring>
 #include <vector>
 
+#include "lanes.hpp"
+#include "stereo.hpp"
+
 namespace stereo {
 namespace {
-
-#if defined(__AVX512F__)
-constexpr int kLanes = 16;
-#elif defined(__AVX__)
-constexpr int kLanes = 8;
-#else
-constexpr int kLanes = 4;
-#endif
-typedef float Lanes __attribute__((vector_size(4 * kLanes)));
-
-Lanes load(const float* values) {
-    Lanes result;
-    std::memcpy(&result, values, sizeof(result));
-    return result;
-}
-Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }
-Lanes distance(Lanes a, Lanes b) { return a < b ? b - a : a - b; }
 
 // (D, R, C) volumes: rows are visited in order, the pixels of a row are independent.
 struct Candidates {
@@ -41,7 +25,8 @@ struct Candidates {
 // Adds the path costs of direction (dx, +1 or -1 row) to `sum` (D, R, C).
 void add_path(const Candidates& p, int dx, bool reverse, const ChooseOptions& o, float* sum) {
     const int w = p.columns, d = p.count;
-    const std::size_t padded = static_cast<std::size_t>((w + kLanes - 1) / kLanes) * kLanes;
+    // A cache line more than a row needs: rows a power of two apart would drive each other out of the cache.
+    const std::size_t padded = static_cast<std::size_t>((w + kLanes - 1) / kLanes) * kLanes + 16;
     // Of this row, and of each pixel's predecessor; where that lies outside the image all is 0: the path starts anew.
     std::vector<float> own(padded * d, 0.0f), path(padded * d, 0.0f);
     std::vector<float> beside(padded * d, 0.0f), cost_beside(padded * d, 0.0f);
@@ -61,24 +46,27 @@ void add_path(const Candidates& p, int dx, bool reverse, const ChooseOptions& o,
             std::copy_n(path.data(), w, least.data());
             for (int k = 1; k < d; ++k)
                 for (int x = 0; x < w; ++x) least[x] = std::min(least[x], path[k * padded + x]);
+            // Inverse depths in units of cost: their difference is the penalty.
             for (int k = 0; k < d; ++k) {
-                std::copy_n(p.surfaces + p.at(k, y), w, own.data() + k * padded);
-                std::copy(p.surfaces + p.at(k, before) + from - dx, p.surfaces + p.at(k, before) + to - dx,
-                          beside.data() + k * padded + from);
-                for (int x = from; x < to; ++x)
-                    cost_beside[k * padded + x] = path[k * padded + x - dx] - least[x - dx];
+                const float *surface = p.surfaces + p.at(k, y), *surface_beside = p.surfaces + p.at(k, before) - dx;
+                const float* along = path.data() + k * padded - dx;
+                float *scaled = own.data() + k * padded, *scaled_beside = beside.data() + k * padded;
+                float* so_far = cost_beside.data() + k * padded;
+                for (int x = from; x < to; ++x) scaled[x] = small[x] * surface[x];
+                for (int x = from; x < to; ++x) scaled_beside[x] = small[x] * surface_beside[x];
+                for (int x = from; x < to; ++x) so_far[x] = along[x] - least[x - dx];
             }
         }
-        for (std::size_t x = 0; x < padded; x += kLanes) {
-            const Lanes slope = load(&small[x]), most = load(&large[x]);
+        for (std::size_t x = 0; x < static_cast<std::size_t>(w); x += kLanes) {
+            const Lanes most = load(&large[x]);
             for (int k = 0; k < d; ++k) {
                 const Lanes surface = load(&own[k * padded + x]);
-                Lanes lowest = load(&cost_beside[x]) + smaller(slope * distance(surface, load(&beside[x])), most);
-                for (int j = 1; j < d; ++j) {
-                    const Lanes jump = smaller(slope * distance(surface, load(&beside[j * padded + x])), most);
-                    lowest = smaller(lowest, load(&cost_beside[j * padded + x]) + jump);
+                Lanes lowest = most;  // from the best predecessor, whose cost so far counts 0
+                for (int j = 0; j < d; ++j) {
+                    const Lanes change = magnitude(surface - load(&beside[j * padded + x]));
+                    lowest = smaller(lowest, load(&cost_beside[j * padded + x]) + change);
                 }
-                std::memcpy(&path[k * padded + x], &lowest, sizeof(lowest));
+                store(&path[k * padded + x], lowest);
             }
         }
         for (int k = 0; k < d; ++k) {

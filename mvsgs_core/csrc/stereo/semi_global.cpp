@@ -3,13 +3,14 @@
 // Indices, not inverse depths, are smoothed: the hypotheses of two pixels are offsets from the surface `first`, so a
 // slanted surface that an earlier stage found costs nothing. Where `first` itself jumps the path starts anew.
 // Volumes are (H, D, W): paths with a vertical component vectorise along W; horizontal ones run on the transpose.
-#include "stereo.hpp"
-
-#include <omp.h>
-
 #include <algorithm>
 #include <cmath>
-#include <limits>
+#include <cstdint>
+#include <vector>
+
+#include "exponential.hpp"
+#include "lanes.hpp"
+#include "stereo.hpp"
 
 namespace stereo {
 namespace {
@@ -39,13 +40,18 @@ void add_path(const Plane& p, int dx, bool reverse, const SmoothOptions& o, floa
         const std::size_t row = static_cast<std::size_t>(y) * w;
         if (i > 0) {
             const std::size_t before = static_cast<std::size_t>(reverse ? y + 1 : y - 1) * w;
-            for (int x = 0; x < w; ++x) {
-                const int q = std::min(std::max(x - dx, 0), w - 1);
+            const int from = std::max(dx, 0), to = w + std::min(dx, 0);
+            const auto relaxed = [&](int x, int q) {
                 const float contrast = std::fabs(p.image[row + x] - p.image[before + q]) * inv_edge;
                 const float jump = std::fabs(p.first[row + x] - p.first[before + q]);
-                const bool broken = jump > o.break_steps * std::max(p.step[row + x], p.step[before + q]);
-                relax[x] = broken ? 0.0f : 1.0f / (1.0f + contrast);
-            }
+                const bool broken = jump > o.break_steps * larger(p.step[row + x], p.step[before + q]);
+                return broken ? 0.0f : 1.0f / (1.0f + contrast);
+            };
+            if (from > 0) relax[0] = relaxed(0, 0);  // where the path starts at the image's side
+            if (to < w) relax[w - 1] = relaxed(w - 1, w - 1);
+            float* out = relax.data();
+#pragma omp simd
+            for (int x = from; x < to; ++x) out[x] = relaxed(x, x - dx);
         }
         float* low = lowest.data() + 1;
         std::fill(low, low + w, kHigh);
@@ -58,14 +64,15 @@ void add_path(const Plane& p, int dx, bool reverse, const SmoothOptions& o, floa
             const float* c = p.cost + (static_cast<std::size_t>(y) * d + k) * w;
             float* total = sum + (static_cast<std::size_t>(y) * d + k) * w;
             const float small = o.small_jump, large = o.large_jump;
+            const float* eased = relax.data();
 #pragma omp simd
             for (int x = 0; x < w; ++x) {
                 const float base = low_q[x];
-                const float jump = std::min(std::min(below[x], above[x]) + small * relax[x], base + large * relax[x]);
-                const float value = c[x] + std::min(same[x], jump) - base;
+                const float beside = smaller(below[x], above[x]) + small * eased[x];
+                const float value = c[x] + smaller(same[x], smaller(beside, base + large * eased[x])) - base;
                 out[x] = value;
                 total[x] += value;
-                low[x] = std::min(low[x], value);
+                low[x] = smaller(low[x], value);
             }
         }
         std::swap(current, previous);
@@ -89,33 +96,38 @@ void transpose(const float* in, int rows, int middle, int columns, float* out) {
 void select_row(const float* total, int d, int w, float temperature, float* index, float* probability, float* margin,
                 std::int32_t* best) {
     const float scale = -1.0f / temperature;
-    const auto at = [&](int k, int x) { return total[static_cast<std::size_t>(k) * w + x]; };
+    std::vector<float> lowest(total, total + w), all(w, 0.0f), near(w, 0.0f);
+    std::fill_n(best, w, 0);
+    std::fill_n(margin, w, 1.0f);
+    for (int k = 1; k < d; ++k) {
+        const float* cost = total + static_cast<std::size_t>(k) * w;
+#pragma omp simd
+        for (int x = 0; x < w; ++x) {
+            best[x] = cost[x] < lowest[x] ? k : best[x];
+            lowest[x] = cost[x] < lowest[x] ? cost[x] : lowest[x];
+        }
+    }
+    float *sum = all.data(), *sum_near = near.data();
+    for (int k = 0; k < d; ++k) {
+        const float* cost = total + static_cast<std::size_t>(k) * w;
+#pragma omp simd
+        for (int x = 0; x < w; ++x) {
+            const float gap = cost[x] - lowest[x], weight = exponential(gap * scale);
+            const bool beside = k - best[x] <= 1 && best[x] - k <= 1;
+            sum[x] += weight;
+            sum_near[x] += beside ? weight : 0.0f;
+            margin[x] = !beside && gap < margin[x] ? gap : margin[x];
+        }
+    }
     for (int x = 0; x < w; ++x) {
-        int k_best = 0;
-        float lowest = at(0, x);
-        for (int k = 1; k < d; ++k) {
-            const float v = at(k, x);
-            if (v < lowest) lowest = v, k_best = k;
-        }
-        float all = 0.0f, near = 0.0f, elsewhere = 1.0f;
-        for (int k = 0; k < d; ++k) {
-            const float gap = at(k, x) - lowest;
-            const float weight = std::exp(gap * scale);
-            all += weight;
-            if (std::abs(k - k_best) <= 1)
-                near += weight;
-            else
-                elsewhere = std::min(elsewhere, gap);
-        }
+        const float* at = total + static_cast<std::size_t>(best[x]) * w + x;
         float offset = 0.0f;
-        if (k_best > 0 && k_best < d - 1) {
-            const float before = at(k_best - 1, x) - lowest, after = at(k_best + 1, x) - lowest;
+        if (best[x] > 0 && best[x] < d - 1) {
+            const float before = at[-w] - lowest[x], after = at[w] - lowest[x];
             if (before + after > 1e-9f) offset = 0.5f * (before - after) / (before + after);
         }
-        index[x] = static_cast<float>(k_best) + offset;
-        probability[x] = near / all;
-        margin[x] = elsewhere;
-        best[x] = k_best;
+        index[x] = static_cast<float>(best[x]) + offset;
+        probability[x] = near[x] / all[x];
     }
 }
 
