@@ -218,11 +218,10 @@ void sweep(const float* reference, int height, int width, const float* neighbors
                     for (int y = y0; y < y1; ++y) {
                         const float* slots = s.best.data() + static_cast<std::size_t>(y - y0) * s.padded * best;
                         float* out = cost + (static_cast<std::size_t>(y) * o.hypotheses + k) * width;
-#pragma omp simd
-                        for (int x = run.from; x < run.to; ++x) {
-                            float sum = 0.0f;
-                            for (int j = 0; j < best; ++j) sum += slots[static_cast<std::size_t>(j) * s.padded + x];
-                            out[x] = sum * share;
+                        for (int x = run.from; x < run.to; ++x) out[x] = slots[x] * share;
+                        for (int j = 1; j < best; ++j) {
+                            slots += s.padded;
+                            for (int x = run.from; x < run.to; ++x) out[x] += slots[x] * share;
                         }
                     }
                 }
