@@ -1,6 +1,7 @@
 // Matching cost of a plane or surface sweep: warp, ZNCC in adaptive windows, mean over the best views.
 #include <algorithm>
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
 #include <cstring>
 
@@ -30,8 +31,8 @@ struct Scratch {
           variance(padded), best(static_cast<std::size_t>(padded) * kBand * best_views) {}
 };
 
-// Where a row's pixels lie in the neighbor: of the upper left of the four pixels around it, and the shares of the others.
-// The four come in two pairs, each one load: gathers are slow, and many instruction sets have none.
+// Where a row's pixels lie in the neighbor: the upper left of the four pixels around each, and the others' shares. The
+// four come in two pairs, each one load: gathers are slow, and many instruction sets have none.
 struct Footprints {
     static constexpr int kBlock = 64;
     std::int32_t at[kBlock];
@@ -96,8 +97,8 @@ void warp_rows(const float* neighbor, int nh, int nw, const Warp& warp, int begi
     }
 }
 
-// ZNCC of row y against the samples, -2 where the neighbor does not see the pixel, and the samples' mean in each window:
-// in `s`, from the first of the columns to the end of the last one's vector.
+// ZNCC of row y against the samples, -2 where the neighbor does not see the pixel, and the samples' mean in each
+// window: in `s`, from the first of the columns to the end of the last one's vector.
 void correlate_row(const Windows& windows, int y, int y0, int begin, int height, Columns columns, float noise,
                    Scratch& s) {
     const int radius = windows.radius, side = 2 * radius + 1, row = y - y0;
@@ -131,8 +132,8 @@ void correlate_row(const Windows& windows, int y, int y0, int begin, int height,
     }
 }
 
-// Turns a row's correlation into costs, with the mean gray levels of both windows, and keeps the `best` smallest of each
-// pixel, ascending; slots is [best][padded].
+// Turns a row's correlation into costs, with the mean gray levels of both windows, and keeps the `best` smallest of
+// each pixel, ascending; slots is [best][padded].
 void insert_cost(const float* mean, Columns columns, const CostOptions& o, int best, Scratch& s, float* slots) {
     const float level = o.level, sharpness = 1.0f / o.level_range;
     const float* mean_there = s.mean.data();

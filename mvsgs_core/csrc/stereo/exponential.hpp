@@ -1,6 +1,5 @@
 #pragma once
 
-#include <algorithm>
 #include <bit>
 #include <cstdint>
 
@@ -8,7 +7,7 @@ namespace stereo {
 
 // e^x of x <= 0, to 1e-6 of itself; the library's function keeps loops around it from being vectorized.
 inline float exponential(float x) {
-    const float power = std::max(x * 1.442695041f, -126.0f);
+    const float scaled = x * 1.442695041f, power = scaled > -126.0f ? scaled : -126.0f;  // of NaN: 0
     const std::int32_t whole = static_cast<std::int32_t>(power - 0.5f);
     const float f = power - static_cast<float>(whole);
     float p = 1.540353e-4f;

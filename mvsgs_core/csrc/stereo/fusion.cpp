@@ -1,8 +1,9 @@
 // Agreement of depth maps: geometric consistency, and fusion by support and free-space violation.
-#include "stereo.hpp"
-
 #include <algorithm>
 #include <cmath>
+
+#include "exponential.hpp"
+#include "stereo.hpp"
 
 namespace stereo {
 namespace {
@@ -99,7 +100,7 @@ void fuse_depth(const float* depth, const float* confidence, int height, int wid
                 float weights = 0.0f, inverse = 0.0f, for_it = 0.0f, against = 0.0f, from_own = 0.0f;
                 if (z_own > 0.0f) {
                     const float difference = (z_own - z) / z;
-                    from_own = c_own * std::exp(sharpness * difference * difference);
+                    from_own = c_own * exponential(sharpness * difference * difference);
                     weights = from_own;
                     inverse = from_own / z_own;
                     if (std::fabs(difference) > tolerance) against += c_own;
@@ -111,7 +112,7 @@ void fuse_depth(const float* depth, const float* confidence, int height, int wid
                     const float found = neighbor_depths[n * stride + at], c = neighbor_confidences[n * stride + at];
                     if (!(found > 0.0f) || c < o.least_confidence) continue;
                     const float difference = (found - p.depth) / p.depth;
-                    const float weight = c * std::exp(sharpness * difference * difference);
+                    const float weight = c * exponential(sharpness * difference * difference);
                     for_it += weight;
                     weights += weight;
                     inverse += weight / (z * (1.0f + difference));
