@@ -28,6 +28,7 @@ from bench.depth_photos import PHOTOS, photo_rows
 from bench.depth_pictures import write_pictures
 from bench.depth_polish import polished
 from bench.depth_run import Run, run, score, surest
+from bench.depth_sensor import sensor_offset, without_offset
 from bench.depth_tracked import load_tracked
 from bench.runs import Matrix, figure, folder
 from bench.table import Row, at_least, at_most, main
@@ -88,6 +89,24 @@ def quality_rows(scene: Scene, found: Run, align: bool) -> list[Row]:
             rows.append(at_least(f"{title}: inliers of the surest {completeness:.0%}", best.inliers, "", inliers))
     if scene.name == "redkitchen":
         rows[2] = at_most(rows[2].name, raw.relative_error, "", 0.10)
+    return rows
+
+
+def sensor_section(options: argparse.Namespace) -> list[Row]:
+    """Real sensors' maps against each other, with the tracker's poses; kept depth without an offset that they show."""
+    rows = []
+    for name in [] if options.quick else available(("redkitchen", "fr1_xyz")):
+        scene, found = measured(name, SMALL, None, True)
+        sensor = sensor_offset(scene)
+        title = f"{scene.name}, sensor"
+        rows += [
+            Row(f"{title}: maps differ by", sensor.before),
+            Row(f"{title}: maps differ with an offset by", sensor.after),
+            Row(f"{title}: offset of its inverse depth", sensor.offset if sensor.believed else "not believed", "1/m"),
+        ]
+        if sensor.believed:
+            kept = score([f.depth for f in found.fused], without_offset(scene, sensor.offset), align=True)
+            rows.append(Row(f"{title}: inliers with it taken out", kept.inliers))
     return rows
 
 
@@ -214,6 +233,7 @@ def map_section(options: argparse.Namespace) -> list[Row]:
 SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "quality": partial(quality_section, area=SMALL, tracked=False),
     "tracked": partial(quality_section, area=SMALL, tracked=True),
+    "sensor": sensor_section,
     "ceiling": ceiling_section,
     "polished": polished_section,
     "large": partial(quality_section, area=LARGE, tracked=False),
