@@ -10,7 +10,8 @@ import ctypes
 import time
 from collections.abc import Callable
 
-PERIOD = 1.0  # s between two returns: one takes a few milliseconds
+PERIOD = 0.2  # s between two returns, at least
+SHARE = 0.02  # of the time that returns may take: where one is slow, they are rarer
 
 
 class FreedMemory:
@@ -19,13 +20,14 @@ class FreedMemory:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         self._clock = clock
-        self._last = clock()
+        self._next = clock() + PERIOD
 
     def give_back(self) -> bool:
         """Whether it was time to, and possible."""
-        now = self._clock()
-        if self._trim is None or now - self._last < PERIOD:
+        start = self._clock()
+        if self._trim is None or start < self._next:
             return False
-        self._last = now
         self._trim(0)
+        end = self._clock()
+        self._next = end + max(PERIOD, (end - start) / SHARE)
         return True

@@ -3,7 +3,7 @@ import ctypes
 import numpy as np
 import pytest
 
-from nodes.freed_memory import PERIOD, FreedMemory
+from nodes.freed_memory import PERIOD, SHARE, FreedMemory
 from nodes.status import rss
 
 HAS_TRIM = hasattr(ctypes.CDLL(None), "malloc_trim")
@@ -16,6 +16,22 @@ def test_memory_is_given_back_once_a_period() -> None:
     now[0] += PERIOD
     assert freed.give_back() == HAS_TRIM
     assert not freed.give_back()
+
+
+def test_slow_returns_are_rare(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    freed = FreedMemory(lambda: now[0])
+
+    def slow(_: int) -> None:
+        now[0] += 0.1
+
+    monkeypatch.setattr(freed, "_trim", slow)
+    now[0] += PERIOD
+    assert freed.give_back()
+    now[0] += 0.9 * 0.1 / SHARE
+    assert not freed.give_back()
+    now[0] += 0.2 * 0.1 / SHARE
+    assert freed.give_back()
 
 
 @pytest.mark.skipif(not HAS_TRIM, reason="this C library has no malloc_trim")
