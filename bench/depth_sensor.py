@@ -54,14 +54,14 @@ def sensor_offset(scene: Scene) -> SensorOffset:
     median = float(np.median(np.concatenate([m.depths for m in maps])))
 
     def search(offsets: bool) -> tuple[float, float]:
-        best, least = np.zeros(2), difference(maps, 0.0, 1.0)
+        best, least = np.zeros(2), _difference(maps, 0.0, 1.0)
         step = np.array(FIRST) * (1.0 if offsets else 0.0, 1.0)
         for _ in range(REFINEMENTS):
             middle = best
             for i in range(-STEPS, STEPS + 1) if offsets else (0,):
                 for j in range(-STEPS, STEPS + 1):
                     tried = middle + step * (i, j)
-                    found = difference(maps, tried[0] / median, float(np.exp(tried[1])) * (1.0 + tried[0]))
+                    found = _difference(maps, tried[0] / median, float(np.exp(tried[1])) * (1.0 + tried[0]))
                     if found < least:
                         best, least = tried, found
             step = step / 2.0
@@ -78,7 +78,7 @@ def without_offset(scene: Scene, offset: float) -> Scene:
     return replace(scene, truths=truths)
 
 
-def difference(maps: list[_Map], offset: float, scale: float) -> float:
+def _difference(maps: list[_Map], offset: float, scale: float) -> float:
     """Mean relative difference of depths carried from each map to the others, at most LARGEST each."""
     total, count = 0.0, 0
     for i, source in enumerate(maps):
@@ -103,7 +103,7 @@ def difference(maps: list[_Map], offset: float, scale: float) -> float:
             apart = np.abs(local[inside, 2][known] - found) / found
             total += float(np.minimum(apart, LARGEST).sum())
             count += len(apart)
-    return total / max(1, count)
+    return total / count if count else LARGEST  # maps that no longer meet do not agree
 
 
 def _maps(scene: Scene) -> list[_Map]:
