@@ -8,7 +8,7 @@ import numpy as np
 from mvsgs_core.fusion.interface import Fused
 
 # Logistic regression on `features_of`, by `python -m bench.depth_calibration`.
-WEIGHTS = np.array([-0.166, 1.031, 1.539, -0.665, -0.351, -0.29, 1.424, 0.779, -0.826, -1.02])
+WEIGHTS = np.array([-1.851, 0.966, 1.753, -0.659, -0.379, -0.342, 1.449, 0.733, -0.611, -0.558, 1.103, 0.83])
 
 
 def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, seeing: np.ndarray) -> np.ndarray:
@@ -16,6 +16,7 @@ def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, se
 
     From stereo's confidence, the number of neighbors that agree, and of those that have a depth there at all, each
     (H, W): that few agree where few look, at the image's border or behind an edge, doesn't speak against a depth.
+    The mean of the whole map speaks for its pose and its range: where these are wrong, little matches anywhere.
     """
     around = cv2.blur(confidence, (9, 9))  # errors come in patches
     agreeing = cv2.blur((consistent >= 2).astype(np.float32), (5, 5))
@@ -36,6 +37,8 @@ def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, se
             agreeing,
             4.0 * rim,
             4.0 * behind,
+            np.full_like(confidence, confidence.mean()),
+            cv2.erode(confidence, np.ones((5, 5), np.uint8)),
         ]
     ).astype(np.float32)
 

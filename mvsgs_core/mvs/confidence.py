@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 
 # Logistic regression on `Evidence.features`, by `python -m bench.depth_calibration`.
-WEIGHTS = np.array([-1.614, 1.131, 0.351, 1.401, 0.366, -0.45, 0.027, 2.215, -1.068, 2.015])
+WEIGHTS = np.array([-1.063, 0.909, 0.416, 1.44, 0.798, -0.451, -0.078, 1.443, -1.066, 2.345, 0.919])
+
+BLACK = 128.0 + 10.0  # gray levels: views have 128 taken out; ten more keep the logarithm of black tame
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Evidence:
     margin: np.ndarray  # of the last stage: how much worse other hypotheses are
     bend: np.ndarray  # relative change of inverse depth to the median around: high at jumps and where depth is noise
     gap: np.ndarray  # how much worse other surfaces around the pixel are
+    brightness: np.ndarray  # log of the gray level over the image's median: the dark is noise, and gaps between things
 
     @staticmethod
     def of(
@@ -51,6 +54,7 @@ class Evidence:
             margin=margin,
             bend=np.abs(cv2.medianBlur(inverse_depth, 5) / np.maximum(inverse_depth, 1e-9) - 1.0),
             gap=gap,
+            brightness=np.log((gray + BLACK) / (np.median(gray) + BLACK)).astype(np.float32),
         )
 
     def features(self) -> np.ndarray:
@@ -67,6 +71,7 @@ class Evidence:
                 np.clip(self.margin, 0.0, 0.5),
                 np.clip(cv2.blur(self.bend, (5, 5)) / 0.02, 0.0, 2.0),
                 np.sqrt(np.clip(self.gap, 0.0, 1.0)),
+                self.brightness,
             ]
         ).astype(np.float32)
 

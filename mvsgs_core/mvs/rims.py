@@ -21,7 +21,10 @@ from mvsgs_core.mvs.warp import apply_warp
 class RimChoice:
     """Candidates and their smoothing."""
 
-    rings: tuple[int, ...] = (3, 6)  # pixels: the surfaces so far away, in eight directions, are candidates
+    # Pixels, one tuple a round: the surfaces so far away, in eight directions, are candidates. The wide round frees
+    # what a window covered whole, as between the slats of a chair; the narrow one finds the edge to the pixel.
+    rounds: tuple[tuple[int, ...], ...] = ((4, 8), (2, 4))
+    best_views: int = 2  # that count: right at a rim half of the views see something else
     small_jump: float = 0.3  # cost of a change of inverse depth that moves the point by a pixel
     large_jump: float = 1.0  # the most that a change costs
     contrast: float = 5.0  # gray levels: what differs so from a window's center counts 1 / e in it
@@ -72,18 +75,28 @@ def settle_rims(
     choice: RimChoice,
     backend: Backend,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) float32 inverse depth, and how clear the choice was, 0 to 1, in cost.
+    """(H, W) float32 inverse depth, and how clear the least clear choice was, 0 to 1, in cost.
 
     `pixel` is the change of inverse depth that moves a point by a pixel.
     """
     neighbors = at_level_of(reference, neighbors, warps, inverse_depth)
-    cost_options = replace(cost_options, contrast=choice.contrast, level=choice.level, level_range=choice.level_range)
+    cost_options = replace(
+        cost_options,
+        best=min(choice.best_views, cost_options.best),
+        contrast=choice.contrast,
+        level=choice.level,
+        level_range=choice.level_range,
+    )
     options = ChooseOptions(choice.small_jump / pixel, choice.large_jump, choice.edge, pixel)
-    surfaces = continued_surfaces(inverse_depth, choice.rings)
-    tiles = differing_tiles(surfaces, choice.least * pixel)
-    cost = backend.surface_costs(reference, neighbors, warps, surfaces, cost_options, tiles)
-    best, gap = backend.choose_surface(cost, surfaces, reference, options)
-    return np.ascontiguousarray(np.take_along_axis(surfaces, best[None], axis=0)[0]), gap
+    clear = np.ones(inverse_depth.shape, dtype=np.float32)
+    for rings in choice.rounds:
+        surfaces = continued_surfaces(inverse_depth, rings)
+        tiles = differing_tiles(surfaces, choice.least * pixel)
+        cost = backend.surface_costs(reference, neighbors, warps, surfaces, cost_options, tiles)
+        best, gap = backend.choose_surface(cost, surfaces, reference, options)
+        inverse_depth = np.ascontiguousarray(np.take_along_axis(surfaces, best[None], axis=0)[0])
+        clear = np.minimum(clear, gap)
+    return inverse_depth, clear
 
 
 def at_level_of(

@@ -9,8 +9,8 @@ import numpy as np
 
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.hypotheses import SearchRange
-from mvsgs_core.mvs.interface import TILE
-from mvsgs_core.mvs.rims import at_level_of, continued_surfaces, differing_tiles
+from mvsgs_core.mvs.interface import TILE, CostOptions
+from mvsgs_core.mvs.rims import RimChoice, at_level_of, continued_surfaces, differing_tiles, settle_rims
 from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
 from mvsgs_core.mvs.views import prepare_view
 from tests.core.mvs.plane_scene import look, render, true_depth
@@ -59,3 +59,38 @@ def test_rims_of_a_box_come_out_sharper() -> None:
         found = estimate_depth(views[0], views[1:], SearchRange(0.12, 0.8, "given"), config, NativeBackend(1))
         right[name] = np.mean(np.abs(found.depth - truth)[rim] < 0.05 * truth[rim])
     assert right["with"] > right["without"] + 0.02
+
+
+def test_each_round_frees_more_of_what_a_window_covered() -> None:
+    """A chair's back: slats before a wall, sixteen pixels apart, that grew by six pixels over the gaps of twelve."""
+    v, u = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
+    noise = np.random.default_rng(2)
+    near, far = (cv2.GaussianBlur(noise.normal(0, 80, (SIZE[0], 400)).astype(np.float32), (0, 0), 1.2) for _ in "nf")
+    slats = (0.8, 0.4)  # inverse depths of a slat and the wall
+    focal = 100.0
+
+    def seen(x: float) -> np.ndarray:
+        """A camera at x: what stands at column u of the one at 0 appears at u - focal * x * inverse depth."""
+        wall = u + focal * x * slats[1] + 100
+        slat = u + focal * x * slats[0]
+        there = slat % 24 < 8
+        rows = v.astype(np.float32)
+        behind = cv2.remap(far, wall.astype(np.float32), rows, cv2.INTER_LINEAR)
+        return np.where(there, cv2.remap(near, (slat + 100).astype(np.float32), rows, cv2.INTER_LINEAR), behind)
+
+    places = (-0.1, -0.05, 0.05, 0.1)
+    truth = np.where(u % 24 < 8, *slats).astype(np.float32)
+    closed = np.where((u + 6) % 24 < 20, *slats).astype(np.float32)
+    warps = np.stack([[1, 0, 0, 0, 1, 0, 0, 0, 1, -focal * x, 0, 0] for x in places]).astype(np.float32)
+    images = np.stack([seen(x) for x in places]).astype(np.float32)
+    wrong = []
+    for rounds in ((), ((4, 8),), RimChoice().rounds):
+        surface, clear = settle_rims(
+            closed, seen(0.0).astype(np.float32), images, warps, 1.0 / (focal * 0.075), CostOptions(radius=1),
+            RimChoice(rounds=rounds), NativeBackend(1),
+        )  # fmt: skip
+        wrong.append(np.mean(np.abs(surface - truth)[:, 16:112] > 0.01))
+        assert np.all((clear >= 0) & (clear <= 1))
+    assert wrong[0] == 0.5
+    assert wrong[1] < 0.03
+    assert wrong[2] < 0.3 * wrong[1]
