@@ -16,6 +16,7 @@ from msgs import GroundTruth, SplatMap, Trajectory, View
 from mvsgs_core import weights
 from mvsgs_core.evaluation import html, pictures, trajectory
 from mvsgs_core.evaluation.evaluation import Evaluation, FinishedMap, Track
+from mvsgs_core.evaluation.exposure import IDENTITY
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.splats.model import Splats
 from nodes import Node
@@ -110,10 +111,10 @@ class Evaluator(Node):
             warned["evaluator"] = list(self.stats.warnings)
         self.report["warnings"] = warned
         self.report["protocol"] = (
-            "Scored at native resolution, without exposure correction at test time. Keyframes are training views; "
-            "held-out: every 5th frame that is no keyframe. "
+            "Scored at native resolution; nothing is fitted to a scored frame, exposure neither. "
+            "Keyframes are training views; held-out: every 5th frame that is no keyframe. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self.evaluation.lpips else 'not computed'}. "
-            f"{_shutter(self.evaluation.track)}"
+            f"{_shutter(self.evaluation.track)}{_exposure(self.evaluation.maps)}"
             "ATE: RMSE of keyframe positions after Sim(3) alignment."
         )
 
@@ -148,6 +149,7 @@ def _finished(message: SplatMap) -> FinishedMap:
         {int(i): pose for i, pose in zip(message.keyframes, message.world_from_cam)},
         {int(i): float(s) for i, s in zip(message.keyframes, message.scale)},
         sum(a.nbytes for a in arrays),
+        {int(i): exposure for i, exposure in zip(message.keyframes, message.exposures)},
     )
 
 
@@ -156,6 +158,13 @@ def _shutter(track: Track | None) -> str:
         return ""
     taken_out = f"{1e3 * track.readout:.1f} ms a frame"
     return f"Renders are rolled with the shutter that the tracker took out of the keyframes ({taken_out}). "
+
+
+def _exposure(maps: dict[bool, FinishedMap]) -> str:
+    affines = [affine for finished in maps.values() for affine in finished.exposures.values()]
+    if not affines or np.allclose(affines, IDENTITY):
+        return ""
+    return "Renders have the exposures that the mapper found for keyframes, in between interpolated in time. "
 
 
 def _plain(value: Any) -> Any:

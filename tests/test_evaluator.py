@@ -166,6 +166,23 @@ def test_renders_are_rolled_with_the_shutter_that_the_tracker_took_out(evaluator
     assert "20.0 ms a frame" in evaluator.report["protocol"]
 
 
+def test_frames_between_keyframes_are_rendered_at_an_exposure_between_theirs(evaluator: Evaluator) -> None:
+    poses, index, none = _poses(), np.arange(N), np.zeros(N, np.int32)
+    poses[:, :3, 3] += ORIGIN
+    list(evaluator.on_trajectory(Trajectory(index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none)))
+    splat_map = _splat_map(True)
+    splat_map.exposures[1, :, :3] *= 0.5  # of frame 3; those of frames 0 and 6 are the identity
+    list(evaluator.on_splat_map(splat_map))
+    finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.views()
+    for frame, gain in ((0, 1.0), (2, 2 / 3), (3, 0.5), (5, 5 / 6), (6, 1.0)):
+        view = views[frame]
+        color, _ = render_view(finished.splats, finished.density, view, (H, W))
+        plain, _ = render_view(finished.splats, finished.density, replace(view, exposure=None), (H, W))
+        np.testing.assert_allclose(color, gain * plain, atol=1e-5)
+    list(evaluator.on_end())
+    assert "interpolated in time" in evaluator.report["protocol"]
+
+
 def test_without_truth_the_figures_are_null(tmp_path: Path) -> None:
     node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
     for k in range(N):

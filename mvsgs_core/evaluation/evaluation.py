@@ -11,6 +11,7 @@ import numpy as np
 
 from mvsgs_core.evaluation import scoring, trajectory
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
+from mvsgs_core.evaluation.exposure import between_keyframes
 from mvsgs_core.evaluation.frame_store import FrameStore
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
@@ -31,6 +32,7 @@ class FinishedMap:
     keyframe_poses: dict[int, np.ndarray]
     scale: dict[int, float]  # of each keyframe's depths, see msgs.Poses
     bytes: int
+    exposures: dict[int, np.ndarray] = field(default_factory=dict)  # (3, 4) color affine of each keyframe
 
     def typical_depth(self) -> float:
         """Median distance of the splats from the middle of the keyframes, map units; the world's scale is arbitrary."""
@@ -138,6 +140,7 @@ class Evaluation:
         from_world = np.eye(4)
         from_world[:3, 3] = -finished.origin
         moving = velocities(self.track.timestamp, self.track.world_from_cam, main)
+        exposures = self._exposures(finished, main)
         for k in np.flatnonzero(main & np.isin(self.track.index, list(self._intrinsics))):
             index = int(self.track.index[k])
             views.append(
@@ -149,9 +152,17 @@ class Evaluation:
                     lambda index=index: self.photograph(index),  # type: ignore[misc]
                     near,
                     Shutter(self.track.readout, moving[k]) if self.track.readout else None,
+                    None if exposures is None else exposures[k],
                 )
             )
         return views
+
+    def _exposures(self, finished: FinishedMap, main: np.ndarray) -> np.ndarray | None:
+        """Color affines (N, 3, 4) of the track's frames, from the map's keyframes; None where the mapper had none."""
+        assert self.track is not None
+        known = np.flatnonzero(main & np.isin(self.track.index, list(finished.exposures)))
+        affines = np.array([finished.exposures[int(i)] for i in self.track.index[known]], dtype=np.float32)
+        return between_keyframes(self.track.timestamp, self.track.timestamp[known], affines)
 
     def photograph(self, index: int) -> np.ndarray:
         image = self._store.get("image", index)

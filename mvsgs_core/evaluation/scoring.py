@@ -30,6 +30,7 @@ class View:
     photograph: Callable[[], np.ndarray]  # (H, W, 3) uint8, read when needed
     near: float  # nothing nearer is drawn, map units
     shutter: Shutter | None = None  # how the photograph was read out; None: all rows at once
+    exposure: np.ndarray | None = None  # (3, 4) color affine of the photograph, as the mapper has it; None: none
 
 
 @dataclass(frozen=True)
@@ -42,15 +43,18 @@ class Score:
 
 
 def render_view(splats: Splats, density: str, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Color (H, W, 3) float32 in 0..1, as the view's shutter sees it, and depth (H, W) float32 of the map."""
+    """Color (H, W, 3) float32 in 0..1, as the view's exposure and shutter show it, and depth (H, W) float32."""
+    exposure = None if view.exposure is None else torch.from_numpy(view.exposure)
     with torch.inference_mode():
-        render = rasterize(splats, view.world_from_cam, view.intrinsics, size, density=density, near=view.near)
+        render = rasterize(
+            splats, view.world_from_cam, view.intrinsics, size, exposure=exposure, density=density, near=view.near
+        )
     color, depth = render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
     return color if view.shutter is None else rolled(color, depth, view.intrinsics, view.shutter), depth
 
 
 def score_view(splats: Splats, density: str, view: View, lpips: Lpips | None) -> Score:
-    """Scores one view without any exposure correction at test time."""
+    """Scores one view. Nothing is fitted to its photograph, exposure neither."""
     photograph = view.photograph().astype(np.float32) / 255.0
     color, _ = render_view(splats, density, view, photograph.shape[:2])
     distance = None
