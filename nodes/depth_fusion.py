@@ -99,7 +99,7 @@ class DepthFusion(FusionNode):
         relative: float = 0.02  # relative depth difference that still agrees
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
         least_views: int = 2  # views that must agree, the reference counted
-        confidence: float = 0.78  # least confidence of a kept pixel
+        confidence: float = 0.77  # least confidence of a kept pixel
         rim: int = 2  # pixels: nothing is kept that close to something farther; 0: off
         speckle: int = 200  # pixels: patches up to this size are not kept; 0: off
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda

@@ -16,8 +16,8 @@ from msgs import GroundTruth, SplatMap, Trajectory, View
 from mvsgs_core import weights
 from mvsgs_core.evaluation import html, pictures, trajectory
 from mvsgs_core.evaluation.evaluation import Evaluation, FinishedMap, Track
-from mvsgs_core.evaluation.exposure import IDENTITY
 from mvsgs_core.evaluation.lpips import Lpips
+from mvsgs_core.splats.exposure import IDENTITY
 from mvsgs_core.splats.model import Splats
 from nodes import Node
 

@@ -8,7 +8,7 @@ import numpy as np
 from mvsgs_core.fusion.interface import Fused
 
 # Logistic regression on `features_of`, by `python -m bench.depth_calibration`.
-WEIGHTS = np.array([-1.851, 0.966, 1.753, -0.659, -0.379, -0.342, 1.449, 0.733, -0.611, -0.558, 1.103, 0.83])
+WEIGHTS = np.array([-1.802, 0.956, 1.655, -0.617, -0.337, -0.346, 1.449, 0.637, -0.609, -0.504, 1.107, 0.834])
 
 
 def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, seeing: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ class FusionConfig:
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
     least_views: int = 2  # views that must agree, the reference counted
-    confidence: float = 0.78  # least confidence of a kept pixel
+    confidence: float = 0.77  # least confidence of a kept pixel
     rim: int = 2  # pixels: nothing is kept that close to something farther; 0: off
     speckle: int = 200  # pixels: patches up to this size are not kept; 0: off
     device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda"

@@ -23,7 +23,8 @@ class RimChoice:
 
     # Pixels, one tuple a round: the surfaces so far away, in eight directions, are candidates. The wide round frees
     # what a window covered whole, as between the slats of a chair; the narrow one finds the edge to the pixel.
-    rounds: tuple[tuple[int, ...], ...] = ((4, 8), (2, 4))
+    rounds: tuple[tuple[int, ...], ...] = ((4, 8, 12), (3, 6))
+    radius: int = 1  # pixels, of the matching window: a wide one holds both surfaces
     best_views: int = 2  # that count: right at a rim half of the views see something else
     small_jump: float = 0.3  # cost of a change of inverse depth that moves the point by a pixel
     large_jump: float = 1.0  # the most that a change costs
@@ -82,6 +83,7 @@ def settle_rims(
     neighbors = at_level_of(reference, neighbors, warps, inverse_depth)
     cost_options = replace(
         cost_options,
+        radius=choice.radius,
         best=min(choice.best_views, cost_options.best),
         contrast=choice.contrast,
         level=choice.level,

@@ -34,7 +34,7 @@ class StereoConfig:
 
     stages: tuple[Stage, ...] = (
         Stage(scale=2, step=0.7, hypotheses=128, radius=2, small_jump=0.3, large_jump=2.0),
-        Stage(scale=1, step=0.35, hypotheses=11, radius=1, small_jump=0.05, large_jump=0.4),
+        Stage(scale=1, step=0.35, hypotheses=11, radius=2, small_jump=0.05, large_jump=0.4),
     )
     best_views: int = 3  # of the neighbors, per pixel and hypothesis: the others may be occluded
     noise: float = 1.5  # gray levels²

@@ -28,19 +28,6 @@ def step_exposure(view: TrainingView, rate: float) -> None:
     view.exposure.clamp_(-4.0, 4.0)
 
 
-@torch.no_grad()
-def center_exposures(views: list[TrainingView]) -> None:
-    """Shifts all color affines so that their mean is the identity.
-
-    The map's colors are known up to one affine of all; unheld it drifts, and frames whose exposure nobody estimated
-    (the held-out ones) would be rendered in its colors.
-    """
-    drift = torch.stack([view.exposure for view in views]).mean(dim=0)
-    drift -= torch.eye(3, 4, device=drift.device)
-    for view in views:
-        view.exposure -= drift
-
-
 def step_pose(view: TrainingView, gradient: np.ndarray, angle: float, length: float) -> bool:
     """Adam on the pose: composes the view's `pose_delta` with a twist in the camera's frame, in float64.
 

@@ -13,9 +13,9 @@ import torch
 
 from mvsgs_core import camera
 from mvsgs_core.splats import density_control, optimizer
-from mvsgs_core.splats.camera_steps import center_exposures
 from mvsgs_core.splats.deformation import Similarity, move_with_anchors
 from mvsgs_core.splats.density_control import DensityConfig
+from mvsgs_core.splats.exposure import colors_of_map, fitted_exposure
 from mvsgs_core.splats.filling import fill_points
 from mvsgs_core.splats.insertion import (
     InsertionConfig,
@@ -127,6 +127,8 @@ class OnlineMapper:
                 "pixels", int((~added.valid[0]).sum()), "pixels that are not finite were left out of the training"
             )
         with self.log.time("insertion"):
+            if self.config.training.exposure:
+                self._expose(added)
             inserted = self._insert(view, added, depth) if median > 0 else 0
             inserted += self._fill(view, added, depth == 0)
         self.schedule.owe(self.config.iterations)
@@ -269,8 +271,6 @@ class OnlineMapper:
             self.state, view, config.training, config.skipping, factors, config.rates.decay_steps,
             self.median_depth, self.global_rate, refining, self.log,
         )  # fmt: skip
-        if config.training.exposure:
-            center_exposures(self.views)
         self.iterations += 1
         self.log.count("iterations")
         if not refining and self.iterations % config.density_control.every == 0:
@@ -298,7 +298,7 @@ class OnlineMapper:
             if occupancy and config.map_voxel_error < float("inf"):
                 standing_out = _resized(outliers(*images, config), size)
         intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
-        colors = depth_colors(added.levels[0].cpu().numpy(), size)
+        colors = self._colors(added, size)
         assert self.unit is not None
         points = points_from_depth(depth / self.unit, intrinsics, colors, view.normals, mask)
         if occupancy and len(points):
@@ -328,11 +328,30 @@ class OnlineMapper:
         depth = self._checked_depth(view.unfiltered) * np.float32(added.scale / view.scale / self.unit)
         confidence = np.ones(size, dtype=np.float32) if view.confidence is None else view.confidence
         intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
-        colors = depth_colors(added.levels[0].cpu().numpy(), size)
+        colors = self._colors(added, size)
         points = fill_points(depth, confidence, intrinsics, colors, empty, config.fill)
         filled = self._append(points, added, config.fill_opacity)
         self.log.count("filled", filled)
         return filled
+
+    def _expose(self, added: TrainingView) -> None:
+        """First guess of a keyframe's exposure: what fits the map, or where that shows too little the last one's."""
+        if len(self.state):
+            level = len(added.levels) - 1
+            render = self.render(added, level)
+            images = render.color.cpu().numpy(), render.opacity.cpu().numpy(), added.target(level).cpu().numpy()
+            found = fitted_exposure(*images)
+            if found is not None:
+                added.exposure.copy_(torch.from_numpy(found))
+            elif len(self.views) > 1:
+                added.exposure.copy_(self.views[-2].exposure.detach())
+
+    def _colors(self, added: TrainingView, size: tuple[int, int]) -> np.ndarray:
+        """The keyframe's colors (h, w, 3) as the map has them."""
+        colors = depth_colors(added.levels[0].cpu().numpy(), size)
+        if not self.config.training.exposure:
+            return colors
+        return colors_of_map(colors, added.exposure.detach().cpu().numpy())
 
     def _append(self, points: Points, added: TrainingView, opacity: float) -> int:
         """Makes splats of camera-frame points, as many as the map has room for; returns their number."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from mvsgs_core.splats.exposure import IDENTITY, relative_to_mean
 from mvsgs_core.splats.keyframes import TrainingView
 from mvsgs_core.splats.map_state import MapState
 from mvsgs_core.splats.model import Splats
@@ -43,6 +44,9 @@ def snapshot(
     splats.means = (splats.means.to(torch.float64) * length).to(torch.float32)
     splats.log_scales = splats.log_scales + math.log(length)
     count = len(views)
+    exposures = np.array([v.exposure.detach().cpu().numpy() for v in views], dtype=np.float32).reshape(-1, 3, 4)
+    if count and not np.array_equal(exposures, np.broadcast_to(IDENTITY, exposures.shape)):
+        splats.sh, exposures = relative_to_mean(splats, exposures)
     return Snapshot(
         splats=splats,
         anchors=state.anchors.cpu().numpy().copy(),
@@ -52,9 +56,7 @@ def snapshot(
         keyframes=np.array([view.index for view in views], dtype=np.int64),
         world_from_cam=np.stack([_refined(v, length) for v in views]) if count else np.zeros((0, 4, 4)),
         scale=np.array([view.scale for view in views], dtype=np.float64),
-        exposures=np.stack([v.exposure.detach().cpu().numpy() for v in views]).astype(np.float32)
-        if count
-        else np.zeros((0, 3, 4), dtype=np.float32),
+        exposures=exposures,
     )
 
 
