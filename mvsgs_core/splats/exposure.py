@@ -20,6 +20,9 @@ SATURATED = 0.98  # a camera's color from here on, and from its complement down,
 SAMPLES = 20000  # pixels that are fitted, at most
 HOLD = 1e-3  # variance of color that counts as much as the identity does
 GAINS = (0.25, 4.0)  # what a fit may say
+# Of a fit, toward the identity. A fit is a percent off, new splats pass that on to the next keyframe's fit, and only this
+# keeps a long path from drifting; the training finds the rest.
+KEPT = 0.9
 
 
 def fitted_exposure(render: np.ndarray, opacity: np.ndarray, image: np.ndarray) -> np.ndarray | None:
@@ -46,7 +49,7 @@ def fitted_exposure(render: np.ndarray, opacity: np.ndarray, image: np.ndarray) 
             covariance = weight @ ((x - mean_x) * (y - mean_y))
             gain = float(np.clip((covariance + HOLD) / (weight @ (x - mean_x) ** 2 + HOLD), *GAINS))
             offset = mean_y - gain * mean_x
-        affine[channel, channel], affine[channel, 3] = gain, offset
+        affine[channel, channel], affine[channel, 3] = 1.0 + KEPT * (gain - 1.0), KEPT * offset
     return affine
 
 
