@@ -20,8 +20,8 @@ SATURATED = 0.98  # a camera's color from here on, and from its complement down,
 SAMPLES = 20000  # pixels that are fitted, at most
 HOLD = 1e-3  # variance of color that counts as much as the identity does
 GAINS = (0.25, 4.0)  # what a fit may say
-# Of a fit, toward the identity. A fit is a percent off, new splats pass that on to the next keyframe's fit, and only this
-# keeps a long path from drifting; the training finds the rest.
+# Of a fit, toward the identity. A fit is a percent off, new splats pass that on to the next keyframe's fit, and only
+# this keeps a long path from drifting; the training finds the rest.
 KEPT = 0.9
 
 

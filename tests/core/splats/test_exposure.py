@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mvsgs_core.splats.exposure import IDENTITY, colors_of_map, fitted_exposure, relative_to_mean
+from mvsgs_core.splats.exposure import IDENTITY, KEPT, colors_of_map, fitted_exposure, relative_to_mean
 from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.splats.rasterizer import rasterize
 from mvsgs_core.splats.training import TrainingConfig
@@ -24,8 +24,9 @@ def test_gain_and_offset_are_found_though_a_quarter_of_the_image_is_something_el
     image[:15] = rng.uniform(0.1, 0.9, (15, SIZE[1], 3))
     found = fitted_exposure(render, np.ones(SIZE), image)
     assert found is not None
-    np.testing.assert_allclose(found, AFFINE, atol=0.03)
-    np.testing.assert_allclose(colors_of_map(image[20:], found), render[20:], atol=0.1)
+    fitted = IDENTITY + (found - IDENTITY) / KEPT
+    np.testing.assert_allclose(fitted, AFFINE, atol=0.03)
+    np.testing.assert_allclose(colors_of_map(image[20:], fitted), render[20:], atol=0.1)
 
 
 def test_a_map_that_shows_too_little_and_a_flat_image_say_nothing_wild() -> None:
@@ -35,7 +36,7 @@ def test_a_map_that_shows_too_little_and_a_flat_image_say_nothing_wild() -> None
     found = fitted_exposure(render, np.ones(SIZE), render + 0.1)
     assert found is not None
     np.testing.assert_allclose(found[:, :3], np.eye(3), atol=1e-6)
-    np.testing.assert_allclose(found[:, 3], 0.1, atol=1e-6)
+    np.testing.assert_allclose(found[:, 3], KEPT * 0.1, atol=1e-6)
     render[5, 5] = np.nan
     assert np.isfinite(fitted_exposure(render, np.ones(SIZE), render)).all()
 
@@ -74,3 +75,15 @@ def test_a_keyframe_of_another_exposure_starts_with_it_and_lays_no_second_skin()
             gains = mapper.views[1].exposure.detach().numpy()[:, :3].diagonal()
             np.testing.assert_allclose(gains, 0.7, atol=0.12)
     assert counts[True] < 0.5 * counts[False]
+
+
+def test_a_camera_of_constant_exposure_hardly_drifts() -> None:
+    """What is new comes from the last guess and makes the next one: their errors must not add up."""
+    rng = np.random.default_rng(1)
+    mapper = OnlineMapper(MapperConfig(iterations=10, refinement=0, training=TrainingConfig(threads=1, exposure=True)))
+    for k, time in enumerate(np.linspace(0.0, 1.0, 12)):
+        view = posed_view(k, pose_on_arc(float(time)))
+        noisy = np.clip(view.image + rng.normal(0.0, 8.0, view.image.shape), 0, 255).astype(np.uint8)
+        mapper.add_view(replace(view, image=noisy))
+    gains = np.array([v.exposure.detach().numpy()[:, :3].diagonal() for v in mapper.views])
+    assert np.abs(gains - 1.0).max() < 0.15
