@@ -56,7 +56,7 @@ def fitted_exposure(render: np.ndarray, opacity: np.ndarray, image: np.ndarray) 
 def colors_of_map(colors: np.ndarray, exposure: np.ndarray) -> np.ndarray:
     """Colors (..., 3) of an image as the map has them, in 0..1."""
     matrix, offset = exposure[:, :3].astype(np.float64), exposure[:, 3].astype(np.float64)
-    return np.clip((colors - offset) @ np.linalg.inv(matrix).T, 0.0, 1.0)
+    return np.clip((colors - offset) @ np.linalg.pinv(matrix).T, 0.0, 1.0)
 
 
 def relative_to_mean(splats: Splats, exposures: np.ndarray) -> tuple[Tensor, np.ndarray]:
@@ -68,7 +68,7 @@ def relative_to_mean(splats: Splats, exposures: np.ndarray) -> tuple[Tensor, np.
     matrix, offset = torch.from_numpy(mean[:, :3]), torch.from_numpy(mean[:, 3])
     sh = splats.sh.to(torch.float64) @ matrix.T
     sh[:, 0] += (offset + matrix.sum(dim=1) * 0.5 - 0.5) / C0
-    inverse = np.linalg.inv(mean[:, :3])
+    inverse = np.linalg.pinv(mean[:, :3])
     relative = exposures.astype(np.float64)
     relative[:, :, :3] = relative[:, :, :3] @ inverse
     relative[:, :, 3] -= relative[:, :, :3] @ mean[:, 3]
