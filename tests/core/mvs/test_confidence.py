@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from mvsgs_core.fusion import confidence as fused_confidence
@@ -58,7 +56,7 @@ def test_next_to_a_doubtful_pixel_all_are_doubted() -> None:
 
 def test_every_feature_has_a_weight() -> None:
     zero = np.zeros(SIZE, np.float32)
-    fused = replace(Fused(zero, zero, zero, zero), depth=zero + 1.0)
+    fused = Fused(depth=zero + 1.0, support=zero, violation=zero, own=zero)
     count = np.zeros(SIZE, np.uint8)
     assert len(fused_confidence.features_of(fused, zero, count, count)) == len(fused_confidence.WEIGHTS)
     assert np.isfinite(probability_of_inlier(evidence(np.full(SIZE, -128.0)))).all()

@@ -62,7 +62,7 @@ def test_rims_of_a_box_come_out_sharper() -> None:
 
 
 def test_each_round_frees_more_of_what_a_window_covered() -> None:
-    """A chair's back: slats before a wall, sixteen pixels apart, that grew by six pixels over the gaps of twelve."""
+    """A chair's back: slats before a wall with gaps of sixteen pixels, into which they grew by six from both sides."""
     v, u = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
     noise = np.random.default_rng(2)
     near, far = (cv2.GaussianBlur(noise.normal(0, 80, (SIZE[0], 400)).astype(np.float32), (0, 0), 1.2) for _ in "nf")
