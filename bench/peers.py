@@ -29,7 +29,7 @@ from launch.placement import available_cores
 from msgs import GroundTruth
 from mvsgs_core.datasets import Item
 from mvsgs_core.evaluation import image_metrics, trajectory
-from mvsgs_core.evaluation.scoring import HELD_OUT_EVERY
+from mvsgs_core.held_out import is_held_out
 from mvsgs_core.splats.training import TrainingConfig
 from nodes.reader import Reader
 
@@ -54,7 +54,7 @@ class Ours:
     @property
     def held_out(self) -> list[int]:
         mapped = set(self.keyframes)
-        return [i for i in self.frames if i % HELD_OUT_EVERY == 0 and i not in mapped]
+        return [i for i in self.frames if is_held_out(i) and i not in mapped]
 
     @property
     def poses(self) -> dict[int, np.ndarray]:
@@ -102,7 +102,7 @@ def frames_of(settings: dict[str, Any]) -> dict[int, GroundTruth]:
 def solve_poses(ours: Ours, place: Path, threads: int, resume: bool) -> tuple[Peer, list[int]]:
     """COLMAP's model, from the images as they come, and the frames that it got."""
     stride = max(1, round(len(ours.frames) / EVENLY))
-    known = {*ours.keyframes, *(i for i in ours.frames if i % HELD_OUT_EVERY == 0 or i % stride == 0)}
+    known = {*ours.keyframes, *(i for i in ours.frames if is_held_out(i) or i % stride == 0)}
     if not resume:
         (place / "images.sha256").unlink(missing_ok=True)  # what `solve` would know an earlier model by
     place.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ import numpy as np
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import html, scoring, svg
 from mvsgs_core.evaluation.evaluation import Evaluation
+from mvsgs_core.held_out import is_held_out
 
 Row = tuple[str, dict[str, np.ndarray]]
 
@@ -18,7 +19,7 @@ Row = tuple[str, dict[str, np.ndarray]]
 def comparisons(evaluation: Evaluation) -> list[Row]:
     """Render beside photograph: the worst, median and best held-out frame (keyframes where none is held out)."""
     scores = evaluation.scores.get(True) or evaluation.scores.get(False) or []
-    held_out = [s for s in scores if not s.keyframe and s.index % scoring.HELD_OUT_EVERY == 0] or scores
+    held_out = [s for s in scores if not s.keyframe and is_held_out(s.index)] or scores
     if not held_out:
         return []
     refined = True in evaluation.maps

@@ -13,10 +13,9 @@ from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import image_metrics
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, rolled
+from mvsgs_core.held_out import is_held_out
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.rasterizer import rasterize
-
-HELD_OUT_EVERY = 5  # frames: every 5th that is no keyframe is "held out"
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,8 @@ def choose(views: list[View], limit: int) -> list[View]:
         return views
     groups = [
         [v for v in views if v.keyframe],
-        [v for v in views if not v.keyframe and v.index % HELD_OUT_EVERY == 0],
-        [v for v in views if not v.keyframe and v.index % HELD_OUT_EVERY != 0],
+        [v for v in views if not v.keyframe and is_held_out(v.index)],
+        [v for v in views if not v.keyframe and not is_held_out(v.index)],
     ]
     chosen: list[View] = []
     for k, group in enumerate(groups):
@@ -92,7 +91,7 @@ def summarize(scores: Iterable[Score]) -> dict[str, dict[str, float | int | None
     scores = list(scores)
     return {
         "keyframes": _mean([s for s in scores if s.keyframe]),
-        "held_out": _mean([s for s in scores if not s.keyframe and s.index % HELD_OUT_EVERY == 0]),
+        "held_out": _mean([s for s in scores if not s.keyframe and is_held_out(s.index)]),
         "all": _mean(scores),
     }
 
