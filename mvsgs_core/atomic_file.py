@@ -1,0 +1,39 @@
+"""Files that are whole or not there: written aside, synced, renamed. Whoever dies on the way leaves the one before."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replacing(file: Path) -> Iterator[Path]:
+    """A path beside `file`, of the same suffix, to write to: when the block ends it takes the place of `file`.
+
+    Where the block raises, `file` stays as it was and what was written aside is removed. Raises OSError.
+    """
+    aside = file.with_name(f".{file.stem}.{os.getpid()}{file.suffix}")
+    try:
+        yield aside
+        _sync(aside)
+        os.replace(aside, file)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+    _sync(file.parent)  # the new name too outlives a loss of power
+
+
+def replace_text(file: Path, text: str) -> None:
+    """Writes a text file (UTF-8) in one step: readers see the old one or the new one. Raises OSError."""
+    with replacing(file) as aside:
+        aside.write_text(text, encoding="utf-8")
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
