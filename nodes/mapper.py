@@ -10,9 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from msgs import MapView, Poses, Preview, SplatMap, View
+from mvsgs_core.splats import keyframe_images
+from mvsgs_core.splats.cameras import cameras_of, write_cameras
 from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.export_ply import write_ply
 from mvsgs_core.splats.insertion import InsertionConfig
+from mvsgs_core.splats.keyframe_images import write_image
 from mvsgs_core.splats.keyframes import PosedView
 from mvsgs_core.splats.losses import LossConfig
 from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
@@ -64,7 +67,8 @@ class Mapper(Node):
         preview_period: float = 1.0  # seconds between previews; 0: none
         preview_splats: int = 100000  # at most so many in a preview
         map_views: bool = False  # send what the map shows from each keyframe, as mvs=skipping reads it
-        output: str | None = None  # folder for map.ply; null: none is written
+        output: str | None = None  # folder for map.ply and cameras.json; null: none is written
+        save_images: bool = False  # write each keyframe's image to output/keyframes, for a COLMAP model
         seed: int = 0
         threads: int | None = None  # of the rasterizer; null: all
         device: str = "auto"  # auto, cpu or cuda:0
@@ -94,9 +98,10 @@ class Mapper(Node):
             PosedView(
                 index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
                 depth=view.depth, scale=view.scale, confidence=view.confidence, normals=view.normals,
-                unfiltered=view.unfiltered,
+                unfiltered=view.unfiltered, timestamp=view.timestamp,
             )
         )  # fmt: skip
+        self._save_image(view)
         self._report()
         yield from self._preview()
 
@@ -130,9 +135,22 @@ class Mapper(Node):
         if self.config.output is not None:
             path = Path(self.config.output) / "map.ply"
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_ply(path, self.mapper.snapshot())
+            final = self.mapper.snapshot()
+            write_ply(path, final)
+            write_cameras(path.with_name("cameras.json"), cameras_of(final, self.mapper.views))
             self.stats.values["map_bytes"] = path.stat().st_size
         yield self._map(refined=True)
+
+    def _save_image(self, view: View) -> None:
+        """A disk that is full costs images, not the map."""
+        if not self.config.save_images or self.config.output is None:
+            return
+        try:
+            write_image(Path(self.config.output) / keyframe_images.FOLDER, view.index, view.image)
+            self.stats.count("images_saved")
+        except OSError as error:
+            self.stats.skip("images_not_saved")
+            self.stats.warn(f"images of keyframes cannot be saved: {error.strerror or error}")
 
     def _enter(self, segment: int) -> None:
         """Goes on with the map of this part of the stream, or begins it."""

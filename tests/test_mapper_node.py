@@ -14,6 +14,7 @@ import torch
 import nodes
 from msgs import MapView, Poses, Preview, SplatMap, View
 from mvsgs_core.evaluation.image_metrics import psnr
+from mvsgs_core.splats.cameras import read_cameras
 from mvsgs_core.splats.export_ply import read_ply
 from mvsgs_core.splats.map_state import PARAMETERS
 from mvsgs_core.splats.model import Splats
@@ -69,6 +70,33 @@ def test_two_maps_leave_the_mapper_before_and_after_the_refinement(tmp_path: Pat
     np.testing.assert_allclose(written.splats.means.numpy(), after.means + after.origin, atol=1e-5)
     assert node.stats.values["splats"] == len(after.means)
     assert node.stats.seconds["refinement"] > 0
+
+
+def test_the_cameras_and_on_request_the_images_are_beside_the_map(tmp_path: Path) -> None:
+    node = Mapper(settings(output=str(tmp_path), save_images=True))
+    sent = [view_message(7 * k, k / 2) for k in range(3)]
+    for view in sent:
+        list(node.on_view(view))
+    *_, last = node.on_end()
+    cameras = read_cameras(tmp_path / "cameras.json")
+    assert cameras.keyframes.tolist() == [0, 7, 14]
+    np.testing.assert_array_equal(cameras.world_from_cam, last.world_from_cam)
+    np.testing.assert_array_equal(cameras.intrinsics, [view.intrinsics for view in sent])
+    np.testing.assert_array_equal(cameras.timestamps, [view.timestamp for view in sent])
+    for view in sent:
+        read = cv2.imread(str(tmp_path / "keyframes" / f"{view.index:06d}.png"))
+        np.testing.assert_array_equal(read[..., ::-1], view.image)
+    assert node.stats.counts["images_saved"] == 3
+
+
+def test_a_disk_that_takes_no_images_does_not_cost_the_map(tmp_path: Path) -> None:
+    (tmp_path / "keyframes").write_text("in the folder's place")
+    node = Mapper(settings(output=str(tmp_path), save_images=True))
+    list(node.on_view(view_message(0, 0.5)))
+    list(node.on_end())
+    assert len(read_ply(tmp_path / "map.ply").splats)
+    assert node.stats.skipped["images_not_saved"] == 1
+    assert "cannot be saved" in node.stats.warnings[0]
 
 
 def test_without_refinement_both_maps_are_the_same() -> None:

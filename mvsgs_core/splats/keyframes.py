@@ -24,6 +24,7 @@ class PosedView:
     confidence: np.ndarray | None = None  # (h, w) 0 to 1
     normals: np.ndarray | None = None  # (h, w, 3), camera frame, 0 where unknown
     unfiltered: np.ndarray | None = None  # (h, w) float32 depth before the filters, 0 where unknown
+    timestamp: float = float("nan")  # seconds; NaN: not known
 
 
 @dataclass
@@ -33,6 +34,9 @@ class TrainingView:
     index: int
     levels: list[Tensor]
     intrinsics: list[np.ndarray]  # (4,) for each level
+    image_intrinsics: np.ndarray  # (4,) at image_size
+    image_size: tuple[int, int]  # height, width of the image as it came
+    timestamp: float  # seconds; NaN: not known
     world_from_cam: np.ndarray  # (4, 4) float64, world units
     scale: float
     local_from_cam: np.ndarray  # (4, 4) float64, in the mapper's frame and unit
@@ -110,6 +114,9 @@ def training_view(
         index=view.index,
         levels=levels,
         intrinsics=intrinsics,
+        image_intrinsics=np.asarray(view.intrinsics, dtype=np.float64),
+        image_size=(height, width),
+        timestamp=view.timestamp,
         world_from_cam=np.asarray(view.world_from_cam, dtype=np.float64),
         scale=view.scale,
         local_from_cam=local_from_cam,

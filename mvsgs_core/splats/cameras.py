@@ -1,0 +1,113 @@
+"""cameras.json: the keyframes of a map as cameras, so that whoever opens a map.ply knows what it was seen with."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvsgs_core.splats.keyframes import TrainingView
+from mvsgs_core.splats.snapshot import Snapshot
+
+FORMAT, VERSION = "mvsgs cameras", 1
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """K keyframes, in the order of the stream. Pinhole, undistorted; pixel (0, 0) is the center of the first pixel."""
+
+    keyframes: np.ndarray  # (K,) int64 index of the frame in its stream
+    timestamps: np.ndarray  # (K,) float64 seconds, NaN where not known
+    world_from_cam: np.ndarray  # (K, 4, 4) float64, camera axes x right, y down, z forward; the world of map.ply
+    intrinsics: np.ndarray  # (K, 4) float64 fx, fy, cx, cy in pixels at `sizes`, as the tracker estimated them
+    sizes: np.ndarray  # (K, 2) int64 height, width of the image
+    exposures: np.ndarray  # (K, 3, 4) float64 [A | b]: the image shows A color + b of the map's color, both in [0, 1]
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+
+def cameras_of(final: Snapshot, views: list[TrainingView]) -> Cameras:
+    """The cameras of a map's keyframes, at the size of their images as they came; `views` as in the snapshot."""
+    count = len(views)
+    return Cameras(
+        keyframes=final.keyframes,
+        timestamps=np.array([view.timestamp for view in views], dtype=np.float64),
+        world_from_cam=final.world_from_cam,
+        intrinsics=np.array([view.image_intrinsics for view in views], dtype=np.float64).reshape(count, 4),
+        sizes=np.array([view.image_size for view in views], dtype=np.int64).reshape(count, 2),
+        exposures=final.exposures.astype(np.float64),
+    )
+
+
+def write_cameras(path: Path, cameras: Cameras) -> None:
+    """Replaces `path` atomically: what stood there stays until the new file is whole. Raises OSError."""
+    keyframes = [
+        {
+            "index": int(cameras.keyframes[k]),
+            "timestamp": float(cameras.timestamps[k]) if np.isfinite(cameras.timestamps[k]) else None,
+            "world_from_cam": cameras.world_from_cam[k].tolist(),
+            "intrinsics": cameras.intrinsics[k].tolist(),
+            "size": cameras.sizes[k].tolist(),
+            "exposure": cameras.exposures[k].tolist(),
+        }
+        for k in range(len(cameras))
+    ]
+    text = json.dumps({"format": FORMAT, "version": VERSION, "keyframes": keyframes}, allow_nan=False)
+    aside = path.with_name(path.name + ".part")
+    with aside.open("w", encoding="ascii") as file:
+        file.write(text.replace('{"index"', '\n{"index"') + "\n")  # a keyframe a line
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+
+
+def read_cameras(path: Path) -> Cameras:
+    """The cameras that `write_cameras` wrote. Raises ValueError, saying what is wrong with the file, and OSError."""
+    try:
+        content = json.loads(path.read_text(encoding="ascii"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no cameras.json: {error}") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{path} is no cameras.json of this program")
+    if content.get("version") != VERSION:
+        raise ValueError(f"{path} has version {content.get('version')!r}: this program reads {VERSION}")
+    keyframes = content.get("keyframes")
+    if not isinstance(keyframes, list) or not all(isinstance(entry, dict) for entry in keyframes):
+        raise ValueError(f"{path}: `keyframes` must be a list of objects")
+    result = Cameras(
+        keyframes=_numbers(path, keyframes, "index", ()).astype(np.int64),
+        timestamps=_numbers(path, keyframes, "timestamp", (), unknown=True),
+        world_from_cam=_numbers(path, keyframes, "world_from_cam", (4, 4)),
+        intrinsics=_numbers(path, keyframes, "intrinsics", (4,)),
+        sizes=_numbers(path, keyframes, "size", (2,)).astype(np.int64),
+        exposures=_numbers(path, keyframes, "exposure", (3, 4)),
+    )
+    if (result.sizes < 1).any() or (result.intrinsics[:, :2] <= 0).any():
+        raise ValueError(f"{path}: sizes and focal lengths must be positive")
+    return result
+
+
+def _numbers(
+    path: Path, entries: list[dict[str, Any]], name: str, shape: tuple[int, ...], *, unknown: bool = False
+) -> np.ndarray:
+    """(K, *shape) float64 of one property; null is NaN where it may be unknown."""
+    values = []
+    for k, entry in enumerate(entries):
+        given = entry.get(name)
+        if given is None and unknown:
+            values.append(np.full(shape, np.nan))
+            continue
+        try:
+            value = np.array(given, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            value = np.full((), np.nan)
+        if value.shape != shape or not np.isfinite(value).all():
+            wanted = " x ".join(str(n) for n in shape) or "1"
+            raise ValueError(f"{path}: keyframe {k} has no `{name}` of {wanted} finite numbers")
+        values.append(value)
+    return np.array(values, dtype=np.float64).reshape(len(entries), *shape)

@@ -1,0 +1,24 @@
+"""The images that the keyframes of a map were trained on, as files: what a COLMAP model refers to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+FOLDER = "keyframes"  # beside map.ply
+
+
+def image_name(index: int) -> str:
+    """Of the keyframe that is frame `index` of the stream."""
+    return f"{index:06d}.png"
+
+
+def write_image(folder: Path, index: int, image: np.ndarray) -> None:
+    """Writes an (H, W, 3) uint8 RGB image without loss. Raises OSError where it cannot be written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    encoded, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not encoded:
+        raise OSError(f"the image of keyframe {index} cannot be encoded as PNG")
+    (folder / image_name(index)).write_bytes(data.tobytes())
