@@ -18,7 +18,7 @@ def replacing(file: Path) -> Iterator[Path]:
     try:
         yield aside
         _sync(aside)
-        os.replace(aside, file)
+        aside.replace(file)
     except BaseException:
         aside.unlink(missing_ok=True)
         raise
