@@ -1,0 +1,160 @@
+"""The files of a checkpoint and what can be known of them without a mapper: no torch here, for the launcher too.
+
+    OUTPUT/checkpoint/state-00000007.npz    all that goes on, newest number last; the one before is kept
+    OUTPUT/checkpoint/keyframes/*.png       the keyframes' images, each written once; its name ends in its checksum
+
+A state is an uncompressed .npz: arrays, and `meta`, which is JSON. Nothing is unpickled, and every part has a CRC-32.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import re
+import struct
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FOLDER, KEYFRAMES = "checkpoint", "keyframes"
+FORMAT, VERSION = "mvsgs checkpoint", 1
+MOST_META = 64 << 20  # bytes of JSON
+NEIGHBORS = 16  # keyframes before the newest one that stereo and fusion of the next ones may look at, at most
+
+
+@dataclass(frozen=True)
+class CheckpointInfo:
+    """What a checkpoint says of itself."""
+
+    file: Path  # its state
+    newest_keyframe_index: int  # frame index of the newest keyframe that went into the map; -1: none
+    stream_seconds: float  # timestamp of that keyframe
+    keyframes: np.ndarray  # (K,) int64 frame indices of all mapped keyframes, ascending
+    splats: int  # of the largest part of the map
+    finished: bool  # the stream had ended: only the final refinement is left
+
+    def stereo_after(self, keyframes: int = NEIGHBORS) -> int | None:
+        """Frame index up to which no stereo is needed any more: what `mvs.resume_after` takes.
+
+        `keyframes` newest ones get depth again, as neighbors of those that come next. None: all need it.
+        """
+        return int(self.keyframes[-keyframes - 1]) if len(self.keyframes) > keyframes else None
+
+
+def checkpoint_info(output: Path | str) -> CheckpointInfo:
+    """Of the newest whole checkpoint in a run's output directory. Raises ValueError saying what is wrong.
+
+    To go on where the source can be read again: the same graph from the stream's beginning, with `mapper.resume=output`
+    and, where the node has that parameter, `mvs.resume_after=info.stereo_after()`. The tracker finds its poses again,
+    keyframes that are mapped already are passed over. Where it cannot, or `finished`: `dataset=resumed
+    dataset.path=output mapper.resume=output mapper.reads={View: dataset, Poses: dataset}`, tracker, mvs and
+    depth_fusion off, and the evaluator's Trajectory and View from dataset.
+    """
+    problems = []
+    for file in state_files(Path(output)):
+        try:
+            return _info(file)
+        except ValueError as error:
+            problems.append(str(error))
+    raise ValueError("; ".join(problems) or nothing_there(Path(output)))
+
+
+def nothing_there(output: Path) -> str:
+    if not output.is_dir():
+        return f"{output} is no directory: give the output directory of a run"
+    return (
+        f"{output / FOLDER} has no checkpoint: the run ended before its first map, had mapper.checkpoint=0, or was "
+        "finished (the checkpoint is removed then, unless mapper.keep_checkpoint=true)"
+    )
+
+
+def state_files(output: Path) -> list[Path]:
+    """The states in a run's output directory, the newest first."""
+    numbered = [(number_of(file), file) for file in (output / FOLDER).glob("state-*.npz")]
+    return [file for number, file in sorted(numbered, reverse=True) if number >= 0]
+
+
+def state_file(output: Path, number: int) -> Path:
+    return output / FOLDER / f"state-{number:08d}.npz"
+
+
+def number_of(file: Path) -> int:
+    """Of a state file; -1: it is none."""
+    found = re.fullmatch(r"state-(\d{8,12})\.npz", file.name, re.ASCII)
+    return int(found[1]) if found else -1
+
+
+def write_state(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises OSError; ValueError for a number in `meta` that is not finite."""
+    head = {"format": FORMAT, "version": VERSION, **meta}
+    text = json.dumps(head, allow_nan=False).encode()
+    with path.open("wb") as file:
+        np.savez(file, meta=np.frombuffer(text, dtype=np.uint8), **arrays)  # type: ignore[arg-type]  # stub: allow_pickle
+
+
+def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """`meta` and the arrays, read-only. Raises ValueError for what is no whole state of this version."""
+    try:
+        arrays = _members(path)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, RuntimeError, EOFError, LookupError, struct.error, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    text = arrays.pop("meta", np.zeros(0, np.uint8)).tobytes()
+    if not 0 < len(text) <= MOST_META:
+        raise ValueError(f"{path} is no checkpoint of a mapper")
+    try:
+        meta = json.loads(text, parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        raise ValueError(f"{path} is no checkpoint of a mapper")
+    if meta.get("version") != VERSION:
+        raise ValueError(f"{path} has version {meta.get('version')!r} of the format: this program reads {VERSION}")
+    return meta, arrays
+
+
+def _members(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz: never more memory than the file is long, whatever its headers say."""
+    arrays = {}
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
+                raise ValueError(f"{entry.filename!r} is compressed or encrypted")
+            if entry.file_size > path.stat().st_size:
+                raise ValueError(f"{entry.filename!r} is longer than the file")
+            arrays[entry.filename.removesuffix(".npy")] = _array(archive.read(entry), entry.filename)
+    return arrays
+
+
+def _array(data: bytes, name: str) -> np.ndarray:
+    """Of the bytes of an .npy."""
+    stream = io.BytesIO(data)
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError(f"{name!r} has another version of the .npy format")
+    shape, by_column, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype.hasobject or (by_column and len(shape) > 1):
+        raise ValueError(f"{name!r} has an array of a kind that no checkpoint has")
+    if any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
+        raise ValueError(f"{name!r} has another size than it says")
+    return np.frombuffer(data, dtype=dtype, offset=stream.tell()).reshape(shape)
+
+
+def _info(file: Path) -> CheckpointInfo:
+    meta, arrays = read_state(file)
+    keyframes, newest, seconds = arrays.get("keyframes"), meta.get("newest_view"), meta.get("stream_seconds")
+    splats, ended = meta.get("splats"), meta.get("stream_ended")
+    if not isinstance(keyframes, np.ndarray) or keyframes.dtype != np.int64 or keyframes.ndim != 1:
+        raise ValueError(f"{file} is no checkpoint of a mapper")
+    if not (isinstance(newest, int) and isinstance(seconds, float) and isinstance(splats, int)):
+        raise ValueError(f"{file} is no checkpoint of a mapper")
+    return CheckpointInfo(file, newest, seconds, np.sort(keyframes), splats, ended is True)
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} in its JSON")
