@@ -9,20 +9,23 @@ from pathlib import Path
 
 
 @contextmanager
-def replacing(file: Path) -> Iterator[Path]:
+def replacing(file: Path, *, sync: bool = True) -> Iterator[Path]:
     """A path beside `file`, of the same suffix, to write to: when the block ends it takes the place of `file`.
 
-    Where the block raises, `file` stays as it was and what was written aside is removed. Raises OSError.
+    Where the block raises, `file` stays as it was and what was written aside is removed. Raises OSError. Without `sync`
+    the disk is not waited for: whole whatever process dies, but not where the machine loses power.
     """
     aside = file.with_name(f".{file.stem}.{os.getpid()}{file.suffix}")
     try:
         yield aside
-        _sync(aside)
+        if sync:
+            _sync(aside)
         aside.replace(file)
     except BaseException:
         aside.unlink(missing_ok=True)
         raise
-    _sync(file.parent)  # the new name too outlives a loss of power
+    if sync:
+        _sync(file.parent)  # the new name too outlives a loss of power
 
 
 def replace_text(file: Path, text: str) -> None:
