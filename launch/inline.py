@@ -23,10 +23,16 @@ def run_inline(graph: Graph, observe: Observer | None = None) -> dict[str, nodes
     """Runs the graph to its end and returns its nodes by slot, so that a test can look into them.
 
     Every message goes all the way down before the next one starts, and a node's idle work is done to its end after
-    each message. `observe(slot, node, message)` sees every message sent. An exception in a node passes through.
+    each message. `observe(slot, node, message)` sees every message sent. An exception in a node passes through, after
+    every node's `on_abort`.
     """
     _seed(graph.settings.seed)
-    return _Inline(graph, observe or (lambda slot, node, message: None)).run()
+    run = _Inline(graph, observe or (lambda slot, node, message: None))
+    try:
+        return run.run()
+    except BaseException as error:
+        run.abort(f"{type(error).__name__}: {error}")
+        raise
 
 
 class _Inline:
@@ -52,6 +58,11 @@ class _Inline:
             for reader in dict.fromkeys(edge.reader for edge in self._graph.out_of(name) if not edge.feedback):
                 list(self._runners[reader].handle(end))
         return {name: runner.node for name, runner in self._runners.items()}
+
+    def abort(self, reason: str) -> None:
+        """Lets every node save what it has."""
+        for runner in self._runners.values():
+            runner.node.on_abort(reason)
 
     def _send(self, sender: str, messages: Iterable[Message]) -> None:
         for message in messages:

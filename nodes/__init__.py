@@ -16,6 +16,9 @@ The parameter's type declares the input, the yielded type the output. Hooks:
 - `on_idle(self) -> list[U] | None`: one slice (well under 100 ms) of background work while no message waits;
   None when there is nothing to do until the next message.
 - `on_end(self) -> Iterator[U]`: every input has ended.
+- `on_abort(self, reason)`: the run ends early for this node, by SIGTERM, a lost neighbor or an exception of its own:
+  save what must not be lost, within 3 s, or be killed. Called once, between two hooks or at a `yield` of one (after an
+  exception, where that left the node); nothing can be sent any more.
 - `check(cls, config)`: before any process starts, on the launcher's machine: raises OSError or ValueError, saying what
   to do, where it is plain that the node cannot run (its file is missing). Quick, and opens nothing.
 
@@ -33,7 +36,7 @@ import typing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, is_dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import msgs
 
@@ -75,6 +78,8 @@ class Node:
     class Config:
         pass
 
+    replayable: ClassVar[bool] = False  # sources: the same command gives the same stream once more
+
     config: Any
 
     def __init__(self, config: Any = None) -> None:
@@ -96,8 +101,12 @@ class Node:
     def on_end(self) -> Iterator[Any]:
         yield from ()
 
+    def on_abort(self, reason: str) -> None:
+        """Nothing to save."""
+
 
 _OUTPUT_HOOKS: tuple[str, ...] = ("run", "on_idle", "on_end")
+_NO_HANDLERS = (*_OUTPUT_HOOKS, "on_abort")
 
 
 def is_source(node: type[Node]) -> bool:
@@ -108,7 +117,7 @@ def handlers(node: type[Node]) -> dict[type, str]:
     """Input message type -> name of the method that takes it. Raises TypeError where an annotation is missing."""
     found: dict[type, str] = {}
     for name in dir(node):
-        if not name.startswith("on_") or name in _OUTPUT_HOOKS or not callable(getattr(node, name)):
+        if not name.startswith("on_") or name in _NO_HANDLERS or not callable(getattr(node, name)):
             continue
         hints = _hints(node, name)
         parameters = [t for key, t in hints.items() if key != "return"]

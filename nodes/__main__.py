@@ -2,41 +2,30 @@
 
 What must precede the imports of torch and of the node is done here. A launcher should set the thread counts in the
 environment as well: numpy, which comes with the package, reads its own only then. It should also start this process
-with SIGINT blocked (`signal.pthread_sigmask`): one that comes during the imports then waits until it can be handled.
+with `nodes.signals.STARTING` blocked (`signal.pthread_sigmask`): what comes during the imports then waits.
 """
 
 from __future__ import annotations
 
 import ctypes
-import faulthandler
 import logging
 import os
 import signal
 import sys
 from pathlib import Path
 
+from nodes.signals import Signals
 from nodes.spec import Spec
 
 PR_SET_PDEATHSIG = 1
 
 
-class _Interrupt:
-    """Remembers SIGINT: only sources end by it."""
-
-    came = False
-
-    def __call__(self, *_: object) -> None:
-        self.came = True
-
-
 def main(arguments: list[str]) -> int:
-    interrupt = _Interrupt()
-    signal.signal(signal.SIGINT, interrupt)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signals = Signals()
+    signals.install()
     if len(arguments) != 1:
         print("usage: python -m nodes SPEC.json", file=sys.stderr)
         return 2
-    faulthandler.enable()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s.%(msecs)03d %(message)s", datefmt="%H:%M:%S")
     try:
         spec = Spec.read(Path(arguments[0]))
@@ -48,7 +37,7 @@ def main(arguments: list[str]) -> int:
     _place(spec)
     from nodes.process import run
 
-    return run(spec, lambda: interrupt.came)
+    return run(spec, signals)
 
 
 def _die_with_parent() -> None:

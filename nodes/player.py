@@ -22,6 +22,8 @@ PLAYED = (Frame, GroundTruth)
 class Player(Node):
     """An MCAP recording -> its Frame and GroundTruth messages, in the order of their recording."""
 
+    replayable = True
+
     @dataclass
     class Config:
         path: str | None = None  # .mcap file

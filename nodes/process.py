@@ -2,7 +2,8 @@
 
 Life: start, wait for the readers of its topics, run, `on_end` once every input has ended (a source: once `run` is
 exhausted, or SIGINT has come), End on each topic, wait for the goodbyes, done. A failure at any point is reported
-with its traceback and ends the process with exit code 1; the neighbors notice and fail as well.
+with its traceback, the node saves what it has (`on_abort`), and the process ends with exit code 1; the neighbors notice
+and fail as well. SIGTERM ends it in the same way at the next safe point, with exit code 143.
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ import importlib
 import logging
 import queue
 import random
+import signal
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,7 @@ from nodes.freed_memory import FreedMemory
 from nodes.inbox import Inbox, Reader
 from nodes.parameters import make_config
 from nodes.runner import Runner, merge_stats, own_stats, stats_of
+from nodes.signals import ABORT_SECONDS, Signals, Stopped, end_within
 from nodes.spec import Spec
 from nodes.status import Status, peak_bytes
 from nodes.transport import NewestReader, Publisher, ReliableReader, shut_down
@@ -37,17 +41,20 @@ POLL = 0.25  # s between looks at signals and lost peers while nothing arrives
 STOP_GRACE = 2.0  # s that a source's current item may take after SIGINT
 
 
-def run(spec: Spec, interrupted: Callable[[], bool]) -> int:
-    """Runs the node to its end; exit code. `interrupted` says whether SIGINT has come: it ends a source."""
-    process = _Process(spec, interrupted)
+def run(spec: Spec, signals: Signals) -> int:
+    """Runs the node to its end; exit code."""
+    process = _Process(spec, signals)
     try:
         process.run()
+    except Stopped as stop:
+        process.abort("stopped", str(stop))
+        return 128 + signal.SIGTERM
     except Exception as error:
         logging.exception("failed")
         line = next(iter(str(error).splitlines()), "")
-        process.status.set(
+        process.abort(
             "failed",
-            error=f"{type(error).__name__}: {line}",
+            f"{type(error).__name__}: {line}",
             traceback=traceback.format_exc(),
             peer=isinstance(error, PeerLost),  # the consequence of another node's failure
         )
@@ -66,11 +73,25 @@ def load_node(target: str) -> type[Node]:
     return found
 
 
+@dataclass
+class _Step:
+    """What the main thread is at, for whoever asks whether the work goes on."""
+
+    number: int = 0  # of steps so far: messages, slices of background work, items of a source
+    doing: str = "starting"  # working, waiting (for messages) or held back (by readers)
+    topic: str | None = None  # whose readers hold it back
+
+    def next(self, doing: str, topic: str | None = None) -> None:
+        self.number += 1
+        self.doing, self.topic = doing, topic
+
+
 class _Process:
-    def __init__(self, spec: Spec, interrupted: Callable[[], bool]) -> None:
+    def __init__(self, spec: Spec, signals: Signals) -> None:
         self._spec = spec
-        self._interrupted = interrupted
+        self._signals = signals
         self._began = time.monotonic()
+        self._step = _Step()
         self._runner: Runner | None = None
         self._readers: list[Reader] = []
         self._publishers: dict[str, Publisher] = {}  # by message type
@@ -83,8 +104,10 @@ class _Process:
         runner = self._runner = Runner(self._spec.name, node_type(make_config(node_type, self._spec.config)))
         inbox = self._open()
         self.status.set("waiting")
-        while not all(self._publishers[o.type].ready(o.readers) for o in self._spec.outputs):
-            inbox.watch(POLL)
+        for given in self._spec.outputs:
+            publisher = self._publishers[given.type]
+            while not publisher.ready(given.readers):
+                self._wait(inbox, publisher)
         for publisher in self._publishers.values():
             publisher.start()
         self.status.set("running")
@@ -92,10 +115,22 @@ class _Process:
         for message in messages:
             self._send(message)
         self.status.set("ending")
+        self._step.next("working")
         for message in runner.end():
             self._send(message)
         self._finish(runner, inbox)
         self.status.set("done")
+
+    def abort(self, state: str, error: str, **details: Any) -> None:
+        """Tells the launcher, then lets the node save what it has."""
+        self.status.set(state, error=error, **details)
+        end_within(ABORT_SECONDS)
+        if self._runner is not None:
+            try:
+                self._runner.node.on_abort(error)
+            except Exception:
+                logging.exception("on_abort failed")
+        end_within(ABORT_SECONDS)
 
     def close(self) -> None:
         for end in (*self._publishers.values(), *self._readers):
@@ -124,7 +159,11 @@ class _Process:
         freed = FreedMemory()
         awaited = [reader for reader, given in zip(self._readers, self._spec.inputs, strict=True) if not given.feedback]
         while not all(reader.ended for reader in awaited):
+            self._signals.check()
+            if not idle:
+                self._step.next("waiting")
             received = inbox.receive(0.0 if idle else POLL)
+            self._step.next("working")
             if received is not None:
                 idle = True
                 yield from runner.handle(received[1])
@@ -139,7 +178,8 @@ class _Process:
         source = _Source(runner)
         deadline = None
         while deadline is None or time.monotonic() < deadline:
-            if deadline is None and self._interrupted():
+            self._signals.check()
+            if deadline is None and self._signals.interrupted:
                 source.stop()
                 deadline = time.monotonic() + STOP_GRACE
             try:
@@ -149,6 +189,7 @@ class _Process:
                 continue
             if message is None:
                 return
+            self._step.next("working")
             yield message
         runner.node.stats.warn(f"{self._spec.name}: its last read did not return within {STOP_GRACE:g} s of Ctrl-C")
 
@@ -174,7 +215,13 @@ class _Process:
             publisher.end(end)
         open_topics = list(self._publishers.values())
         while open_topics := [publisher for publisher in open_topics if not publisher.gone()]:
-            inbox.watch(POLL)
+            self._wait(inbox, open_topics[0])
+
+    def _wait(self, inbox: Inbox, publisher: Publisher) -> None:
+        """For readers of that topic, which are not there yet or have not said goodbye."""
+        self._step.doing, self._step.topic = "held back", publisher.topic
+        self._signals.check()
+        inbox.watch(POLL)
 
     def _seed(self) -> None:
         random.seed(self._spec.seed)
@@ -186,6 +233,9 @@ class _Process:
         stats = stats_of(self._runner.node.stats) if self._runner else {}
         stats.pop("seconds", None)
         return stats | {
+            "progress": self._step.number,
+            "doing": self._step.doing,
+            "topic": self._step.topic,
             "in": {reader.topic: reader.received for reader in self._readers},
             "queue": {reader.topic: reader.waiting for reader in self._readers},
             "out": dict(self._runner.sent) if self._runner else {},

@@ -15,6 +15,8 @@ from nodes import Node
 class Reader(Node):
     """Any sequence that `mvsgs_core.datasets.open_dataset` opens -> Frame and GroundTruth of each of its frames."""
 
+    replayable = True
+
     @dataclass
     class Config:
         name: str = "tum"  # format, one of mvsgs_core.datasets.READERS

@@ -35,8 +35,10 @@ class Status:
             self._news.put(self._line())
 
     def close(self) -> None:
-        self._news.put(None)
+        """Writes the last figures, and waits a little until the launcher has taken them."""
         if self._fd is not None:
+            self._news.put(self._line())
+            self._news.put(None)
             self._thread.join(LAST_WORDS)
 
     def _line(self) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from nodes.signals import STARTING
 from tests.shared_data import ROOT
 
 ENVIRONMENT = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -100,7 +101,7 @@ class Graph:
         path = self.directory / f"{name}.json"
         path.write_text(json.dumps(content))
         log = self.directory / f"{name}.log"
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited: none is lost at the start
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, STARTING)  # inherited: none is lost at the start
         with log.open("wb") as output:
             popen = subprocess.Popen(
                 [sys.executable, "-m", "nodes", str(path)],
@@ -129,6 +130,10 @@ class Graph:
     @property
     def joined(self) -> dict[str, Any]:
         return json.loads((self.directory / "joined.json").read_text())
+
+    @property
+    def aborted(self) -> dict[str, Any]:
+        return json.loads((self.directory / "joined.aborted").read_text())
 
     def wait(self, seconds: float) -> dict[str, int]:
         """Exit codes by node; fails if one is still running after that time."""

@@ -73,11 +73,12 @@ class Right(Node):
 
 
 class Join(Node):
-    """Writes what it got to a JSON file."""
+    """Writes what it got to a JSON file; at an early end to another, `.aborted`."""
 
     @dataclass
     class Config:
         path: Path = Path("joined.json")
+        abort_seconds: float = 0.0  # that saving takes
         delay: float = 0.0  # s for each message
         slices: int = 0  # of background work after each message
 
@@ -102,6 +103,10 @@ class Join(Node):
     def on_end(self) -> Iterator[Any]:
         self.config.path.write_text(json.dumps({"received": self.received, "upstream": self.upstream}))
         yield from ()
+
+    def on_abort(self, reason: str) -> None:
+        time.sleep(self.config.abort_seconds)
+        self.config.path.with_suffix(".aborted").write_text(json.dumps({"received": self.received, "reason": reason}))
 
     def _add(self, message: Keyframe | GroundTruth) -> None:
         time.sleep(self.config.delay)

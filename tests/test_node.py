@@ -139,14 +139,64 @@ def test_a_source_that_fails_to_read_is_a_failure_of_the_graph() -> None:
         assert g.processes["source"].last["error"] == "OSError: frame 3 cannot be read"
 
 
-def test_sigterm_stops_a_busy_node_at_once() -> None:
+def test_sigterm_lets_a_node_save_what_it_has() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6})
+        join = g.processes["join"]
+        join.wait_for(lambda status: sum(status.get("in", {}).values()) > 20)
+        join.popen.send_signal(signal.SIGTERM)
+        assert g.wait(DOWN)["join"] == 128 + signal.SIGTERM
+        assert (join.last["state"], join.last["error"]) == ("stopped", "stopped (SIGTERM)")
+        saved = g.aborted
+        assert saved["reason"] == "stopped (SIGTERM)"
+        assert saved["received"]["Keyframe"] == list(range(len(saved["received"]["Keyframe"])))
+        assert sum(map(len, saved["received"].values())) > 20
+
+
+def test_sigterm_stops_a_node_whose_readers_never_come() -> None:
+    with graph() as g:
+        left = g.start("left", "tests.sample_nodes.Left", {}, {"Keyframe": 1})
+        left.wait_for(lambda status: status.get("state") == "waiting")
+        left.popen.send_signal(signal.SIGTERM)
+        assert left.popen.wait(2.0) == 128 + signal.SIGTERM
+
+
+def test_a_node_that_reaches_no_safe_point_after_sigterm_is_gone_all_the_same() -> None:
     with graph() as g:
         g.diamond(source={"count": 10**6}, left={"delay": 100.0})
         g.processes["left"].wait_for(lambda status: sum(status.get("in", {}).values()) == 1)
         began = time.monotonic()
         g.processes["left"].popen.send_signal(signal.SIGTERM)
-        assert g.processes["left"].popen.wait(DOWN) == -signal.SIGTERM
-        assert time.monotonic() - began < 1.0
+        assert g.processes["left"].popen.wait(DOWN) == -signal.SIGALRM
+        assert time.monotonic() - began < DOWN
+
+
+def test_a_node_that_takes_too_long_to_save_is_gone_all_the_same() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6, "fail_at": 20}, join={"abort_seconds": 100.0})
+        assert g.wait(20) == {"source": 1, "left": 1, "right": 1, "join": -signal.SIGALRM}
+
+
+def test_a_lost_neighbor_lets_a_node_save_what_it_has() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6}, left={"die_at": 20})
+        g.wait(20)
+        assert "PeerLost" in g.aborted["reason"]
+        saved = g.aborted["received"]["Keyframe"]  # less what was under way
+        assert saved == list(range(len(saved)))
+
+
+def test_where_its_threads_stand_is_asked_for_by_a_signal() -> None:
+    with graph() as g:
+        g.diamond(source={"count": 10**6}, left={"delay": 100.0})
+        left = g.processes["left"]
+        left.wait_for(lambda status: sum(status.get("in", {}).values()) == 1)
+        left.popen.send_signal(signal.SIGUSR1)
+        until = time.monotonic() + 5
+        while "in on_frame" not in left.log.read_text():
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        assert left.popen.poll() is None
 
 
 def test_a_slow_best_effort_reader_never_holds_its_sender_back() -> None:
