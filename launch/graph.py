@@ -17,7 +17,8 @@ import msgs
 import nodes
 from launch.parameters import GraphError, check_parameters, did_you_mean
 
-# A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have.
+# A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have. Where
+# some slot is their origin, an edge that misses them is an error all the same: corrections would be lost in silence.
 OPTIONAL_MESSAGES = (msgs.Poses, msgs.Trajectory)
 
 
@@ -178,10 +179,11 @@ def load_node(slot: str, target: str) -> type[nodes.Node]:
 def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edge], list[str]]:
     """All edges, and warnings for optional ones that nobody feeds. Raises GraphError for a bad one."""
     sends = {name: _outputs(name, slot.node) for name, slot in slots.items()}
+    takes = {name: _handlers(name, slot.node) for name, slot in slots.items()}
     edges: list[Edge] = []
     warnings: list[str] = []
     for name, slot in slots.items():
-        inputs = _handlers(name, slot.node)
+        inputs = takes[name]
         if nodes.is_source(slot.node) and (inputs or slot.reads):
             raise GraphError(f"{name}: {slot.target} is a source (it has run()), so it can read nothing")
         if not nodes.is_source(slot.node) and not inputs:
@@ -208,7 +210,8 @@ def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edg
                 why = (
                     f"{slots[sender].target} yields {_names(sends[sender])}" if sender in slots else "that slot is off"
                 )
-                if message not in OPTIONAL_MESSAGES:
+                origins = [other for other, types in sends.items() if message in types and message not in takes[other]]
+                if message not in OPTIONAL_MESSAGES or origins:
                     raise GraphError(f"{refusal}: it reads it from {sender}, but {why} ({hint})")
                 warnings.append(f"{name} gets no {message.__name__}: {sender}: {why}")
                 continue

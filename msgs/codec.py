@@ -36,6 +36,7 @@ MAX_TEXT = 64 * 2**10  # bytes of one string
 _PREFIX = struct.Struct("<c3sBBHI")  # delivery, magic, version, length of the name, zero, length of the header
 _MAGIC = b"MVS"
 _HEADER_KEYS = {"sequence", "scalars", "arrays"}
+_ORDER_KEY = "before"  # left out where it says nothing: programs that know no other topic need not send it
 _IMAGE_SIZES = frozenset("HWhw")  # named sizes that may not be 0
 
 
@@ -46,6 +47,7 @@ class CodecError(ValueError):
 class Decoded(NamedTuple):
     message: msgs.Message
     sequence: int  # position of the message in its topic, from 0
+    before: Mapping[str, int] = types.MappingProxyType({})  # messages that its sender had sent of its other types
 
 
 @dataclass(frozen=True)
@@ -69,12 +71,15 @@ def encode(
     message: msgs.Message,
     sequence: int = 0,
     *,
+    before: Mapping[str, int] | None = None,
     delivery: bytes = RELIABLE,
     max_bytes: int | None = None,
     allocate: Callable[[int], np.ndarray] = _allocate,
 ) -> memoryview:
     """The message as one frame, in memory of which `allocate(n)` gives at least n bytes (uint8, contiguous).
 
+    before: how many messages of each other type the sender has sent so far, by which a reader of several of its topics
+    keeps their order.
     Raises CodecError where a field differs from its annotation or the frame would be larger than `max_bytes` (None:
     `max_message_bytes` of its type).
     """
@@ -107,8 +112,11 @@ def encode(
             end = offset + value.nbytes
             arrays[field] = [spec.name, value.shape, offset]
             values.append((value, offset))
+    content: dict[str, Any] = {"sequence": sequence, "scalars": scalars, "arrays": arrays}
+    if before:
+        content[_ORDER_KEY] = dict(before)
     try:
-        header = msgpack.packb({"sequence": sequence, "scalars": scalars, "arrays": arrays})
+        header = msgpack.packb(content)
     except (ValueError, OverflowError, TypeError) as error:
         raise CodecError(f"{name}: {error}") from error
     limit = _header_limit(name)
@@ -150,7 +158,7 @@ def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int
     max_bytes = max_message_bytes(message_type) if max_bytes is None else max_bytes
     if view.nbytes > max_bytes:
         raise CodecError(f"a frame of {view.nbytes} bytes, more than the {max_bytes} that a {name} may have")
-    sequence, scalars, arrays = _unpack_header(header, name)
+    sequence, scalars, arrays, before = _unpack_header(header, name)
     specs = _SPECS[name]
     scalars = {**{field: value for field, value in _DEFAULTS[name].items() if field not in arrays}, **scalars}
     if len(scalars) + len(arrays) != len(specs) or (scalars.keys() | arrays.keys()) != specs.keys():
@@ -175,7 +183,7 @@ def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int
             end = max(end, view.nbytes - section.nbytes + stop)
     if view.nbytes != end:
         raise CodecError(f"the frame of a {name} has {view.nbytes} bytes, its content ends at {end}")
-    return Decoded(message_type(**built), sequence)
+    return Decoded(message_type(**built), sequence, before)
 
 
 def type_name(frame: Any) -> str:
@@ -226,7 +234,7 @@ def _split(view: memoryview) -> tuple[str, memoryview]:
     return name, view[start : start + header_length]
 
 
-def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], dict[str, Any]]:
+def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], dict[str, Any], dict[str, int]]:
     try:
         # msgpack allocates a list's declared length at once: the limits keep a false one small
         content = msgpack.unpackb(
@@ -240,14 +248,21 @@ def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], 
         )
     except (ValueError, TypeError, msgpack.UnpackException) as error:
         raise CodecError(f"{name}: the header is no valid msgpack: {error or type(error).__name__}") from error
-    if not isinstance(content, dict) or content.keys() != _HEADER_KEYS:
+    if not isinstance(content, dict) or content.keys() - {_ORDER_KEY} != _HEADER_KEYS:
         raise CodecError(f"{name}: the header must be a map of sequence, scalars and arrays")
     sequence, scalars, arrays = content["sequence"], content["scalars"], content["arrays"]
-    if type(sequence) is not int or not 0 <= sequence < 2**63:
+    if not _is_count(sequence):
         raise CodecError(f"{name}: the sequence number must be an integer from 0")
+    before = content.get(_ORDER_KEY, {})
+    if not isinstance(before, dict) or not all(t in msgs.TYPES and _is_count(n) for t, n in before.items()):
+        raise CodecError(f"{name}: before must be a map of message types to integers from 0")
     if not isinstance(scalars, dict) or not isinstance(arrays, dict):
         raise CodecError(f"{name}: scalars and arrays must be maps")
-    return sequence, scalars, arrays
+    return sequence, scalars, arrays, before
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**63
 
 
 def _array(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from msgs import Depth, Keyframe
+from msgs import Depth, Keyframe, Poses
 from mvsgs_core import camera
 from mvsgs_core.mvs.coarse import enlarge_inverse_depth
 from nodes import Node
@@ -36,3 +36,7 @@ class CoarseDepth(Node):
             confidence=confidence,
             segment=keyframe.segment,
         )
+
+    def on_poses(self, poses: Poses) -> Iterator[Poses]:
+        """Passed on, so that they reach the next stage between the same keyframes."""
+        yield poses

@@ -1,4 +1,4 @@
-"""Depth -> View: depth maps refined by their neighbors' and filtered, with two keyframes of lag."""
+"""Depth -> View: depth maps refined by their neighbors' and filtered, with two keyframes of lag. Poses pass through."""
 
 from __future__ import annotations
 
@@ -44,11 +44,12 @@ class FusionNode(Node, ABC):
             view = view.moved(*self._poses[depth.index])
         yield from self._timed(self._fusion.add(view))
 
-    def on_poses(self, poses: Poses) -> Iterator[View]:
+    def on_poses(self, poses: Poses) -> Iterator[Poses]:
+        """Takes corrections in and passes them on, so that they reach the mapper between the same keyframes."""
         for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
             self._poses[int(i)] = (pose, float(scale))
         self._fusion.move(self._poses)
-        yield from ()
+        yield poses
 
     def on_end(self) -> Iterator[View]:
         yield from self._timed(self._fusion.flush())

@@ -1,7 +1,8 @@
 """All inputs of a node, taken in turn.
 
 A node never waits for one chosen input: in a diamond, where two paths join again, that is a deadlock as soon as the
-other path is full.
+other path is full. Only topics of one sender are kept in the order in which it sent: what a message waits for is on its
+way. So a node whose reliable inputs come from one sender gets the same messages in the same order in every run.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ class Inbox:
         self._publishers = list(publishers)
         self._sockets = [socket for reader in readers for socket in (reader.pollable, reader.monitor)]
         self._sockets += [publisher.socket for publisher in publishers]
+        self._siblings = {reader: _of_the_same_sender(reader, self._readers) for reader in self._readers}
 
     def watch(self, timeout_s: float = 0.0) -> None:
         """Waits until something arrives on any socket. Raises TransportError for a lost peer or refused keys."""
@@ -37,6 +39,8 @@ class Inbox:
         for seconds in (0.0, timeout_s) if timeout_s > 0 else (0.0,):
             self.watch(seconds)
             for reader in self._readers:
+                if self._early(reader):
+                    continue
                 message = reader.take()
                 if message is not None:
                     self._readers.remove(reader)
@@ -44,3 +48,20 @@ class Inbox:
                     return reader, message
                 reader.check_peer()
         return None
+
+    def _early(self, reader: Reader) -> bool:
+        """Whether messages of other topics, sent before this reader's next one, are still to come."""
+        siblings = self._siblings[reader]
+        head = reader.head() if siblings and isinstance(reader, ReliableReader) else None
+        return head is not None and any(head.before.get(name, 0) > other.expected for name, other in siblings.items())
+
+
+def _of_the_same_sender(reader: Reader, readers: Sequence[Reader]) -> dict[str, ReliableReader]:
+    """The reliable readers of the same sender's other topics, by message type."""
+    if not isinstance(reader, ReliableReader):
+        return {}
+    return {
+        other.type_name: other
+        for other in readers
+        if isinstance(other, ReliableReader) and other is not reader and other.sender == reader.sender
+    }

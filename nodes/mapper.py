@@ -106,6 +106,8 @@ class Mapper(Node):
         yield from self._preview()
 
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
+        while not self.config.realtime and self.mapper.step():  # the map must not depend on when they come
+            pass
         for mapper in self._by_segment.values() or [self.mapper]:
             mapper.correct(poses.index, poses.world_from_cam, poses.scale)
         if poses.segment is not None:

@@ -1,4 +1,4 @@
-"""Keyframe -> Depth: multi-view stereo with two keyframes of lag."""
+"""Keyframe -> Depth: multi-view stereo with two keyframes of lag. Poses pass through."""
 
 from __future__ import annotations
 
@@ -47,11 +47,12 @@ class StereoNode(Node, ABC):
             view = view.moved(*self._poses[keyframe.index])
         yield from self._timed(self._cascade.add(view))
 
-    def on_poses(self, poses: Poses) -> Iterator[Depth]:
+    def on_poses(self, poses: Poses) -> Iterator[Poses]:
+        """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
         for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
             self._poses[int(i)] = (pose, float(scale))
         self._cascade.move(self._poses)
-        yield from ()
+        yield poses
 
     def on_end(self) -> Iterator[Depth]:
         yield from self._timed(self._cascade.flush())

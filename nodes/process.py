@@ -194,9 +194,10 @@ class _Process:
         runner.node.stats.warn(f"{self._spec.name}: its last read did not return within {STOP_GRACE:g} s of Ctrl-C")
 
     def _send(self, message: Message) -> None:
-        publisher = self._publishers.get(type(message).__name__)
+        name = type(message).__name__
+        publisher = self._publishers.get(name)
         if publisher is not None:  # else nobody reads it
-            publisher.send(message)
+            publisher.send(message, {t: p.sent for t, p in self._publishers.items() if t != name and p.sent})
 
     def _finish(self, runner: Runner, inbox: Inbox) -> None:
         node = runner.node

@@ -45,7 +45,7 @@ class SkippingMvs(Mvs):
         self._explained.see(sight)
         yield from ()
 
-    def on_poses(self, poses: Poses) -> Iterator[Depth]:
+    def on_poses(self, poses: Poses) -> Iterator[Poses]:
         yield from super().on_poses(poses)
         self._explained.move(self._poses)
 

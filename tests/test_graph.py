@@ -132,6 +132,13 @@ def test_another_target_starts_from_its_own_defaults() -> None:
         fake(f"relay._target_={STAGES}.Uncorrected", "relay.stride=3")
 
 
+def test_corrections_are_not_lost_in_silence() -> None:
+    """Poses may be missing where no tracker makes any, not where a stage on their way does not pass them on."""
+    assert compose(["tracker=ground_truth", "dataset=tum", "dataset.path=."]).warnings
+    with pytest.raises(GraphError, match=r"set mapper.reads.Poses to one that does: tracker"):
+        compose(["mapper.reads.Poses=evaluator"])
+
+
 def test_external_keeps_the_choice() -> None:
     assert fake("relay=external").slots["relay"].placement.external
     assert fake("relay=external").slots["relay"].node is Relay

@@ -66,6 +66,12 @@ def test_the_room_is_mapped(room: tuple[Path, str]) -> None:
     assert scores["depth"]["completeness"] > 0.2
 
 
+def test_the_same_command_gives_the_same_map(room: tuple[Path, str], tmp_path: Path) -> None:
+    run_all(tmp_path, *SMALL, "evaluator.max_frames=0")
+    maps = [(folder / "out" / "map.ply").read_bytes() for folder in (room[0], tmp_path)]
+    assert maps[0] == maps[1]
+
+
 def test_the_report_has_every_figure(room: tuple[Path, str]) -> None:
     scores = report(room[0])
     for rendering in ("rendering", "rendering_before_refinement"):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zmq
 
-from msgs import End, Frame, Keyframe
+from msgs import End, Frame, Keyframe, Poses
 from msgs.codec import NEWEST, CodecError, encode
 from nodes.addresses import IPC_PATH_BYTES, PeerLost, TransportError, check_address, load_keys
 from nodes.inbox import Inbox
@@ -265,6 +265,28 @@ def test_inputs_take_turns(tmp_path: Path, opened: Callable) -> None:
     inbox = Inbox(readers, publishers)
     turns = [inbox.receive(1)[0].topic[-1] for _ in range(8)]
     assert turns == ["0", "1"] * 4
+
+
+def test_topics_of_one_sender_come_in_the_order_in_which_it_sent(tmp_path: Path, opened: Callable) -> None:
+    """However they arrive: all of one topic is there before the first of the other is sent off."""
+    frames = opened(Publisher(f"ipc://{tmp_path}/a.Frame"))
+    ends = opened(Publisher(f"ipc://{tmp_path}/a.Poses"))
+    readers = [
+        opened(ReliableReader(f"ipc://{tmp_path}/a.Frame", Frame, topic="a.Frame")),
+        opened(ReliableReader(f"ipc://{tmp_path}/a.Poses", Poses, topic="a.Poses")),
+    ]
+    until(lambda: frames.ready(1) and ends.ready(1))
+    inbox = Inbox(readers, [])
+    sent = ["Frame", "Poses", "Frame", "Frame", "Poses"]
+    before = [{"Poses": sent[:k].count("Poses")} for k, name in enumerate(sent) if name == "Frame"]
+    for k, counts in enumerate(before):
+        frames.send(frame(k), counts)
+    assert inbox.receive(0.5)[1].index == 0
+    assert inbox.receive(0.3) is None  # the second frame was sent after the first poses
+    for revision, at in enumerate(k for k, name in enumerate(sent) if name == "Poses"):
+        none = np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0)
+        ends.send(Poses(revision, *none), {"Frame": sent[:at].count("Frame")})
+    assert [type(inbox.receive(1)[1]).__name__ for _ in sent[1:]] == sent[1:]
 
 
 def test_keys_let_in_only_those_who_have_them(tmp_path: Path, opened: Callable) -> None:

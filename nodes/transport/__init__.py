@@ -1,0 +1,19 @@
+"""Topics over ZeroMQ: the only package that imports it.
+
+A topic has one publisher, one message type and one address. What ZeroMQ does not do by itself is done here:
+
+- XPUB_NODROP makes a publisher wait for its slowest reliable reader instead of dropping; sequence numbers check that
+  nothing was lost.
+- A best-effort reader must never slow the publisher, which NODROP would let it do on the same socket. The first byte
+  of a frame says for whom it is ("R" or "N"), readers subscribe to theirs, and the "N" copy is sent with NODROP off.
+- XPUB_VERBOSER reports each reader's arrival and departure: a publisher waits for its readers at the start and for
+  their goodbyes after `End`, because closing earlier throws away what a stalled reader has not read yet
+  (libzmq issue 4660), whatever the linger.
+- A reader whose publisher disappears without `End`, and a publisher whose reader leaves before it, raise PeerLost.
+"""
+
+from nodes.transport.publisher import Publisher
+from nodes.transport.readers import NewestReader, ReliableReader
+from nodes.transport.sockets import create_keys, shut_down, wait
+
+__all__ = ["NewestReader", "Publisher", "ReliableReader", "create_keys", "shut_down", "wait"]

@@ -1,0 +1,133 @@
+"""The sending end of a topic."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import zmq
+
+from msgs import End, Message
+from msgs.codec import NEWEST, RELIABLE, encode
+from nodes.addresses import Keys, PeerLost, TransportError, check_address
+from nodes.frame_pool import FramePool
+from nodes.transport.sockets import guard, open_socket, readable
+
+MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
+NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
+
+
+class Publisher:
+    """Sends one topic. Until `start`, messages go to whoever listens; after it, a lost reliable reader is an error.
+
+    `send` holds the caller back while a reliable reader is `buffer` messages behind. Not for use by two threads.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        topic: str = "",
+        buffer: int = 8,
+        keys: Keys | None = None,
+        max_bytes: int | None = None,
+    ) -> None:
+        check_address(address, bind=True, keys=keys)
+        self.topic = topic or address
+        self.sent = 0
+        self.readers: Counter[bytes] = Counter()  # by delivery
+        self._max_bytes = max_bytes
+        self._started = self._ended = False
+        self._pool = FramePool()
+        self._keys = keys
+        self._file = Path(address.removeprefix("ipc://")) if address.startswith("ipc") else None
+        if keys is not None:
+            guard.enter(keys)
+        self.socket = open_socket(zmq.XPUB, address, keys, MAX_SUBSCRIPTION_BYTES)
+        self.socket.sndhwm = max(1, buffer)
+        self.socket.setsockopt(zmq.XPUB_NODROP, 1)
+        self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
+        try:
+            self.socket.bind(address)
+        except zmq.ZMQError as error:
+            self.close()
+            raise TransportError(f"{self.topic}: cannot bind {address}: {error}") from error
+
+    def ready(self, readers: int) -> bool:
+        """Whether that many readers, of either kind, are there."""
+        self.watch()
+        return self.readers.total() >= readers
+
+    def start(self) -> None:
+        self._started = True
+
+    def watch(self) -> None:
+        """Takes note of arrivals and departures. Raises PeerLost."""
+        while readable(self.socket):
+            event = self.socket.recv()
+            delivery = event[1:]
+            if delivery not in (RELIABLE, NEWEST):
+                continue  # no reader of ours
+            if event[:1] == b"\x01":
+                self.readers[delivery] += 1
+            elif self.readers[delivery] > 0:
+                self.readers[delivery] -= 1
+                if delivery == RELIABLE and self._started and not self._ended:
+                    raise PeerLost(f"a reader of {self.topic} left before the end")
+
+    def send(self, message: Message, before: Mapping[str, int] | None = None) -> None:
+        """Raises CodecError for a message that differs from its annotations, PeerLost when a reader is gone.
+
+        before: messages that the caller has sent by its other publishers, by type.
+        """
+        self.watch()
+        sequence, self.sent = self.sent, self.sent + 1
+        if self.readers[NEWEST] > 0:
+            self._send(message, sequence, NEWEST, before)
+        if self.readers[RELIABLE] > 0:
+            self._send(message, sequence, RELIABLE, before)
+
+    def end(self, message: End) -> None:
+        self._ended = True
+        self.send(message)
+        self._end, self._deadline = message, time.monotonic() + NEWEST_GOODBYE
+
+    def gone(self) -> bool:
+        """After `end`: whether all readers have said goodbye."""
+        self.watch()
+        late = time.monotonic() > self._deadline
+        if self.readers[NEWEST] > 0 and not late:
+            self._send(self._end, self.sent - 1, NEWEST)
+        return self.readers[RELIABLE] <= 0 and (late or self.readers[NEWEST] <= 0)
+
+    def close(self) -> None:
+        """Unbinds. A publisher outside a graph first sends End to those who listen and waits a second for them."""
+        if self.socket.closed:
+            return
+        if not self._started and not self._ended:
+            self.end(End())
+            until = time.monotonic() + 1.0
+            while not self.gone() and time.monotonic() < until:
+                self.socket.poll(20)
+        self.socket.close(linger=0)
+        if self._file is not None:
+            self._file.unlink(missing_ok=True)
+        if self._keys is not None:
+            guard.leave(self._keys)
+
+    def _send(self, message: Message, sequence: int, delivery: bytes, before: Mapping[str, int] | None = None) -> None:
+        buffers: list[np.ndarray] = []
+
+        def allocate(size: int) -> np.ndarray:
+            buffers.append(self._pool.take(size))
+            return buffers[0]
+
+        frame = encode(
+            message, sequence, before=before, delivery=delivery, max_bytes=self._max_bytes, allocate=allocate
+        )
+        self.socket.setsockopt(zmq.XPUB_NODROP, int(delivery == RELIABLE))
+        tracker = self.socket.send(frame, copy=False, track=True)
+        self._pool.give(buffers[0], tracker)

@@ -1,0 +1,225 @@
+"""The receiving ends of a topic: every message in order, or the newest only."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from msgs import End, Message
+from msgs.codec import NEWEST, RELIABLE, CodecError, Decoded, decode, max_message_bytes, type_name
+from nodes.addresses import Keys, PeerLost, TransportError, check_address
+from nodes.transport.sockets import open_socket, readable
+
+REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+LOST = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
+PEER_GRACE = 0.5  # s between a disconnection and its report: whoever failed first should be heard first
+
+
+class _Reader:
+    """What both kinds of readers share: the connection, its monitor, and decoding."""
+
+    delivery: bytes
+
+    def __init__(
+        self,
+        address: str,
+        type: type,
+        *,
+        topic: str = "",
+        buffer: int = 8,
+        keys: Keys | None = None,
+        max_bytes: int | None = None,
+    ) -> None:
+        check_address(address)
+        self.topic = topic or address
+        self.received = self.skipped = self.expected = 0
+        self.ended = False
+        self._type = type
+        self._keys = keys
+        self._buffer = max(1, buffer)
+        self._max_bytes = max_message_bytes(type) if max_bytes is None else max_bytes
+        self._frames: deque[zmq.Frame] = deque()  # taken over, not asked for yet
+        self._lost_at: float | None = None
+        self._socket = open_socket(zmq.SUB, address, keys, self._max_bytes)
+        self._socket.rcvhwm = self._buffer
+        self._socket.reconnect_ivl = 50
+        self.monitor = self._socket.get_monitor_socket(LOST)
+        self._socket.connect(address)
+        self._socket.subscribe(self.delivery)
+
+    def watch(self) -> None:
+        """Takes note of a lost connection. Raises TransportError if the publisher refuses this reader's keys."""
+        while readable(self.monitor):
+            event = recv_monitor_message(self.monitor)["event"]
+            if event & REFUSED and self._keys is not None:
+                raise TransportError(f"the publisher of {self.topic} refused the keys: both ends need the same file")
+            if event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+                raise TransportError(f"the publisher of {self.topic} speaks another protocol: keys on one side only?")
+            if self._lost_at is None:
+                self._lost_at = time.monotonic()
+
+    def check_peer(self) -> None:
+        """Raises PeerLost if the publisher is gone without End. To be called when no message waits."""
+        if self._lost_at is not None and not self.ended and time.monotonic() - self._lost_at > PEER_GRACE:
+            raise PeerLost(f"the publisher of {self.topic} disappeared before the end")
+
+    @property
+    def sender(self) -> str:
+        """The slot that sends a topic `slot.MessageType`."""
+        return self.topic.rpartition(".")[0] or self.topic
+
+    @property
+    def type_name(self) -> str:
+        return self._type.__name__
+
+    @property
+    def waiting(self) -> int:
+        return len(self._frames)
+
+    def _close_socket(self) -> None:
+        if not self._socket.closed:
+            self._socket.disable_monitor()
+            self.monitor.close()
+            self._socket.close(linger=500)  # ms for the goodbye to leave
+
+    def _decode(self, frame: zmq.Frame) -> Decoded:
+        try:
+            return decode(frame.buffer, expect=(self._type, End), max_bytes=self._max_bytes)
+        except CodecError as error:
+            raise CodecError(f"{self.topic}: {error}") from error
+
+    def _count(self, message: Message) -> None:
+        if isinstance(message, End):
+            self.ended = True
+        else:
+            self.received += 1
+
+
+class ReliableReader(_Reader):
+    """Every message of a topic, in order. Takes up to `buffer` messages over before they are asked for."""
+
+    delivery = RELIABLE
+    _head: Decoded | None = None  # the next message, looked at already
+
+    @property
+    def pollable(self) -> zmq.Socket[bytes]:
+        return self._socket
+
+    def head(self) -> Decoded | None:
+        """The next message, if one has arrived; `take` gives it. Raises TransportError if one was lost."""
+        while len(self._frames) < self._buffer and readable(self._socket):
+            self._frames.append(self._socket.recv(copy=False))
+        if self._head is None and self._frames and not self.ended:
+            self._head = self._decode(self._frames.popleft())
+            if self._head.sequence != self.expected:
+                raise TransportError(
+                    f"{self.topic}: message {self._head.sequence} came where {self.expected} was due: some were lost"
+                )
+        return self._head
+
+    def take(self) -> Message | None:
+        """The next message, if one has arrived; after End nothing. Raises TransportError if one was lost."""
+        head, self._head = self.head(), None
+        if head is None:
+            return None
+        self.expected += 1
+        self._count(head.message)
+        if self.ended:
+            self._socket.unsubscribe(self.delivery)  # the goodbye that the publisher waits for
+        return head.message
+
+    def close(self) -> None:
+        self._close_socket()
+
+
+class NewestReader(_Reader):
+    """The newest message of a topic only; what it skipped is counted. Never slows the publisher.
+
+    A thread takes the frames over, so that a busy owner finds a fresh one; only those it asks for are decoded.
+    """
+
+    delivery = NEWEST
+
+    def __init__(
+        self,
+        address: str,
+        type: type,
+        *,
+        topic: str = "",
+        late: bool = True,  # what was sent before the first message that it gets is not "skipped"
+        keys: Keys | None = None,
+        max_bytes: int | None = None,
+    ) -> None:
+        super().__init__(address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes)
+        self._frames = deque(maxlen=1)  # a newer one takes the older one's place
+        self._late = late
+        self._end: zmq.Frame | None = None
+        self._closing = False
+        wake = f"inproc://newest-{id(self)}"
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
+        self.pollable = context.socket(zmq.PAIR)
+        self.pollable.bind(wake)
+        self._wake = context.socket(zmq.PAIR)
+        self._wake.connect(wake)
+        self._wake.linger = 0
+        self._socket.rcvtimeo = 100
+        self._thread = threading.Thread(target=self._drain, name=f"newest {self.topic}", daemon=True)
+        self._thread.start()
+
+    def take(self) -> Message | None:
+        """The newest message that was not taken yet, or None. Raises CodecError for a frame that is no message."""
+        while self.pollable.poll(0):
+            self.pollable.recv()
+        frame: zmq.Frame | None
+        try:
+            frame = self._frames.popleft()
+        except IndexError:
+            frame, self._end = self._end, None
+        if frame is None or self.ended:
+            return None
+        message, sequence, _ = self._decode(frame)
+        self._count(message)
+        if not self._late or self.expected:
+            self.skipped += max(0, sequence - self.expected)
+        self.expected = sequence + 1
+        return message
+
+    def receive(self, timeout_s: float | None = None) -> Message | None:
+        """Waits for a message that was not taken yet: the newest, or End; None when none comes in time.
+
+        Raises CodecError for a frame that is no message; the next call goes on. Raises TransportError for wrong keys.
+        """
+        self.watch()
+        message = self.take()
+        if message is None and self.pollable.poll(None if timeout_s is None else round(timeout_s * 1000)):
+            message = self.take()
+        return message
+
+    def close(self) -> None:
+        self._closing = True
+        self._thread.join()
+        self.pollable.close()
+        self._close_socket()
+
+    def _drain(self) -> None:
+        while not self._closing:
+            try:
+                frame = self._socket.recv(copy=False)
+            except zmq.Again:
+                continue
+            try:
+                is_end = type_name(frame.buffer) == "End"
+            except CodecError:
+                is_end = False  # reported to the owner when it decodes the frame
+            if is_end:
+                self._end = frame
+                self._socket.unsubscribe(self.delivery)
+            else:
+                self._frames.append(frame)
+            if self._wake.poll(0, zmq.POLLOUT):
+                self._wake.send(b"")
+        self._wake.close()

@@ -1,0 +1,80 @@
+"""Sockets as all topics open them: limits, keep-alive, CURVE keys and whom they let in."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import zmq
+from zmq.auth.thread import ThreadAuthenticator
+
+from nodes.addresses import Keys, save_keys
+
+
+def create_keys(folder: str | Path) -> Keys:
+    """A new key pair in `folder`; copy it (scp -p) to each machine of the graph."""
+    keys = Keys(*zmq.curve_keypair())
+    save_keys(Path(folder), keys)
+    return keys
+
+
+class _Guard:
+    """Lets in only readers that own a graph's secret key: knowing the public one is not enough."""
+
+    def __init__(self) -> None:
+        self._users: Counter[Keys] = Counter()
+        self._authenticator: ThreadAuthenticator | None = None
+
+    def enter(self, keys: Keys) -> None:
+        self._users[keys] += 1
+        if self._authenticator is None:
+            self._authenticator = ThreadAuthenticator(zmq.Context.instance())
+            self._authenticator.start()
+            self._authenticator.configure_curve_callback("*", self)
+
+    def leave(self, keys: Keys) -> None:
+        self._users[keys] -= 1
+        if self._authenticator is not None and not +self._users:
+            self._authenticator.stop()
+            self._authenticator = None
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        return any(key == keys.public and users > 0 for keys, users in list(self._users.items()))
+
+
+guard = _Guard()
+
+
+def open_socket(kind: int, address: str, keys: Keys | None, max_bytes: int) -> zmq.Socket[bytes]:
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+    socket.linger = 0
+    socket.maxmsgsize = max_bytes
+    if address.startswith("tcp"):
+        socket.ipv6 = "[" in address
+        socket.tcp_keepalive, socket.tcp_keepalive_idle = 1, 10
+        socket.tcp_keepalive_intvl, socket.tcp_keepalive_cnt = 5, 3
+    if keys is not None:
+        socket.curve_publickey, socket.curve_secretkey = keys
+        if kind == zmq.XPUB:
+            socket.curve_server = True
+        else:
+            socket.curve_serverkey = keys.public
+    return socket
+
+
+def readable(socket: zmq.Socket[bytes]) -> bool:
+    return bool(int(socket.events) & zmq.POLLIN)
+
+
+def shut_down() -> None:
+    """Closes what is left and waits until ZeroMQ's threads have sent the last goodbyes and removed the socket files."""
+    zmq.Context.instance().destroy()
+
+
+def wait(sockets: Iterable[zmq.Socket[bytes]], timeout_s: float) -> None:
+    """Until something arrives on one of the sockets (`pollable`, `monitor`, `Publisher.socket`) or the time is up."""
+    poller = zmq.Poller()
+    for socket in sockets:
+        poller.register(socket, zmq.POLLIN)
+    poller.poll(round(timeout_s * 1000))
