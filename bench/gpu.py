@@ -32,10 +32,10 @@ from bench.table import Row, main
 from mvsgs_core.splats import optimizer, ssim
 from mvsgs_core.splats.keyframes import PosedView, training_view
 from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.mapper_log import MapperLog
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.rasterizer import rasterize
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.stats import Stats
 
 Action = Callable[[], object]
 
@@ -171,7 +171,7 @@ def iteration_rows(size: tuple[int, int], count: int, device: torch.device, roun
     view = training_view(posed, np.eye(4), None, 1, device)
     training = TrainingConfig(backend="triton")
     groups = optimizer.groups(optimizer.LearningRates(), 1.0, 1.0, False, training.density)
-    log = MapperLog()
+    log = Stats()
     rendered = torch.rand(*size, 3, device=device, requires_grad=True)
     target = view.target(0)
 

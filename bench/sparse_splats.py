@@ -16,12 +16,12 @@ from mvsgs_core.splats import density_control, optimizer
 from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
 from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.mapper_log import MapperLog
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.optimizer import LearningRates
 from mvsgs_core.splats.rasterizer import rasterize
 from mvsgs_core.splats.spherical_harmonics import C0
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.stats import Stats
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class SparseMap:
         self.origin = views[0].world_from_cam[:3, 3].copy()
         self.unit = _median_depth(views, points)
         self.state = MapState(1, torch.device("cpu"))
-        self.log = MapperLog()
+        self.log = Stats()
         self.iterations = 0
         self.seconds = 0.0
         self._skip = SkipConfig(converged=False, tiles=False, coarse_to_fine=False, levels=1)

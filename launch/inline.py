@@ -14,7 +14,7 @@ import nodes
 from launch.graph import Graph
 from msgs import End, Message
 from nodes.parameters import make_config
-from nodes.runner import Runner, own_stats
+from nodes.runner import Runner, end_of
 
 Observer = Callable[[str, nodes.Node, Any], None]
 
@@ -54,7 +54,7 @@ class _Inline:
                     self._send(name, [message])
         for name, runner in self._runners.items():  # senders come before their readers
             self._send(name, runner.end())
-            end = End(runner.node.upstream | {name: self._stats(runner)})
+            end = self._end(name, runner)
             for reader in dict.fromkeys(edge.reader for edge in self._graph.out_of(name) if not edge.feedback):
                 list(self._runners[reader].handle(end))
         return {name: runner.node for name, runner in self._runners.items()}
@@ -77,9 +77,9 @@ class _Inline:
         while (produced := runner.idle()) is not None:
             self._send(name, produced)
 
-    def _stats(self, runner: Runner) -> dict[str, Any]:
+    def _end(self, name: str, runner: Runner) -> End:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # of all nodes together, here
-        return own_stats(runner.node, peak_bytes=peak, busy_seconds=runner.busy_seconds)
+        return end_of(name, runner.node, peak_bytes=peak, busy_seconds=runner.busy_seconds)
 
 
 def _seed(seed: int) -> None:

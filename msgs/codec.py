@@ -196,6 +196,11 @@ def max_message_bytes(message_type: type) -> int:
     return MAX_MAP_BYTES if message_type is msgs.SplatMap else MAX_MESSAGE_BYTES
 
 
+def stats_bytes(stats: Mapping[str, Any]) -> int:
+    """What `End.stats`, plain values within the limits of one, take in the header."""
+    return len(msgpack.packb(stats))
+
+
 def array_specs(message_type: type) -> dict[str, FieldSpec]:
     """Field name -> what the annotation asks for."""
     return dict(_SPECS[message_type.__name__])

@@ -30,45 +30,14 @@ A node imports no socket and knows no topic: it is tested as `list(Tracker(confi
 
 from __future__ import annotations
 
-import time
 import types
 import typing
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any, ClassVar
 
 import msgs
-
-
-@dataclass
-class Stats:
-    """What a node counts and times; it travels downstream in `End` and ends in the report."""
-
-    counts: dict[str, float] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    skipped: dict[str, float] = field(default_factory=dict)
-    values: dict[str, Any] = field(default_factory=dict)  # latest value: for the live display and the report
-    warnings: list[str] = field(default_factory=list)  # what a user should know: fallbacks, lost tracking
-
-    def count(self, name: str, n: float = 1) -> None:
-        self.counts[name] = self.counts.get(name, 0) + n
-
-    def skip(self, what: str, n: float = 1) -> None:
-        """Work that was not done because the scene did not need it."""
-        self.skipped[what] = self.skipped.get(what, 0) + n
-
-    def warn(self, text: str) -> None:
-        if text not in self.warnings:
-            self.warnings.append(text)
-
-    @contextmanager
-    def time(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+from mvsgs_core.stats import Stats
 
 
 class Node:

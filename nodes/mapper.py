@@ -79,9 +79,7 @@ class Mapper(Node):
         super().__init__(config)
         self._core_config = mapper_config(self.config)
         self.mapper = OnlineMapper(self._core_config)
-        self._log = self.mapper.log  # one set of counters: what the core counts is what the node reports
-        self.stats.counts, self.stats.skipped = self._log.counts, self._log.skipped
-        self.stats.seconds, self.stats.warnings = self._log.seconds, self._log.warnings
+        self.stats = self.mapper.log  # one set of counters: what the core counts is what the node reports
         self._by_segment: dict[int, OnlineMapper] = {}
         self._segment_of: dict[int, int] = {}  # by keyframe, as the newest Poses that named it say
         self._last_preview = 0.0
@@ -161,7 +159,7 @@ class Mapper(Node):
         if segment not in self._by_segment:
             while self.mapper.step():  # what the part before is owed
                 pass
-            self._by_segment[segment] = OnlineMapper(self._core_config, self._log, self.mapper.corrections)
+            self._by_segment[segment] = OnlineMapper(self._core_config, self.stats, self.mapper.corrections)
         self.mapper = self._by_segment[segment]
 
     def _join(self) -> None:

@@ -133,7 +133,4 @@ class PosedTracker(Node):
         )
 
     def _report(self) -> None:
-        self.stats.counts.update(self._tracker.stats.counts)
-        self.stats.seconds.update(self._tracker.stats.seconds)
-        for warning in self._tracker.stats.warnings:
-            self.stats.warn(warning)
+        self.stats.include(self._tracker.stats)

@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 
 import msgs
-from msgs import End, Message
+from msgs import Message
 from nodes import Node, is_source
 from nodes.addresses import PeerLost, load_keys
 from nodes.freed_memory import FreedMemory
 from nodes.inbox import Inbox, Reader
 from nodes.parameters import make_config
-from nodes.runner import Runner, merge_stats, own_stats, stats_of
+from nodes.runner import Runner, end_of, stats_of
 from nodes.signals import ABORT_SECONDS, Signals, Stopped, end_within
 from nodes.spec import Spec
 from nodes.status import Status, peak_bytes
@@ -201,7 +201,8 @@ class _Process:
 
     def _finish(self, runner: Runner, inbox: Inbox) -> None:
         node = runner.node
-        own = own_stats(
+        end = end_of(
+            self._spec.name,
             node,
             wall_seconds=time.monotonic() - self._began,
             busy_seconds=runner.busy_seconds,
@@ -211,7 +212,6 @@ class _Process:
             best_effort_skipped={r.topic: r.skipped for r in self._readers if isinstance(r, NewestReader)},
             sent=dict(runner.sent),
         )
-        end = End(merge_stats(dict(node.upstream), {self._spec.name: own}))
         for publisher in self._publishers.values():
             publisher.end(end)
         open_topics = list(self._publishers.values())
@@ -275,4 +275,4 @@ class _Source:
         self._messages.put(None)
 
 
-__all__ = ["load_node", "merge_stats", "own_stats", "run"]
+__all__ = ["load_node", "run"]

@@ -57,8 +57,7 @@ class Reader(Node):
             self._pass_warnings_on(sequence)
 
     def _pass_warnings_on(self, sequence: Sequence) -> None:
-        for warning in sequence.warnings:
-            self.stats.warn(warning)
+        self.stats.warnings.include(sequence.warnings)
 
     def _open(self) -> Sequence:
         c = self.config

@@ -7,13 +7,15 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-import numpy as np
-
 from msgs import End, Message
-from msgs.codec import MAX_DEPTH, MAX_ITEMS
-from nodes import Node, Stats, handlers, outputs
+from msgs.codec import MAX_END_HEADER_BYTES, MAX_HEADER_BYTES
+from mvsgs_core.stats import Stats
+from mvsgs_core.warned import Warnings
+from nodes import Node, handlers, outputs
+from nodes.plain import fitted, plain, plain_section
 
 STATS_KEYS = ("counts", "seconds", "skipped", "values", "warnings")
+END_BYTES = MAX_END_HEADER_BYTES - MAX_HEADER_BYTES  # the rest is for what a header holds beside the statistics
 
 
 class Runner:
@@ -66,36 +68,22 @@ class Runner:
 
 def own_stats(node: Node, **figures: Any) -> dict[str, Any]:
     """What the node counted and timed, with the figures of its run, as plain values that a message can carry."""
-    return stats_of(node.stats) | {key: plain(value) for key, value in figures.items()}
+    warnings = node.stats.warnings if isinstance(node.stats.warnings, Warnings) else Warnings(node.stats.warnings)
+    return stats_of(node.stats) | {"warnings": warnings.lines()} | {key: plain(value) for key, value in figures.items()}
 
 
 def stats_of(stats: Stats) -> dict[str, Any]:
     """A copy of the statistics in plain values; safe while the node goes on."""
-    return {key: plain(getattr(stats, key).copy()) for key in STATS_KEYS}
+    return {key: plain_section(getattr(stats, key).copy()) for key in STATS_KEYS}
 
 
 def merge_stats(upstream: dict[str, Any], news: Mapping[str, Any]) -> dict[str, Any]:
     """Adds what an End brought, by node name: the paths of a diamond bring the same nodes' figures twice."""
     for name, stats in news.items():
-        upstream[name] = plain(stats)
+        upstream[name] = {key: plain(value) for key, value in stats.items()} if isinstance(stats, Mapping) else {}
     return upstream
 
 
-def plain(value: Any, depth: int = MAX_DEPTH - 2) -> Any:
-    """Dicts with string keys, lists, numbers, strings, booleans and None, within the codec's limits.
-
-    What does not fit them is replaced by a text that says so: a figure too many must not cost a whole run.
-    """
-    if isinstance(value, np.generic | np.ndarray):
-        value = value.tolist()
-    if value is None or isinstance(value, bool | float | str):
-        return value
-    if isinstance(value, int):
-        return int(value) if abs(value) < 2**63 else float(value)
-    if isinstance(value, Mapping | list | tuple | set | frozenset):
-        if depth == 0 or len(value) > MAX_ITEMS:
-            return f"({len(value)} entries left out)"
-        if isinstance(value, Mapping):
-            return {str(key): plain(item, depth - 1) for key, item in value.items()}
-        return [plain(item, depth - 1) for item in value]
-    return str(value)
+def end_of(name: str, node: Node, **figures: Any) -> End:
+    """The node's last message: its statistics beside those of all nodes upstream, within a message's limits."""
+    return End(fitted(merge_stats(dict(node.upstream), {name: own_stats(node, **figures)}), END_BYTES))

@@ -9,9 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from msgs import Frame, Keyframe, Poses, Trajectory
+from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.frames import Path
 from mvsgs_core.tracking.publish import Correction
-from mvsgs_core.tracking.stats import TrackingStats
 from mvsgs_core.tracking.tracker import Update
 from nodes import Node
 
@@ -20,7 +20,7 @@ class CoreTracker(Protocol):
     """The part of a tracker of the core that is the same for all."""
 
     @property
-    def stats(self) -> TrackingStats: ...
+    def stats(self) -> Stats: ...
 
     @property
     def pending(self) -> set[int]: ...  # frames that may still be sent as keyframes
@@ -89,10 +89,4 @@ class TrackerNode(Node, ABC):
         )  # fmt: skip
 
     def _report(self) -> None:
-        stats = self._core.stats
-        self.stats.counts.update(stats.counts)
-        self.stats.seconds.update(stats.seconds)
-        self.stats.skipped.update(stats.skipped)
-        self.stats.values.update(stats.values)
-        for warning in stats.warnings:
-            self.stats.warn(warning)
+        self.stats.include(self._core.stats)

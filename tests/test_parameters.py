@@ -15,7 +15,8 @@ from msgs import End, Frame, Keyframe
 from msgs.codec import decode, encode
 from nodes import Node
 from nodes.parameters import make_config
-from nodes.runner import Runner, merge_stats, own_stats, plain
+from nodes.plain import plain
+from nodes.runner import Runner, merge_stats, own_stats
 from tests.sample_nodes import Left, Wrong
 
 

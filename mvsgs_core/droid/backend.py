@@ -7,14 +7,14 @@ from mvsgs_core.droid.networks import Networks
 from mvsgs_core.droid.presets import Preset
 from mvsgs_core.droid.proximity import by_proximity
 from mvsgs_core.droid.video import Video
-from mvsgs_core.tracking.stats import TrackingStats
+from mvsgs_core.stats import Stats
 
 _FACTORS_PER_KEYFRAME = 16
 _LEAST = 3  # keyframes
 
 
 def adjust_globally(
-    video: Video, networks: Networks, preset: Preset, steps: int, correlation: str, threads: int, stats: TrackingStats
+    video: Video, networks: Networks, preset: Preset, steps: int, correlation: str, threads: int, stats: Stats
 ) -> None:
     """Normalizes the scale, chooses edges among all keyframes, and updates all of them `steps` times."""
     if len(video) < _LEAST:

@@ -8,7 +8,7 @@ from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.presets import Preset
 from mvsgs_core.droid.proximity import by_proximity, neighborhood
 from mvsgs_core.droid.video import Video
-from mvsgs_core.tracking.stats import TrackingStats
+from mvsgs_core.stats import Stats
 
 _START_UPDATES = 8  # with edges to neighbors, and again with edges by proximity
 _START_REACH, _START_RADIUS, _START_NMS, _START_BETA = 3, 2, 2, 0.25
@@ -18,7 +18,7 @@ _LEAST = 4  # keyframes of a forced start
 
 
 class Frontend:
-    def __init__(self, video: Video, graph: FactorGraph, preset: Preset, stats: TrackingStats) -> None:
+    def __init__(self, video: Video, graph: FactorGraph, preset: Preset, stats: Stats) -> None:
         self.video, self.graph, self.preset, self.stats = video, graph, preset, stats
         self.started = False
         self._mean_over = 1  # keyframes whose mean inverse depth a new one begins with

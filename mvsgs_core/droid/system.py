@@ -23,9 +23,9 @@ from mvsgs_core.droid.presets import AREA, Preset
 from mvsgs_core.droid.trajectory_filler import StoredFrame, fill
 from mvsgs_core.droid.video import Video, VideoFrame
 from mvsgs_core.networks.droid import DroidNet
+from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.frames import Path, State
 from mvsgs_core.tracking.publish import Publisher
-from mvsgs_core.tracking.stats import TrackingStats
 from mvsgs_core.tracking.tracker import Update
 
 _DEGENERATE = 0.05  # share of cells that agree with a neighbor, below which a keyframe's depth is none
@@ -48,7 +48,7 @@ class DroidSlam:
         """Raises FileNotFoundError or ValueError where the weights are missing or wrong. net: instead of weights."""
         self.config = config or DroidConfig()
         self.networks = Networks(load(self.config.weights) if net is None else net, torch.device(self.config.device))
-        self.stats = TrackingStats()
+        self.stats = Stats()
         if net is None and self.config.weights == RANDOM:
             self.stats.warn("DROID-SLAM runs on random weights: its poses and depths are noise")
         self.framing: Framing | None = None

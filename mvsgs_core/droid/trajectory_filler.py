@@ -12,7 +12,7 @@ from mvsgs_core import geometry
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.networks import Networks
 from mvsgs_core.droid.video import Video, VideoFrame
-from mvsgs_core.tracking.stats import TrackingStats
+from mvsgs_core.stats import Stats
 
 BATCH = 16  # frames solved together
 _UPDATES = 6  # motion only
@@ -43,7 +43,7 @@ def fill(
     frames: Sequence[StoredFrame],
     correlation: str,
     threads: int,
-    stats: TrackingStats,
+    stats: Stats,
 ) -> np.ndarray:
     """cam_from_world (N, 4, 4) of N frames that are no keyframes, none before the first keyframe."""
     poses = [np.zeros((0, 4, 4))]
@@ -58,7 +58,7 @@ def _fill(
     frames: Sequence[StoredFrame],
     correlation: str,
     threads: int,
-    stats: TrackingStats,
+    stats: Stats,
 ) -> np.ndarray:
     count = len(video)
     before, after = video.around([frame.index for frame in frames])

@@ -18,13 +18,13 @@ from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.insertion import InsertionConfig
 from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
 from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.mapper_log import MapperLog
 from mvsgs_core.splats.optimizer import LearningRates
 from mvsgs_core.splats.rasterizer import Render, rasterize
 from mvsgs_core.splats.schedule import Schedule
 from mvsgs_core.splats.self_check import SelfCheck, check
 from mvsgs_core.splats.snapshot import Snapshot, snapshot
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.stats import Stats
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class OnlineMapper:
     def __init__(
         self,
         config: MapperConfig | None = None,
-        log: MapperLog | None = None,
+        log: Stats | None = None,
         corrections: dict[int, tuple[np.ndarray, float]] | None = None,
     ) -> None:
         """log, corrections (world_from_cam (4, 4), scale; by keyframe): what mappers of one stream share."""
@@ -62,7 +62,7 @@ class OnlineMapper:
         self.views: list[TrainingView] = []
         self._with_image: list[TrainingView] = []  # those of them that are trained on
         self.schedule = Schedule(self.config.window, self.config.seed)
-        self.log = log or MapperLog()
+        self.log = log or Stats()
         self.iterations = 0
         self.origin: np.ndarray | None = None  # (3,) float64 world position of the first keyframe
         self.unit: float | None = None  # median depth of the first keyframe that has depth, world units

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.frames import Path, State
 from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.stats import TrackingStats
 
 
-def warn_of_gaps(stats: TrackingStats, path: Path) -> None:
+def warn_of_gaps(stats: Stats, path: Path) -> None:
     """Frames without a pose, and a map in several segments."""
     segments = len(np.unique(path.segment[path.keyframe]))
     if segments > 1:
@@ -21,7 +21,7 @@ def warn_of_gaps(stats: TrackingStats, path: Path) -> None:
         stats.warn(f"{unstarted} of {len(path.state)} frames came before a start and have no pose")
 
 
-def warn_of_few_matches(stats: TrackingStats, graph: KeyframeGraph, enough: int) -> None:
+def warn_of_few_matches(stats: Stats, graph: KeyframeGraph, enough: int) -> None:
     """Few points hold the poses: their errors do not average out, and the whole map bends without any residual."""
     if not graph.edges:
         return

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.focal import FocalConfig, focal_of_all, observability, refine_focal
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.rolling_shutter import estimate_readout
-from mvsgs_core.tracking.stats import TrackingStats
 
 READOUT_AGAIN = (10, 20, 40)  # keyframes of the map at which the readout is estimated again: the first say little
 
@@ -21,7 +21,7 @@ class Calibration:
 
     graph: KeyframeGraph
     config: FocalConfig
-    stats: TrackingStats
+    stats: Stats
     given: np.ndarray  # (4,) intrinsics that came with the frames, at the tracker's size
     settled: bool  # from the start on, where the intrinsics are no guess
     readout: float | None  # seconds; None: to be estimated

@@ -8,6 +8,7 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.bundle_adjustment import Solver, reproject
 from mvsgs_core.tracking.flow import Matches, make_flow
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
@@ -15,7 +16,6 @@ from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from mvsgs_core.tracking.matcher import Matcher
-from mvsgs_core.tracking.stats import TrackingStats
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class PosedTracker:
 
     def __init__(self, config: PosedConfig | None = None) -> None:
         self.config = config or PosedConfig()
-        self.stats = TrackingStats()
+        self.stats = Stats()
         self.graph: KeyframeGraph | None = None
         self.pending: list[int] = []  # keyframes not given out yet
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
 from mvsgs_core.tracking.bundle_adjustment import Solver
@@ -33,7 +34,6 @@ from mvsgs_core.tracking.publish import Correction, Publisher
 from mvsgs_core.tracking.recovery import Recovery, RecoveryConfig
 from mvsgs_core.tracking.sighting import Sighting
 from mvsgs_core.tracking.starting import Starter, StartingConfig
-from mvsgs_core.tracking.stats import TrackingStats
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Tracker:
 
             find_device(self.config.device)
         self.records: list[FrameRecord] = []
-        self.stats = TrackingStats(clock=clock)
+        self.stats = Stats(clock=clock)
         self.started = False
         self.segment = 0
         self.graph: KeyframeGraph | None = None

@@ -1,0 +1,61 @@
+"""What a stage counts, times and warns of, for the live display and the report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from mvsgs_core.warned import Warnings
+
+
+@dataclass
+class Stats:
+    """Figures by name; of a node they travel downstream in `End` and end in the report."""
+
+    counts: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    skipped: dict[str, float] = field(default_factory=dict)  # work that was not done because the scene did not need it
+    values: dict[str, Any] = field(default_factory=dict)  # latest value: for the live display and the report
+    warnings: Warnings = field(default_factory=Warnings)  # what a user should know: fallbacks, lost tracking
+    clock: Callable[[], float] = time.perf_counter  # seconds; time.process_time where other processes disturb
+
+    def count(self, name: str, n: float = 1) -> None:
+        self.counts[name] = self.counts.get(name, 0) + n
+
+    def skip(self, what: str, n: float = 1) -> None:
+        self.skipped[what] = self.skipped.get(what, 0) + n
+
+    def warn(self, text: str) -> None:
+        """The same text is shown once, with a count."""
+        self.warnings.add(text)
+
+    def refuse(self, name: str, n: float, text: str) -> None:
+        """Counts bad input or a bad step that had no effect, and warns."""
+        self.count(f"refused_{name}", n)
+        self.warn(text)
+
+    def nothing(self, reason: str) -> None:
+        """The stage ends with nothing to show. `reason` is what was measured; the run fails, and says it."""
+        self.values["nothing"] = reason
+
+    @contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        start = self.clock()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + self.clock() - start
+
+    def include(self, part: Stats) -> None:
+        """The figures of a part as they are now. To be called as often as one likes: nothing is counted twice."""
+        self.counts.update(part.counts)
+        self.seconds.update(part.seconds)
+        self.skipped.update(part.skipped)
+        self.values.update(part.values)
+        self.warnings.include(part.warnings)
+
+
+__all__ = ["Stats"]
