@@ -24,9 +24,9 @@ from mvsgs_core.splats.insertion import (
 )  # fmt: skip
 from mvsgs_core.splats.keyframes import PosedView, TrainingView
 from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.mapper_log import MapperLog
 from mvsgs_core.splats.rasterizer import Render
 from mvsgs_core.splats.training import TrainingConfig
+from mvsgs_core.stats import Stats
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Densifier:
     render: Callable[[TrainingView, int], Render]  # of `state` from a keyframe's pose at a pyramid level
     unit: float | None  # world units; None: no keyframe had depth yet
     median_depth: float  # of the scene, in `unit`
-    log: MapperLog
+    log: Stats
 
     def insert(self, view: PosedView, added: TrainingView, depth: np.ndarray) -> int:
         """Adds splats where `depth` (h, w), world units, is known and the map does not explain the image."""
@@ -130,7 +130,7 @@ class Densifier:
         return len(points)
 
 
-def checked_depth(depth: np.ndarray, log: MapperLog) -> np.ndarray:
+def checked_depth(depth: np.ndarray, log: Stats) -> np.ndarray:
     """Depth (h, w) float32 with 0, unknown, for what is not finite or negative; counted as refused."""
     bad = ~np.isfinite(depth) | (depth < 0)
     if bad.any():
