@@ -19,6 +19,9 @@ import msgpack
 import numpy as np
 
 import msgs
+from msgs import statistics
+from msgs.header import MAX_TEXT, unpack
+from mvsgs_core.printable import printable
 
 VERSION = 1
 RELIABLE = b"R"  # first byte of a frame, which readers subscribe to: every message ...
@@ -29,9 +32,8 @@ MAX_MESSAGE_BYTES = 256 * 2**20
 MAX_MAP_BYTES = 4 * 2**30  # a SplatMap: about 16 million splats with all their spherical harmonics
 MAX_HEADER_BYTES = 64 * 2**10
 MAX_END_HEADER_BYTES = 2**20  # End carries the statistics of the whole graph
-MAX_ITEMS = 4096  # entries of one list or map in End.stats
-MAX_DEPTH = 8  # of the maps and lists in End.stats
-MAX_TEXT = 64 * 2**10  # bytes of one string
+MAX_VALUES = 1000  # keys and values in a header, in all; of an End:
+MAX_END_VALUES = MAX_VALUES + 2 * statistics.MAX_ENTRIES
 
 _PREFIX = struct.Struct("<c3sBBHI")  # delivery, magic, version, length of the name, zero, length of the header
 _MAGIC = b"MVS"
@@ -162,7 +164,7 @@ def decode(frame: Any, *, expect: tuple[type, ...] | None = None, max_bytes: int
     specs = _SPECS[name]
     scalars = {**{field: value for field, value in _DEFAULTS[name].items() if field not in arrays}, **scalars}
     if len(scalars) + len(arrays) != len(specs) or (scalars.keys() | arrays.keys()) != specs.keys():
-        given = ", ".join(map(str, (*scalars, *arrays)))
+        given = printable(", ".join(map(str, (*scalars, *arrays))), 300)
         raise CodecError(f"{name} has the fields {', '.join(specs)}; this frame has {given or 'none'}")
     built: dict[str, Any] = {}
     sizes: dict[str, int] = {}
@@ -194,11 +196,6 @@ def type_name(frame: Any) -> str:
 def max_message_bytes(message_type: type) -> int:
     """The largest frame of a type unless a topic sets another limit."""
     return MAX_MAP_BYTES if message_type is msgs.SplatMap else MAX_MESSAGE_BYTES
-
-
-def stats_bytes(stats: Mapping[str, Any]) -> int:
-    """What `End.stats`, plain values within the limits of one, take in the header."""
-    return len(msgpack.packb(stats))
 
 
 def array_specs(message_type: type) -> dict[str, FieldSpec]:
@@ -241,18 +238,9 @@ def _split(view: memoryview) -> tuple[str, memoryview]:
 
 def _unpack_header(header: memoryview, name: str) -> tuple[int, dict[str, Any], dict[str, Any], dict[str, int]]:
     try:
-        # msgpack allocates a list's declared length at once: the limits keep a false one small
-        content = msgpack.unpackb(
-            header,
-            strict_map_key=True,
-            max_array_len=MAX_ITEMS,
-            max_map_len=MAX_ITEMS,
-            max_str_len=MAX_TEXT,
-            max_bin_len=0,
-            max_ext_len=0,
-        )
-    except (ValueError, TypeError, msgpack.UnpackException) as error:
-        raise CodecError(f"{name}: the header is no valid msgpack: {error or type(error).__name__}") from error
+        content = unpack(header, MAX_END_VALUES if name == "End" else MAX_VALUES)
+    except ValueError as error:
+        raise CodecError(f"{name}: the header is no valid msgpack: {error}") from None
     if not isinstance(content, dict) or content.keys() - {_ORDER_KEY} != _HEADER_KEYS:
         raise CodecError(f"{name}: the header must be a map of sequence, scalars and arrays")
     sequence, scalars, arrays = content["sequence"], content["scalars"], content["arrays"]
@@ -278,10 +266,9 @@ def _array(
         raise CodecError(f"{where} must be given as [dtype, shape, offset]")
     dtype, shape, offset = entry
     if dtype != spec.name:
-        raise CodecError(f"{where} must be {spec.name}, not {dtype}")
-    for number in (*shape, offset):
-        if type(number) is not int or number < 0:
-            raise CodecError(f"{where}: shape {shape} and offset {offset} must be integers from 0")
+        raise CodecError(f"{where} must be {spec.name}, not {_shown(dtype)}")
+    if not all(map(_is_count, (*shape, offset))):  # before any of them is shown: lists in lists have no end
+        raise CodecError(f"{where}: the sizes of its shape and its offset must be integers from 0")
     _check_shape(spec, shape, sizes, where)
     stop = offset + math.prod(shape) * spec.dtype.itemsize
     if offset % ALIGNMENT or stop > section.nbytes:
@@ -302,13 +289,21 @@ def _array(
 
 def _check_shape(spec: ArraySpec, shape: Sequence[int], sizes: dict[str, int], where: str) -> None:
     if len(shape) != len(spec.dims):
-        raise CodecError(f"{where} must have the shape ({' '.join(map(str, spec.dims))}), not {tuple(shape)}")
+        given = printable(tuple(shape), 100)
+        raise CodecError(f"{where} must have the shape ({' '.join(map(str, spec.dims))}), not {given}")
     for size, dim in zip(shape, spec.dims):
         expected = dim if type(dim) is int else sizes.setdefault(dim, size)  # type: ignore[arg-type]
         if size != expected:
             raise CodecError(f"{where} has the shape {tuple(shape)}, but {dim} is {expected}")
         if size == 0 and dim in _IMAGE_SIZES:
             raise CodecError(f"{where} is an empty image: shape {tuple(shape)}")
+    if 0 in shape and math.prod(filter(None, shape)) > MAX_MAP_BYTES:  # it takes no bytes, but numpy has no such shape
+        raise CodecError(f"{where} is larger than any message: shape {tuple(shape)}")
+
+
+def _shown(value: Any) -> str:
+    """Any value of a header, in an error: a list may be nested deeper than Python can print."""
+    return f"a {type(value).__name__}" if isinstance(value, list | dict) else printable(value, 100)
 
 
 def _checked_scalar(value: Any, kind: Any, where: str) -> Any:
@@ -317,7 +312,10 @@ def _checked_scalar(value: Any, kind: Any, where: str) -> Any:
     if kind is float and type(value) is int:
         value = float(value)
     if kind is Mapping:
-        return _checked_stats(value, where, MAX_DEPTH, top=True)
+        try:
+            return statistics.checked(value)
+        except ValueError as error:
+            raise CodecError(f"{where}: {error}") from None
     if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
         raise CodecError(f"{where} must be {kind.__name__}, not {type(value).__name__}")
     if kind is float and not math.isfinite(value):
@@ -329,31 +327,6 @@ def _checked_scalar(value: Any, kind: Any, where: str) -> Any:
     if kind is str and len(value.encode(errors="replace")) > MAX_TEXT:
         raise CodecError(f"{where} is longer than {MAX_TEXT} bytes")
     return value
-
-
-def _checked_stats(value: Any, where: str, depth: int, *, top: bool = False) -> Any:
-    """Maps, lists, strings, numbers, booleans and nil, nested at most MAX_DEPTH deep."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, Mapping | list | tuple):
-        if depth == 0:
-            raise CodecError(f"{where} is nested more than {MAX_DEPTH} deep")
-        if len(value) > MAX_ITEMS:
-            raise CodecError(f"{where} has {len(value)} entries, more than {MAX_ITEMS}")
-    if isinstance(value, Mapping):
-        if not all(isinstance(key, str) for key in value):
-            raise CodecError(f"{where}: keys must be strings")
-        return {key: _checked_stats(item, f"{where}.{key}", depth - 1) for key, item in value.items()}
-    if top:
-        raise CodecError(f"{where} must be a map, not {type(value).__name__}")
-    if isinstance(value, list | tuple):
-        return [_checked_stats(item, where, depth - 1) for item in value]
-    if value is None or isinstance(value, bool | float):
-        return value
-    for kind in (str, int):
-        if isinstance(value, kind):
-            return _checked_scalar(value, kind, where)
-    raise CodecError(f"{where}: a {type(value).__name__} cannot be sent; use numbers, strings, lists and maps")
 
 
 def _specs_of(message_type: type) -> dict[str, FieldSpec]:

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from msgs.codec import MAX_DEPTH, MAX_ITEMS, stats_bytes
+from msgs.statistics import MAX_DEPTH, MAX_ENTRIES, MAX_ITEMS, fits
 
 MAX_CHARACTERS = 10_000  # of a text: 60 kB at most where each takes an escape, below the codec's limit
 MAX_KEY = 200  # characters
-MAX_ENTRIES = 4 * MAX_ITEMS  # of one value, in all its lists and maps together
 SHORTENED = "some figures were left out or cut: those of the whole graph did not fit into a message"
 # characters of a text and entries of a list or map, tried in turn until all figures fit: the longest texts go first
 _STEPS = ((1000, MAX_ITEMS), (200, MAX_ITEMS), (100, MAX_ITEMS), (100, 500), (100, 50), (50, 10), (20, 1))
@@ -61,11 +60,11 @@ def fitted(stats: dict[str, Any], limit: int) -> dict[str, Any]:
     Where they take more, the longest texts are cut first, then the ends of long lists and maps; who lost something
     says so in its warnings.
     """
-    if stats_bytes(stats) <= limit:
+    if fits(stats, limit):
         return stats
     for characters, entries in _STEPS:
         short = {name: _noted(own, _cut(own, characters, entries)) for name, own in stats.items()}
-        if stats_bytes(short) <= limit:
+        if fits(short, limit):
             return short
     return {}
 
