@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import socket
-import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,33 +11,7 @@ from launch.graph import Edge, Graph
 from launch.parameters import GraphError
 from nodes.addresses import TransportError, load_keys
 
-LONGEST_SOCKET_PATH = 107  # bytes that a Unix socket's address holds
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-
-
-@dataclass(frozen=True)
-class RunDirectory:
-    """A short-named directory for sockets and specs, gone when the run is."""
-
-    path: Path
-
-    @staticmethod
-    def create(graph: Graph) -> RunDirectory:
-        """Raises GraphError where no directory has a name short enough for a socket's address."""
-        longest = max((len(_topic(edge)) for edge in graph.edges), default=0)
-        for base in dict.fromkeys((tempfile.gettempdir(), "/tmp")):
-            if (
-                len(os.fsencode(base)) + len("/mvsgs-12345678/") + longest <= LONGEST_SOCKET_PATH
-                and Path(base).is_dir()
-            ):
-                return RunDirectory(Path(tempfile.mkdtemp(prefix="mvsgs-", dir=base)))
-        raise GraphError(
-            f"the path of a socket in {tempfile.gettempdir()} would be longer than {LONGEST_SOCKET_PATH} bytes: "
-            "set TMPDIR to a shorter one, or transport=tcp"
-        )
-
-    def remove(self) -> None:
-        shutil.rmtree(self.path, ignore_errors=True)
 
 
 def addresses(graph: Graph, directory: Path) -> dict[str, str]:
@@ -51,7 +21,7 @@ def addresses(graph: Graph, directory: Path) -> dict[str, str]:
             load_keys(Path(graph.settings.keys))
         except TransportError as error:
             raise GraphError(f"keys={graph.settings.keys}: {error}") from error
-    topics = list(dict.fromkeys(_topic(edge) for edge in graph.edges))
+    topics = list(dict.fromkeys(topic(edge) for edge in graph.edges))
     if graph.settings.transport == "ipc":
         return {topic: f"ipc://{directory}/{topic}" for topic in topics}
     found = {}
@@ -84,19 +54,24 @@ def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_
     own_threads = {"threads": threads} if "threads" in slot.config else {}  # a node's kernels keep to its share too
     outputs: dict[str, dict[str, Any]] = {}
     for edge in graph.out_of(name):
+        kind = edge.message.__name__
         output = outputs.setdefault(
-            edge.message.__name__, {"type": edge.message.__name__, "address": address[_topic(edge)], "readers": 0}
+            kind, {"type": kind, "address": address[topic(edge)], "readers": 0, "observers": []}
         )
-        output["readers"] += 1
+        if edge.reader in graph.observers:
+            output["observers"].append(edge.reader)
+        else:
+            output["readers"] += 1
     return {
         "name": name,
         "target": slot.target,
         "config": slot.config | own_threads,
+        "observer": name in graph.observers,
         "inputs": [
             {
                 "type": edge.message.__name__,
                 "slot": edge.sender,
-                "address": address[_topic(edge)],
+                "address": address[topic(edge)],
                 "best_effort": edge.best_effort,
                 "feedback": edge.feedback,
             }
@@ -117,5 +92,6 @@ def write_spec(content: dict[str, Any], path: Path) -> Path:
     return path
 
 
-def _topic(edge: Edge) -> str:
+def topic(edge: Edge) -> str:
+    """`slot.MessageType`."""
     return f"{edge.sender}.{edge.message.__name__}"
