@@ -6,9 +6,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
-from launch.status import NodeStatus
+import psutil
+
+from launch.outcome import Failure
+from launch.status import NodeStatus, printable_lines
+from nodes.signals import STARTING
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -28,10 +33,11 @@ class Child:
         self.status = status
         self.log = log
         self.pipe = pipe[0]
+        self.heard = self.moved = time.monotonic()  # when it last said anything, and when it last got on with its work
         self._text = b""
-        # SIGINT waits, blocked, until the node can handle it. Its own session: the terminal's Ctrl-C reaches only the
-        # launcher, which decides whom to stop.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        # These signals wait, blocked, until the node can handle them. Its own session: the terminal's Ctrl-C reaches
+        # only the launcher, which decides whom to stop.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, STARTING)
         with log.open("wb") as output:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "nodes", str(spec)],
@@ -60,13 +66,17 @@ class Child:
             if not news:
                 return False
             *lines, self._text = (self._text + news).split(b"\n")
+            self.heard = time.monotonic()
+            before = self.status.done_so_far
             for line in filter(None, lines):
                 self.status.update(line)
+            if self.status.done_so_far != before:
+                self.moved = self.heard
 
     def failure(self) -> str | None:
         """What went wrong, or None as long as nothing did."""
         code = self.process.poll()
-        if self.status.state == "failed":
+        if self.status.state in ("failed", "stopped"):
             return self.status.error or "failed"
         if code is None or code == 0:
             return None
@@ -75,14 +85,30 @@ class Child:
             return f"killed by signal {-code} ({signal.strsignal(-code)}{hint})"
         return f"exit code {code}"
 
+    @property
+    def running(self) -> bool:
+        return self.process.poll() is None
+
+    @property
+    def frozen(self) -> bool:
+        """Whether its process was stopped by a signal, or by a debugger."""
+        try:
+            return psutil.Process(self.process.pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
+        except psutil.Error:
+            return False
+
+    def failed(self, error: str = "") -> Failure:
+        """Its failure, as it is reported."""
+        return Failure(self.name, error or self.failure() or "failed", self.last_words(), self.log)
+
     def last_words(self, lines: int = 30) -> str:
         """The traceback that the node reported, else the end of its log."""
         if self.status.traceback:
             return self.status.traceback.rstrip()
-        return "\n".join(self.log.read_text(errors="replace").splitlines()[-lines:])
+        return printable_lines(self.log.read_text(errors="replace"), lines)
 
     def send(self, number: signal.Signals) -> None:
-        if self.process.poll() is None:
+        if self.running:
             self.process.send_signal(number)
 
     def kill_group(self) -> None:

@@ -6,11 +6,11 @@ choices and edges all come from `conf/`.
 
 from __future__ import annotations
 
-import functools
 import importlib
 import inspect
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import msgs
@@ -20,6 +20,14 @@ from launch.parameters import GraphError, check_parameters, did_you_mean
 # A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have. Where
 # some slot is their origin, an edge that misses them is an error all the same: corrections would be lost in silence.
 OPTIONAL_MESSAGES = (msgs.Poses, msgs.Trajectory)
+
+
+@dataclass(frozen=True)
+class Supervise:
+    """What the launcher does about a node that it no longer hears of."""
+
+    silent: float = 10.0  # seconds until it is named
+    dead: float = 60.0  # seconds until the run ends without it, or goes on without it where it only observes
 
 
 @dataclass(frozen=True)
@@ -36,6 +44,7 @@ class Settings:
     port: int | None = None
     keys: str | None = None
     screen: Literal["auto", "live", "plain", "off"] = "auto"
+    supervise: Supervise = field(default_factory=Supervise)
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,7 @@ class Placement:
     best_effort: list[str] = field(
         default_factory=list
     )  # types that this slot sends newest-only, as a live camera does
+    observer: bool = False  # watches only: the run goes on without it
 
 
 @dataclass(frozen=True)
@@ -91,6 +101,17 @@ class Graph:
     def out_of(self, slot: str) -> list[Edge]:
         return [edge for edge in self.edges if edge.sender == slot]
 
+    @cached_property
+    def observers(self) -> frozenset[str]:
+        """Slots that nobody who makes the map depends on: declared so, or readers of best-effort edges only."""
+        found: set[str] = set()
+        for name, slot in reversed(self.slots.items()):
+            only_newest = bool(self.into(name)) and all(edge.best_effort for edge in self.into(name))
+            watched = all(edge.reader in found for edge in self.out_of(name) if not edge.feedback)
+            if slot.placement.observer or (only_newest and watched and not any(e.feedback for e in self.out_of(name))):
+                found.add(name)
+        return frozenset(found)
+
     @property
     def sources(self) -> list[str]:
         return [name for name, slot in self.slots.items() if nodes.is_source(slot.node)]
@@ -107,10 +128,7 @@ class Replaced:
 def build(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | None = None) -> Graph:
     """The checked graph of a resolved configuration. Raises GraphError, with what would be valid."""
     replaced = replaced or {}
-    sections = {key: value for key, value in config.items() if isinstance(value, Mapping)}
-    settings = Settings(
-        **check_parameters("", "config.yaml", Settings, {k: v for k, v in config.items() if k not in sections})
-    )
+    settings, sections = _settings(config)
     device = _Device(settings.device)
     slots: dict[str, Slot] = {}
     for name, section in sections.items():
@@ -120,7 +138,18 @@ def build(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | None = N
     names, edges = order(slots, edges)
     resolved = {key: value for key, value in config.items() if key not in sections}
     resolved |= {name: _section(slots[name]) if name in slots else {"_target_": None} for name in sections}
-    return Graph({name: slots[name] for name in names}, edges, settings, resolved, warnings)
+    graph = Graph({name: slots[name] for name in names}, edges, settings, resolved, warnings)
+    _check_observers(graph)
+    return graph
+
+
+def _settings(config: Mapping[str, Any]) -> tuple[Settings, dict[str, Mapping[str, Any]]]:
+    """The keys that belong to no slot, and the slots' sections."""
+    own = Settings.__dataclass_fields__
+    sections = {key: value for key, value in config.items() if isinstance(value, Mapping) and key not in own}
+    given = {key: value for key, value in config.items() if key not in sections}
+    checked = check_parameters("", "config.yaml", Settings, given)
+    return Settings(**(checked | {"supervise": Supervise(**checked["supervise"])})), sections
 
 
 def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None, device: _Device) -> Slot:
@@ -244,6 +273,16 @@ def order(slots: Collection[str], edges: Collection[Edge]) -> tuple[list[str], l
     return done, [replace(e, feedback=done.index(e.sender) >= done.index(e.reader)) for e in edges]
 
 
+def _check_observers(graph: Graph) -> None:
+    """Nothing that makes the map may depend on an observer."""
+    for edge in graph.edges:
+        if edge.sender in graph.observers and edge.reader not in graph.observers:
+            raise GraphError(
+                f"{edge.reader} reads {edge.message.__name__} from {edge.sender}, which may fail alone: set "
+                f"{edge.sender}.observer=false, or {edge.reader}.observer=true"
+            )
+
+
 def _handlers(name: str, node: type[nodes.Node]) -> dict[type, str]:
     try:
         return nodes.handlers(node)
@@ -278,7 +317,7 @@ class _Device:
             raise GraphError(f"device={wanted}: must be auto, cpu, cuda or cuda:<number>")
         self._wanted = wanted
 
-    @functools.cached_property
+    @cached_property
     def resolved(self) -> str:
         if self._wanted == "cpu":
             return "cpu"

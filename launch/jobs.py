@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import signal
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+import msgs
 import nodes
 from launch.compose import graph_of
 from launch.graph import Graph
 from launch.inline import run_inline
+from launch.outcome import FAILED, REFUSED, Outcome, finished
+from launch.output import Output
 from launch.parameters import GraphError
 from launch.screen import Screen, make_screen
 from launch.status import NodeStatus
 from launch.summary import summary
-from launch.supervise import Outcome, Supervisor
+from launch.supervise import Supervisor
 from nodes.parameters import make_config
 
 
@@ -37,6 +39,7 @@ class Job:
     overrides: Sequence[str]
     choices: dict[str, Any]
     number: int | None  # in a sweep
+    resumed: bool = False  # goes on with what is in its output directory
 
     @staticmethod
     def of(config: DictConfig, hydra: Any) -> Job:
@@ -63,24 +66,34 @@ def _run(job: Job) -> int:
     try:
         graph = graph_of(job.config, job.overrides, job.choices)
         _check_nodes(graph)
-        output = _prepare_output(graph)
-        screen = make_screen(graph.settings.screen)
-        began = time.time()
-        if graph.settings.inline:
-            _run_inline(graph, screen)
-            outcome = Outcome(0)
-        else:
-            outcome = Supervisor(graph, screen).run()
+        output = Output(Path(graph.settings.output))
     except GraphError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    if outcome.failed is None and outcome.code == 0:
-        screen.note(summary(output, newer_than=began))
-    elif outcome.failed is None:
-        screen.note("stopped")
-    else:
-        _report_failure(outcome)
-    return outcome.code
+        return _refused(error)
+    try:
+        output.begin(graph.resolved, resumed=job.resumed)
+        screen = make_screen(graph.settings.screen)
+        outcome = _run_inline(graph, screen) if graph.settings.inline else Supervisor(graph, screen).run()
+        output.settle(outcome, scored=nodes_write_reports(graph))
+        _say(outcome, screen, output)
+        return outcome.code
+    except GraphError as error:
+        output.settle(Outcome(REFUSED, f"refused: {error}"), scored=False)
+        return _refused(error)
+    except BaseException as error:
+        output.settle(Outcome(FAILED, f"{type(error).__name__}: {error}"), scored=False)
+        raise
+    finally:
+        output.release()
+
+
+def _refused(error: GraphError) -> int:
+    print(f"error: {error}", file=sys.stderr)
+    return REFUSED
+
+
+def nodes_write_reports(graph: Graph) -> bool:
+    """Whether some node of the graph scores the run: it takes the finished map and is no source of it."""
+    return any(edge.message is msgs.SplatMap and edge.reader in graph.observers for edge in graph.edges)
 
 
 def _check_nodes(graph: Graph) -> None:
@@ -106,18 +119,7 @@ def _check_device(slot: str, device: Any) -> None:
         raise GraphError(f"{slot}.device={device}: this machine has {there} CUDA devices; use {slot}.device=cpu")
 
 
-def _prepare_output(graph: Graph) -> Path:
-    """Creates the output directory with the configuration as it runs."""
-    output = Path(graph.settings.output)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GraphError(f"output={output}: {error.strerror}") from error
-    (output / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(graph.resolved)))
-    return output
-
-
-def _run_inline(graph: Graph, screen: Screen) -> None:
+def _run_inline(graph: Graph, screen: Screen) -> Outcome:
     statuses = {name: NodeStatus(name, "running") for name in graph.slots}
     screen.start(graph, statuses, {})
 
@@ -125,17 +127,39 @@ def _run_inline(graph: Graph, screen: Screen) -> None:
         status = statuses[slot]
         status.sent[type(message).__name__] = status.sent.get(type(message).__name__, 0) + 1
         status.counts, status.values = node.stats.counts, node.stats.values
-        status.skipped, status.warnings = node.stats.skipped, node.stats.warnings
+        status.skipped, status.warnings = node.stats.skipped, list(node.stats.warnings)
         screen.refresh()
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C shows where it was
     try:
-        run_inline(graph, observe)
+        ran = run_inline(graph, observe)
     finally:
         screen.stop()
+    nothing = {name: str(node.stats.values["nothing"]) for name, node in ran.items() if "nothing" in node.stats.values}
+    return finished((), nothing)
 
 
-def _report_failure(outcome: Outcome) -> None:
-    """The node's name and its traceback, last on the screen."""
-    lines = [f"\n{outcome.failed} failed: {outcome.error}", f"log: {outcome.log}", outcome.traceback]
-    print("\n".join(filter(None, lines)), file=sys.stderr, flush=True)
+def _say(outcome: Outcome, screen: Screen, output: Output) -> None:
+    """What a run reached, what failed, and what can be done about it: last on the screen."""
+    for failure in (*outcome.observers, *([outcome.failed] if outcome.failed else [])):
+        lines = [f"\n{failure.node} failed: {failure.error}", f"log: {failure.log}", failure.traceback]
+        print("\n".join(filter(None, lines)), file=sys.stderr, flush=True)
+    if not outcome.whole:
+        if outcome.failed is None:
+            screen.note(outcome.reason)
+        screen.note(unfinished(output))
+        return
+    screen.note(summary(output.path))
+    for node, reason in outcome.nothing.items():
+        screen.note(f"nothing to show: {node}: {reason}")
+    for failure in outcome.observers:
+        screen.note(f"the map is finished, but {failure.node} failed: {failure.error}")
+
+
+def unfinished(output: Output) -> str:
+    """Where the map so far is, and how to go on."""
+    there = [name for name in ("map.ply", "trajectory.txt") if (output.path / name).exists()]
+    resume = output.resume_command()
+    lines = [f"\nunfinished: the map so far is {output.path / 'map.ply'}" if "map.ply" in there else "\nno map yet"]
+    lines.append(f"go on with it: {resume}" if resume else f"nothing to go on with: no checkpoint in {output.path}")
+    return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The directory of a run's results: one run at a time, nothing of two runs mixed, and a report that is true at any time.
+"""The directory of a run's results: one run at a time, nothing of two runs mixed, a report that is always true.
 
 `report.json` says `"finished": false` from the start, so that it holds whatever befalls the launcher; the evaluator's
 own report takes its place at the end.
@@ -62,7 +62,7 @@ class Output:
     def settle(self, outcome: Outcome, scored: bool) -> None:
         """Writes how the run ended, where no evaluator's report does. `scored`: the graph has who writes one."""
         report = self.report()
-        if report.get("finished"):
+        if report and report.get("finished", True):
             if outcome.nothing and "nothing" not in report:
                 self.write_report(report | {"nothing": dict(outcome.nothing)})
             return

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from launch.graph import Graph
 from launch.parameters import GraphError
-from launch.specs import topic
+from launch.specs import topic_of
 from nodes.spec import gone_file
 
 LONGEST_SOCKET_PATH = 107  # bytes that a Unix socket's address holds
@@ -25,7 +25,7 @@ class RunDirectory:
 
     def __init__(self, graph: Graph) -> None:
         """Raises GraphError where no directory has a name short enough for a socket's address."""
-        self.path = _create(max((len(topic(edge)) for edge in graph.edges), default=0))
+        self.path = _create(max((len(topic_of(edge)) for edge in graph.edges), default=0))
         aside = self.path / f"{LOCK}.new"
         self._lock = os.open(aside, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._lock, fcntl.LOCK_EX)

@@ -21,7 +21,7 @@ def addresses(graph: Graph, directory: Path) -> dict[str, str]:
             load_keys(Path(graph.settings.keys))
         except TransportError as error:
             raise GraphError(f"keys={graph.settings.keys}: {error}") from error
-    topics = list(dict.fromkeys(topic(edge) for edge in graph.edges))
+    topics = list(dict.fromkeys(topic_of(edge) for edge in graph.edges))
     if graph.settings.transport == "ipc":
         return {topic: f"ipc://{directory}/{topic}" for topic in topics}
     found = {}
@@ -56,7 +56,7 @@ def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_
     for edge in graph.out_of(name):
         kind = edge.message.__name__
         output = outputs.setdefault(
-            kind, {"type": kind, "address": address[topic(edge)], "readers": 0, "observers": []}
+            kind, {"type": kind, "address": address[topic_of(edge)], "readers": 0, "observers": []}
         )
         if edge.reader in graph.observers:
             output["observers"].append(edge.reader)
@@ -71,7 +71,7 @@ def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_
             {
                 "type": edge.message.__name__,
                 "slot": edge.sender,
-                "address": address[topic(edge)],
+                "address": address[topic_of(edge)],
                 "best_effort": edge.best_effort,
                 "feedback": edge.feedback,
             }
@@ -92,6 +92,6 @@ def write_spec(content: dict[str, Any], path: Path) -> Path:
     return path
 
 
-def topic(edge: Edge) -> str:
+def topic_of(edge: Edge) -> str:
     """`slot.MessageType`."""
     return f"{edge.sender}.{edge.message.__name__}"

@@ -7,13 +7,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from mvsgs_core.printable import printable
+
+TRACEBACK_LINES = 200
+
 
 @dataclass
 class NodeStatus:
     """The newest figures of one node."""
 
     name: str
-    state: str = "starting"  # as the node says it: starting, waiting, running, ending, done, failed; or external
+    state: str = "starting"  # as the node says it: starting, waiting, running, ending, done, failed, stopped (external)
+    progress: int = 0  # steps of its main thread: messages, slices of background work
+    doing: str = "starting"  # what that thread is at: working, waiting (for messages), held back (by readers)
+    topic: str | None = None  # whose readers hold it back, or did last
     received: Any = field(default_factory=dict)  # messages, by type
     queue: Any = field(default_factory=dict)  # messages that wait, by type
     sent: Any = field(default_factory=dict)
@@ -28,14 +35,34 @@ class NodeStatus:
     peer: bool = False  # it failed because another node is gone
 
     def update(self, line: bytes) -> None:
-        """Folds one JSON line in. Raises ValueError for anything else."""
+        """Folds one JSON line in, all text made fit for a screen. Raises ValueError for anything else."""
         news = json.loads(line)
         if not isinstance(news, dict):
             raise ValueError(f"{self.name}: a status must be a JSON object, not {line!r}")
         for key, value in news.items():
             name = {"in": "received", "out": "sent", "bytes": "memory"}.get(key, key)
             if name in self.__dataclass_fields__ and name != "name" and value is not None:
-                setattr(self, name, value)
+                setattr(self, name, printable_lines(value, TRACEBACK_LINES) if name == "traceback" else _shown(value))
+
+    @property
+    def done_so_far(self) -> object:
+        """Changes whenever the node gets on with its work."""
+        return self.state, self.progress, self.doing, repr(self.counts), repr(self.values)
+
+
+def printable_lines(text: object, most: int) -> str:
+    """The last `most` lines of a text, each made fit for a screen."""
+    return "\n".join(printable(line) for line in str(text).splitlines()[-most:])
+
+
+def _shown(value: Any) -> Any:
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, list):
+        return [_shown(item) for item in value]
+    if isinstance(value, dict):
+        return {printable(key): _shown(item) for key, item in value.items()}
+    return value
 
 
 def total(figure: Any) -> int:

@@ -10,13 +10,13 @@ from typing import Any
 FILES = ("report.html", "report.json", "map.ply", "trajectory.txt", "config.yaml", "logs")
 
 
-def summary(output: Path, newer_than: float = 0.0) -> str:
-    """What the run reached and where its files are. A report from before `newer_than` (Unix time) is not this run's."""
-    report = output / "report.json"
-    lines = [""]
-    if report.exists() and report.stat().st_mtime >= newer_than:
-        lines += _figures(json.loads(report.read_text()))
-    else:
+def summary(output: Path) -> str:
+    """What the run reached and where its files are."""
+    report = json.loads((output / "report.json").read_text())
+    lines = ["", *_figures(report)]
+    if not report.get("finished", True):
+        lines.append(f"no report: {report.get('reason')}")
+    elif len(lines) == 1:
         lines.append("no report: the graph has no evaluator here, or it had nothing to score")
     there = [name for name in FILES if (output / name).exists()]
     return "\n".join([*lines, f"in {output}: {', '.join(there)}"])

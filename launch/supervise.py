@@ -1,7 +1,8 @@
 """Runs a graph as processes: starts them, watches them, stops them, and leaves nothing behind.
 
-First Ctrl-C: only the sources end, so that the map and the report are finished. Second: everything stops. A node that
-fails stops the graph. SIGTERM and a closed terminal stop everything at once.
+First Ctrl-C: only the sources end, so that the map and the report are finished. Second: everything stops. A stage that
+fails stops the graph, in an orderly way: every node may save what it has. Who only observes fails alone. SIGTERM and a
+closed terminal stop everything.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ import selectors
 import shlex
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,26 +25,17 @@ import psutil
 
 from launch.children import Child, python_path
 from launch.graph import Graph
+from launch.outcome import BY_SIGNAL, FAILED, Failure, Outcome, finished
 from launch.placement import thread_environment, thread_plan
+from launch.run_directory import RunDirectory, remove_orphans
 from launch.screen import Screen
-from launch.specs import RunDirectory, addresses, spec, write_spec
+from launch.specs import addresses, spec, write_spec
 from launch.status import NodeStatus
+from launch.watchdog import Watchdog
 
-TERMINATE_SECONDS = 3.0  # from SIGTERM to SIGKILL
+TERMINATE_SECONDS = 4.0  # from the first sign of a failure, or a second Ctrl-C, to SIGKILL
 REFRESH_SECONDS = 0.25
 BLAME_SECONDS = 1.5  # how long to listen, after a node failed for want of a neighbor, for what befell that one
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a run ended."""
-
-    code: int  # for the shell: 0, 1 after a failure, 130 after a second Ctrl-C, 143 after SIGTERM
-    failed: str | None = None  # node
-    error: str = ""
-    traceback: str = ""
-    log: Path | None = None
-    interrupted: bool = False  # the stream was ended early, by Ctrl-C
 
 
 class Supervisor:
@@ -57,15 +49,20 @@ class Supervisor:
         self._signals: list[int] = []
         self._interrupts = 0
         self._selector = selectors.DefaultSelector()
+        self._watchdog = Watchdog(graph.settings.supervise, screen.note, graph.observers)
+        self._failed_observers: dict[str, Failure] = {}
+        self._stop_by: float | None = None  # when what is left is killed
 
     def run(self) -> Outcome:
         """Runs to the end. Whatever happens, no process, socket file or temporary directory is left."""
         try:
             with self._signal_handlers():
-                directory = RunDirectory.create(self._graph)
+                for orphan in remove_orphans():
+                    self._screen.note(f"removed {orphan}: its launcher was killed")
+                directory = RunDirectory(self._graph)
                 try:
                     self._start(directory)
-                    return self._watch()
+                    return self._watch(directory)
                 finally:
                     try:
                         self._stop_all()
@@ -99,23 +96,74 @@ class Supervisor:
             self._selector.register(child.pipe, selectors.EVENT_READ, child)
             processes[name] = psutil.Process(child.process.pid)
 
-    def _watch(self) -> Outcome:
-        """Until every process has ended by itself, one has failed, or a signal says to stop."""
+    def _watch(self, directory: RunDirectory) -> Outcome:
+        """Until every process has ended by itself, a stage has failed, or a signal says to stop."""
         while True:
             self._listen(REFRESH_SECONDS)
-            if any(child.failure() for child in self._children.values()):
+            if any(child.failure() for child in self._stages()):
                 return self._blame()
             while self._signals:
                 number = self._signals.pop(0)
                 if number != signal.SIGINT:
-                    return Outcome(128 + number, interrupted=True)
+                    return self._stopped(number)
                 self._interrupts += 1
                 if self._interrupts > 1:
-                    return Outcome(130, interrupted=True)
+                    return self._stopped(number)
                 self._end_sources()
-            if all(child.process.poll() is not None for child in self._children.values()):
-                return Outcome(0, interrupted=self._interrupts > 0)
+            watched = [child for name, child in self._children.items() if name not in self._failed_observers]
+            if given_up := self._watchdog.look(watched):
+                child, reason = given_up
+                failure = Failure(child.name, reason, self._watchdog.where(child.name), child.log)
+                if child.name not in self._graph.observers:
+                    return self._failure(failure)
+                self._give_up(child, failure, directory)
+            failed = [child for child in self._observers() if child.failure()]
+            for child in failed:
+                # one that has only lost its sender is heard before it is known that this one has failed
+                if not child.status.peer or time.monotonic() - child.heard > BLAME_SECONDS:
+                    self._give_up(child, child.failed(), directory)
+            if not failed and not any(child.running for child in self._children.values()):
+                return self._finished()
             self._screen.refresh()
+
+    def _stages(self) -> list[Child]:
+        """The nodes that make the map."""
+        return [child for name, child in self._children.items() if name not in self._graph.observers]
+
+    def _observers(self) -> list[Child]:
+        """The nodes that only observe, without those that were given up."""
+        there = [child for name, child in self._children.items() if name in self._graph.observers]
+        return [child for child in there if child.name not in self._failed_observers]
+
+    def _give_up(self, child: Child, failure: Failure, directory: RunDirectory) -> None:
+        """The run goes on without this observer."""
+        self._failed_observers[child.name] = failure
+        child.kill_group()
+        with suppress(subprocess.TimeoutExpired):
+            child.process.wait(1.0)
+        directory.tell_gone(child.name)
+        self._screen.note(f"{child.name} failed: {failure.error}; the run goes on without it (log: {child.log})")
+
+    def _finished(self) -> Outcome:
+        for child in self._children.values():
+            with suppress(ValueError, OSError):
+                child.read_status()
+        nothing = {
+            name: str(child.status.values["nothing"])
+            for name, child in sorted(self._children.items(), key=lambda item: list(self._graph.slots).index(item[0]))
+            if child.status.values.get("nothing")
+        }
+        return finished(tuple(self._failed_observers.values()), nothing)
+
+    def _stopped(self, number: int) -> Outcome:
+        self._stop_by = time.monotonic() + TERMINATE_SECONDS
+        how = "stopped by Ctrl-C" if number == signal.SIGINT else f"stopped by {signal.Signals(number).name}"
+        return Outcome(BY_SIGNAL + number, how, observers=tuple(self._failed_observers.values()))
+
+    def _failure(self, failure: Failure) -> Outcome:
+        self._stop_by = self._stop_by or time.monotonic() + TERMINATE_SECONDS
+        reason = f"{failure.node} failed: {failure.error}"
+        return Outcome(FAILED, reason, failure, tuple(self._failed_observers.values()))
 
     def _listen(self, seconds: float) -> None:
         for key, _ in self._selector.select(seconds):
@@ -135,25 +183,25 @@ class Supervisor:
 
     def _blame(self) -> Outcome:
         """The failure that came first. One node's death makes its neighbors fail, and they may be heard before it."""
+        self._stop_by = time.monotonic() + TERMINATE_SECONDS
         until = time.monotonic() + BLAME_SECONDS
         while (left := until - time.monotonic()) > 0:
             self._listen(left)
-            if any(child.failure() and not child.status.peer for child in self._children.values()):
+            if any(child.failure() and not child.status.peer for child in self._stages()):
                 break
-        failed = [child for child in self._children.values() if child.failure()]
+        failed = [child for child in self._stages() if child.failure()]
         child = min(failed, key=lambda child: (child.status.peer, (child.process.poll() or 0) >= 0))
         child.read_status()
-        return Outcome(1, child.name, child.failure() or "", child.last_words(), child.log)
+        return self._failure(child.failed())
 
     def _stop_all(self) -> None:
-        """SIGTERM, SIGKILL for what is left after TERMINATE_SECONDS; then no process of the run is alive."""
-        running = [child for child in self._children.values() if child.process.poll() is None]
+        """SIGTERM, SIGKILL for what is left when the time is over; then no process of the run is alive."""
+        running = [child for child in self._children.values() if child.running]
         for child in running:
             child.send(signal.SIGTERM)
-        until = time.monotonic() + TERMINATE_SECONDS
-        for child in running:
-            with suppress(Exception):
-                child.process.wait(max(0.0, until - time.monotonic()))
+        until = self._stop_by or time.monotonic() + TERMINATE_SECONDS
+        while any(child.running and not child.frozen for child in running) and time.monotonic() < until:
+            self._listen(0.05)
         for child in self._children.values():
             child.kill_group()
             child.process.wait()

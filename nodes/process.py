@@ -19,6 +19,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,7 @@ class _Process:
         self.status.set("waiting")
         for given in self._spec.outputs:
             publisher = self._publishers[given.type]
-            while not publisher.ready(given.readers):
+            while not publisher.ready(given.readers, self._spec.awaited_observers(given)):
                 self._wait(inbox, publisher)
         for publisher in self._publishers.values():
             publisher.start()
@@ -133,8 +134,10 @@ class _Process:
         end_within(ABORT_SECONDS)
 
     def close(self) -> None:
-        for end in (*self._publishers.values(), *self._readers):
-            end.close()
+        for publisher in self._publishers.values():
+            publisher.close(farewell=False)
+        for reader in self._readers:
+            reader.close()
         shut_down()
         self.status.close()
 
@@ -142,15 +145,21 @@ class _Process:
         """Readers first: the nodes upstream wait for them, whoever waits here for others."""
         spec = self._spec
         keys = None if spec.keys is None else load_keys(Path(spec.keys))
+        observer = spec.name if spec.observer else None
         for i in spec.inputs:
             kind = msgs.TYPES[i.type]
             if i.best_effort:
-                self._readers.append(NewestReader(i.address, kind, topic=i.topic, late=False, keys=keys))
+                reader: Reader = NewestReader(i.address, kind, topic=i.topic, late=False, keys=keys, observer=observer)
             else:
-                self._readers.append(ReliableReader(i.address, kind, topic=i.topic, buffer=spec.buffer, keys=keys))
+                reader = ReliableReader(
+                    i.address, kind, topic=i.topic, buffer=spec.buffer, keys=keys, observer=observer
+                )
+            self._readers.append(reader)
         for o in spec.outputs:
             topic = f"{spec.name}.{o.type}"
-            self._publishers[o.type] = Publisher(o.address, topic=topic, buffer=spec.buffer, keys=keys)
+            self._publishers[o.type] = Publisher(
+                o.address, topic=topic, buffer=spec.buffer, keys=keys, held_back=partial(self._held_back, topic)
+            )
         return Inbox(self._readers, list(self._publishers.values()))
 
     def _answers(self, runner: Runner, inbox: Inbox) -> Iterator[Message]:
@@ -198,6 +207,7 @@ class _Process:
         publisher = self._publishers.get(name)
         if publisher is not None:  # else nobody reads it
             publisher.send(message, {t: p.sent for t, p in self._publishers.items() if t != name and p.sent})
+            self._step.next("working")
 
     def _finish(self, runner: Runner, inbox: Inbox) -> None:
         node = runner.node
@@ -220,9 +230,12 @@ class _Process:
 
     def _wait(self, inbox: Inbox, publisher: Publisher) -> None:
         """For readers of that topic, which are not there yet or have not said goodbye."""
-        self._step.doing, self._step.topic = "held back", publisher.topic
-        self._signals.check()
+        self._held_back(publisher.topic)
         inbox.watch(POLL)
+
+    def _held_back(self, topic: str) -> None:
+        self._step.doing, self._step.topic = "held back", topic
+        self._signals.check()
 
     def _seed(self) -> None:
         random.seed(self._spec.seed)

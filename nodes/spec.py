@@ -3,10 +3,11 @@
     {"name": "mvs", "target": "nodes.mvs.Mvs", "config": {...},
      "inputs": [{"type": "Keyframe", "slot": "tracker", "address": "ipc:///tmp/x/tracker.Keyframe",
                  "best_effort": false}],
-     "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1}],
-     "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "keys": null, "status_fd": null}
+     "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1, "observers": []}],
+     "observer": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "keys": null, "status_fd": null}
 
-`readers` counts those of both kinds; `buffer` is in messages; `keys` is a folder, see `nodes.addresses.load_keys`.
+`readers` counts those of both kinds without observers, which are named; `buffer` is in messages; `keys` is a folder,
+see `nodes.addresses.load_keys`. A file NAME.gone beside this one says that the observer NAME is gone.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ class Output:
     type: str
     address: str
     readers: int
+    observers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,14 @@ class Spec:
     config: Mapping[str, Any]
     inputs: tuple[Input, ...]
     outputs: tuple[Output, ...]
+    observer: bool = False  # nobody who makes the map depends on this node
     buffer: int = 4  # messages
     seed: int = 0
     threads: int | None = None
     cpu: tuple[int, ...] | None = None  # cores; None: all
     keys: str | None = None
     status_fd: int | None = None
+    folder: Path | None = None  # of the file it was read from
 
     @staticmethod
     def read(path: Path) -> Spec:
@@ -65,7 +69,15 @@ class Spec:
             if item.type not in msgs.TYPES:
                 raise ValueError(f"{path}: {item.type} is no message; the types are {', '.join(msgs.TYPES)}")
         cpu = None if spec.cpu is None else tuple(spec.cpu)
-        return Spec(**(vars(spec) | {"inputs": inputs, "outputs": outputs, "cpu": cpu}))
+        return Spec(**(vars(spec) | {"inputs": inputs, "outputs": outputs, "cpu": cpu, "folder": path.parent}))
+
+    def awaited_observers(self, output: Output) -> list[str]:
+        """The observers of an output that are not known to be gone."""
+        return [name for name in output.observers if self.folder is None or not gone_file(self.folder, name).exists()]
+
+
+def gone_file(folder: Path, name: str) -> Path:
+    return folder / f"{name}.gone"
 
 
 def _build(kind: Any, content: Any, where: str) -> Any:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from nodes.spec import gone_file
 from nodes.transport import create_keys
 from tests.processes import ENVIRONMENT, graph
 from tests.shared_data import ROOT
@@ -153,6 +154,22 @@ def test_sigterm_lets_a_node_save_what_it_has() -> None:
         assert sum(map(len, saved["received"].values())) > 20
 
 
+@pytest.mark.parametrize("busy", [{"left": {"delay": 100.0}}, {"join": {"delay": 100.0}}])
+def test_sigterm_stops_a_node_that_waits_for_others(busy: dict[str, dict[str, float]]) -> None:
+    """For a message that doesn't come, or for a reader that takes none: at once, not when that one goes on."""
+    with graph() as g:
+        g.diamond(source={"count": 10**6}, **busy)
+        waits = "join" if "left" in busy else "left"
+        g.processes["left"].wait_for(lambda status: sum(status.get("in", {}).values()) >= 1)
+        if waits == "left":
+            g.processes["left"].wait_for(lambda status: status.get("doing") == "held back")
+            assert g.processes["left"].last["topic"] == "left.Keyframe"
+        began = time.monotonic()
+        g.processes[waits].popen.send_signal(signal.SIGTERM)
+        assert g.processes[waits].popen.wait(DOWN) == 128 + signal.SIGTERM
+        assert time.monotonic() - began < 2.0
+
+
 def test_sigterm_stops_a_node_whose_readers_never_come() -> None:
     with graph() as g:
         left = g.start("left", "tests.sample_nodes.Left", {}, {"Keyframe": 1})
@@ -224,6 +241,37 @@ def test_a_frozen_best_effort_reader_never_holds_its_sender_back() -> None:
         assert source.popen.wait(10) == 0  # its goodbye is not waited for without end
 
 
+def test_an_observer_that_is_killed_takes_nobody_along() -> None:
+    """While its sender is held back by it, at that."""
+    with graph() as g:
+        here = "tests.sample_nodes"
+        frames = {"observers": ["watcher"], "address": g.address("source.Frame"), "type": "Frame", "readers": 1}
+        g.start("left", f"{here}.Left", {"Frame": "source"}, {})
+        watcher = g.start("watcher", f"{here}.Right", {"Frame": "source"}, {}, observer=True)
+        source = g.start("source", f"{here}.Source", {}, {}, {"count": 300, "delay": 0.001}, outputs=[frames])
+        watcher.wait_for(lambda status: sum(status.get("in", {}).values()) > 3)
+        watcher.popen.send_signal(signal.SIGSTOP)
+        source.wait_for(lambda status: status.get("doing") == "held back")
+        assert source.last["topic"] == "source.Frame"
+        watcher.popen.kill()
+        assert g.wait(20) == {"left": 0, "watcher": -signal.SIGKILL, "source": 0}
+        assert g.processes["left"].last["in"] == {"source.Frame": 300}
+
+
+def test_an_observer_that_never_comes_is_waited_for_until_it_is_known_to_be_gone() -> None:
+    with graph() as g:
+        here = "tests.sample_nodes"
+        frames = {"observers": ["watcher"], "address": g.address("source.Frame"), "type": "Frame", "readers": 1}
+        left = g.start("left", f"{here}.Left", {"Frame": "source"}, {})
+        source = g.start("source", f"{here}.Source", {}, {}, {"count": 3}, outputs=[frames])
+        left.wait_for(lambda status: status.get("state") == "running")
+        time.sleep(0.5)
+        assert source.last["state"] == "waiting"
+        gone_file(g.directory, "watcher").touch()
+        assert set(g.wait(10).values()) == {0}
+        assert left.last["in"] == {"source.Frame": 3}
+
+
 def test_a_node_that_yields_what_it_does_not_declare_fails() -> None:
     with graph() as g:
         g.start("left", "tests.sample_nodes.Wrong", {"Frame": "source"}, {})
@@ -288,6 +336,7 @@ def test_no_node_outlives_a_killed_launcher() -> None:
 
 _LAUNCHER = """
 import sys, time
+from nodes.spec import gone_file
 from nodes.transport import create_keys
 from tests.processes import Graph
 g = Graph()

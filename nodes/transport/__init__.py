@@ -9,7 +9,8 @@ A topic has one publisher, one message type and one address. What ZeroMQ does no
 - XPUB_VERBOSER reports each reader's arrival and departure: a publisher waits for its readers at the start and for
   their goodbyes after `End`, because closing earlier throws away what a stalled reader has not read yet
   (libzmq issue 4660), whatever the linger.
-- A reader whose publisher disappears without `End`, and a publisher whose reader leaves before it, raise PeerLost.
+- A reader whose publisher disappears without `End`, and a publisher whose reader leaves before it, raise PeerLost. A
+  reader that only observes says so in a second subscription (`OBSERVER`), which no frame matches: it may leave.
 """
 
 from nodes.transport.publisher import Publisher

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +14,19 @@ from msgs import End, Message
 from msgs.codec import NEWEST, RELIABLE, encode
 from nodes.addresses import Keys, PeerLost, TransportError, check_address
 from nodes.frame_pool import FramePool
-from nodes.transport.sockets import guard, open_socket, readable
+from nodes.transport.sockets import OBSERVER, guard, open_socket, readable
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
 NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
+HELD_BACK_MS = 100  # between two calls of `held_back`
 
 
 class Publisher:
-    """Sends one topic. Until `start`, messages go to whoever listens; after it, a lost reliable reader is an error.
+    """Sends one topic. Until `start`, messages go to whoever listens; after it, a lost reliable reader is an error,
+    unless it has said that it only observes.
 
-    `send` holds the caller back while a reliable reader is `buffer` messages behind. Not for use by two threads.
+    `send` holds the caller back while a reliable reader is `buffer` messages behind; meanwhile it calls `held_back`,
+    which may raise. Not for use by two threads.
     """
 
     def __init__(
@@ -34,11 +37,15 @@ class Publisher:
         buffer: int = 8,
         keys: Keys | None = None,
         max_bytes: int | None = None,
+        held_back: Callable[[], None] = lambda: None,
     ) -> None:
         check_address(address, bind=True, keys=keys)
         self.topic = topic or address
         self.sent = 0
         self.readers: Counter[bytes] = Counter()  # by delivery
+        self.observers: dict[str, bytes] = {}  # delivery of those readers that only observe, by name
+        self._essential = 0  # reliable readers that were there at the start
+        self._held_back = held_back
         self._max_bytes = max_bytes
         self._started = self._ended = False
         self._pool = FramePool()
@@ -48,6 +55,7 @@ class Publisher:
             guard.enter(keys)
         self.socket = open_socket(zmq.XPUB, address, keys, MAX_SUBSCRIPTION_BYTES)
         self.socket.sndhwm = max(1, buffer)
+        self.socket.sndtimeo = HELD_BACK_MS
         self.socket.setsockopt(zmq.XPUB_NODROP, 1)
         self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
         try:
@@ -56,27 +64,36 @@ class Publisher:
             self.close()
             raise TransportError(f"{self.topic}: cannot bind {address}: {error}") from error
 
-    def ready(self, readers: int) -> bool:
-        """Whether that many readers, of either kind, are there."""
+    def ready(self, readers: int, observers: Collection[str] = ()) -> bool:
+        """Whether that many readers, of either kind, are there, and these observers beside them."""
         self.watch()
-        return self.readers.total() >= readers
+        return self.readers.total() - len(self.observers) >= readers and set(observers) <= self.observers.keys()
 
     def start(self) -> None:
         self._started = True
+        self._essential = self._reliable_readers()
 
     def watch(self) -> None:
         """Takes note of arrivals and departures. Raises PeerLost."""
         while readable(self.socket):
             event = self.socket.recv()
-            delivery = event[1:]
-            if delivery not in (RELIABLE, NEWEST):
-                continue  # no reader of ours
-            if event[:1] == b"\x01":
-                self.readers[delivery] += 1
-            elif self.readers[delivery] > 0:
-                self.readers[delivery] -= 1
-                if delivery == RELIABLE and self._started and not self._ended:
-                    raise PeerLost(f"a reader of {self.topic} left before the end")
+            self._note(arrived=event[:1] == b"\x01", what=event[1:])
+        if self._started and not self._ended and self._reliable_readers() < self._essential:
+            raise PeerLost(f"a reader of {self.topic} left before the end")
+
+    def _note(self, arrived: bool, what: bytes) -> None:
+        if what[:1] == OBSERVER:
+            name = what[2:].decode(errors="replace")
+            if arrived:
+                self.observers[name] = what[1:2]
+            else:
+                self.observers.pop(name, None)
+        elif what in (RELIABLE, NEWEST):  # else it is no reader of ours
+            self.readers[what] = max(0, self.readers[what] + (1 if arrived else -1))
+
+    def _reliable_readers(self) -> int:
+        """Without observers."""
+        return self.readers[RELIABLE] - list(self.observers.values()).count(RELIABLE)
 
     def send(self, message: Message, before: Mapping[str, int] | None = None) -> None:
         """Raises CodecError for a message that differs from its annotations, PeerLost when a reader is gone.
@@ -103,11 +120,12 @@ class Publisher:
             self._send(self._end, self.sent - 1, NEWEST)
         return self.readers[RELIABLE] <= 0 and (late or self.readers[NEWEST] <= 0)
 
-    def close(self) -> None:
-        """Unbinds. A publisher outside a graph first sends End to those who listen and waits a second for them."""
+    def close(self, *, farewell: bool = True) -> None:
+        """Unbinds. A publisher outside a graph first sends End to those who listen and waits a second for them; without
+        `farewell` they notice that it is lost."""
         if self.socket.closed:
             return
-        if not self._started and not self._ended:
+        if farewell and not self._started and not self._ended:
             self.end(End())
             until = time.monotonic() + 1.0
             while not self.gone() and time.monotonic() < until:
@@ -129,5 +147,11 @@ class Publisher:
             message, sequence, before=before, delivery=delivery, max_bytes=self._max_bytes, allocate=allocate
         )
         self.socket.setsockopt(zmq.XPUB_NODROP, int(delivery == RELIABLE))
-        tracker = self.socket.send(frame, copy=False, track=True)
+        whole = zmq.Frame(frame, track=True, copy=None, copy_threshold=self.socket.copy_threshold)
+        while True:
+            try:
+                tracker = self.socket.send(whole, copy=False, track=True)
+                break
+            except zmq.Again:
+                self._held_back()
         self._pool.give(buffers[0], tracker)

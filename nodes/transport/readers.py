@@ -12,7 +12,7 @@ from zmq.utils.monitor import recv_monitor_message
 from msgs import End, Message
 from msgs.codec import NEWEST, RELIABLE, CodecError, Decoded, decode, max_message_bytes, type_name
 from nodes.addresses import Keys, PeerLost, TransportError, check_address
-from nodes.transport.sockets import open_socket, readable
+from nodes.transport.sockets import OBSERVER, open_socket, readable
 
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 LOST = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
@@ -33,6 +33,7 @@ class _Reader:
         buffer: int = 8,
         keys: Keys | None = None,
         max_bytes: int | None = None,
+        observer: str | None = None,  # the name of one that only observes: its loss does not concern the publisher
     ) -> None:
         check_address(address)
         self.topic = topic or address
@@ -49,6 +50,8 @@ class _Reader:
         self._socket.reconnect_ivl = 50
         self.monitor = self._socket.get_monitor_socket(LOST)
         self._socket.connect(address)
+        if observer is not None:  # first: it must not pass for another reader
+            self._socket.subscribe(OBSERVER + self.delivery + observer.encode())
         self._socket.subscribe(self.delivery)
 
     def watch(self) -> None:
@@ -153,8 +156,9 @@ class NewestReader(_Reader):
         late: bool = True,  # what was sent before the first message that it gets is not "skipped"
         keys: Keys | None = None,
         max_bytes: int | None = None,
+        observer: str | None = None,
     ) -> None:
-        super().__init__(address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes)
+        super().__init__(address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes, observer=observer)
         self._frames = deque(maxlen=1)  # a newer one takes the older one's place
         self._late = late
         self._end: zmq.Frame | None = None

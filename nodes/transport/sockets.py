@@ -11,6 +11,8 @@ from zmq.auth.thread import ThreadAuthenticator
 
 from nodes.addresses import Keys, save_keys
 
+OBSERVER = b"O"  # begins the subscription by which a reader says its delivery and its name: no frame begins so
+
 
 def create_keys(folder: str | Path) -> Keys:
     """A new key pair in `folder`; copy it (scp -p) to each machine of the graph."""

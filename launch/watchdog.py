@@ -1,0 +1,133 @@
+"""Looks after nodes that are no longer heard of, or no longer get on.
+
+Each node's status comes from a thread of its own, so only a process that hangs as a whole, or is stopped, is silent.
+One that is heard of but stays at the same piece of work is slow: it is named and left alone, for nobody can tell a long
+adjustment from an endless one. Only where it just observes, and holds back a stage that makes the map, is it given up.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+
+from launch.children import Child
+from launch.graph import Supervise
+from launch.status import printable_lines
+
+DUMP_SECONDS = 0.5  # that a process has to write where its threads stand
+ABSENCE_SECONDS = 2.0  # between two looks: the launcher itself was stopped, or the machine slept
+DUMP_LINES = 40
+
+
+@dataclass
+class _Watched:
+    child: Child
+    slow: bool = False  # has been named
+    asked: float | None = None  # when it was asked where its threads stand
+    dump_from: int = 0  # bytes of its log before the answer
+    named: bool = False
+    dump: str = ""
+
+
+@dataclass
+class Watchdog:
+    """`look` at the nodes a few times a second; `note` takes what a user should read."""
+
+    limits: Supervise
+    note: Callable[[str], None]
+    observers: Collection[str] = ()
+    clock: Callable[[], float] = time.monotonic
+    _watched: dict[str, _Watched] = field(default_factory=dict)
+    _looked: float | None = None
+
+    def look(self, children: Iterable[Child]) -> tuple[Child, str] | None:
+        """A node to be given up, with the reason; None while all are well, or only slow."""
+        now = self.clock()
+        running = [child for child in children if child.running]
+        self._forgive_own_absence(now, running)
+        for child in running:
+            watched = self._watched.setdefault(child.name, _Watched(child))
+            reason = self._silent(watched, now) or self._held_up(child, running, now)
+            if reason:
+                return child, reason
+            self._slow(watched, now)
+        return None
+
+    def where(self, node: str) -> str:
+        """Where that node's threads stood when it was named; empty where that is not known."""
+        return self._watched[node].dump if node in self._watched else ""
+
+    def _forgive_own_absence(self, now: float, running: list[Child]) -> None:
+        away = 0.0 if self._looked is None else now - self._looked
+        self._looked = now
+        if away > ABSENCE_SECONDS:
+            for child in running:
+                child.heard += away
+                child.moved += away
+
+    def _silent(self, watched: _Watched, now: float) -> str | None:
+        """Names a node that has not been heard of; a reason once that has lasted too long."""
+        child, silence = watched.child, now - watched.child.heard
+        if silence < self.limits.silent:
+            if watched.named:
+                self.note(f"{child.name} is heard of again")
+            watched.named, watched.asked = False, None
+            return None
+        if watched.asked is None:
+            watched.asked, watched.dump_from = now, child.log.stat().st_size
+            child.send(signal.SIGUSR1)
+        if not watched.named and now - watched.asked >= DUMP_SECONDS:
+            watched.named = True
+            watched.dump = "" if child.frozen else _dump(child, watched.dump_from)
+            self.note(f"{child.name} has been silent for {silence:.0f} s: {self._state(watched)}")
+        if silence >= max(self.limits.dead, self.limits.silent + DUMP_SECONDS):
+            how = "it was stopped by a signal" if child.frozen else "it hangs"
+            return f"silent for {silence:.0f} s: {how}"
+        return None
+
+    def _state(self, watched: _Watched) -> str:
+        limit = f"; after {self.limits.dead:g} s " + (
+            "the run goes on without it" if watched.child.name in self.observers else "the run ends"
+        )
+        if watched.child.frozen:
+            return f"its process was stopped (kill -CONT {watched.child.process.pid} lets it go on){limit}"
+        if not watched.dump:
+            return f"its process hangs{limit}"
+        return f"its process hangs{limit}. Where its threads stand:\n{watched.dump}"
+
+    def _held_up(self, child: Child, running: list[Child], now: float) -> str | None:
+        """A reason to give up an observer that does not get on and holds back who makes the map."""
+        if child.name not in self.observers or child.status.doing != "working":
+            return None
+        if now - child.moved < self.limits.dead:
+            return None
+        for sender in running:
+            if sender.name in self.observers or sender.status.doing != "held back" or sender.status.topic is None:
+                continue
+            if sender.status.topic in child.status.received and now - sender.moved >= self.limits.dead:
+                return f"it has held {sender.name} back for {now - sender.moved:.0f} s"
+        return None
+
+    def _slow(self, watched: _Watched, now: float) -> None:
+        child = watched.child
+        still = now - child.moved
+        if still < self.limits.dead or child.status.doing != "working" or child.name in self.observers:
+            watched.slow = False
+        elif not watched.slow and not watched.named:
+            watched.slow = True
+            child.send(signal.SIGUSR1)
+            what = "been at the same piece of work" if child.status.received else "sent nothing"
+            self.note(
+                f"{child.name} has {what} for {still:.0f} s; it is alive, so it is left alone (where it stands: "
+                f"{child.log})"
+            )
+
+
+def _dump(child: Child, start: int) -> str:
+    """What the node wrote to its log since it was asked."""
+    with child.log.open("rb") as log:
+        log.seek(start)
+        text = log.read(1 << 16).decode(errors="replace")
+    return printable_lines(text, DUMP_LINES)
