@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.splats.keyframes import TrainingView
 from mvsgs_core.splats.snapshot import Snapshot
 
@@ -58,12 +58,7 @@ def write_cameras(path: Path, cameras: Cameras) -> None:
         for k in range(len(cameras))
     ]
     text = json.dumps({"format": FORMAT, "version": VERSION, "keyframes": keyframes}, allow_nan=False)
-    aside = path.with_name(path.name + ".part")
-    with aside.open("w", encoding="ascii") as file:
-        file.write(text.replace('{"index"', '\n{"index"') + "\n")  # a keyframe a line
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    replace_text(path, text.replace('{"index"', '\n{"index"') + "\n")  # a keyframe a line
 
 
 def read_cameras(path: Path) -> Cameras:

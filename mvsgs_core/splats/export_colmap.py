@@ -2,51 +2,143 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image, UnidentifiedImageError
 
-from mvsgs_core import geometry
+from mvsgs_core import camera, geometry
+from mvsgs_core.splats.cameras import Cameras
+from mvsgs_core.splats.keyframe_images import image_name
+from mvsgs_core.splats.rasterizer import rasterize
 from mvsgs_core.splats.snapshot import Snapshot
 from mvsgs_core.splats.spherical_harmonics import C0
+
+BEHIND = 0.03  # of the rendered depth: a point farther behind the surface is hidden by it
+
+
+@dataclass(frozen=True)
+class Written:
+    images: int
+    points: int
+    observations: int  # 0 where none were asked for
 
 
 def write_colmap(
     folder: Path,
     final: Snapshot,
-    names: list[str],
-    world_from_cam: np.ndarray,
-    intrinsics: np.ndarray,
-    size: tuple[int, int],
+    cameras: Cameras,
+    images: Path | None = None,
+    observations: bool = False,
     min_opacity: float = 0.1,
-) -> int:
-    """cameras.txt, images.txt and points3D.txt for images `names` (K) at poses (K, 4, 4); returns the number of points.
+) -> Written:
+    """`folder`/sparse/0 with cameras.txt, images.txt and points3D.txt, and `folder`/images with what they refer to.
 
-    intrinsics: (4,) at `size` (height, width); COLMAP's pixel centers are at 0.5, ours at 0. Points have no tracks.
-    Raises ValueError where names and poses differ in number.
+    images: a folder with the keyframes' images, as mapper.save_images=true writes them, to be copied; None: the model
+    only has their names, which are the same. observations: each point's track names the images in which it is seen, at
+    the pixels it projects to: they are of this map, not measured. Hidden is what lies `BEHIND` the rendered depth.
+    Splats of less than `min_opacity` make no point. COLMAP's pixel (0, 0) is the corner of the first pixel, ours its
+    center. Raises ValueError where an image is missing or of another size than its camera.
     """
-    if len(names) != len(world_from_cam):
-        raise ValueError(f"{len(names)} image names for {len(world_from_cam)} poses")
-    folder.mkdir(parents=True, exist_ok=True)
-    fx, fy, cx, cy = (float(value) for value in intrinsics)
-    (folder / "cameras.txt").write_text(
-        "# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-        f"1 PINHOLE {size[1]} {size[0]} {fx!r} {fy!r} {cx + 0.5!r} {cy + 0.5!r}\n"
-    )
-    lines = ["# Image list: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D[] (none)"]
-    for k, (name, pose) in enumerate(zip(names, world_from_cam, strict=True)):
-        cam_from_world = geometry.inverse(pose)
-        numbers = [*geometry.quaternion_from_rotation(cam_from_world[:3, :3]), *cam_from_world[:3, 3]]
-        lines += [f"{k + 1} {' '.join(repr(float(value)) for value in numbers)} 1 {name}", ""]
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    if images is not None:
+        _copy(images, folder / "images", cameras)
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True, exist_ok=True)
+    lenses, lens_of = np.unique(np.hstack([cameras.sizes, cameras.intrinsics]), axis=0, return_inverse=True)
+    text = ["# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    for k, (height, width, fx, fy, cx, cy) in enumerate(lenses.tolist()):
+        text.append(f"{k + 1} PINHOLE {width:.0f} {height:.0f} {fx!r} {fy!r} {cx + 0.5!r} {cy + 0.5!r}")
+    _write(model / "cameras.txt", text)
     solid = torch.sigmoid(final.splats.opacity_logits).numpy() >= min_opacity
-    means = final.splats.means.numpy()[solid].astype(np.float64) + final.origin
+    means = final.splats.means.numpy()[solid].astype(np.float64)
+    tracks = _Tracks(len(means))
+    text = ["# Image list: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D[] (X, Y, POINT3D_ID)"]
+    for k in range(len(cameras)):
+        cam_from_world = geometry.inverse(cameras.world_from_cam[k])
+        numbers = [*geometry.quaternion_from_rotation(cam_from_world[:3, :3]), *cam_from_world[:3, 3]]
+        name = image_name(int(cameras.keyframes[k]))
+        text.append(f"{k + 1} {' '.join(repr(float(value)) for value in numbers)} {lens_of.flat[k] + 1} {name}")
+        seen, pixels = _seen(final, means, cameras, k) if observations else _NOTHING
+        tracks.add(k + 1, seen)
+        points2d = zip((pixels + 0.5).tolist(), (seen + 1).tolist(), strict=True)
+        text.append(" ".join(f"{x!r} {y!r} {point}" for (x, y), point in points2d))
+    _write(model / "images.txt", text)
     colors = np.clip((0.5 + C0 * final.splats.sh[:, 0].numpy()[solid]) * 255.0, 0, 255).round().astype(int)
-    points = ["# 3D point list: POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] (none)"]
-    points += [
-        f"{k + 1} {x!r} {y!r} {z!r} {r} {g} {b} 0"
-        for k, ((x, y, z), (r, g, b)) in enumerate(zip(means.tolist(), colors.tolist(), strict=True))
-    ]
-    (folder / "points3D.txt").write_text("\n".join(points) + "\n")
-    return len(means)
+    world = (means + final.origin).tolist()
+    text = ["# 3D point list: POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] (IMAGE_ID, POINT2D_IDX)"]
+    for k, ((x, y, z), (r, g, b), track) in enumerate(zip(world, colors.tolist(), tracks, strict=True)):
+        text.append(" ".join([f"{k + 1} {x!r} {y!r} {z!r} {r} {g} {b} 0", *track]))
+    _write(model / "points3D.txt", text)
+    return Written(len(cameras), len(means), tracks.count)
+
+
+_NOTHING = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+
+
+class _Tracks:
+    """By point, where it is seen: `IMAGE_ID POINT2D_IDX` of each image."""
+
+    def __init__(self, points: int) -> None:
+        self._points = points
+        self._entries: list[np.ndarray] = []  # (M, 3) point, image, row among the image's points
+
+    def add(self, image: int, seen: np.ndarray) -> None:
+        """Points (M,) in the order in which the image lists them."""
+        self._entries.append(np.stack([seen, np.full(len(seen), image), np.arange(len(seen))], axis=1))
+
+    @property
+    def count(self) -> int:
+        return sum(len(entries) for entries in self._entries)
+
+    def __iter__(self) -> Iterator[list[str]]:
+        entries = np.concatenate(self._entries) if self._entries else np.zeros((0, 3), dtype=np.int64)
+        entries = entries[np.argsort(entries[:, 0], kind="stable")]
+        ends = np.searchsorted(entries[:, 0], np.arange(self._points), side="right").tolist()
+        begin = 0
+        for end in ends:
+            yield [f"{image} {row}" for _, image, row in entries[begin:end].tolist()]
+            begin = end
+
+
+def _seen(final: Snapshot, means: np.ndarray, cameras: Cameras, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (M,) of `means` (N, 3), relative to the origin, that camera k sees, and where (M, 2), in our pixels."""
+    local = cameras.world_from_cam[k].copy()
+    local[:3, 3] -= final.origin
+    height, width = cameras.sizes[k].tolist()
+    with torch.no_grad():
+        render = rasterize(final.splats, local, cameras.intrinsics[k], (height, width), density=final.density)
+    surface = torch.where(render.opacity >= 0.5, render.depth, torch.inf).numpy()
+    in_camera = means @ geometry.inverse(local)[:3, :3].T + geometry.inverse(local)[:3, 3]
+    ahead = np.flatnonzero(in_camera[:, 2] > 0)
+    pixels = camera.project(in_camera[ahead], cameras.intrinsics[k])
+    inside = ((pixels > -0.5) & (pixels < [width - 0.5, height - 0.5])).all(axis=1)
+    ahead, pixels = ahead[inside], pixels[inside]
+    column, row = np.round(pixels).astype(int).T
+    shown = in_camera[ahead, 2] <= (1.0 + BEHIND) * surface[row, column]
+    return ahead[shown], pixels[shown]
+
+
+def _copy(images: Path, target: Path, cameras: Cameras) -> None:
+    found = {}
+    for index, (height, width) in zip(cameras.keyframes.tolist(), cameras.sizes.tolist()):
+        found[index] = images / image_name(index)
+        try:
+            with Image.open(found[index]) as image:
+                size = image.size
+        except FileNotFoundError:
+            raise ValueError(f"{found[index]} is missing: run with mapper.save_images=true") from None
+        except (UnidentifiedImageError, Image.DecompressionBombError) as error:
+            raise ValueError(f"{found[index]} is no image that can be read: {error}") from None
+        if size != (width, height):
+            raise ValueError(f"{found[index]} has {size[0]}x{size[1]} pixels, its camera {width}x{height}")
+    target.mkdir(parents=True, exist_ok=True)
+    for path in found.values():
+        shutil.copyfile(path, target / path.name)
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")

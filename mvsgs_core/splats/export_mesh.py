@@ -9,36 +9,33 @@ import torch
 
 from mvsgs_core import camera
 from mvsgs_core.open3d_loader import open3d
+from mvsgs_core.splats.cameras import Cameras
+from mvsgs_core.splats.export_glb import write_glb
 from mvsgs_core.splats.rasterizer import rasterize
 from mvsgs_core.splats.snapshot import Snapshot
 
 
 def write_mesh(
-    path: Path,
-    final: Snapshot,
-    world_from_cam: np.ndarray,
-    intrinsics: np.ndarray,
-    size: tuple[int, int],
-    voxel: float = 0.01,
-    min_opacity: float = 0.5,
+    path: Path, final: Snapshot, cameras: Cameras, voxel: float = 0.01, min_opacity: float = 0.5
 ) -> tuple[int, int]:
-    """Renders depth from poses (K, 4, 4) with intrinsics (4,) at `size`, fuses it and writes a .ply, .obj or .glb mesh.
+    """Renders depth from the cameras, fuses it and writes a mesh with colors: .glb, or what open3d writes (.ply, .obj).
 
-    voxel: edge in median depths. Pixels of an opacity below `min_opacity` say nothing. Positions are world coordinates.
-    Returns the numbers of vertices and triangles. Raises ValueError where no pose sees the map.
+    voxel: edge in median depths. Pixels of an opacity below `min_opacity` say nothing. Positions are world coordinates,
+    in the axes of map.ply except for .glb, whose axes are defined. Returns the numbers of vertices and triangles.
+    Raises ValueError where no camera sees the map or the depth makes no surface.
     """
     o3d = open3d()
     views = []
-    for pose in world_from_cam:
+    for pose, intrinsics, size in zip(cameras.world_from_cam, cameras.intrinsics, cameras.sizes.tolist()):
         local = pose.copy()
         local[:3, 3] -= final.origin
         with torch.no_grad():
-            render = rasterize(final.splats, local, intrinsics, size, density=final.density)
+            render = rasterize(final.splats, local, intrinsics, (size[0], size[1]), density=final.density)
         depth = torch.where(render.opacity >= min_opacity, render.depth, 0.0)
-        views.append((local, depth.numpy(), render.color.clamp(0.0, 1.0).numpy()))
-    seen = [depth[depth > 0] for _, depth, _ in views if (depth > 0).any()]
+        views.append((local, intrinsics, depth.numpy(), render.color.clamp(0.0, 1.0).numpy()))
+    seen = [depth[depth > 0] for _, _, depth, _ in views if (depth > 0).any()]
     if not seen:
-        raise ValueError("no pose sees the map: nothing to fuse; check that the poses are those of this map")
+        raise ValueError("no camera sees the map: nothing to fuse; check that the poses are those of this map")
     median, farthest = float(np.median(np.concatenate(seen))), float(np.max([values.max() for values in seen]))
     edge = voxel * median
     grid = o3d.t.geometry.VoxelBlockGrid(
@@ -49,16 +46,22 @@ def write_mesh(
         block_resolution=16,
         block_count=10000,
     )
-    matrix = o3d.core.Tensor(camera.matrix(intrinsics))
     truncation = 6.0  # voxels, of the distance field
-    for local, seen_depth, color in views:
+    for local, intrinsics, seen_depth, color in views:
+        matrix = o3d.core.Tensor(camera.matrix(intrinsics))
         extrinsic = o3d.core.Tensor(np.linalg.inv(local))
         depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(seen_depth)))
         color_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(color)))
         blocks = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1.0, farthest, truncation)
         grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, 1.0, farthest, truncation)
     mesh = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
-    mesh.translate(final.origin)
-    if not o3d.io.write_triangle_mesh(str(path), mesh):
-        raise OSError(f"open3d could not write {path}")
+    if not len(mesh.triangles):
+        raise ValueError("the depth makes no surface: try a larger --voxel")
+    if path.suffix == ".glb":
+        vertices, triangles, colors = map(np.asarray, (mesh.vertices, mesh.triangles, mesh.vertex_colors))
+        write_glb(path, vertices, triangles, colors, final.origin)
+    else:
+        mesh.translate(final.origin)
+        if not o3d.io.write_triangle_mesh(str(path), mesh):
+            raise OSError(f"open3d could not write {path}")
     return len(mesh.vertices), len(mesh.triangles)

@@ -11,14 +11,17 @@ from mvsgs_core.open3d_loader import open3d
 from mvsgs_core.splats.export_ply import folded, relative_origin
 from mvsgs_core.splats.snapshot import Snapshot
 from mvsgs_core.splats.spherical_harmonics import C0
+from mvsgs_core.splats.turning import RUB_FROM_RDF, turned
 
 SPZ_STEP = 1.0 / 4096.0  # .spz keeps positions as multiples of this
+SPZ_REACH = 2048.0  # in 24 bits
 
 
 def write_splat(path: Path, final: Snapshot) -> None:
     """position 3 float32, standard deviation 3 float32, color and opacity 4 uint8, rotation 4 uint8; no directions.
 
-    The largest and most opaque splats come first: viewers show a file while it loads.
+    Axes as in map.ply: the format names none, and those who convert between the two change none. The largest and most
+    opaque splats come first: viewers show a file while it loads.
     """
     splats = folded(final.splats, final.density)
     means = splats.means.numpy() + (final.origin - relative_origin(final)).astype(np.float64)
@@ -37,14 +40,25 @@ def write_splat(path: Path, final: Snapshot) -> None:
 
 
 def write_spz(path: Path, final: Snapshot) -> None:
-    """Through open3d. Raises ValueError where the format's fixed steps of 1/4096 unit would blur the map."""
-    splats = folded(final.splats, final.density)
-    means = splats.means.numpy() + (final.origin - relative_origin(final)).astype(np.float64)
+    """Through open3d. The format's axes are x right, y up, z back ("RUB"): everything is turned by 180 degrees about x,
+    view-dependent colors too.
+
+    Raises ValueError where the format's fixed steps of 1/4096 unit would blur the map or its 24 bits do not reach as
+    far, OSError where the file cannot be written.
+    """
+    splats = turned(folded(final.splats, final.density), RUB_FROM_RDF)
+    means = splats.means.numpy() + RUB_FROM_RDF @ (final.origin - relative_origin(final))
     typical = float(splats.log_scales.max(dim=1).values.median().exp()) if len(splats) else 1.0
     if typical < 2.0 * SPZ_STEP:
         raise ValueError(
             f".spz rounds positions to 1/4096 unit, and half of the splats are smaller than {typical:.2g}: "
             "write .ply or .splat, or enlarge the map (--scale)"
+        )
+    far = int((np.abs(means) >= SPZ_REACH).any(axis=1).sum())
+    if far:
+        raise ValueError(
+            f".spz holds positions within {SPZ_REACH:g} units, and {far} splats are farther away: "
+            "write .ply or .splat, or make the map smaller (--scale)"
         )
     o3d = open3d()
 

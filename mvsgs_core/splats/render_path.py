@@ -1,4 +1,7 @@
-"""A saved map along a path as a video: `python -m mvsgs_core.splats.render_path MAP.ply TRAJECTORY.txt OUT.mp4`."""
+"""A saved map along a path as a video: `python -m mvsgs_core.splats.render_path MAP.ply TRAJECTORY.txt OUT.mp4`.
+
+The camera is that of the newest keyframe in the cameras.json beside the map.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
 from mvsgs_core import geometry
 from mvsgs_core.evaluation.trajectory import read_tum
-from mvsgs_core.splats.export import camera_arguments, intrinsics_of
-from mvsgs_core.splats.export_ply import read_ply
+from mvsgs_core.splats.export_input import input_arguments, lens, read_map
 from mvsgs_core.splats.rasterizer import rasterize
 from mvsgs_core.splats.snapshot import Snapshot
+from mvsgs_core.video_file import write_video
 
 
 def resampled(world_from_cam: np.ndarray, frames: int) -> np.ndarray:
@@ -42,38 +44,27 @@ def frames_along(
         yield (color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 
 
-def write_video(path: Path, frames: Iterator[np.ndarray], size: tuple[int, int], fps: float) -> int:
-    """Writes frames (H, W, 3) uint8 RGB; returns their number. Raises OSError if the file cannot be written."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (size[1], size[0]))
-    if not writer.isOpened():
-        raise OSError(f"cannot write a video to {path}: use a name that ends in .mp4, in a folder that exists")
-    count = 0
-    for frame in frames:
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-        count += 1
-    writer.release()
-    return count
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m mvsgs_core.splats.render_path", description=__doc__)
-    parser.add_argument("map", type=Path, help="map.ply")
+    input_arguments(parser)
     parser.add_argument("trajectory", type=Path, help="poses, TUM format: time tx ty tz qx qy qz qw")
     parser.add_argument("out", type=Path, help="video.mp4")
     parser.add_argument("--frames", type=int, help="of the video, spread over the path; default: one a pose")
     parser.add_argument("--fps", type=float, default=30.0)
-    camera_arguments(parser)
     options = parser.parse_args(arguments)
     try:
-        final = read_ply(options.map)
+        final, left_out = read_map(options)
         _, poses = read_tum(options.trajectory)
+        if not len(poses):
+            raise ValueError(f"{options.trajectory} has no poses")
         path = resampled(poses, options.frames or len(poses))
-        size = (options.size[0], options.size[1])
-        count = write_video(options.out, frames_along(final, path, intrinsics_of(options), size), size, options.fps)
+        intrinsics, size = lens(options)
+        count = write_video(options.out, frames_along(final, path, intrinsics, size), size, options.fps)
     except (ValueError, OSError, ImportError) as error:
         print(f"render_path: {error}", file=sys.stderr)
         return 1
-    print(f"{options.out}: {count} frames")
+    dropped = f"; {left_out} splats that are not finite were left out" if left_out else ""
+    print(f"{options.out}: {count} frames{dropped}")
     return 0
 
 

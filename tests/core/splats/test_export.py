@@ -2,52 +2,22 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
 
-from mvsgs_core.datasets.colmap import read_colmap
-from mvsgs_core.evaluation.trajectory import write_tum
-from mvsgs_core.open3d_loader import open3d
-from mvsgs_core.splats import export, render_path
+from mvsgs_core.splats import export
 from mvsgs_core.splats.densities import log_scale_shift
+from mvsgs_core.splats.export_input import input_arguments, lens
 from mvsgs_core.splats.export_ply import folded, read_ply, write_ply
-from mvsgs_core.splats.export_splat import write_splat, write_spz
-from mvsgs_core.splats.insertion import InsertionConfig, points_from_depth, splats_from_points
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.snapshot import Snapshot
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
-
-ORIGIN = np.array([10.0, -3.0, 0.5])
-
-
-def final_map(bases: int = 4, density: str = "gaussian", origin: np.ndarray = ORIGIN) -> Snapshot:
-    view = posed_view(0, np.eye(4), (24, 32))
-    points = points_from_depth(
-        view.depth, view.intrinsics, view.image / 255.0, view.normals, np.ones((24, 32), dtype=bool)
-    )
-    splats = splats_from_points(points, np.eye(4), bases, density, InsertionConfig(initial_opacity=0.9))
-    generator = torch.Generator().manual_seed(0)
-    splats.sh[:, 1:] = 0.1 * torch.randn(splats.sh[:, 1:].shape, generator=generator)
-    splats.betas = splats.betas + torch.rand(len(splats), generator=generator)
-    return Snapshot(
-        splats=splats, anchors=np.zeros(len(splats), dtype=np.int64), origin=origin, density=density, iterations=5,
-        keyframes=np.zeros(1, dtype=np.int64), world_from_cam=np.eye(4)[None], scale=np.ones(1),
-        exposures=np.eye(3, 4, dtype=np.float32)[None],
-    )  # fmt: skip
-
-
-def write_poses(path: Path, times: list[float]) -> np.ndarray:
-    poses = np.stack([pose_on_arc(t) for t in times])
-    poses[:, :3, 3] += ORIGIN
-    write_tum(path, np.arange(len(times), dtype=np.float64), poses)
-    return poses
+from tests.core.splats.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map, save_cameras, write_poses
 
 
 @pytest.mark.parametrize("bases", [1, 4, 16])
@@ -124,94 +94,78 @@ def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, content: bytes, m
         read_ply(tmp_path / "bad.ply")
 
 
-def test_splat_rows_are_32_bytes_and_open3d_reads_them(tmp_path: Path) -> None:
-    final = final_map(1)
-    write_splat(tmp_path / "map.splat", final)
-    assert (tmp_path / "map.splat").stat().st_size == 32 * len(final.splats)
-    cloud = open3d().t.io.read_point_cloud(str(tmp_path / "map.splat"))
-    positions = cloud.point["positions"].numpy()
-    expected = final.splats.means.numpy() + ORIGIN
-    order, expected_order = (np.lexsort(np.round(p, 4).T) for p in (positions, expected))
-    np.testing.assert_allclose(positions[order], expected[expected_order], atol=1e-4)
-    np.testing.assert_allclose(
-        cloud.point["f_dc"].numpy()[order], final.splats.sh[:, 0].numpy()[expected_order], atol=0.02
-    )
-
-
-def test_spz_comes_back_and_a_map_too_fine_for_it_is_refused(tmp_path: Path) -> None:
-    final = final_map(4)
-    write_spz(tmp_path / "map.spz", final)
-    cloud = open3d().t.io.read_point_cloud(str(tmp_path / "map.spz"))
-    np.testing.assert_allclose(cloud.point["positions"].numpy(), final.splats.means.numpy() + ORIGIN, atol=5e-4)
-    np.testing.assert_allclose(cloud.point["scale"].numpy(), final.splats.log_scales.exp().numpy(), rtol=0.05)
-    assert (tmp_path / "map.spz").stat().st_size < 32 * len(final.splats)
-    with pytest.raises(ValueError, match="1/4096"):
-        write_spz(tmp_path / "fine.spz", export.scaled(final, 1e-3))
-
-
-def test_colmap_model_is_read_by_the_reader_of_colmap_models(tmp_path: Path) -> None:
-    trajectory, out = tmp_path / "trajectory.txt", tmp_path / "colmap"
-    poses = write_poses(trajectory, [0.0, 0.5, 1.0])
-    write_ply(tmp_path / "map.ply", final_map())
-    arguments = [str(tmp_path / "map.ply"), str(out), "--trajectory", str(trajectory), "--every", "1"]
-    assert export.main([*arguments, "--size", "24", "32", "--intrinsics", "25", "26", "15.5", "11.5"]) == 0
-    model = read_colmap(out)
-    assert len(model.shots) == 3
-    np.testing.assert_allclose(model.shots["1.000000.png"].world_from_cam, poses[1], atol=1e-6)
-    assert (out / "cameras.txt").read_text().splitlines()[1] == "1 PINHOLE 32 24 25.0 26.0 16.0 12.0"
-    points = np.loadtxt(out / "points3D.txt")
-    assert points.shape == (24 * 32, 8)
-    np.testing.assert_allclose(points[:, 1:4], final_map().splats.means.numpy() + ORIGIN, atol=1e-5)
-
-
-def test_mesh_lies_on_the_walls_of_the_box(tmp_path: Path) -> None:
-    trajectory, out = tmp_path / "trajectory.txt", tmp_path / "mesh.ply"
-    write_poses(trajectory, [0.5])
-    near_origin = replace(final_map(1), splats=_denser(final_map(1).splats))
-    write_ply(tmp_path / "map.ply", near_origin)
-    arguments = [str(tmp_path / "map.ply"), str(out), "--mesh", "--trajectory", str(trajectory), "--voxel", "0.02"]
-    assert export.main([*arguments, "--size", "48", "64", "--intrinsics", "51", "51", "31.5", "23.5"]) == 0
-    mesh = open3d().io.read_triangle_mesh(str(out))
-    vertices = np.asarray(mesh.vertices) - ORIGIN - [0.0, 0.0, 1.0]
-    assert len(vertices) > 300
-    distance = np.abs(np.abs(vertices) - [1.6, 1.2, 1.4]).min(axis=1)
-    assert np.median(distance) < 0.05
-
-
-def _denser(splats: Splats) -> Splats:
-    return replace(splats, opacity_logits=torch.full_like(splats.opacity_logits, 4.0))
-
-
-def test_a_path_becomes_a_video(tmp_path: Path) -> None:
-    write_poses(tmp_path / "trajectory.txt", [0.0, 1.0])
-    write_ply(tmp_path / "map.ply", final_map())
-    out = tmp_path / "video.mp4"
-    arguments = [str(tmp_path / "map.ply"), str(tmp_path / "trajectory.txt"), str(out), "--frames", "5"]
-    assert render_path.main([*arguments, "--size", "48", "64"]) == 0
-    video = cv2.VideoCapture(str(out))
-    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 5
-    read, frame = video.read()
-    assert read
-    assert frame.shape == (48, 64, 3)
-    assert frame.mean() > 20
-
-
-def test_a_resampled_path_keeps_its_ends_and_is_even() -> None:
-    poses = np.stack([pose_on_arc(t) for t in (0.0, 0.5, 1.0)])
-    path = render_path.resampled(poses, 9)
-    np.testing.assert_allclose(path[[0, 4, 8]], poses, atol=1e-9)
-    np.testing.assert_allclose(render_path.resampled(poses[:1], 3), poses[[0, 0, 0]], atol=1e-9)
-
-
 @pytest.mark.parametrize(
-    ("out", "message"), [("mesh.obj", "--trajectory"), ("map.xyz", "no format '.xyz'"), ("folder", "--trajectory")]
+    ("arguments", "message"),
+    [
+        (["mesh.obj"], "need cameras, and there is no cameras.json beside"),
+        (["folder"], "need cameras, and there is no cameras.json beside"),
+        (["mesh.obj", "--trajectory", "trajectory.txt"], "the camera is not known"),
+        (["mesh.obj", "--trajectory", "trajectory.txt", "--size", "24", "32"], "the camera is not known"),
+        (["folder", "--trajectory", "trajectory.txt", "--images"], "of which a --trajectory knows nothing"),
+        (["map.xyz"], "no format '.xyz'"),
+        (["map.splat", "--scale", "0"], "--scale must be positive"),
+        (["folder", "--cameras", "none.json"], "none.json"),
+    ],
 )
 def test_the_command_line_says_what_is_missing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, message: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    message: str,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_poses(tmp_path / "trajectory.txt", [0.5])
     write_ply(tmp_path / "map.ply", final_map(1))
-    assert export.main([str(tmp_path / "map.ply"), str(tmp_path / out)]) == 1
+    assert export.main(["map.ply", *arguments]) == 1
     assert message in capsys.readouterr().err
+
+
+def arguments_of(*words: str) -> argparse.Namespace:
+    """As the export's command line has them, for `map.ply` in the current folder."""
+    parser = argparse.ArgumentParser()
+    input_arguments(parser)
+    return parser.parse_args(["map.ply", *words])
+
+
+def test_the_camera_is_the_one_that_the_run_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_cameras(tmp_path, [0.0, 1.0])
+    intrinsics, size = lens(arguments_of())
+    np.testing.assert_array_equal(intrinsics, INTRINSICS)
+    assert size == SIZE
+    intrinsics, size = lens(arguments_of("--size", "48", "64"))
+    np.testing.assert_allclose(intrinsics, [50.0, 52.0, 31.5, 23.5])
+    assert size == (48, 64)
+    intrinsics, size = lens(arguments_of("--intrinsics", "9", "9", "1", "1"))
+    assert intrinsics.tolist() == [9, 9, 1, 1]
+    assert size == SIZE
+    with pytest.raises(ValueError, match="must be positive"):
+        lens(arguments_of("--intrinsics", "nan", "9", "1", "1"))
+    with pytest.raises(ValueError, match="must be positive"):
+        lens(arguments_of("--size", "0", "64"))
+
+
+@pytest.mark.parametrize("field", ["means", "log_scales", "quaternions", "opacity_logits", "sh"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_splats_that_are_not_finite_are_refused_or_left_out_and_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], field: str, value: float
+) -> None:
+    broken = final_map(4, origin=np.zeros(3))
+    getattr(broken.splats, field)[5:8] = value
+    write_ply(tmp_path / "map.ply", broken)
+    for name in ("map.splat", "map.spz", "again.ply"):
+        out = tmp_path / name
+        assert export.main([str(tmp_path / "map.ply"), str(out)]) == 1
+        assert "3 of 768 splats" in capsys.readouterr().err
+        assert not out.exists()
+        assert export.main([str(tmp_path / "map.ply"), str(out), "--drop-unsound"]) == 0
+        said = capsys.readouterr().out
+        assert "765 splats" in said
+        assert "3 splats that are not finite were left out" in said
+    kept = read_ply(tmp_path / "again.ply").splats
+    assert len(kept) == 765
+    assert all(bool(torch.isfinite(tensor).all()) for tensor in kept.tensors().values())
 
 
 def test_scaling_a_map_scales_its_picture_not_at_all() -> None:

@@ -1,0 +1,117 @@
+"""What an export starts from: a map.ply whose splats are sound, and the cameras that saw it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mvsgs_core import camera
+from mvsgs_core.evaluation.trajectory import read_tum
+from mvsgs_core.splats.cameras import Cameras, read_cameras
+from mvsgs_core.splats.export_ply import read_ply
+from mvsgs_core.splats.model import Splats
+from mvsgs_core.splats.snapshot import Snapshot
+
+
+def input_arguments(parser: argparse.ArgumentParser) -> None:
+    """The map and the camera, for `read_map`, `lens` and `cameras_of_map`."""
+    parser.add_argument("map", type=Path, help="map.ply")
+    parser.add_argument(
+        "--drop-unsound", action="store_true", help="leave out splats with NaN or Inf, and say how many"
+    )
+    parser.add_argument("--cameras", type=Path, help="default: the cameras.json beside the map")
+    parser.add_argument("--size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="default: that of the cameras")
+    parser.add_argument(
+        "--intrinsics", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"),
+        help="pixels at --size; default: those of the cameras",
+    )  # fmt: skip
+
+
+def read_map(options: argparse.Namespace) -> tuple[Snapshot, int]:
+    """The map and the number of splats that were left out because a value of theirs is not finite.
+
+    Raises ValueError where there are such and --drop-unsound was not given.
+    """
+    final = read_ply(options.map)
+    splats = final.splats
+    sound = torch.ones(len(splats), dtype=torch.bool)
+    for value in splats.tensors().values():
+        sound &= torch.isfinite(value).reshape(len(splats), -1).all(dim=1)
+    sound &= splats.quaternions.norm(dim=1) > 0
+    unsound = int((~sound).sum())
+    if unsound and not options.drop_unsound:
+        raise ValueError(
+            f"{unsound} of {len(splats)} splats in {options.map} have values that are not finite: the file is damaged; "
+            "--drop-unsound leaves them out"
+        )
+    kept = Splats(**{name: value[sound] for name, value in splats.tensors().items()})
+    return replace(final, splats=kept, anchors=final.anchors[sound.numpy()]), unsound
+
+
+def known_cameras(options: argparse.Namespace) -> Cameras | None:
+    """Those that were named, or that stand beside the map."""
+    beside: Path = options.map.with_name("cameras.json")
+    if options.cameras is None and not beside.is_file():
+        return None
+    cameras = read_cameras(options.cameras or beside)
+    return cameras if len(cameras) else None
+
+
+def lens(options: argparse.Namespace) -> tuple[np.ndarray, tuple[int, int]]:
+    """Intrinsics (4,) and size (height, width) for poses that come without: given, or the newest keyframe's.
+
+    Raises ValueError where neither says them.
+    """
+    known = known_cameras(options)
+    size = None if options.size is None else (options.size[0], options.size[1])
+    if size is not None and min(size) < 1:
+        raise ValueError(f"--size {size[0]} {size[1]}: both must be positive")
+    if known is not None:
+        known_size = (int(known.sizes[-1, 0]), int(known.sizes[-1, 1]))
+        size = size or known_size
+        if options.intrinsics is None:
+            return camera.scale_intrinsics(known.intrinsics[-1], known_size, size), size
+    if size is None or options.intrinsics is None:
+        raise ValueError(
+            f"there is no cameras.json beside {options.map}, so that the camera is not known: give it with --cameras, "
+            "or its --intrinsics and --size"
+        )
+    intrinsics = np.array(options.intrinsics)
+    if not (np.isfinite(intrinsics).all() and (intrinsics[:2] > 0).all()):
+        raise ValueError("--intrinsics: the focal lengths must be positive")
+    return intrinsics, size
+
+
+def cameras_of_map(options: argparse.Namespace) -> Cameras:
+    """Every --every-th keyframe of the map, or pose of --trajectory, at --scale.
+
+    Raises ValueError where the map has no cameras.json and no trajectory was given.
+    """
+    if options.every < 1:
+        raise ValueError("--every must be at least 1")
+    known = known_cameras(options)
+    if options.trajectory is not None:
+        stamps, poses = read_tum(options.trajectory)
+        found = Cameras(
+            keyframes=np.arange(len(stamps)), timestamps=stamps, world_from_cam=poses, intrinsics=np.zeros((0, 4)),
+            sizes=np.zeros((0, 2)), exposures=np.tile(np.eye(3, 4), (len(stamps), 1, 1)),
+        )  # fmt: skip
+    elif known is not None:
+        found = known
+    else:
+        raise ValueError(
+            f"a mesh and a COLMAP model need cameras, and there is no cameras.json beside {options.map}: give it with "
+            "--cameras, or --trajectory, --intrinsics and --size"
+        )
+    if options.trajectory is not None or options.intrinsics is not None or options.size is not None:
+        intrinsics, size = lens(options)
+        found = replace(
+            found, intrinsics=np.tile(intrinsics, (len(found), 1)), sizes=np.tile(np.array(size), (len(found), 1))
+        )
+    chosen = Cameras(**{name: value[:: options.every].copy() for name, value in vars(found).items()})
+    chosen.world_from_cam[:, :3, 3] *= options.scale
+    return chosen
