@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
+import math
 import resource
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +17,12 @@ import torch
 
 from msgs import GroundTruth, SplatMap, Trajectory, View
 from mvsgs_core import weights
-from mvsgs_core.evaluation import html, pictures, trajectory
-from mvsgs_core.evaluation.evaluation import Evaluation, FinishedMap, Track
+from mvsgs_core.atomic_file import replace_text, replacing
+from mvsgs_core.evaluation import html, pictures, statistics, trajectory
+from mvsgs_core.evaluation.evaluation import Evaluation, FinishedMap
 from mvsgs_core.evaluation.lpips import Lpips
+from mvsgs_core.evaluation.track import Track
+from mvsgs_core.held_out import HELD_OUT_EVERY
 from mvsgs_core.splats.exposure import IDENTITY
 from mvsgs_core.splats.model import Splats
 from nodes import Node
@@ -29,7 +35,9 @@ class Evaluator(Node):
     class Config:
         output: str | None = None  # folder for report.json, report.html, trajectory.txt; none are written if null
         title: str = "MVS-GS run"
+        input: str = ""  # what was mapped, for the report
         max_frames: int = 200  # frames scored at most, keyframes, held-out and others evenly; 0: no scoring
+        max_bytes: float = 2e9  # of images and depth maps that wait on disk to be scored
         lpips: str = "auto"  # "auto": if its weights are found, "off", "on": an error if they are not
 
     config: Config
@@ -41,7 +49,7 @@ class Evaluator(Node):
             folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         lpips = self._load_lpips()
-        self.evaluation = Evaluation(self.config.max_frames, lpips, folder)
+        self.evaluation = Evaluation(self.config.max_frames, lpips, folder, self.config.max_bytes)
         self.report: dict[str, Any] = {}
 
     def on_ground_truth(self, truth: GroundTruth) -> Iterator[None]:
@@ -49,7 +57,7 @@ class Evaluator(Node):
         yield from ()
 
     def on_view(self, view: View) -> Iterator[None]:
-        self.evaluation.add_depth(view.index, view.depth, view.scale)
+        self.evaluation.add_keyframe(view.index, view.image, view.intrinsics, view.depth, view.scale)
         yield from ()
 
     def on_trajectory(self, track: Trajectory) -> Iterator[None]:
@@ -87,47 +95,39 @@ class Evaluator(Node):
             return None
         try:
             return Lpips(weights.find("lpips_squeeze_trunk"), weights.find("lpips_squeeze_head"))
-        except FileNotFoundError as error:
-            text = f"LPIPS is left out: {error}"
-        if self.config.lpips == "on":
-            raise FileNotFoundError(text)
-        self.stats.warn(text)
-        return None
+        except (FileNotFoundError, ValueError) as error:
+            if self.config.lpips == "on":
+                raise
+            self.stats.warn(f"LPIPS is left out: {error}")
+            return None
 
     def _add_statistics(self) -> None:
         own = {
-            "seconds": dict(self.stats.seconds),
+            "seconds": self.stats.seconds,
             "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+            "warnings": self.stats.warnings,
         }
-        everything = {**self.upstream, "evaluator": own}
-        time = self.report["time"]
-        time["stages"] = {node: dict(s.get("seconds", {})) for node, s in everything.items()}
-        time["cpu"] = {node: s["cpu_seconds"] for node, s in everything.items() if "cpu_seconds" in s}
-        self.report["memory"] = {"peak_bytes": {n: s["peak_bytes"] for n, s in everything.items() if "peak_bytes" in s}}
-        self.report["skipped"] = {n: dict(s["skipped"]) for n, s in everything.items() if s.get("skipped")}
-        self.report["counts"] = {n: dict(s["counts"]) for n, s in everything.items() if s.get("counts")}
-        warned = {n: list(s["warnings"]) for n, s in everything.items() if s.get("warnings")}
-        if self.stats.warnings:
-            warned["evaluator"] = list(self.stats.warnings)
-        self.report["warnings"] = warned
+        said = statistics.collected({**self.upstream, "evaluator": own})
+        self.report["time"] |= said.pop("time")
+        self.report |= said
+        self.report |= {
+            "finished": True,
+            "date": time.strftime("%Y-%m-%d %H:%M:%S %Z"),
+            "version": _version(),
+            "input": self.config.input,
+        }
         self.report["protocol"] = (
             "Scored at native resolution; nothing is fitted to a scored frame, exposure neither. "
-            "Keyframes are training views; held-out: every 5th frame that is no keyframe. "
+            f"Keyframes are training views; held-out: every {HELD_OUT_EVERY}th frame that is no keyframe. Covered: "
+            "pixels at which the render is more than half opaque. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self.evaluation.lpips else 'not computed'}. "
             f"{_shutter(self.evaluation.track)}{_exposure(self.evaluation.maps)}"
             "ATE: RMSE of keyframe positions after Sim(3) alignment."
         )
 
     def _write(self, folder: Path) -> None:
-        track = self.evaluation.track
-        if track is not None:
-            trajectory.write_tum(
-                folder / "trajectory.txt", track.timestamp[track.posed], track.world_from_cam[track.posed]
-            )
-        (folder / "report.json").write_text(json.dumps(self.report, indent=1, default=_plain))
+        """Each file in one step; the room that the frames took on disk is given back before."""
         comparisons = pictures.comparisons(self.evaluation)
-        if comparisons:
-            pictures.write_sheet(folder / "comparison.png", comparisons)
         document = html.page(
             self.config.title,
             self.report,
@@ -135,7 +135,16 @@ class Evaluator(Node):
             pictures.depth_maps(self.evaluation),
             pictures.plots(self.evaluation, self.report["time"]["stages"]),
         )
-        (folder / "report.html").write_text(document)
+        self.evaluation.close()
+        replace_text(folder / "report.json", json.dumps(_plain(self.report), indent=1, allow_nan=False))
+        track = self.evaluation.track
+        if track is not None:
+            with replacing(folder / "trajectory.txt") as aside:
+                trajectory.write_tum(aside, track.timestamp[track.posed], track.world_from_cam[track.posed])
+        if comparisons:
+            with replacing(folder / "comparison.png") as aside:
+                pictures.write_sheet(aside, comparisons)
+        replace_text(folder / "report.html", document)
 
 
 def _finished(message: SplatMap) -> FinishedMap:
@@ -168,6 +177,19 @@ def _exposure(maps: dict[bool, FinishedMap]) -> str:
 
 
 def _plain(value: Any) -> Any:
+    """The report as JSON can hold it: what is not finite becomes null."""
     if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"the report holds a {type(value).__name__}")
+        value = value.item()
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _version() -> str | None:
+    """Of the installed package; None where a checkout runs without being installed."""
+    try:
+        return importlib.metadata.version("mvsgs")
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -14,6 +14,7 @@ from msgs import GroundTruth, SplatMap, TrackingState, Trajectory, View
 from mvsgs_core import geometry
 from mvsgs_core.evaluation.scoring import render_view
 from nodes.evaluator import Evaluator
+from tests.core.evaluation.test_frame_store import full_after
 
 H, W, N, SCALE = 24, 32, 12, 0.5  # the estimate's unit is 2 true units
 INTRINSICS = np.array([30.0, 30.0, 15.5, 11.5])
@@ -66,7 +67,7 @@ def evaluator(tmp_path: Path) -> Evaluator:
     return node
 
 
-def _feed(node: Evaluator, lost: tuple[int, ...] = ()) -> dict[str, Any]:
+def _feed(node: Evaluator, lost: tuple[int, ...] = (), upstream: dict[str, Any] | None = None) -> dict[str, Any]:
     world_from_cam = _poses()
     world_from_cam[:, :3, 3] += ORIGIN
     state = np.zeros(N, np.uint8)
@@ -82,7 +83,7 @@ def _feed(node: Evaluator, lost: tuple[int, ...] = ()) -> dict[str, Any]:
     list(node.on_view(view))
     for refined in (False, True):
         list(node.on_splat_map(_splat_map(refined)))
-    node.upstream = {
+    node.upstream |= upstream or {
         "tracker": {"seconds": {"flow": 1.5}, "peak_bytes": 5, "skipped": {"frames": 2}, "warnings": ["w"]}
     }
     list(node.on_end())
@@ -107,6 +108,7 @@ def test_report(evaluator: Evaluator) -> None:
         "inlier_ratio": 1.0,
         "completeness": 1.0,
         "scale_ratio": pytest.approx(1.0),
+        "count": 1,
     }
     assert report["map"]["splats"] == 1200
     assert report["time"]["stages"]["tracker"] == {"flow": 1.5}
@@ -126,7 +128,7 @@ def test_files(evaluator: Evaluator) -> None:
         "trajectory.txt",
     }
     html = (evaluator.folder / "report.html").read_text()
-    assert html.count("data:image/jpeg;base64,") >= 12
+    assert html.count("data:image/jpeg;base64,") == 10  # four of each of the two held-out frames, and a depth map
     assert "http://" not in html  # nothing is fetched
     assert "https://" not in html
     assert len((evaluator.folder / "trajectory.txt").read_text().splitlines()) == N + 1
@@ -159,8 +161,8 @@ def test_renders_are_rolled_with_the_shutter_that_the_tracker_took_out(evaluator
     assert view.shutter.readout == 0.02
     moved = geometry.se3_log(geometry.inverse(poses[4]) @ poses[6])
     np.testing.assert_allclose(view.shutter.velocity, moved * 15, atol=1e-7)
-    color, _ = render_view(finished.splats, finished.density, view, (H, W))
-    still, _ = render_view(finished.splats, finished.density, replace(view, shutter=None), (H, W))
+    color = render_view(finished.splats, finished.density, view, (H, W)).color
+    still = render_view(finished.splats, finished.density, replace(view, shutter=None), (H, W)).color
     assert np.abs(color - still).max() > 1e-3
     list(evaluator.on_end())
     assert "20.0 ms a frame" in evaluator.report["protocol"]
@@ -176,8 +178,8 @@ def test_frames_between_keyframes_are_rendered_at_an_exposure_between_theirs(eva
     finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.views()
     for frame, gain in ((0, 1.0), (2, 2 / 3), (3, 0.5), (5, 5 / 6), (6, 1.0)):
         view = views[frame]
-        color, _ = render_view(finished.splats, finished.density, view, (H, W))
-        plain, _ = render_view(finished.splats, finished.density, replace(view, exposure=None), (H, W))
+        color = render_view(finished.splats, finished.density, view, (H, W)).color
+        plain = render_view(finished.splats, finished.density, replace(view, exposure=None), (H, W)).color
         np.testing.assert_allclose(color, gain * plain, atol=1e-5)
     list(evaluator.on_end())
     assert "interpolated in time" in evaluator.report["protocol"]
@@ -212,3 +214,145 @@ def test_missing_lpips_weights_are_named(tmp_path: Path, monkeypatch: pytest.Mon
     node = Evaluator(Evaluator.Config(lpips="auto"))
     assert any("LPIPS is left out" in w for w in node.stats.warnings)
     node.evaluation.close()
+
+
+def test_the_worst_of_all_frames_is_shown_beside_the_held_out(evaluator: Evaluator) -> None:
+    """The last frame shows what the map has not: it is no held-out one, and stands in no mean that anybody looks at."""
+    spoiled = np.full((H, W, 3), (0, 200, 0), np.uint8)
+    list(evaluator.on_ground_truth(GroundTruth(N - 1, (N - 1) / 30, spoiled, INTRINSICS, None, None)))
+    report = _feed(evaluator)
+    assert report["rendering"]["worst"]["all"]["index"] == N - 1
+    assert report["rendering"]["worst"]["held_out"]["index"] in (5, 10)
+    assert report["rendering"]["worst"]["all"]["psnr"] < report["rendering"]["worst"]["held_out"]["psnr"] - 10
+    assert [frame["index"] for frame in report["rendering"]["frames"]] == list(range(N))
+    assert report["rendering"]["coverage"]["count"] == N
+    assert report["rendering"]["coverage"]["mean"] > 0.9
+    assert evaluator.folder is not None
+    html = (evaluator.folder / "report.html").read_text()
+    assert f"worst of all {N} frames scored: {N - 1} (between keyframes)" in html
+    assert "pixels covered by the map, of 12 frames" in html
+
+
+def test_no_picture_is_shown_twice_where_few_frames_are_held_out(evaluator: Evaluator) -> None:
+    report = _feed(evaluator, lost=(5,))
+    assert report["rendering"]["held_out"]["count"] == 1
+    assert any("1 of the 11 frames scored are held out" in note for note in report["notes"])
+    assert evaluator.folder is not None
+    html = (evaluator.folder / "report.html").read_text()
+    assert html.count("held-out frame: 10 (held out)") == 1
+    assert "only held-out frame: 10" in html
+
+
+def test_held_out_frames_that_became_keyframes_are_named(evaluator: Evaluator) -> None:
+    assert _feed(evaluator)["trajectory"]["held_out_keyframes"] == [0]
+
+
+def test_frames_without_a_pose_are_counted_by_state(evaluator: Evaluator) -> None:
+    trajectory = _feed(evaluator, lost=(0, 1, 7))["trajectory"]
+    assert trajectory["frames_without_pose"] == {"lost": 3}
+    assert (trajectory["first_tracked"], trajectory["last_tracked"]) == (2, N - 1)
+
+
+def test_the_report_says_that_the_run_finished(tmp_path: Path) -> None:
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off", input="tum walk"))
+    (tmp_path / "report.json").write_text('{"finished": false}')  # as the launcher leaves it at the start
+    report = _feed(node)
+    assert report["finished"] is True
+    assert report["input"] == "tum walk"
+    assert report["date"]
+    assert "tum walk" in (tmp_path / "report.html").read_text()
+
+
+def test_a_report_that_cannot_be_written_leaves_the_one_before(
+    evaluator: Evaluator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert evaluator.folder is not None
+    before = '{"finished": false}'
+    (evaluator.folder / "report.json").write_text(before)
+
+    def full(path: Path, *_: object, **__: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        _feed(evaluator)
+    assert [p.name for p in evaluator.folder.iterdir()] == ["report.json"]
+    assert (evaluator.folder / "report.json").read_text() == before
+
+
+def test_what_other_nodes_say_is_shown_whatever_its_form(evaluator: Evaluator) -> None:
+    evaluator.upstream = {"mvs": {"warnings": "(5000 entries left out)", "seconds": "fast", "peak_bytes": None}}
+    report = _feed(evaluator, upstream={"mapper": {"values": {"nothing": "no splats: all depth was rejected"}}})
+    assert report["warnings"]["mvs"] == ["(5000 entries left out)"]
+    assert report["nothing"] == {"mapper": "no splats: all depth was rejected"}
+    assert evaluator.folder is not None
+    html = (evaluator.folder / "report.html").read_text()
+    assert "mvs: (5000 entries left out)" in html
+    assert "mapper: no splats: all depth was rejected" in html
+
+
+def test_the_report_is_json_where_a_figure_is_not_finite(evaluator: Evaluator) -> None:
+    """A render equal to its photograph has a PSNR without bound."""
+    _feed(evaluator, upstream={"tracker": {"counts": {"frames": float("nan"), "keyframes": 4}}})
+    assert evaluator.folder is not None
+
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is no JSON")
+
+    report = json.loads((evaluator.folder / "report.json").read_text(), parse_constant=refuse)
+    assert report["counts"] == {"tracker": {"keyframes": 4}}
+
+
+def test_a_resumed_run_is_reported_of_its_keyframes_alone(tmp_path: Path) -> None:
+    """Its source knows keyframes only: no true pose, no depth, no frame between."""
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
+    index = np.arange(0, N, 3)
+    image = np.full((H, W, 3), (204, 51, 51), np.uint8)
+    world_from_cam = _poses()[index]
+    world_from_cam[:, :3, 3] += ORIGIN
+    for k in index:
+        list(node.on_ground_truth(GroundTruth(int(k), k / 30, image, INTRINSICS, None, None)))
+    none = np.zeros(len(index), np.int32)
+    keyframe = np.ones(len(index), bool)
+    list(node.on_trajectory(Trajectory(index, index / 30, world_from_cam, keyframe, none.astype(np.uint8), none)))
+    list(node.on_splat_map(_splat_map(True)))
+    list(node.on_end())
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["rendering"]["keyframes"]["count"] == 4
+    assert report["rendering"]["keyframes"]["psnr"] > 35
+    assert report["rendering"]["held_out"]["count"] == 0
+    assert report["trajectory"]["frames_tracked"] == 4
+    assert any("no renders before refinement" in note for note in report["notes"])
+    assert "0 of the 4 frames scored are held out" in " ".join(report["notes"])
+    assert (tmp_path / "comparison.png").exists()
+
+
+def test_without_any_frame_the_map_is_scored_on_what_was_mapped(tmp_path: Path) -> None:
+    """A source that sends no GroundTruth, as a robot in a hurry: the keyframes' own images remain."""
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
+    report = _feed(node)
+    assert report["rendering"]["all"]["count"] == 1  # the one View
+    assert report["rendering"]["frames"][0]["index"] == 3
+
+
+def test_nothing_is_scored_nor_kept_with_max_frames_0(tmp_path: Path) -> None:
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off", max_frames=0))
+    for k in range(N):
+        image = np.full((H, W, 3), 128, np.uint8)
+        list(node.on_ground_truth(GroundTruth(k, k / 30, image, INTRINSICS, _poses()[k], None)))
+    report = _feed(node)
+    assert report["frames_on_disk"]["bytes"] == 0
+    assert report["rendering"]["all"]["count"] == 0
+    assert report["trajectory"]["ate_rmse"] == pytest.approx(0, abs=1e-6)
+    assert report["notes"] == []
+
+
+def test_a_full_disk_costs_frames_and_not_the_report(tmp_path: Path) -> None:
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
+    with full_after(500):
+        for k in range(N):
+            image = np.random.default_rng(k).integers(0, 256, (H, W, 3), np.uint8)
+            list(node.on_ground_truth(GroundTruth(k, k / 30, image, INTRINSICS, None, None)))
+    report = _feed(node)
+    assert report["rendering"]["all"]["count"] == 6  # the last five, and the keyframe's own image
+    assert any("other frames could not be kept" in note for note in report["notes"])

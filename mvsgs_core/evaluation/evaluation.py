@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvsgs_core.evaluation import scoring, trajectory
+from mvsgs_core.evaluation import scoring, track, trajectory
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.exposure import between_keyframes
-from mvsgs_core.evaluation.frame_store import FrameStore
+from mvsgs_core.evaluation.frames import Frames
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
+from mvsgs_core.evaluation.track import Track
 from mvsgs_core.splats.model import Splats
 
 NEAR = 0.01  # of the typical depth: splats nearer to a camera are not drawn
-TRACKED = 0  # state of a frame whose pose is good; other states are lost, not started, degenerate
+ENOUGH = 3  # held-out frames whose mean and worst say something
 
 
 @dataclass(frozen=True)
@@ -43,31 +45,14 @@ class FinishedMap:
         return float(np.median(np.linalg.norm(self.splats.means.numpy() - center, axis=1)))
 
 
-@dataclass(frozen=True)
-class Track:
-    """All frames that the tracker saw: arrays over N frames."""
-
-    index: np.ndarray
-    timestamp: np.ndarray
-    world_from_cam: np.ndarray  # (N, 4, 4), NaN without a pose
-    keyframe: np.ndarray
-    state: np.ndarray
-    segment: np.ndarray
-    focal_factor: float = 1.0  # on the focal lengths of the frames, where they were guessed
-    readout: float = 0.0  # seconds of the rolling shutter
-
-    @property
-    def posed(self) -> np.ndarray:
-        return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
-
-
 @dataclass
 class Evaluation:
     """Feed it with `add_*` in any order; `report()` needs at least a track."""
 
-    max_frames: int = 200  # frames scored at most; all keyframes count first
+    max_frames: int = 200  # frames scored at most, of each kind as many; 0: none, and no depth maps
     lpips: Lpips | None = None
     folder: Path | None = None  # where frames wait on disk
+    max_bytes: float = 2e9  # there
     started: float | None = None
     mapped: float | None = None
     track: Track | None = None
@@ -75,10 +60,9 @@ class Evaluation:
     scores: dict[bool, list[scoring.Score]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._store = FrameStore(self.folder)
+        self._frames = Frames(self.folder, self.max_frames, self.max_bytes)
+        self._received = 0
         self._truth: dict[int, np.ndarray] = {}
-        self._intrinsics: dict[int, np.ndarray] = {}
-        self._depth_scale: dict[int, float] = {}
 
     def add_frame(
         self,
@@ -90,17 +74,16 @@ class Evaluation:
     ) -> None:
         if self.started is None:
             self.started = time.perf_counter()
-        self._store.put("image", index, image)
-        self._intrinsics[index] = intrinsics
+        self._received += 1
+        self._frames.add(index, image, intrinsics, depth)
         if world_from_cam is not None and np.isfinite(world_from_cam).all():
             self._truth[index] = world_from_cam
-        if depth is not None:
-            self._store.put("depth", index, depth.astype(np.float32, copy=False))
 
-    def add_depth(self, index: int, depth: np.ndarray, scale: float) -> None:
-        """A keyframe's filtered depth map, computed at the map's scale `scale`."""
-        self._store.put("filtered", index, depth)
-        self._depth_scale[index] = scale
+    def add_keyframe(
+        self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray, scale: float
+    ) -> None:
+        """A keyframe as it is mapped, with its filtered depth, computed at the map's scale `scale`."""
+        self._frames.add_keyframe(index, image, intrinsics, depth, scale)
 
     def add_map(self, finished: FinishedMap, refined: bool) -> None:
         self.maps[refined] = finished
@@ -113,12 +96,13 @@ class Evaluation:
         rendering = {refined: self._score_renders(refined, notes) for refined in (True, False)}
         final = self.maps.get(True) or self.maps.get(False)
         wall = None if self.started is None or self.mapped is None else self.mapped - self.started
-        keyframes = int(self.track.keyframe.sum()) if self.track is not None else 0
+        keyframes = trajectory_report["keyframes"]
         return {
             "rendering": rendering[True],
             "rendering_before_refinement": rendering[False],
             "trajectory": trajectory_report,
             "depth": self._score_depths(alignment, notes),
+            "frames_on_disk": {"bytes": self._frames.size},
             "map": {
                 "splats": len(final.splats.means) if final else 0,
                 "bytes": final.bytes if final else 0,
@@ -129,29 +113,35 @@ class Evaluation:
                 "wall": wall,
                 "keyframes_per_second": keyframes / wall if wall else None,
             },
-            "notes": notes,
+            "notes": notes + self._frames.notes(),
         }
 
-    def _views(self, finished: FinishedMap) -> list[scoring.View]:
-        assert self.track is not None
+    def views(self, refined: bool = True) -> list[scoring.View]:
+        """All frames with a pose in the main part of the map whose image is there, in the order of the stream."""
+        finished, tracked = self.maps[refined], self.track
+        assert tracked is not None
         views = []
-        main = _largest_segment(self.track)
+        main = tracked.main()
         near = NEAR * finished.typical_depth()
         from_world = np.eye(4)
         from_world[:3, 3] = -finished.origin
-        moving = velocities(self.track.timestamp, self.track.world_from_cam, main)
+        moving = velocities(tracked.timestamp, tracked.world_from_cam, main)
         exposures = self._exposures(finished, main)
-        for k in np.flatnonzero(main & np.isin(self.track.index, list(self._intrinsics))):
-            index = int(self.track.index[k])
+        photographs = self._frames.photographs()
+        for k in np.flatnonzero(main & np.isin(tracked.index, list(photographs))):
+            index = int(tracked.index[k])
+            photograph = photographs[index]
+            focal = 1.0 if photograph.as_mapped else tracked.focal_factor
+            rolling = tracked.readout and not photograph.as_mapped
             views.append(
                 scoring.View(
                     index,
-                    bool(self.track.keyframe[k]),
-                    from_world @ finished.keyframe_poses.get(index, self.track.world_from_cam[k]),
-                    self._intrinsics[index] * [self.track.focal_factor, self.track.focal_factor, 1.0, 1.0],
-                    lambda index=index: self.photograph(index),  # type: ignore[misc]
+                    bool(tracked.keyframe[k]),
+                    from_world @ finished.keyframe_poses.get(index, tracked.world_from_cam[k]),
+                    photograph.intrinsics * [focal, focal, 1.0, 1.0],
+                    photograph.image,
                     near,
-                    Shutter(self.track.readout, moving[k]) if self.track.readout else None,
+                    Shutter(tracked.readout, moving[k]) if rolling else None,
                     None if exposures is None else exposures[k],
                 )
             )
@@ -165,107 +155,75 @@ class Evaluation:
         return between_keyframes(self.track.timestamp, self.track.timestamp[known], affines)
 
     def photograph(self, index: int) -> np.ndarray:
-        image = self._store.get("image", index)
-        if image is None:
-            raise KeyError(f"frame {index} was never received")
-        return image
+        """(H, W, 3) uint8. Raises KeyError for a frame that was not kept."""
+        return self._frames.photographs()[index].image()
+
+    def filtered_depths(self) -> list[int]:
+        """Keyframes whose filtered depth is there."""
+        return [index for index, _ in self._frames.filtered_depths()]
 
     def filtered_depth(self, index: int) -> np.ndarray | None:
-        return self._store.get("filtered", index)
-
-    def views(self, refined: bool = True) -> list[scoring.View]:
-        return self._views(self.maps[refined])
+        return self._frames.filtered_depth(index)
 
     def _score_renders(self, refined: bool, notes: list[str]) -> dict[str, Any]:
         finished = self.maps.get(refined)
+        if not self.max_frames:
+            return scoring.summarize([])
         if finished is None or self.track is None or not len(finished.splats.means):
             which = "after" if refined else "before"
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
-        views = scoring.choose(self._views(finished), self.max_frames)
-        self.scores[refined] = [scoring.score_view(finished.splats, finished.density, v, self.lpips) for v in views]
-        return scoring.summarize(self.scores[refined])
+        views = scoring.choose(self.views(refined), self.max_frames)
+        scores = [scoring.score_view(finished.splats, finished.density, v, self.lpips) for v in views]
+        self.scores[refined] = scores
+        held_out = sum(score.held_out for score in scores)
+        few = f"{held_out} of the {len(scores)} frames scored are held out: their mean and their worst say little"
+        if held_out < ENOUGH and few not in notes:
+            notes.append(few)
+        return scoring.summarize(scores)
 
     def _score_trajectory(self, notes: list[str]) -> tuple[trajectory.Alignment | None, dict[str, Any]]:
-        report: dict[str, Any] = dict.fromkeys(
-            ("ate_rmse", "ate_rmse_frames", "ate_percent", "rpe_translation", "rpe_rotation", "path_length", "scale")
-        )
-        track = self.track
-        if track is None:
+        if self.track is None:
             notes.append("no trajectory was received")
-            return None, {**report, "frames": len(self._intrinsics), "frames_tracked": 0, "keyframes": 0}
-        main = _largest_segment(track)
-        report |= {
-            "frames": len(track.index),
-            "frames_tracked": int((track.posed & (track.state == TRACKED)).sum()),
-            "keyframes": int(track.keyframe.sum()),
-            "segments": len(np.unique(track.segment[track.posed])),
-        }
-        known = main & np.isin(track.index, list(self._truth))
-        estimate, truth = track.world_from_cam[known], self._true_poses(track.index[known])
-        is_keyframe = track.keyframe[known]
-        try:
-            alignment = trajectory.align(estimate[is_keyframe], truth[is_keyframe])
-        except ValueError as error:
-            notes.append(f"no trajectory error: {error}" if self._truth else "no trajectory error: no true poses")
-            return None, report
-        errors = trajectory.absolute_errors(estimate, truth, alignment)
-        length = trajectory.path_length(truth)
-        report |= {
-            "ate_rmse": trajectory.rmse(errors[is_keyframe]),
-            "ate_rmse_frames": trajectory.rmse(errors),
-            "ate_percent": 100 * trajectory.rmse(errors[is_keyframe]) / length if length else None,
-            "path_length": length,
-            "scale": alignment.scale,
-        }
-        if len(estimate) > 1:
-            report["rpe_translation"], report["rpe_rotation"] = trajectory.relative_errors(
-                estimate, truth, alignment.scale
-            )
-        return alignment, report
-
-    def _true_poses(self, indices: np.ndarray) -> np.ndarray:
-        return np.array([self._truth[int(i)] for i in indices], dtype=np.float64).reshape(-1, 4, 4)
+            return None, {**track.NO_SCORE, **track.NO_TRACK, "frames": self._received}
+        alignment, errors = track.score(self.track, self._truth, notes)
+        return alignment, {**errors, **self.track.counts()}
 
     def aligned_paths(self) -> dict[str, np.ndarray]:
         """Camera positions (N, 3) for a plot: "estimate" in the frame of the "truth" where there is one."""
         if self.track is None:
             return {}
-        main = _largest_segment(self.track)
+        main = self.track.main()
         alignment, _ = self._score_trajectory([])
         if alignment is None:
             return {"estimate": self.track.world_from_cam[main][:, :3, 3]}
         known = main & np.isin(self.track.index, list(self._truth))
         return {
-            "truth": self._true_poses(self.track.index[known])[:, :3, 3],
+            "truth": track.poses_of(self._truth, self.track.index[known])[:, :3, 3],
             "estimate": alignment.positions(self.track.world_from_cam[main]),
         }
 
-    def _score_depths(self, alignment: trajectory.Alignment | None, notes: list[str]) -> dict[str, float | None]:
+    def _score_depths(self, alignment: trajectory.Alignment | None, notes: list[str]) -> dict[str, Any]:
         """After one scale for the whole run, the median ratio of true to estimated depth, as is usual for monocular
         depth; `scale_ratio` is that over the trajectory's scale, 1 where poses and depth maps of the truth agree."""
         finished = self.maps.get(True) or self.maps.get(False)
-        maps = []
-        for index, scale in self._depth_scale.items():
-            truth, depth = self._store.get("depth", index), self._store.get("filtered", index)
-            if truth is not None and depth is not None:
-                maps.append((depth * (finished.scale.get(index, scale) / scale if finished else 1.0), truth))
-        ratios = [depth_ratios(depth, truth) for depth, truth in maps]
+
+        def maps() -> Iterator[tuple[np.ndarray, np.ndarray]]:  # read again for each use: all at once are gigabytes
+            for index, scale in self._frames.filtered_depths():
+                truth, depth = self._frames.true_depth(index), self._frames.filtered_depth(index)
+                if truth is not None and depth is not None:
+                    yield depth * (finished.scale.get(index, scale) / scale if finished else 1.0), truth
+
+        ratios = [depth_ratios(depth, truth) for depth, truth in maps()]
+        count = sum(len(ratio) > 0 for ratio in ratios)
         known = np.concatenate(ratios) if ratios else np.empty(0)
         if not len(known):
-            notes.append("no depth error: no keyframe has both filtered and true depth")
-            return {**NO_DEPTH.summary(), "scale_ratio": None}
+            if self.max_frames:
+                notes.append("no depth error: no keyframe has both filtered and true depth")
+            return {**NO_DEPTH.summary(), "scale_ratio": None, "count": 0}
         scale = float(np.median(known))
-        total = sum((score_depth(depth, truth, scale) for depth, truth in maps), NO_DEPTH)
-        return {**total.summary(), "scale_ratio": scale / alignment.scale if alignment else None}
+        total = sum((score_depth(depth, truth, scale) for depth, truth in maps()), NO_DEPTH)
+        return {**total.summary(), "scale_ratio": scale / alignment.scale if alignment else None, "count": count}
 
     def close(self) -> None:
-        self._store.close()
-
-
-def _largest_segment(track: Track) -> np.ndarray:
-    """(N,) bool: frames with a pose in the part of the map that has most frames."""
-    if not track.posed.any():
-        return track.posed
-    segments, counts = np.unique(track.segment[track.posed], return_counts=True)
-    return np.asarray(track.posed & (track.segment == segments[np.argmax(counts)]))
+        self._frames.close()

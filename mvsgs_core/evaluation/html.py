@@ -50,6 +50,25 @@ def rendering_table(report: Mapping[str, Any]) -> str:
     return f"<table>{''.join(rows)}</table>"
 
 
+def worst_figures(rendering: Mapping[str, Any]) -> dict[str, str]:
+    """The worst frames and how much of the frames the map covers, from `report["rendering"]`."""
+    coverage = rendering["coverage"]
+    figures = {}
+    for name, worst, count in (
+        ("worst held-out frame", rendering["worst"]["held_out"], rendering["held_out"]["count"]),
+        ("worst of all frames scored", rendering["worst"]["all"], rendering["all"]["count"]),
+    ):
+        if worst:
+            what = "keyframe" if worst["keyframe"] else "held out" if worst["held_out"] else "between keyframes"
+            figures[f"{name} ({count})"] = f"{worst['index']} ({what}): {number(worst['psnr'], 2)} dB"
+    if coverage["count"]:
+        mean, least = (f"{100 * coverage[key]:.1f} %" for key in ("mean", "min"))
+        figures[f"pixels covered by the map, of {coverage['count']} frames"] = (
+            f"{mean}; least {least}, frame {coverage['min_index']}"
+        )
+    return figures
+
+
 def figures_table(figures: Mapping[str, Any]) -> str:
     rows = [f"<tr><td>{escape(str(k))}</td><td>{escape(str(v))}</td></tr>" for k, v in figures.items()]
     return f"<table>{''.join(rows)}</table>"
@@ -57,6 +76,21 @@ def figures_table(figures: Mapping[str, Any]) -> str:
 
 def number(value: float | None, digits: int = 3) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _span(trajectory: Mapping[str, Any]) -> str:
+    first, last = trajectory["first_tracked"], trajectory["last_tracked"]
+    return "" if first is None else f", {first} to {last}"
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
+
+
+def _some(indices: Sequence[int], most: int = 8) -> str:
+    if not indices:
+        return "none"
+    return f"{len(indices)}: {', '.join(map(str, indices[:most]))}{', …' if len(indices) > most else ''}"
 
 
 def page(
@@ -71,8 +105,13 @@ def page(
     figures = {
         "ATE RMSE of keyframes (after Sim(3), unit of the true poses)": number(trajectory["ate_rmse"], 4),
         "… in % of the path": number(trajectory["ate_percent"], 2),
-        "frames tracked": f"{trajectory['frames_tracked']} of {trajectory['frames']}",
+        "… of so many keyframes with a true pose": trajectory["ate_keyframes"],
+        "frames tracked": f"{trajectory['frames_tracked']} of {trajectory['frames']}{_span(trajectory)}",
+        "frames without a pose": _listed(trajectory["frames_without_pose"]) or "none",
+        "frames with a pose of too little motion or texture": trajectory["frames_degenerate"],
         "keyframes": trajectory["keyframes"],
+        "keyframes that were to be held out": _some(trajectory["held_out_keyframes"]),
+        "filtered depth: keyframes with true depth": depth["count"],
         "filtered depth: absolute relative error": number(depth["abs_rel"], 4),
         "filtered depth: inliers within 5 %": number(depth["inlier_ratio"]),
         "filtered depth: completeness": number(depth["completeness"]),
@@ -85,14 +124,18 @@ def page(
     }
     memory = {node: f"{size / 1e6:.0f} MB" for node, size in report.get("memory", {}).get("peak_bytes", {}).items()}
     skipped = {f"{node}: {what}": f"{n:g}" for node, s in report.get("skipped", {}).items() for what, n in s.items()}
-    warnings = [f"{node}: {text}" for node, texts in report.get("warnings", {}).items() for text in texts]
+    warnings = [f"{node}: {text}" for node, text in report.get("nothing", {}).items()]
+    warnings += [f"{node}: {text}" for node, texts in report.get("warnings", {}).items() for text in texts]
     warnings += report.get("notes", [])
+    origin = [report.get("input"), report.get("date"), report.get("version") and f"MVS-GS {report['version']}"]
     body = [
         f"<h1>{escape(title)}</h1>",
+        f"<p>{escape(' · '.join(str(part) for part in origin if part))}</p>",
         f"<p>{escape(report.get('protocol', ''))}</p>",
         "".join(f'<p class="warning">{escape(w)}</p>' for w in warnings),
         "<h2>Rendering</h2>",
         rendering_table(report),
+        figures_table(worst_figures(report["rendering"])),
         *(_row(caption, pictures) for caption, pictures in comparisons),
         "<h2>Figures</h2>",
         figures_table(figures),

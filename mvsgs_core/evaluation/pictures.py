@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -11,28 +11,45 @@ import numpy as np
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import html, scoring, svg
 from mvsgs_core.evaluation.evaluation import Evaluation
-from mvsgs_core.held_out import is_held_out
 
 Row = tuple[str, dict[str, np.ndarray]]
 
 
 def comparisons(evaluation: Evaluation) -> list[Row]:
-    """Render beside photograph: the worst, median and best held-out frame (keyframes where none is held out)."""
+    """Render beside photograph: the worst, median and best held-out frame, as far as there are as many, and the worst
+    of all. Of all frames, where none is held out."""
     scores = evaluation.scores.get(True) or evaluation.scores.get(False) or []
-    held_out = [s for s in scores if not s.keyframe and is_held_out(s.index)] or scores
-    if not held_out:
+    if not scores:
         return []
     refined = True in evaluation.maps
     finished = evaluation.maps[refined]
     views = {v.index: v for v in evaluation.views(refined)}
-    ranked = sorted(held_out, key=lambda s: s.psnr)
-    picks = {"worst": ranked[0], "median": ranked[len(ranked) // 2], "best": ranked[-1]}
     rows = []
-    for name, score in picks.items():
-        kind = "keyframe" if score.keyframe else "held-out"
-        caption = f"{name} {kind} frame {score.index}: {score.psnr:.2f} dB, SSIM {score.ssim:.3f}"
+    for name, score in _picks(scores):
+        figures = f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}, {100 * score.coverage:.1f} % covered"
+        caption = f"{name}: {score.index} ({kind(score)}), {figures}"
         rows.append((caption, scoring.comparison(finished.splats, finished.density, views[score.index])))
     return rows
+
+
+def _picks(scores: Sequence[scoring.Score]) -> list[tuple[str, scoring.Score]]:
+    """No frame twice."""
+    held_out = [s for s in scores if s.held_out]
+    among = "held-out frame" if held_out else "frame"
+    ranked = sorted(held_out or scores, key=lambda s: s.psnr)
+    places = {"worst": 0, "median": len(ranked) // 2, "best": len(ranked) - 1}
+    picks: dict[int, tuple[str, scoring.Score]] = {}
+    for name, place in places.items():
+        picks.setdefault(ranked[place].index, (f"{name} {among}", ranked[place]))
+    if len(ranked) == 1:
+        picks = {ranked[0].index: (f"only {among}", ranked[0])}
+    worst = min(scores, key=lambda s: s.psnr)
+    picks.setdefault(worst.index, (f"worst of all {len(scores)} frames scored", worst))
+    return list(picks.values())
+
+
+def kind(score: scoring.Score) -> str:
+    return "keyframe" if score.keyframe else "held out" if score.held_out else "between keyframes"
 
 
 def write_sheet(file: Path, rows: list[Row]) -> None:
@@ -44,10 +61,7 @@ def write_sheet(file: Path, rows: list[Row]) -> None:
 
 def depth_maps(evaluation: Evaluation, count: int = 3) -> list[Row]:
     """Filtered depth maps of keyframes spread over the run, beside the photographs."""
-    if evaluation.track is None:
-        return []
-    indices = [int(i) for i in evaluation.track.index[evaluation.track.keyframe]]
-    available = [i for i in indices if evaluation.filtered_depth(i) is not None]
+    available = evaluation.filtered_depths()
     rows = []
     for k in np.unique(np.linspace(0, len(available) - 1, count).round().astype(int)) if available else []:
         index = available[k]
@@ -72,14 +86,16 @@ def plots(evaluation: Evaluation, stages: Mapping[str, Mapping[str, float]]) -> 
         center = next(iter(paths.values())).mean(axis=0)
         series = [svg.Series(name, *((p - center) @ axes.T).T) for name, p in paths.items()]
         result["Trajectory"] = svg.plot(series, "widest direction", "second", equal=True)
-    series = []
+    series, covered = [], []
     for refined, name in ((False, "before refinement"), (True, "after")):
         scores = evaluation.scores.get(refined, [])
         if scores:
             index = np.array([s.index for s in scores], dtype=float)
             series.append(svg.Series(name, index, np.array([s.psnr for s in scores])))
+            covered.append(svg.Series(name, index, np.array([100 * s.coverage for s in scores])))
     if series:
         result["PSNR by frame"] = svg.plot(series, "frame", "dB")
+        result["Coverage by frame"] = svg.plot(covered, "frame", "% of the pixels more than half opaque")
     if stages:
         result["Time by stage"] = html.timing_bars(stages)
     return result

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import image_metrics
+from mvsgs_core.evaluation.frames import ENDING
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, rolled
 from mvsgs_core.held_out import is_held_out
@@ -39,23 +41,41 @@ class Score:
     psnr: float
     ssim: float
     lpips: float | None
+    coverage: float  # share of the pixels at which the render is more opaque than not
+
+    @property
+    def held_out(self) -> bool:
+        """The map was not made of it: held out before the run, and no keyframe."""
+        return not self.keyframe and is_held_out(self.index)
+
+    def entry(self) -> dict[str, Any]:
+        """As it stands in report.json."""
+        return {**vars(self), "held_out": self.held_out}
 
 
-def render_view(splats: Splats, density: str, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Color (H, W, 3) float32 in 0..1, as the view's exposure and shutter show it, and depth (H, W) float32."""
+class Rendered(NamedTuple):
+    color: np.ndarray  # (H, W, 3) float32 in 0..1, as the view's exposure and shutter show it
+    depth: np.ndarray  # (H, W) float32, 0 where nothing is rendered
+    opacity: np.ndarray  # (H, W) float32 in 0..1
+
+
+def render_view(splats: Splats, density: str, view: View, size: tuple[int, int]) -> Rendered:
+    """What the map shows from the view, at (height, width)."""
     exposure = None if view.exposure is None else torch.from_numpy(view.exposure)
     with torch.inference_mode():
         render = rasterize(
             splats, view.world_from_cam, view.intrinsics, size, exposure=exposure, density=density, near=view.near
         )
     color, depth = render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
-    return color if view.shutter is None else rolled(color, depth, view.intrinsics, view.shutter), depth
+    if view.shutter is not None:
+        color = rolled(color, depth, view.intrinsics, view.shutter)
+    return Rendered(color, depth, render.opacity.cpu().numpy())
 
 
 def score_view(splats: Splats, density: str, view: View, lpips: Lpips | None) -> Score:
     """Scores one view. Nothing is fitted to its photograph, exposure neither."""
     photograph = view.photograph().astype(np.float32) / 255.0
-    color, _ = render_view(splats, density, view, photograph.shape[:2])
+    color, _, opacity = render_view(splats, density, view, photograph.shape[:2])
     distance = None
     if lpips is not None:
         images = [torch.from_numpy(i).permute(2, 0, 1)[None].contiguous() for i in (color, photograph)]
@@ -66,19 +86,22 @@ def score_view(splats: Splats, density: str, view: View, lpips: Lpips | None) ->
         image_metrics.psnr(color, photograph),
         image_metrics.ssim(color, photograph),
         distance,
+        float((opacity > 0.5).mean()),
     )
 
 
 def choose(views: list[View], limit: int) -> list[View]:
-    """All views, or where there are more than `limit` as many of each kind, spread evenly over the run."""
+    """All views, in the order of the stream, or where there are more than `limit` as many of each kind, spread evenly
+    over the run, and its last ones: the last, and of many the last few, for the end of a stream is where maps fail."""
     if len(views) <= limit:
         return views
+    last = min(ENDING, max(1, limit // 20))
+    chosen, rest = views[-last:], views[:-last]
     groups = [
-        [v for v in views if v.keyframe],
-        [v for v in views if not v.keyframe and is_held_out(v.index)],
-        [v for v in views if not v.keyframe and not is_held_out(v.index)],
+        [v for v in rest if v.keyframe],
+        [v for v in rest if not v.keyframe and is_held_out(v.index)],
+        [v for v in rest if not v.keyframe and not is_held_out(v.index)],
     ]
-    chosen: list[View] = []
     for k, group in enumerate(groups):
         share = (limit - len(chosen)) // (len(groups) - k)
         places = np.linspace(0, max(len(group) - 1, 0), min(share, len(group)))
@@ -86,17 +109,34 @@ def choose(views: list[View], limit: int) -> list[View]:
     return sorted(chosen, key=lambda v: v.index)
 
 
-def summarize(scores: Iterable[Score]) -> dict[str, dict[str, float | int | None]]:
-    """Means over keyframes (training views), held-out frames (never mapped), and all frames scored."""
+def summarize(scores: Iterable[Score]) -> dict[str, Any]:
+    """Means over keyframes (training views), held-out frames (never mapped) and all frames scored, with their number;
+    the worst of each by PSNR; how much of the frames the map covers; each frame."""
     scores = list(scores)
+    held_out = [s for s in scores if s.held_out]
     return {
         "keyframes": _mean([s for s in scores if s.keyframe]),
-        "held_out": _mean([s for s in scores if not s.keyframe and is_held_out(s.index)]),
+        "held_out": _mean(held_out),
         "all": _mean(scores),
+        "worst": {"held_out": _worst(held_out), "all": _worst(scores)},
+        "coverage": _coverage(scores),
+        "frames": [s.entry() for s in scores],
     }
 
 
-def _mean(scores: list[Score]) -> dict[str, float | int | None]:
+def _worst(scores: Sequence[Score]) -> dict[str, Any] | None:
+    return min(scores, key=lambda s: s.psnr).entry() if scores else None
+
+
+def _coverage(scores: Sequence[Score]) -> dict[str, Any]:
+    if not scores:
+        return {"mean": None, "min": None, "min_index": None, "count": 0}
+    least = min(scores, key=lambda s: s.coverage)
+    mean = float(np.mean([s.coverage for s in scores]))
+    return {"mean": mean, "min": least.coverage, "min_index": least.index, "count": len(scores)}
+
+
+def _mean(scores: Sequence[Score]) -> dict[str, float | int | None]:
     def mean(values: list[float]) -> float | None:
         return float(np.mean(values)) if values else None
 
@@ -111,7 +151,7 @@ def _mean(scores: list[Score]) -> dict[str, float | int | None]:
 def comparison(splats: Splats, density: str, view: View, width: int = 400) -> dict[str, np.ndarray]:
     """Pictures (h, w, 3) uint8 of a view for the report: photograph, render, error, rendered depth."""
     photograph = view.photograph()
-    color, depth = render_view(splats, density, view, photograph.shape[:2])
+    color, depth, _ = render_view(splats, density, view, photograph.shape[:2])
     size = (max(1, round(photograph.shape[0] * width / photograph.shape[1])), width)
     error = np.abs(color - photograph.astype(np.float32) / 255.0).mean(axis=2)
     pictures = {

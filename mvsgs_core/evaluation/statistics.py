@@ -1,0 +1,51 @@
+"""What the nodes of a run counted, timed, skipped and warned of, as the report shows it.
+
+It came over the wire, perhaps from a node that somebody else wrote: what has not the form that it should have is left
+out, or shown as the text that it is, and never ends the report.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+
+def collected(stats: Mapping[str, Any]) -> dict[str, Any]:
+    """Parts of the report, from the statistics of each node by name."""
+    nodes = {str(name): s for name, s in stats.items() if isinstance(s, Mapping)}
+    cpu = {name: _number(s.get("cpu_seconds")) for name, s in nodes.items()}
+    peak = {name: _number(s.get("peak_bytes")) for name, s in nodes.items()}
+    nothing = {name: _mapping(s.get("values")).get("nothing") for name, s in nodes.items()}
+    return {
+        "time": {
+            "stages": {name: _numbers(s.get("seconds")) for name, s in nodes.items()},
+            "cpu": {name: seconds for name, seconds in cpu.items() if seconds is not None},
+        },
+        "memory": {"peak_bytes": {name: size for name, size in peak.items() if size is not None}},
+        "skipped": {name: found for name, s in nodes.items() if (found := _numbers(s.get("skipped")))},
+        "counts": {name: found for name, s in nodes.items() if (found := _numbers(s.get("counts")))},
+        "warnings": {name: texts for name, s in nodes.items() if (texts := _texts(s.get("warnings")))},
+        "nothing": {name: str(reason) for name, reason in nothing.items() if reason},
+    }
+
+
+def _mapping(value: Any) -> Mapping[Any, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _number(value: Any) -> float | None:
+    real = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return value if real else None
+
+
+def _numbers(value: Any) -> dict[str, float]:
+    pairs = ((str(key), _number(item)) for key, item in _mapping(value).items())
+    return {key: number for key, number in pairs if number is not None}
+
+
+def _texts(value: Any) -> list[str]:
+    """A text is one text, not its characters."""
+    if not value:
+        return []
+    return [str(item) for item in value] if isinstance(value, list | tuple) else [str(value)]
