@@ -82,7 +82,9 @@ class Trained:
 
 def run_ours(scene: str, overrides: list[str], output: Path, made: pieces.Pieces) -> Ours | None:
     """None where the run failed, runs.log in `output` says why, or is not there yet."""
-    matrix = Matrix([scene], overrides=[*overrides, "recorder=track", "evaluator.max_frames=2000"])
+    matrix = Matrix(
+        [scene], overrides=[*overrides, "recorder=track", "evaluator.max_frames=2000", "evaluator.max_bytes=2e10"]
+    )
     runs = made.runs({str(output.relative_to(made.output)): matrix})
     if not runs or runs[0].report is None or not (runs[0].folder / "track.json").exists():
         return None

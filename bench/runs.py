@@ -156,6 +156,8 @@ class Matrix:
         for number, (scene, variant, setting, seed) in enumerate(self.names()):
             file = output / str(number) / "report.json"
             report = json.loads(file.read_text()) if file.exists() else None
+            if report is not None and report.get("finished") is False:
+                report = None  # of a run that ended early; what it reached is no result
             runs.append(Run(scene, variant, seed, file.parent, report, setting))
         return runs
 

@@ -29,10 +29,14 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
         before = _image(_get(report, "rendering_before_refinement", part))
         if after or before:
             lines.append(f"{title}   {after or '-'}" + (f"   (before refinement: {before})" if before else ""))
+    lines += _worst(report, "rendering") or _worst(report, "rendering_before_refinement")
     trajectory = _get(report, "trajectory") or {}
     if trajectory:
         tracked = f"{trajectory.get('frames_tracked')} of {trajectory.get('frames')} frames"
-        ate = f", ATE {_number(trajectory.get('ate_rmse'))} (RMSE, in the true poses' unit)"
+        ate = (
+            f", ATE {_number(trajectory.get('ate_rmse'))} (RMSE of {trajectory.get('ate_keyframes')} keyframes, in the "
+            "true poses' unit)"
+        )
         lines.append(
             f"trajectory  {tracked}, {trajectory.get('keyframes')} keyframes"
             + (ate if trajectory.get("ate_rmse") is not None else "")
@@ -41,7 +45,8 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
     if depth and depth.get("abs_rel") is not None:
         lines.append(
             f"depth       relative error {_number(depth['abs_rel'])}, within 5 %: "
-            f"{_percent(depth.get('inlier_ratio'))}, complete: {_percent(depth.get('completeness'))}"
+            f"{_percent(depth.get('inlier_ratio'))}, complete: {_percent(depth.get('completeness'))}, "
+            f"{depth.get('count')} keyframes"
         )
     splats, size = _get(report, "map", "splats"), _get(report, "map", "bytes")
     if splats is not None:
@@ -59,6 +64,19 @@ def _image(scores: Mapping[str, Any] | None) -> str:
     if scores.get("lpips") is not None:
         text += f", LPIPS {scores['lpips']:.3f}"
     return f"{text}, {scores.get('count')} frames"
+
+
+def _worst(report: Mapping[str, Any], part: str) -> list[str]:
+    """The worst of all frames that were scored, and the one that the map covers least."""
+    worst, coverage = _get(report, part, "worst", "all"), _get(report, part, "coverage")
+    if not worst or not coverage or coverage.get("min") is None:
+        return []
+    kind = "keyframe" if worst.get("keyframe") else "held out" if worst.get("held_out") else "between keyframes"
+    psnr = "" if worst.get("psnr") is None else f": {worst['psnr']:.2f} dB"
+    return [
+        f"worst       frame {worst.get('index')} ({kind}){psnr}; least covered: frame {coverage.get('min_index')}, "
+        f"{100 * coverage['min']:.1f} % (of {coverage.get('count')} frames)"
+    ]
 
 
 def _get(report: Mapping[str, Any], *path: str) -> Any:

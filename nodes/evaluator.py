@@ -105,7 +105,7 @@ class Evaluator(Node):
         own = {
             "seconds": self.stats.seconds,
             "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-            "warnings": self.stats.warnings,
+            "warnings": self.stats.warnings.lines(),
         }
         said = statistics.collected({**self.upstream, "evaluator": own})
         self.report["time"] |= said.pop("time")

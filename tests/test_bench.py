@@ -122,6 +122,8 @@ def test_the_command_names_everything_and_jobs_are_in_its_order(tmp_path: Path) 
     assert [(r.scene, r.variant, r.setting, r.seed) for r in runs] == [tuple(r.report["name"]) for r in runs]  # type: ignore[index]
     assert len(runs) == 16
     assert (runs[1].scene, runs[1].variant, runs[1].setting, runs[1].seed) == ("room", "full", "x", 3)
+    (tmp_path / "0" / "report.json").write_text(json.dumps({"finished": False, "reason": "mapper failed"}))
+    assert matrix.collect(tmp_path)[0].report is None  # it ended early: no result
 
 
 def test_unknown_names_are_refused_with_those_there_are() -> None:
