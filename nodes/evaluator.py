@@ -114,7 +114,7 @@ class Evaluator(Node):
             "finished": True,
             "date": time.strftime("%Y-%m-%d %H:%M:%S %Z"),
             "version": _version(),
-            "input": self.config.input,
+            "input": self.config.input.strip(),
         }
         self.report["protocol"] = (
             "Scored at native resolution; nothing is fitted to a scored frame, exposure neither. "

@@ -123,7 +123,9 @@ def page(
         "keyframes per second": number(times["keyframes_per_second"], 2),
     }
     memory = {node: f"{size / 1e6:.0f} MB" for node, size in report.get("memory", {}).get("peak_bytes", {}).items()}
-    skipped = {f"{node}: {what}": f"{n:g}" for node, s in report.get("skipped", {}).items() for what, n in s.items()}
+    skipped = {
+        f"{node}: {what}": f"{n:,.10g}" for node, s in report.get("skipped", {}).items() for what, n in s.items()
+    }
     warnings = [f"{node}: {text}" for node, text in report.get("nothing", {}).items()]
     warnings += [f"{node}: {text}" for node, texts in report.get("warnings", {}).items() for text in texts]
     warnings += report.get("notes", [])
@@ -149,7 +151,7 @@ def page(
         "<h2>Peak memory</h2>",
         figures_table(memory),
     ]
-    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{_STYLE}</style>'
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title><style>{_STYLE}</style>'
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
 
 
