@@ -103,12 +103,12 @@ class Graph:
 
     @cached_property
     def observers(self) -> frozenset[str]:
-        """Slots that nobody who makes the map depends on: declared so, or readers of best-effort edges only."""
+        """Slots that nobody who makes the map depends on: declared so, or by their own choice newest-only readers."""
         found: set[str] = set()
         for name, slot in reversed(self.slots.items()):
-            only_newest = bool(self.into(name)) and all(edge.best_effort for edge in self.into(name))
-            watched = all(edge.reader in found for edge in self.out_of(name) if not edge.feedback)
-            if slot.placement.observer or (only_newest and watched and not any(e.feedback for e in self.out_of(name))):
+            only_newest = bool(slot.reads) and all(sender.endswith("?") for sender in slot.reads.values())
+            watched = all(edge.reader in found and not edge.feedback for edge in self.out_of(name))
+            if slot.placement.observer or (only_newest and watched):
                 found.add(name)
         return frozenset(found)
 

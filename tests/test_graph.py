@@ -40,6 +40,7 @@ def test_parameters_are_the_choice_files_then_the_command_lines_then_the_default
     slot = fake("relay.stride=7", "relay.gain=2").slots["relay"]
     assert slot.config == {
         "stride": 7, "gain": 2.0, "fail_at": None, "kill_at": None, "hang_at": None, "seconds": 0.0,
+        "long_at": None, "long": 0.0, "how": "asleep", "says": None, "nothing": None,
     }  # fmt: skip
     assert isinstance(slot.config["gain"], float)
 
@@ -104,6 +105,19 @@ def test_refused_before_anything_starts(overrides: list[str], what: str, valid: 
         fake(*overrides)
     assert what in str(refusal.value)
     assert valid in str(refusal.value)
+
+
+def test_observers_are_those_declared_and_readers_of_best_effort_edges_only() -> None:
+    newest = [f"sink.reads.{name}" for name in ("Keyframe=relay?", "Poses=relay?", "GroundTruth=source?")]
+    assert fake().observers == set()
+    assert fake("sink.observer=true").observers == {"sink"}
+    assert fake(*newest).observers == {"sink"}
+    assert fake(*newest[:2]).observers == set()
+    assert fake("source=live").observers == set()  # whom the map needs, even if a camera sends it the newest only
+    assert fake("sink.observer=true", f"relay._target_={STAGES}.Uncorrected", "source=live").observers == {"sink"}
+    assert compose(["viewer=viser", "recorder=mcap"]).observers == {"evaluator", "viewer", "recorder"}
+    with pytest.raises(GraphError, match=r"sink reads Keyframe from relay, which may fail alone: set relay.observer"):
+        fake("relay.observer=true")
 
 
 def test_a_cycle_is_refused_with_its_path() -> None:

@@ -3,96 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 import yaml
 
 from nodes.transport import create_keys
+from tests.launches import DOWN, ROOT, Launch, launch
 
-ROOT = Path(__file__).resolve().parent.parent
-FAKE = ROOT / "tests" / "fake_graph" / "conf"
-DOWN = 5.0  # seconds in which a graph must be gone
-
-
-class Launch:
-    """One run of the launcher, in a temporary directory of its own so that whatever it leaves there is found."""
-
-    def __init__(self, folder: Path, *overrides: str, conf: Path = FAKE) -> None:
-        self.output = folder / "out"
-        self._sockets = Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))  # short: a socket's path must fit
-        self.process = subprocess.Popen(
-            [sys.executable, ROOT / "launch/run_all.py", "--config-path", conf, f"output={self.output}", *overrides],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=folder,
-            start_new_session=True,
-            env={**os.environ, "TMPDIR": str(self._sockets), "PYTHONPATH": ""},
-        )
-
-    def finish(self, seconds: float = 60.0) -> tuple[int, str, str]:
-        """Exit code and what was printed; then no process, socket or temporary file of the run may be left."""
-        out, err = self.process.communicate(timeout=seconds)
-        assert self.nodes() == []
-        assert list(self._sockets.iterdir()) == []
-        self._sockets.rmdir()
-        return self.process.returncode, out, err
-
-    def nodes(self) -> list[int]:
-        """Processes of this run's nodes: their spec lies in its temporary directory."""
-        found = []
-        for process in psutil.process_iter(["cmdline", "status"]):
-            line = " ".join(process.info["cmdline"] or [])
-            if f"{self._sockets}/" in line and process.info["status"] != psutil.STATUS_ZOMBIE:
-                found.append(process.pid)
-        return found
-
-    def node(self, name: str) -> psutil.Process:
-        return next(p for p in map(psutil.Process, self.nodes()) if f"/{name}.json" in " ".join(p.cmdline()))
-
-    def wait_until_running(self) -> None:
-        """Until the sink's log says so: by then every node is."""
-        until = time.monotonic() + 30
-        log = self.output / "logs" / "sink.log"
-        while time.monotonic() < until and self.process.poll() is None:
-            if log.exists() and "running" in log.read_text():
-                return
-            time.sleep(0.05)
-        raise AssertionError(f"the graph did not come up: {self.process.communicate(timeout=10)}")
-
-    def ctrl_c(self) -> None:
-        """As a terminal does it: to all processes of the foreground group."""
-        os.killpg(self.process.pid, signal.SIGINT)
-
-    def kill(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.communicate()
-
-
-@pytest.fixture
-def launch(tmp_path: Path) -> Iterator[type[Launch]]:
-    runs: list[Launch] = []
-
-    class Started(Launch):
-        def __init__(self, *overrides: str, conf: Path = FAKE) -> None:
-            super().__init__(tmp_path, *overrides, conf=conf)
-            runs.append(self)
-
-    yield Started
-    for run in runs:
-        run.kill()
+__all__ = ["launch"]  # the fixture
 
 
 def sink(output: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import signal
@@ -54,6 +55,11 @@ class Relay(Node):
         kill_at: int | None = None  # frame at which it is killed, as by the system
         hang_at: int | None = None  # frame at which it stops answering, SIGTERM included
         seconds: float = 0.0  # work per frame
+        long_at: int | None = None  # frame that takes long
+        long: float = 0.0  # seconds of it
+        how: Literal["asleep", "busy", "locked"] = "asleep"  # meanwhile; locked: none of its threads can run
+        says: str | None = None  # a warning
+        nothing: str | None = None  # why its result is empty
 
     config: Config
 
@@ -80,6 +86,11 @@ class Relay(Node):
         return []
 
     def on_end(self) -> Iterator[Poses]:
+        if self.config.says is not None:
+            self.stats.values["says"] = self.config.says
+            self.stats.warnings.append(self.config.says)  # past what makes it printable: a node may do anything
+        if self.config.nothing is not None:
+            self.stats.nothing(self.config.nothing)
         yield Poses(1, np.zeros(1, np.int64), np.eye(4)[None], np.ones(1))
 
     def _misbehave(self, index: int) -> None:
@@ -91,6 +102,18 @@ class Relay(Node):
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             while True:
                 time.sleep(1)
+        if index == self.config.long_at:
+            take(self.config.long, self.config.how)
+
+
+def take(seconds: float, how: str) -> None:
+    """That time: asleep, busy in Python, or in a call that keeps the interpreter's lock."""
+    if how == "locked":
+        ctypes.PyDLL(None).read(os.pipe()[0], ctypes.create_string_buffer(1), 1)  # nobody writes
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if how == "asleep":
+            time.sleep(seconds)
 
 
 class Sink(Node):
@@ -100,17 +123,22 @@ class Sink(Node):
     class Config:
         output: str
         labels: dict[str, Any] = field(default_factory=dict)
+        refuse: bool = False  # fails before the run starts
+        long: float = 0.0  # seconds for each keyframe
 
     config: Config
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
+        if self.config.refuse:
+            raise OSError(28, "No space left on device")
         self.keyframes: list[int] = []
         self.truths: list[int] = []
         self.poses = 0
         self.seen_upstream: dict[str, Any] = {}
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[None]:
+        take(self.config.long, "asleep")
         self.keyframes.append(keyframe.index)
         self.stats.count("keyframes")
         yield from ()
