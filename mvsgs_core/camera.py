@@ -2,8 +2,31 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
+
+_NARROWEST, _WIDEST = 1000.0, 0.01  # focal lengths as multiples of the longer side: 0.06 and 179 degrees of view
+_OFF_CENTER = 2.0  # image sizes from the middle: a principal point farther out is not even that of a cropped picture
+_LONGEST_SIDE = 2**20  # pixels
+
+
+def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int]) -> None:
+    """Raises ValueError for (fx, fy, cx, cy) that no camera with images of `size` (height, width) has."""
+    fx, fy, cx, cy = (float(v) for v in intrinsics)
+    height, width = size
+    if not (1 <= height <= _LONGEST_SIDE and 1 <= width <= _LONGEST_SIDE):
+        raise ValueError(f"an image of {width}x{height} pixels is none")
+    if not all(math.isfinite(v) for v in (fx, fy, cx, cy)):
+        raise ValueError(f"intrinsics must be finite, got fx, fy, cx, cy = {fx:g}, {fy:g}, {cx:g}, {cy:g}")
+    if fx <= 0 or fy <= 0:
+        raise ValueError(f"focal lengths must be positive, got fx, fy = {fx:g}, {fy:g}")
+    longer = max(size)
+    if not all(_WIDEST * longer <= f <= _NARROWEST * longer for f in (fx, fy)):
+        raise ValueError(f"focal lengths fx, fy = {fx:g}, {fy:g} are no camera's with {width}x{height} pixels")
+    if abs(cx - 0.5 * width) > _OFF_CENTER * width or abs(cy - 0.5 * height) > _OFF_CENTER * height:
+        raise ValueError(f"principal point cx, cy = {cx:g}, {cy:g} is far outside of {width}x{height} pixels")
 
 
 def scale_intrinsics(intrinsics: np.ndarray, from_size: tuple[int, int], to_size: tuple[int, int]) -> np.ndarray:

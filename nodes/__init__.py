@@ -20,7 +20,8 @@ The parameter's type declares the input, the yielded type the output. Hooks:
   save what must not be lost, within 3 s, or be killed. Called once, between two hooks or at a `yield` of one (after an
   exception, where that left the node); nothing can be sent any more.
 - `check(cls, config)`: before any process starts, on the launcher's machine: raises OSError or ValueError, saying what
-  to do, where it is plain that the node cannot run (its file is missing). Quick, and opens nothing.
+  to do, where it is plain that the node cannot run (its file is missing, or cannot be read). A source opens its input
+  and reads one frame of it, no more: quick, and nothing is written or sent.
 
 Arrays of a message that came from another process are read-only, and those over 4 kB are views that keep its whole
 frame in memory: copy what you change, and what you keep of it.

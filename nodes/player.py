@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
-
-from mcap.exceptions import InvalidMagic, McapError
-from mcap.reader import McapReader, NonSeekingReader, SeekingReader
 
 from msgs import Frame, GroundTruth
-from msgs.codec import decode
+from msgs.codec import MAX_MESSAGE_BYTES, CodecError, decode
+from mvsgs_core.bad_file import BadFileError, brief
+from mvsgs_core.datasets.mcap_file import McapFile, Recorded
 from nodes import Node
 from nodes.recorder import ENCODING
 
@@ -20,7 +17,10 @@ PLAYED = (Frame, GroundTruth)
 
 
 class Player(Node):
-    """An MCAP recording -> its Frame and GroundTruth messages, in the order of their recording."""
+    """An MCAP recording -> its Frame and GroundTruth messages, in the order of their recording.
+
+    Damaged parts are left out, counted and warned of. Raises BadFileError where nothing is left to play.
+    """
 
     replayable = True
 
@@ -37,53 +37,69 @@ class Player(Node):
     def check(cls, config: Config) -> None:
         if config.path is None or not Path(config.path).is_file():
             raise FileNotFoundError(f"dataset.path={config.path}: must be an .mcap file, as recorder=mcap writes it")
+        if config.start < 0 or config.stride < 1 or (config.stop is not None and config.stop <= config.start):
+            wanted = f"start={config.start}, stop={config.stop}, stride={config.stride}"
+            raise ValueError(f"{wanted}: 0 <= start < stop and stride >= 1")
+        player = cls(config)
+        recording = player._recording()
+        for record in player._records(recording):
+            if player._decoded(record, recording) is not None:
+                return
+        raise _nothing_played(recording, config)
 
     def run(self) -> Iterator[Frame | GroundTruth]:
         c = self.config
         self.check(c)
-        assert c.path is not None
-        if c.start < 0 or c.stride < 1 or (c.stop is not None and c.stop <= c.start):
-            raise ValueError(f"start={c.start}, stop={c.stop}, stride={c.stride}: 0 <= start < stop and stride >= 1")
+        recording = self._recording()
         last = -1
-        for place, record in self._records(Path(c.path)):
-            last = max(last, place)
-            if place >= c.start and (place - c.start) % c.stride == 0 and (c.stop is None or place < c.stop):
-                message = decode(record, expect=PLAYED).message
-                assert isinstance(message, PLAYED)
-                self.stats.count("frames", isinstance(message, Frame))
-                yield message
+        try:
+            for record in self._records(recording):
+                place = record.sequence  # in its topic: the nth ground truth belongs to the nth frame, wherever it is
+                last = max(last, place)
+                if place >= c.start and (place - c.start) % c.stride == 0 and (c.stop is None or place < c.stop):
+                    message = self._decoded(record, recording)
+                    if message is not None:
+                        self.stats.count("frames", isinstance(message, Frame))
+                        yield message
+        finally:  # also when the run is interrupted
+            for warning in recording.warnings:
+                self.stats.warn(warning)
         if last < c.start:
             raise ValueError(f"{c.path} has {last + 1} frames: start={c.start} is beyond its end")
+        if not self.stats.counts.get("frames"):
+            raise _nothing_played(recording, c)
 
-    def _records(self, path: Path) -> Iterator[tuple[int, bytes]]:
-        """Messages with their place in their topic: the nth ground truth belongs to the nth frame, wherever it is."""
-        names = [t.__name__ for t in PLAYED]
-        with path.open("rb") as file:
-            reader, topics = self._open(file)
-            passed: set[str] = set()  # topics of which the rest is not wanted
-            try:
-                for _, channel, record in reader.iter_messages(topics=names, log_time_order=False):
-                    if channel.message_encoding != ENCODING:
-                        raise ValueError(f"{path} holds {channel.message_encoding} messages: play recorder=mcap's")
-                    yield record.sequence, record.data
-                    if self.config.stop is not None and record.sequence >= self.config.stop - 1:
-                        passed.add(channel.topic)
-                        if passed == topics:
-                            return
-            except InvalidMagic as error:
-                raise ValueError(f"{path} is no recording: {error}") from error
-            except McapError as error:
-                self.stats.warn(f"{path} was cut off: what is there is played ({type(error).__name__} {error})")
+    def _recording(self) -> McapFile:
+        assert self.config.path is not None
+        return McapFile(Path(self.config.path), MAX_MESSAGE_BYTES)
 
-    def _open(self, file: BinaryIO) -> tuple[McapReader, set[str]]:
-        """A reader and, where the file has its index, the topics to play: a recording that was cut off has none."""
+    def _records(self, recording: McapFile) -> Iterator[Recorded]:
+        """Those of the topics that are played, until each has passed `stop`."""
+        names = {t.__name__ for t in PLAYED}
+        passed: set[str] = set()
+        for record in recording.messages():
+            if record.topic not in names:
+                continue
+            if record.encoding != ENCODING:
+                held = brief(ValueError(record.encoding))
+                raise BadFileError(f"{self.config.path} holds {held} messages: play recorder=mcap's")
+            yield record
+            if self.config.stop is not None and record.sequence >= self.config.stop - 1:
+                passed.add(record.topic)
+                if passed == names & recording.indexed:
+                    return
+
+    @staticmethod
+    def _decoded(record: Recorded, recording: McapFile) -> Frame | GroundTruth | None:
         try:
-            reader = SeekingReader(file)
-            summary = reader.get_summary()
-            if summary is not None:
-                names = {t.__name__ for t in PLAYED}
-                return reader, names & {channel.topic for channel in summary.channels.values()}
-        except McapError:
-            logging.info("no index: read from its beginning")
-        file.seek(0)
-        return NonSeekingReader(file), set()
+            message = decode(record.data, expect=PLAYED).message
+        except CodecError as error:
+            recording.leave_out(f"{record.topic} {record.sequence}: {brief(error)}")
+            return None
+        assert isinstance(message, PLAYED)
+        return message
+
+
+def _nothing_played(recording: McapFile, config: Player.Config) -> BadFileError:
+    said = "; ".join(recording.warnings) or "it holds no frames"
+    return BadFileError(f"{config.path}: nothing of it can be played: {said}")

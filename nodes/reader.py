@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from msgs import Frame, GroundTruth
-from mvsgs_core.datasets import Item, Sequence, check_path, open_dataset
+from mvsgs_core.datasets import Item, Sequence, check, open_dataset
 from nodes import Node
 
 
@@ -34,10 +34,10 @@ class Reader(Node):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        check_path(config.name, config.path)
+        check(config.name, **_options(config))
 
     def run(self) -> Iterator[Frame | GroundTruth]:
-        sequence = self._open()
+        sequence = open_dataset(self.config.name, **_options(self.config))
         self.stats.values["frames_expected"] = len(sequence)
         self._pass_warnings_on(sequence)  # those that opening gave; the others are counted until the end
         pace = _Pace()
@@ -59,11 +59,12 @@ class Reader(Node):
     def _pass_warnings_on(self, sequence: Sequence) -> None:
         self.stats.warnings.include(sequence.warnings)
 
-    def _open(self) -> Sequence:
-        c = self.config
-        own = {"path": c.path, "size": c.size, "intrinsics": c.intrinsics, "distortion": c.distortion or None}
-        given = {key: value for key, value in own.items() if value is not None}  # not every format takes all of them
-        return open_dataset(c.name, start=c.start, stop=c.stop, stride=c.stride, **given, **c.options)
+
+def _options(c: Reader.Config) -> dict[str, Any]:
+    """Of `open_dataset`."""
+    own = {"path": c.path, "size": c.size, "intrinsics": c.intrinsics, "distortion": c.distortion or None}
+    given = {key: value for key, value in own.items() if value is not None}  # not every format takes all of them
+    return {"start": c.start, "stop": c.stop, "stride": c.stride, **given, **c.options}
 
 
 def _ground_truth(item: Item) -> GroundTruth:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+import inspect
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -45,25 +47,47 @@ READERS = {
 }
 
 
-def check_path(name: str, path: str | None) -> None:
-    """Raises ValueError for an unknown name, and FileNotFoundError, saying where the data can be had, where there is
+def check(name: str, **options: Any) -> None:
+    """Opens a sequence as `open_dataset` does, reads its first frame where it begins with the file's, and closes it.
 
-    nothing at `path` to read it from. Opens nothing; "synthetic" takes no path.
+    Raises what that raises: so it is known before a run starts whether its input can be read. "synthetic" reads nothing
+    and takes seconds to make, so of it only the options are looked at.
     """
-    if name not in READERS:
-        raise ValueError(f"no dataset {name!r}; there are: {', '.join(READERS)}")
-    layout = getattr(importlib.import_module(READERS[name].partition(":")[0]), "LAYOUT", None)
-    if layout is not None:
-        layout.present(path)
+    reader = _reader(name, options)
+    if name == "synthetic":
+        return
+    try:
+        sequence: Sequence = reader(**options)
+    except ImportError as error:  # rosbags is optional
+        raise ValueError(str(error)) from error
+    if not options.get("start"):
+        with closing(_frames(sequence)) as frames:
+            next(frames)
 
 
 def open_dataset(name: str, **options: Any) -> Sequence:
     """Opens a sequence: `open_dataset("tum", path=..., start=0, stop=None, stride=1, size=(240, 320))`.
 
-    Raises ValueError for an unknown name and FileNotFoundError, saying where the data can be had, for a missing path.
+    Raises ValueError for an unknown name or option, FileNotFoundError, saying where the data can be had, for a missing
+    path, and BadFileError, a ValueError, for files that are damaged or hostile; iterating raises that where no frame at
+    all can be read.
     """
+    sequence: Sequence = _reader(name, options)(**options)
+    return sequence
+
+
+def _reader(name: str, options: Mapping[str, Any]) -> Callable[..., Any]:
     if name not in READERS:
         raise ValueError(f"no dataset {name!r}; there are: {', '.join(READERS)}")
     module, _, attribute = READERS[name].partition(":")
-    sequence: Sequence = getattr(importlib.import_module(module), attribute)(**options)
-    return sequence
+    reader: Callable[..., Any] = getattr(importlib.import_module(module), attribute)
+    signature = inspect.signature(reader)
+    try:
+        signature.bind(**options)
+    except TypeError as error:
+        raise ValueError(f"{name}: {error}; there are: {', '.join(signature.parameters)}") from error
+    return reader
+
+
+def _frames(sequence: Sequence) -> Generator[Item, None, None]:
+    yield from sequence

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item
+from mvsgs_core.datasets.bag_file import messages, opened_bag
 from mvsgs_core.datasets.calibration import lens_from_option
-from mvsgs_core.datasets.files import Layout, UnreadableImageError
+from mvsgs_core.datasets.files import Layout
 from mvsgs_core.datasets.framing import Framing, Size
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.ros import lens_of, rgb_of
+from mvsgs_core.datasets.ros import calibrated, lens_of, rgb_of
 from mvsgs_core.datasets.sequence import Notices, same_shape, selection
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
 
 LAYOUT = Layout(
     "A bag",
@@ -34,8 +36,10 @@ class Bag:
     """Images of one topic, undistorted, with the time stamps of their headers.
 
     topic: of the images; null takes the only color one. info_topic: of the calibration; null takes the camera_info
-    beside the images. intrinsics (or "auto") and distortion replace it. size, crop: see `Framing`.
-    Raises ImportError without rosbags, FileNotFoundError and ValueError, which say what was expected.
+    beside the images. intrinsics (or "auto") and distortion replace it; where there is none, or an empty one, the lens
+    is the guess of "auto", for the tracker to estimate. size, crop: see `Framing`.
+    Damaged messages are left out and counted. Raises ImportError without rosbags, FileNotFoundError and ValueError,
+    which say what was expected, BadFileError for a bag that cannot be read or holds no image that can be.
     """
 
     def __init__(
@@ -61,14 +65,17 @@ class Bag:
         self._framing = Framing(size, crop)
         self.warnings: list[str] = Notices()
         self._notices: Notices = self.warnings  # the same list, with its counting
-        with self._open() as bag:
+        with opened_bag(self._path) as bag:
             self._topic = _image_topic(bag, topic)
             self._count = sum(c.msgcount for c in bag.connections if c.topic == self._topic)
+            lens = None
             if intrinsics is None:
-                self._lens = _recorded_lens(bag, self._topic, info_topic)
-            else:
-                self._lens, notes = lens_from_option(intrinsics, distortion, _first_size(bag, self._topic))
+                intrinsics = "auto"
+                lens = _recorded_lens(bag, self._topic, info_topic, self._notices)
+            if lens is None:
+                lens, notes = lens_from_option(intrinsics, distortion, _first_size(bag, self._topic))
                 self.warnings += notes
+            self._lens = lens
         if start >= self._count:
             raise ValueError(f"no frame left: {self._topic} has {self._count}, wanted from {start}")
         self._opening_warnings = len(self.warnings)
@@ -81,17 +88,16 @@ class Bag:
         self._notices.truncate(self._opening_warnings)
         wanted = range(self._count)[self._wanted]
         index = 0
-        with self._open() as bag:
+        with opened_bag(self._path) as bag:
             connections = [c for c in bag.connections if c.topic == self._topic]
-            for number, (connection, nanoseconds, data) in enumerate(bag.messages(connections)):
+            for number, (connection, nanoseconds, data) in enumerate(messages(bag, connections, self._notices)):
                 if number >= wanted.stop:
                     break
                 if number not in wanted:
                     continue
-                message = bag.deserialize(data, connection.msgtype)
                 try:
-                    image = rgb_of(message)
-                except UnreadableImageError as error:
+                    seconds, image = _picture(bag, connection, nanoseconds, data)
+                except BadFileError as error:
                     self._notices.tally("images left out because they could not be read", str(error))
                     continue
                 native = image.shape[0], image.shape[1]
@@ -99,33 +105,15 @@ class Bag:
                     what = "images left out because their calibration is for another aspect ratio"
                     self._notices.tally(what, f"{native} for {self._lens.size}")
                     continue
-                yield self._item(index, _seconds(message, nanoseconds), image)
+                yield self._item(index, seconds, image)
                 index += 1
         if index == 0:
-            raise ValueError(f"no image of {self._topic} could be read: " + "; ".join(self.warnings))
+            raise BadFileError(f"no image of {self._topic} could be read: " + "; ".join(self.warnings))
 
     def _item(self, index: int, seconds: float, image: np.ndarray) -> Item:
         native = image.shape[0], image.shape[1]
         framed, intrinsics = self._framing.image(image, self._lens.at(native), self._framing.size_of(self._lens.size))
         return Item(index, seconds, framed, intrinsics, intrinsics_guessed=self._lens.guessed)
-
-    @contextmanager
-    def _open(self) -> Iterator[AnyReader]:
-        try:
-            from rosbags.highlevel import AnyReader, AnyReaderError
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise ImportError("bags are read by rosbags, which is optional: pip install rosbags") from error
-        try:
-            # ROS 2 bags before Iron hold no message definitions; image and camera_info have not changed since
-            bag = AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-            bag.open()
-        except AnyReaderError as error:
-            raise LAYOUT.missing(f"{self._path} is no bag that can be read ({error})") from error
-        try:
-            yield bag
-        finally:
-            bag.close()
 
 
 def _image_topic(bag: AnyReader, given: str | None) -> str:
@@ -142,28 +130,44 @@ def _image_topic(bag: AnyReader, given: str | None) -> str:
     raise ValueError(f"the bag has several image topics; set dataset.options.topic to one of: {', '.join(topics)}")
 
 
-def _recorded_lens(bag: AnyReader, topic: str, given: str | None) -> Lens:
+def _recorded_lens(bag: AnyReader, topic: str, given: str | None, notices: Notices) -> Lens | None:
+    """The lens of the camera_info beside the images, or of the topic `given`; None, said in `notices`, without one."""
     topics = sorted({c.topic for c in bag.connections if c.msgtype == _INFO and c.msgcount})
+    if given is not None and given not in topics:
+        raise ValueError(f"the bag has no camera_info at {given}; it has it at: {', '.join(topics) or 'no topic'}")
     beside = [str(parent / "camera_info") for parent in PurePosixPath(topic).parents]
     chosen = next((t for t in ((given,) if given is not None else beside) if t in topics), None)
     if chosen is None:
-        raise ValueError(
-            f"no camera_info for {given or topic}; set dataset.intrinsics=[fx,fy,cx,cy] or "
-            f"dataset.options.info_topic to one of: {', '.join(topics) or 'none in this bag'}"
-        )
-    connections = [c for c in bag.connections if c.topic == chosen]
-    _, _, data = next(bag.messages(connections))
-    return lens_of(bag.deserialize(data, _INFO), rectified="rect" in PurePosixPath(topic).as_posix().split("image")[-1])
+        others = f", only at {', '.join(topics)} (dataset.options.info_topic chooses one)" if topics else ""
+        notices.append(f"no calibration: the bag has no camera_info for {topic}{others}")
+        return None
+    rectified = "rect" in PurePosixPath(topic).as_posix().split("image")[-1]
+    for _, _, data in messages(bag, [c for c in bag.connections if c.topic == chosen], notices):
+        with reading(chosen, "in the bag is no camera_info that can be used; set dataset.intrinsics=[fx,fy,cx,cy]"):
+            info = bag.deserialize(data, _INFO)
+            if calibrated(info):
+                return lens_of(info, rectified)
+            break
+    notices.append(f"no calibration: {chosen} in the bag is empty, the camera was not calibrated")
+    return None
 
 
 def _first_size(bag: AnyReader, topic: str) -> tuple[int, int]:
-    for connection, _, data in bag.messages([c for c in bag.connections if c.topic == topic]):
+    ignored = Notices()  # reading the sequence reports it
+    for connection, _, data in messages(bag, [c for c in bag.connections if c.topic == topic], ignored):
         try:
-            image = rgb_of(bag.deserialize(data, connection.msgtype))
-        except UnreadableImageError:
-            continue  # reading the sequence reports it
+            _, image = _picture(bag, connection, 0, data)
+        except BadFileError:
+            continue
         return image.shape[0], image.shape[1]
-    raise ValueError(f"no image of {topic} can be read")
+    raise BadFileError(f"no image of {topic} can be read")
+
+
+def _picture(bag: AnyReader, connection: Connection, nanoseconds: int, data: bytes) -> tuple[float, np.ndarray]:
+    """Seconds and (H, W, 3) uint8 RGB of a message. Raises BadFileError for a damaged one."""
+    with reading("a message", "cannot be read"):
+        message = bag.deserialize(data, connection.msgtype)
+        return _seconds(message, nanoseconds), rgb_of(message)
 
 
 def _seconds(message: Any, nanoseconds: int) -> float:

@@ -6,10 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from PIL import Image
-
 from mvsgs_core.datasets.exif import read_exif_lens
-from mvsgs_core.datasets.files import upright_size
+from mvsgs_core.datasets.files import UnreadableImageError, opened_image, upright_size
 from mvsgs_core.datasets.lens import Lens, guess_lens
 
 
@@ -58,8 +56,8 @@ def image_size(images: Iterable[Path]) -> tuple[int, int]:
     """(height, width) of the first image whose header can be read. Raises ValueError if there is none."""
     for path in images:
         try:
-            with Image.open(path) as opened:
+            with opened_image(path, path.name) as opened:
                 return upright_size(opened)
-        except (OSError, SyntaxError, ValueError):
+        except UnreadableImageError:
             continue  # reading the sequence reports it
     raise ValueError("intrinsics are for the size of the images, but none of them can be opened")

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.model import Model, Shot
+from mvsgs_core.datasets.model import Model, Shot, rigid
 from mvsgs_core.geometry import inverse, rotation_from_quaternion
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", "dense/sparse", ".")
@@ -39,16 +40,16 @@ def find_colmap(folder: Path) -> Path | None:
 def read_colmap(folder: Path) -> Model:
     """The model in `folder`, binary if both are there.
 
-    Raises ValueError for a damaged file or a camera model that has no counterpart here.
+    Raises BadFileError for a damaged file, a camera or pose that cannot be, or a camera model that has no counterpart.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    try:
-        lenses = _binary_cameras(folder / "cameras.bin") if binary else _text_cameras(folder / "cameras.txt")
-        shots = _binary_images(folder / "images.bin", lenses) if binary else _text_images(folder / "images.txt", lenses)
-    except (struct.error, IndexError, KeyError, UnicodeDecodeError) as error:
-        raise ValueError(f"the COLMAP model in {folder} is damaged or incomplete ({error!r})") from error
+    cameras, images = (folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images"))
+    with reading(cameras, "of a COLMAP model is damaged or incomplete, or cannot be used"):
+        lenses = _binary_cameras(cameras) if binary else _text_cameras(cameras)
+    with reading(images, "of a COLMAP model is damaged or incomplete, or cannot be used"):
+        shots = _binary_images(images, lenses) if binary else _text_images(images, lenses)
     if not shots:
-        raise ValueError(f"the COLMAP model in {folder} has no registered image")
+        raise BadFileError(f"the COLMAP model in {folder} has no registered image")
     return Model("COLMAP model", shots)
 
 
@@ -73,12 +74,12 @@ def _shot(lens: Lens, quaternion: Sequence[float], translation: Sequence[float])
     cam_from_world = np.eye(4)
     cam_from_world[:3, :3] = rotation_from_quaternion(np.array(quaternion, dtype=np.float64))
     cam_from_world[:3, 3] = translation
-    return Shot(lens, inverse(cam_from_world))
+    return Shot(lens, inverse(rigid(cam_from_world, "a pose")))
 
 
 def _text_cameras(path: Path) -> dict[int, Lens]:
     lenses = {}
-    for line in path.read_text().splitlines():
+    for line in path.read_text(encoding="utf-8").splitlines():
         parts = line.split()
         if parts and not line.startswith("#"):
             lenses[int(parts[0])] = lens_of(parts[1], int(parts[2]), int(parts[3]), [float(v) for v in parts[4:]])
@@ -87,7 +88,7 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
 
 def _text_images(path: Path, lenses: dict[int, Lens]) -> dict[str, Shot]:
     shots = {}
-    lines = iter(line for line in path.read_text().splitlines() if not line.startswith("#"))
+    lines = iter(line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#"))
     for line in lines:
         parts = line.split(maxsplit=9)
         if not parts:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from PIL import Image
-
-from mvsgs_core.datasets.files import upright_size
+from mvsgs_core.datasets.files import UnreadableImageError, opened_image, upright_size
 from mvsgs_core.datasets.lens import Lens
 
 _EXIF_IFD = 0x8769
@@ -21,22 +19,26 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)  # CIPA DCG-001: "35 mm equivalent" comp
 def read_exif_lens(path: Path) -> Lens | None:
     """Focal length from the header, principal point in the middle, no distortion; None where the header lacks it.
 
+    A header that cannot be read, or tells of a focal length that no camera has, is one that lacks it.
     Prefers focal length times the resolution of the sensor, which is exact for a picture that was scaled but not
     cropped, over the 35 mm equivalent, which is rounded to whole millimeters.
     """
     try:
-        with Image.open(path) as image:
+        with opened_image(path, path.name) as image:
             header = image.getexif().get_ifd(_EXIF_IFD)
             height, width = upright_size(image)
-    except (OSError, SyntaxError, ValueError):
-        return None
+    except UnreadableImageError:
+        return None  # reading the sequence reports it
     focal = _from_sensor(header, max(height, width))
     if focal is None:
         focal_35mm = _positive(header.get(_FOCAL_LENGTH_35MM))
         if focal_35mm is None:
             return None
         focal = focal_35mm * math.hypot(width, height) / _DIAGONAL_35MM
-    return Lens((focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), (height, width))
+    try:
+        return Lens((focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), (height, width))
+    except ValueError:  # a focal length that no camera has
+        return None
 
 
 def _from_sensor(header: dict[int, object], longer_side: int) -> float | None:

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from PIL import Image, ImageOps
 
+from mvsgs_core.bad_file import BadFileError, brief, reading
+
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
+MAX_PIXELS = 2**27  # of one image: 134 million, more than cameras of 100 million have
+_FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM")  # of these suffixes: Pillow knows 40 more that nobody needs
 _ORIENTATION = 0x0112  # EXIF tag
+
+Image.MAX_IMAGE_PIXELS = MAX_PIXELS  # Pillow's own bound, of what it decodes inside of other formats, is the same
 
 
 @dataclass(frozen=True)
@@ -46,26 +56,45 @@ class Layout:
         return path
 
 
-class UnreadableImageError(Exception):
+class UnreadableImageError(BadFileError):
     """A file that is missing, truncated or no image; the message names it."""
 
 
-def read_image(path: Path, *, turn_upright: bool = True) -> np.ndarray:
+@contextmanager
+def opened_image(source: Path | BinaryIO, name: str) -> Iterator[Image.Image]:
+    """An image of which the header is read and nothing decoded yet.
+
+    Raises UnreadableImageError, naming it `name`, for more than MAX_PIXELS pixels, and for whatever Pillow raises while
+    it is open.
+    """
+    if isinstance(source, Path) and source.exists() and not source.is_file():
+        raise UnreadableImageError(f"{name}: is no file")  # a pipe would be waited for
+    try:
+        with Image.open(source, formats=_FORMATS) as image:
+            width, height = image.size
+            if not 0 < width * height <= MAX_PIXELS:
+                raise UnreadableImageError(f"{name}: {width}x{height} pixels, more than {MAX_PIXELS}: scale it down")
+            yield image
+    except UnreadableImageError:
+        raise
+    except Exception as error:  # damaged content makes Pillow raise nearly anything
+        raise UnreadableImageError(f"{name}: {brief(error)}") from error
+
+
+def read_image(source: Path | BinaryIO, *, name: str | None = None, turn_upright: bool = True) -> np.ndarray:
     """(H, W, 3) uint8 RGB. Pillow and not OpenCV, because OpenCV fills the rest of a truncated file with gray.
 
-    turn_upright: applies the orientation of the EXIF header. Raises UnreadableImageError.
+    name: for messages, of what is no path. turn_upright: applies the orientation of the EXIF header.
+    Raises UnreadableImageError.
     """
-    try:
-        with Image.open(path) as opened:
-            image: Image.Image = opened
-            if turn_upright:
-                image = ImageOps.exif_transpose(opened)
-            if image.mode.startswith("I;16"):  # 16-bit gray: Pillow's own conversion would clip it at 255
-                gray = (np.asarray(image) >> 8).astype(np.uint8)
-                return np.repeat(gray[..., None], 3, axis=-1)
-            return np.array(image.convert("RGB"))
-    except (OSError, SyntaxError, ValueError) as error:
-        raise UnreadableImageError(f"{path.name}: {error}") from error
+    with opened_image(source, name or (source.name if isinstance(source, Path) else "image")) as opened:
+        image: Image.Image = opened
+        if turn_upright:
+            image = ImageOps.exif_transpose(opened)
+        if image.mode.startswith("I;16"):  # 16-bit gray: Pillow's own conversion would clip it at 255
+            gray = (np.asarray(image) >> 8).astype(np.uint8)
+            return np.repeat(gray[..., None], 3, axis=-1)
+        return np.array(image.convert("RGB"))
 
 
 def upright_size(image: Image.Image) -> tuple[int, int]:
@@ -80,22 +109,41 @@ def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> 
 
     Raises UnreadableImageError.
     """
-    try:
-        with Image.open(path) as opened:
-            counts = np.asarray(opened)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise UnreadableImageError(f"{path.name}: {error}") from error
+    with opened_image(path, path.name) as opened:
+        counts = np.asarray(opened)
     if counts.ndim != 2:
         raise UnreadableImageError(f"{path.name}: a depth map has one channel, this one is {counts.shape}")
     depth = (counts / per_unit).astype(np.float32)
-    depth[np.isin(counts, invalid)] = 0.0
+    depth[np.isin(counts, invalid) | ~(depth > 0) | np.isinf(depth)] = 0.0
     return depth
+
+
+def read_numbers(path: Path) -> np.ndarray:
+    """(N,) float64: the numbers of a text file, separated by white space; NaN and infinity are for the caller to judge.
+
+    Raises BadFileError for anything else, OSError for a file that cannot be read.
+    """
+    with reading(path, "must hold numbers and nothing else"):
+        return np.array([float(v) for v in path.read_text(encoding="utf-8").split()])
+
+
+def inside(folder: Path, name: str, listing: Path) -> Path:
+    """`folder / name` of a name that `listing` gives.
+
+    Raises BadFileError where that leads out of the folder, by its parents, from the root or over a link: a data set
+    that came from elsewhere reads its own files and no others.
+    """
+    with reading(listing, f"names {brief(ValueError(name))!r}"):
+        path = folder / name
+        if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
+            raise ValueError("that is outside of its folder; copy the file into it and name it from there")
+        return path
 
 
 def natural_order(name: str) -> list[tuple[int, int | str]]:
     """Sort key that puts frame2 before frame10."""
     parts = re.split(r"(\d+)", name.lower())
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts if part]
 
 
 def images_in(folder: Path) -> list[Path]:

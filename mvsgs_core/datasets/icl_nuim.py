@@ -47,7 +47,7 @@ class IclNuim(ImageSequence):
     ) -> None:
         folder = LAYOUT.folder(path)
         rgb = folder / "rgb"
-        images = [p for p in images_in(rgb) if p.stem.isdigit()] if rgb.is_dir() else []
+        images = [p for p in images_in(rgb) if p.stem.isascii() and p.stem.isdecimal()] if rgb.is_dir() else []
         if not images:
             raise LAYOUT.missing(f"{rgb} has no 0.png, 1.png, ...")
         lens, notes = _PUBLISHED, list[str]()

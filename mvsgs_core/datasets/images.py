@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvsgs_core.datasets.calibration import image_size, lens_for_images
+from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.datasets.calibration import image_size, lens_for_images, lens_from_option
 from mvsgs_core.datasets.colmap import find_colmap, read_colmap
 from mvsgs_core.datasets.exif import read_exif_lens
 from mvsgs_core.datasets.files import IMAGE_SUFFIXES, Layout, images_in, natural_order
@@ -30,7 +31,7 @@ class Images(ImageSequence):
 
     intrinsics: [fx, fy, cx, cy] in pixels of the images, "auto" for EXIF or a guess, null for what is found: a COLMAP
     model, a transforms.json, Strecha's .camera files, whose poses then are the ground truth, or EXIF headers, in this
-    order.
+    order; where there is none of them it is the guess of "auto", for the tracker to estimate.
     model: path of a COLMAP model's folder, a transforms.json or a folder of .camera files that lies elsewhere.
     rate: images per second, for the timestamps. crop: see `Framing`.
     Raises FileNotFoundError and ValueError, which say what was expected.
@@ -108,7 +109,7 @@ def _from_model(model: Model, folder: Path, images: list[Path], rate: float, not
     unknown = [image.name for image, shot in zip(images, shots) if shot is None]
     if len(unknown) == len(images):
         names = ", ".join(list(model.shots)[:3])
-        raise ValueError(f"the {model.kind} knows none of the images: it names {names}, here is {unknown[0]}")
+        raise BadFileError(f"the {model.kind} knows none of the images: it names {names}, here is {unknown[0]}")
     common = model.common_lens
     records = []
     for i, (image, shot) in enumerate(zip(images, shots)):
@@ -132,11 +133,10 @@ def _lenses(
     found = [read_exif_lens(image) for image in images]
     known = [lens for lens in found if lens is not None]
     if not known:
-        raise ValueError(
-            f"no calibration for {images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal "
-            "lengths were found; set dataset.intrinsics=[fx,fy,cx,cy] in pixels, or dataset.intrinsics=auto to have "
-            "the focal length estimated"
-        )
+        lens, warnings = lens_from_option("auto", distortion, image_size(images))
+        where = f"{images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal lengths were found"
+        notes += [f"no calibration for {where}", *warnings]
+        return [lens] * len(images)
     notes.append(
         f"intrinsics are from EXIF: focal length {known[0].intrinsics[0]:.0f} pixels for "
         f"{known[0].size[1]}x{known[0].size[0]}, good to a few percent, distortion unknown"

@@ -8,15 +8,19 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from mvsgs_core.camera import matrix, scale_intrinsics
+from mvsgs_core.camera import check_intrinsics, matrix, scale_intrinsics
 
+_LARGEST_COEFFICIENT = 1e6  # of distortion: real ones are below 100
 _MAX_ZOOM = 3.0  # a lens that needs more to hide its black border is no pinhole in any useful sense
 _GUESSED_FIELD_OF_VIEW = math.radians(65.0)  # across the longer side: phones 60 to 69, webcams 60 to 70
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A calibrated camera. `distortion` is OpenCV's: (k1, k2, p1, p2[, k3[, k4, k5, k6]]), fisheye (k1, k2, k3, k4)."""
+    """A calibrated camera. Raises ValueError for numbers that no camera has.
+
+    `distortion` is OpenCV's: (k1, k2, p1, p2[, k3[, k4, k5, k6]]), fisheye (k1, k2, k3, k4).
+    """
 
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels at `size`, (0, 0) is a pixel's center
     size: tuple[int, int]  # (height, width) that the intrinsics are for
@@ -25,10 +29,9 @@ class Lens:
     guessed: bool = False  # the focal length is a guess
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(v) for v in (*self.intrinsics, *self.distortion)):
-            raise ValueError(f"intrinsics and distortion must be finite, got {self.intrinsics} and {self.distortion}")
-        if self.intrinsics[0] <= 0 or self.intrinsics[1] <= 0:
-            raise ValueError(f"focal lengths must be positive, got fx, fy = {self.intrinsics[:2]}")
+        check_intrinsics(np.array(self.intrinsics), self.size)
+        if not all(math.isfinite(v) and abs(v) < _LARGEST_COEFFICIENT for v in self.distortion):
+            raise ValueError(f"distortion must be finite and of sensible size, got {self.distortion}")
         allowed = (0, 4) if self.fisheye else (0, 4, 5, 8)
         if len(self.distortion) not in allowed:
             raise ValueError(f"distortion must have {allowed} coefficients, got {len(self.distortion)}")

@@ -11,6 +11,8 @@ import numpy as np
 
 from mvsgs_core.datasets.lens import Lens
 
+_FARTHEST = 1e12  # in the file's own unit: the Earth's radius is 6e9 millimeters
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -53,6 +55,8 @@ def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
     """A 4x4 pose as written in a file, its rotation made exactly orthonormal. Raises ValueError if it is no pose."""
     if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
         raise ValueError(f"{where}: a pose must be 4x4 finite numbers")
+    if np.any(np.abs(matrix[:3, 3]) > _FARTHEST):
+        raise ValueError(f"{where}: a position farther than {_FARTHEST:g} from the origin, {matrix[:3, 3]}")
     u, singular, vt = np.linalg.svd(matrix[:3, :3])
     if np.any(np.abs(singular - 1.0) > 1e-2) or np.linalg.det(u @ vt) < 0:
         raise ValueError(f"{where}: its upper left 3x3 is no rotation (singular values {np.round(singular, 4)})")
@@ -60,6 +64,15 @@ def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
     pose[:3, :3] = u @ vt
     pose[:3, 3] = matrix[:3, 3]
     return pose
+
+
+def is_rigid(matrix: np.ndarray) -> bool:
+    """Whether `rigid` takes it."""
+    try:
+        rigid(matrix, "")
+    except ValueError:
+        return False
+    return True
 
 
 def _without_suffix(name: str) -> str:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets.calibration import lens_for_images
-from mvsgs_core.datasets.files import Layout, natural_order
+from mvsgs_core.datasets.files import Layout, natural_order, read_numbers
 from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.model import is_rigid
 from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
 
 LAYOUT = Layout(
@@ -41,7 +44,8 @@ class Replica(ImageSequence):
         distortion: Sequence[float] = (),
     ) -> None:
         folder = LAYOUT.folder(path)
-        images = sorted((folder / "results").glob("frame*.*"), key=lambda p: natural_order(p.name))
+        images = [p for p in (folder / "results").glob("frame*.*") if re.search(r"[0-9]", p.stem)]
+        images.sort(key=lambda p: natural_order(p.name))
         if not images:
             raise LAYOUT.missing(f"{folder / 'results'} has no frame000000.jpg")
         lens, per_meter = _camera(folder)
@@ -51,7 +55,7 @@ class Replica(ImageSequence):
         poses, pose_notes = _poses(folder / "traj.txt")
         records = []
         for image in images:
-            digits = re.sub(r"\D", "", image.stem)
+            digits = re.sub(r"[^0-9]", "", image.stem)
             number = int(digits)
             pose = poses[number] if number < len(poses) else None
             records.append(Record(number / _FRAME_RATE, image, lens, pose, image.with_name(f"depth{digits}.png")))
@@ -66,24 +70,22 @@ def _camera(folder: Path) -> tuple[Lens, float]:
     """The lens and how many counts of a depth map are a meter."""
     for path in (folder / "cam_params.json", folder.parent / "cam_params.json"):
         if path.is_file():
-            try:
-                c = json.loads(path.read_text())["camera"]
-                lens = Lens(
-                    (float(c["fx"]), float(c["fy"]), float(c["cx"]), float(c["cy"])), (int(c["h"]), int(c["w"]))
-                )
-                return lens, float(c["scale"])
-            except (KeyError, TypeError, ValueError) as error:
-                raise ValueError(f"{path} must hold camera: w, h, fx, fy, cx, cy, scale ({error!r})") from error
+            with reading(path, "must hold camera: w, h, fx, fy, cx, cy, scale"):
+                c = json.loads(path.read_bytes())["camera"]
+                fx, fy, cx, cy, scale = (float(c[name]) for name in ("fx", "fy", "cx", "cy", "scale"))
+                if not (math.isfinite(scale) and scale > 0):
+                    raise ValueError(f"scale = {scale} counts of depth are no meter")
+                return Lens((fx, fy, cx, cy), (int(c["h"]), int(c["w"]))), scale
     return _PUBLISHED, _DEPTH_PER_METER
 
 
 def _poses(path: Path) -> tuple[list[np.ndarray | None], list[str]]:
-    """world_from_cam by frame number, None where a line is not finite."""
+    """world_from_cam by frame number, None where a line is no pose: not finite, or no rotation."""
     if not path.is_file():
         return [], [f"{path.name} is missing: the trajectory is not scored"]
-    values = np.array([float(v) for v in path.read_text().split()])
+    values = read_numbers(path)
     if values.size == 0:
         return [], [f"{path.name} is empty: the trajectory is not scored"]
     if values.size % 16:
-        raise ValueError(f"{path}: a line must be 16 numbers, a 4x4 camera to world; there are {values.size} in all")
-    return [pose if np.all(np.isfinite(pose)) else None for pose in values.reshape(-1, 4, 4)], []
+        raise BadFileError(f"{path}: a line must be 16 numbers, a 4x4 camera to world; there are {values.size} in all")
+    return [pose if is_rigid(pose) else None for pose in values.reshape(-1, 4, 4)], []

@@ -7,9 +7,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
 
-from mvsgs_core.datasets.files import UnreadableImageError
+from mvsgs_core.bad_file import brief
+from mvsgs_core.datasets.files import MAX_PIXELS, UnreadableImageError, read_image
 from mvsgs_core.datasets.lens import Lens
 
 # channels a pixel, bits a channel, conversion to RGB (None: it is)
@@ -43,41 +43,48 @@ def rgb_of(message: Any) -> np.ndarray:
     """
     if hasattr(message, "encoding"):
         return _raw(message)
-    try:
-        with Image.open(io.BytesIO(bytes(message.data))) as image:
-            return np.array(image.convert("RGB"))
-    except (OSError, SyntaxError, ValueError) as error:
-        raise UnreadableImageError(f"compressed image ({message.format}): {error}") from error
+    name = f"compressed image ({brief(ValueError(message.format))})"
+    return read_image(io.BytesIO(bytes(message.data)), name=name, turn_upright=False)
 
 
 def _raw(message: Any) -> np.ndarray:
     if message.encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
-        raise UnreadableImageError(f"encoding {message.encoding!r} is no color or gray image; known are {known}")
+        raise UnreadableImageError(
+            f"encoding {str(message.encoding)[:40]!r} is no color or gray image; known are {known}"
+        )
     channels, bits, conversion = _ENCODINGS[message.encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * channels * bits // 8
-    data = np.asarray(message.data, dtype=np.uint8)
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
     if height < 1 or row < 1 or step < row or data.size < step * (height - 1) + row:
         raise UnreadableImageError(f"{data.size} bytes are no {width}x{height} image in {message.encoding}")
-    padded = np.zeros(step * height, dtype=np.uint8)  # the last row may lack its padding
-    padded[: min(data.size, padded.size)] = data[: padded.size]
-    rows = np.ascontiguousarray(padded.reshape(height, step)[:, :row])
+    if height * width > MAX_PIXELS:
+        raise UnreadableImageError(f"{width}x{height} pixels, more than {MAX_PIXELS}")
+    padded = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1))  # the last row may lack its padding
+    rows = np.ascontiguousarray(padded)
     if bits == 16:
         rows = (rows.view(">u2" if message.is_bigendian else "<u2") >> 8).astype(np.uint8)
     pixels = rows.reshape(height, width, channels) if channels > 1 else rows.reshape(height, width)
-    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+    try:
+        return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+    except cv2.error as error:  # a pattern of two by two pixels in an image of one row
+        raise UnreadableImageError(f"a {width}x{height} image in {message.encoding}: {brief(error)}") from error
+
+
+def calibrated(info: Any) -> bool:
+    """Whether a sensor_msgs CameraInfo says anything: drivers of cameras that nobody calibrated send zeros."""
+    k = np.asarray(getattr(info, "k", getattr(info, "K", None)), dtype=np.float64)
+    return bool(k[0] > 0 and min(int(info.height), int(info.width)) > 0)
 
 
 def lens_of(info: Any, rectified: bool) -> Lens:
-    """The lens of a sensor_msgs CameraInfo; `rectified` is for images that ROS has undistorted already.
+    """The lens of a `calibrated` sensor_msgs CameraInfo; `rectified` is for images that ROS has undistorted already.
 
-    Raises ValueError if the camera was never calibrated or its distortion model is unknown.
+    Raises ValueError if its distortion model is unknown, or its numbers are no camera's.
     """
     d, k, p = (np.asarray(getattr(info, name, getattr(info, name.upper(), None)), dtype=np.float64) for name in "dkp")
     size = int(info.height), int(info.width)
-    if k[0] <= 0 or min(size) < 1:
-        raise ValueError("the camera_info in the bag is empty: the camera was not calibrated; set dataset.intrinsics")
     if rectified:
         fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if p[0] > 0 else (k[0], k[4], k[2], k[5])
         return Lens((float(fx), float(fy), float(cx), float(cy)), size)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.files import UnreadableImageError, read_depth, read_image
 from mvsgs_core.datasets.framing import Framing, Size
@@ -72,7 +73,8 @@ class ImageSequence:
 
     records: all frames of the original sequence, in order. start, stop, stride: the frames wanted of them.
     size, crop: see `Framing`. turn_upright: whether the calibration is for the image as EXIF says it should be shown.
-    Raises ValueError for options that make no sense and where nothing is selected.
+    Raises ValueError for options that make no sense and where nothing is selected, BadFileError while iterating where
+    not one image can be read.
     """
 
     def __init__(
@@ -121,7 +123,7 @@ class ImageSequence:
                 index += 1
                 yield item
         if index == 0:
-            raise ValueError("no image could be read: " + "; ".join(self._notices))
+            raise BadFileError("no image could be read: " + "; ".join(self._notices))
 
     def _item(self, index: int, record: Record, image: np.ndarray, first: tuple[int, int] | None) -> Item | None:
         native = image.shape[0], image.shape[1]
@@ -137,7 +139,12 @@ class ImageSequence:
             self._notices.tally("images scaled to the size of the first", example)
         size = self._framing.size_of(first or native)
         lens = record.lens.at(native)
-        framed, intrinsics = self._framing.image(image, lens, size)
+        try:
+            framed, intrinsics = self._framing.image(image, lens, size)
+        except ValueError as error:
+            what = "images left out because their distortion cannot be undone"
+            self._notices.tally(what, f"{record.image.name}, {error}")
+            return None
         depth = self._depth(record, native)
         if depth is not None:
             depth = self._framing.depth(depth, lens, size)

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.camera import project, unproject
 from mvsgs_core.datasets.calibration import lens_for_images
-from mvsgs_core.datasets.files import Layout, natural_order
+from mvsgs_core.datasets.files import Layout, natural_order, read_numbers
 from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.model import is_rigid
 from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
 
 LAYOUT = Layout(
@@ -58,7 +60,8 @@ class SevenScenes(ImageSequence):
         registered: bool = True,
     ) -> None:
         folder = _sequence_folder(LAYOUT.folder(path), sequence)
-        images = sorted(folder.glob("frame-*.color.*"), key=lambda p: natural_order(p.name))
+        images = [p for p in folder.glob("frame-*.color.*") if re.search(r"[0-9]", p.name.split(".")[0])]
+        images.sort(key=lambda p: natural_order(p.name))
         if not images:
             raise LAYOUT.missing(f"{folder} has no frame-*.color.png")
         self._depth_camera = _find_depth_camera(folder)
@@ -76,7 +79,7 @@ class SevenScenes(ImageSequence):
                 without_pose.append(stem)
             elif registered:
                 pose[:3, 3] += pose[:3, 0] * _BASELINE
-            number = int(re.sub(r"\D", "", stem))
+            number = int(re.sub(r"[^0-9]", "", stem))
             records.append(Record(number / _FRAME_RATE, image, color, pose, folder / f"{stem}.depth.png"))
         super().__init__(records, start=start, stop=stop, stride=stride, size=size, depth_format=_DEPTH)
         self.warnings += notes
@@ -119,20 +122,19 @@ def _sequence_folder(folder: Path, sequence: str | None) -> Path:
 def _find_depth_camera(folder: Path) -> Lens:
     for path in (folder / "camera-intrinsics.txt", folder.parent / "camera-intrinsics.txt"):
         if path.is_file():
-            k = np.array([float(v) for v in path.read_text().split()])
+            k = read_numbers(path)
             if k.shape != (9,):
-                raise ValueError(f"{path} must hold a 3x3 camera matrix, it has {k.size} numbers")
+                raise BadFileError(f"{path} must hold a 3x3 camera matrix, it has {k.size} numbers")
             fx, _, cx, _, fy, cy = (float(v) for v in k[:6])
-            return Lens((fx, fy, cx, cy), _DEPTH_CAMERA.size)
+            with reading(path, "holds a camera that cannot be"):
+                return Lens((fx, fy, cx, cy), _DEPTH_CAMERA.size)
     return _DEPTH_CAMERA
 
 
 def _read_pose(path: Path) -> np.ndarray | None:
-    """(4, 4) float64, None where the file is missing, empty or marks a lost frame (the set writes NaN or infinity)."""
+    """(4, 4) float64, None where the file is missing or no pose: lost frames are marked by NaN or infinity."""
     try:
-        pose = np.array([float(v) for v in path.read_text().split()])
-    except (OSError, ValueError):
+        pose = read_numbers(path)
+    except (OSError, BadFileError):
         return None
-    if pose.shape != (16,) or not np.all(np.isfinite(pose)):
-        return None
-    return pose.reshape(4, 4)
+    return pose.reshape(4, 4) if pose.shape == (16,) and is_rigid(pose.reshape(4, 4)) else None

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mvsgs_core.bad_file import reading
+from mvsgs_core.datasets.files import read_numbers
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model, Shot, rigid
 
@@ -19,24 +21,25 @@ def find_strecha(folder: Path) -> Path | None:
 
 
 def read_strecha(folder: Path) -> Model:
-    """The model of a folder of .camera files. Raises ValueError for a malformed one."""
+    """The model of a folder of .camera files. Raises BadFileError for a malformed one."""
     shots = {}
     for path in sorted(folder.glob("*.camera")):
-        try:
-            values = np.array([float(v) for v in path.read_text().split()])
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-        if values.size != _NUMBERS:
-            raise ValueError(f"{path} must hold {_NUMBERS} numbers: K, distortion, R, center, size; got {values.size}")
-        k = values[:9].reshape(3, 3)
-        distortion = tuple(float(v) for v in values[9:12])
-        if any(distortion):
-            raise ValueError(f"{path}: only undistorted images are supported, this one has distortion {distortion}")
-        pose = np.eye(4)
-        pose[:3, :3] = values[12:21].reshape(3, 3)
-        pose[:3, 3] = values[21:24]
-        lens = Lens(
-            (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])), (int(values[25]), int(values[24]))
-        )
-        shots[path.name.removesuffix(".camera")] = Shot(lens, rigid(pose, str(path)))
+        values = read_numbers(path)
+        with reading(path, "is no camera of Strecha's that can be used"):
+            shots[path.name.removesuffix(".camera")] = _shot(values)
     return Model("Strecha cameras", shots)
+
+
+def _shot(values: np.ndarray) -> Shot:
+    if values.size != _NUMBERS:
+        raise ValueError(f"it must hold {_NUMBERS} numbers: K, distortion, R, center, size; got {values.size}")
+    k = values[:9].reshape(3, 3)
+    distortion = tuple(float(v) for v in values[9:12])
+    if any(distortion):
+        raise ValueError(f"only undistorted images are supported, this one has distortion {distortion}")
+    pose = np.eye(4)
+    pose[:3, :3] = values[12:21].reshape(3, 3)
+    pose[:3, 3] = values[21:24]
+    size = int(values[25]), int(values[24])
+    lens = Lens((float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])), size)
+    return Shot(lens, rigid(pose, "its pose"))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mvsgs_core.bad_file import reading
 from mvsgs_core.datasets.files import IMAGE_SUFFIXES
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model, Shot, rigid
@@ -25,18 +26,16 @@ def find_transforms(folder: Path) -> Path | None:
 def read_transforms(path: Path, image_size: tuple[int, int]) -> Model:
     """The model of a transforms.json; image_size (height, width) where the file does not say it.
 
-    Raises ValueError for a malformed file.
+    Raises BadFileError for a malformed file, or a camera or pose in it that cannot be.
     """
-    try:
-        content = json.loads(path.read_text())
-        frames = content["frames"]
-        shots = {}
-        for frame in frames:
-            matrix = np.array(frame["transform_matrix"], dtype=np.float64)
-            pose = rigid(matrix, f"{path.name}: {frame['file_path']}") @ _OPENGL_FROM_OPENCV
-            shots[_relative(frame["file_path"])] = Shot(_lens({**content, **frame}, image_size), pose)
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is no transforms.json: {error!r}") from error
+    shots = {}
+    with reading(path, "is no transforms.json that can be used"):
+        content = json.loads(path.read_bytes())
+        for frame in content["frames"]:
+            name = frame["file_path"]
+            with reading(f"frame {name!r}", "cannot be"):
+                pose = rigid(np.array(frame["transform_matrix"], dtype=np.float64), "transform_matrix")
+                shots[_relative(name)] = Shot(_lens({**content, **frame}, image_size), pose @ _OPENGL_FROM_OPENCV)
     return Model("transforms.json", shots)
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mvsgs_core.bad_file import reading
 from mvsgs_core.datasets.calibration import lens_for_images
-from mvsgs_core.datasets.files import Layout
+from mvsgs_core.datasets.files import Layout, inside
 from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
@@ -30,6 +31,7 @@ CAMERAS = {
 }
 CALIBRATION_FILE = "camera.txt"  # our own addition: `fx fy cx cy [distortion]` in one line, in pixels of the images
 _DEPTH = DepthFormat(per_unit=5000.0)
+_LATEST = 1e12  # seconds, or units from the origin: more is damage
 
 
 class Tum(ImageSequence):
@@ -59,16 +61,14 @@ class Tum(ImageSequence):
         max_difference: float = 0.02,
     ) -> None:
         folder = LAYOUT.folder(path)
-        images = _read_list(LAYOUT.file(folder / "rgb.txt"))
+        images = _read_list(folder, LAYOUT.file(folder / "rgb.txt"))
         if not images:
             raise LAYOUT.missing(f"{folder / 'rgb.txt'} lists no image")
         times = np.array([t for t, _ in images])
-        found, notes = _find_lens(folder, [folder / name for _, name in images], camera, intrinsics, distortion)
+        found, notes = _find_lens(folder, [image for _, image in images], camera, intrinsics, distortion)
         depth_of = _depth_maps(folder, times, max_difference)
         poses, pose_notes = _poses(folder, times, max_difference)
-        records = [
-            Record(time, folder / name, found, poses.get(i), depth_of.get(i)) for i, (time, name) in enumerate(images)
-        ]
+        records = [Record(time, image, found, poses.get(i), depth_of.get(i)) for i, (time, image) in enumerate(images)]
         super().__init__(
             records, start=start, stop=stop, stride=stride, size=size, crop=crop,
             depth_format=_DEPTH if depth_of else None,
@@ -88,15 +88,17 @@ def nearest(wanted: np.ndarray, available: np.ndarray, max_difference: float) ->
     return {int(i): int(best[i]) for i in np.flatnonzero(near)}
 
 
-def _read_list(path: Path) -> list[tuple[float, str]]:
+def _read_list(folder: Path, path: Path) -> list[tuple[float, Path]]:
+    """Times and files of the lines of `path`, sorted by time. Raises BadFileError for one that is none."""
     entries = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         parts = line.split()
         if len(parts) >= 2 and not line.startswith("#"):
-            try:
-                entries.append((float(parts[0]), parts[1]))
-            except ValueError as error:
-                raise ValueError(f"{path}: a line must be `timestamp file`, this one is {line!r}") from error
+            with reading(path, f"has a line that is not `timestamp file`, {line[:200]!r}"):
+                time = float(parts[0])
+                if not abs(time) < _LATEST:
+                    raise ValueError(f"{time} s is no time")
+            entries.append((time, inside(folder, parts[1], path)))
     return sorted(entries)
 
 
@@ -115,8 +117,9 @@ def _find_lens(
         return CAMERAS[camera], []
     calibration = folder / CALIBRATION_FILE
     if calibration.is_file():
-        values = [float(v) for v in calibration.read_text().split("#")[0].split()]
-        return lens_for_images(values[:4], values[4:], images)
+        with reading(calibration, "must hold `fx fy cx cy` and perhaps the distortion"):
+            values = [float(v) for v in calibration.read_text(encoding="utf-8").split("#")[0].split()]
+            return lens_for_images(values[:4], values[4:], images)
     header = folder / "groundtruth.txt"
     head = header.read_text(errors="replace")[:400] if header.is_file() else ""
     for text in (folder.name, folder.resolve().name, head):
@@ -134,12 +137,10 @@ def _depth_maps(folder: Path, times: np.ndarray, max_difference: float) -> dict[
     listing = folder / "depth.txt"
     if not listing.is_file():
         return {}
-    entries = _read_list(listing)
+    entries = _read_list(folder, listing)
     depth_times = np.array([t for t, _ in entries])
     image_of = nearest(depth_times, times, np.inf)  # a depth map belongs to the image nearest to it, and to no other
-    return {
-        i: folder / entries[j][1] for i, j in nearest(times, depth_times, max_difference).items() if image_of[j] == i
-    }
+    return {i: entries[j][1] for i, j in nearest(times, depth_times, max_difference).items() if image_of[j] == i}
 
 
 def _poses(folder: Path, times: np.ndarray, max_difference: float) -> tuple[dict[int, np.ndarray], list[str]]:
@@ -171,19 +172,20 @@ def _pose_at(time: float, table: np.ndarray, closest: int, max_difference: float
 
 
 def read_trajectory(path: Path) -> np.ndarray:
-    """(N, 8) float64 rows `timestamp tx ty tz qx qy qz qw`, sorted by time. Raises ValueError for a malformed line."""
+    """(N, 8) float64 rows `timestamp tx ty tz qx qy qz qw`, sorted by time. Raises BadFileError for a malformed line.
+
+    Rows that are no pose are left out: motion capture writes zeros where it lost its markers.
+    """
     rows = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         text = line.split("#")[0].replace(",", " ").split()
         if not text:
             continue
-        try:
+        with reading(path, f"has a line that is not `timestamp tx ty tz qx qy qz qw`, {line[:200]!r}"):
             row = [float(v) for v in text]
-        except ValueError as error:
-            raise ValueError(f"{path}: not a line of numbers: {line!r}") from error
-        if len(row) != 8:
-            raise ValueError(f"{path}: a line must be `timestamp tx ty tz qx qy qz qw`, this one is {line!r}")
-        if np.all(np.isfinite(row)) and np.linalg.norm(row[4:]) > 0.5:  # motion capture writes zeros where it lost it
+            if len(row) != 8:
+                raise ValueError(f"{len(row)} numbers")
+        if np.all(np.abs(row) < _LATEST) and np.linalg.norm(row[4:]) > 0.5:
             rows.append(row)
     table = np.array(rows, dtype=np.float64).reshape(-1, 8)
     return table[np.argsort(table[:, 0], kind="stable")]

@@ -9,11 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError, brief, reading
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.files import Layout
 from mvsgs_core.datasets.framing import Framing, Size
-from mvsgs_core.datasets.sequence import selection
+from mvsgs_core.datasets.sequence import Notices, same_shape, selection
 
 LAYOUT = Layout(
     "A video",
@@ -21,7 +22,9 @@ LAYOUT = Layout(
     "your own camera or phone; walk slowly, move sideways rather than turn on the spot, lock exposure and focus",
 )
 _DEFAULT_RATE = 30.0
-_SHORT = 0.98  # less of the promised frames than this: the file is cut off (containers overstate by a frame or two)
+# A container's frame count is an estimate: of mkv its duration times a rate, of mp4 with the frames that are not shown.
+# A gap is worth a word where it is more than both of these, in frames and in time.
+_GAP_FRAMES, _GAP_SHARE = 2, 0.01
 
 
 class Video:
@@ -29,7 +32,8 @@ class Video:
 
     intrinsics: [fx, fy, cx, cy] in pixels of the video's frames, or "auto": 65 degrees across the longer side, for the
     tracker to estimate. A video says nothing of its camera, so null is refused. size, crop: see `Framing`.
-    Raises FileNotFoundError and ValueError, which say what was expected.
+    Frames of another shape than the first are left out and counted, those of another size scaled to it.
+    Raises FileNotFoundError and ValueError, which say what was expected, BadFileError for a file that has no frame.
     """
 
     def __init__(
@@ -54,14 +58,17 @@ class Video:
             )
         self._wanted = selection(start, stop, stride)
         self._framing = Framing(size, crop)
-        self.warnings: list[str] = []
+        self.warnings: list[str] = Notices()
+        self._notices: Notices = self.warnings  # the same list, with its counting
         capture = self._open()
-        read, frame = capture.read()
+        with reading(self._path, "cannot be decoded"):
+            read, frame = capture.read()
         count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
         capture.release()
         if not read:
-            raise ValueError(f"{self._path} opens but has no frame: it is damaged, or no video")
+            raise BadFileError(f"{self._path} opens but has no frame: it is damaged, or no video")
         self._lens, notes = lens_from_option(intrinsics, distortion, (frame.shape[0], frame.shape[1]))
+        self._native = frame.shape[0], frame.shape[1]
         self._count = int(count) if math.isfinite(count) and count > 0 else 0
         self._rate = rate if math.isfinite(rate) and 0 < rate < 1000 else _DEFAULT_RATE
         self.warnings += notes
@@ -77,46 +84,63 @@ class Video:
         return len(range(end)[self._wanted])
 
     def __iter__(self) -> Iterator[Item]:
-        del self.warnings[self._opening_warnings :]  # those of an earlier pass
+        self._notices.truncate(self._opening_warnings)  # those of an earlier pass
         capture = self._open()
-        number = index = undecoded = 0
-        last = -math.inf
+        number = index = 0
+        first, last = math.inf, -math.inf  # seconds
         try:
-            while (self._wanted.stop is None or number < self._wanted.stop) and capture.grab():
+            while self._wanted.stop is None or number < self._wanted.stop:
+                if not capture.grab():
+                    self._judge_end(number, last - first)
+                    break
                 seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
                 if not math.isfinite(seconds) or seconds <= last:
                     seconds = last + 1.0 / self._rate if math.isfinite(last) else number / self._rate
-                last = seconds
+                first, last = min(first, seconds), seconds
                 offset = number - self._wanted.start
                 if offset >= 0 and offset % self._wanted.step == 0:
-                    decoded, frame = capture.retrieve()
-                    if decoded:
-                        yield self._item(index, seconds, frame)
+                    item = self._item(index, number, seconds, capture)
+                    if item is not None:
                         index += 1
-                    else:
-                        undecoded += 1
+                        yield item
                 number += 1
         finally:
             capture.release()
-        promised = min(self._count, self._wanted.stop or self._count)
-        if number < _SHORT * promised:
-            self.warnings.append(
-                f"{self._path.name} ends after {number} of {promised} frames: it is cut off or damaged"
-            )
+        if index == 0:
+            raise BadFileError(f"no frame of {self._path} could be read: " + "; ".join(self.warnings))
 
-        if undecoded:
-            self.warnings.append(f"frames of {self._path.name} left out because they could not be decoded: {undecoded}")
-
-    def _item(self, index: int, seconds: float, frame: np.ndarray) -> Item:
-        native = frame.shape[0], frame.shape[1]
-        rgb = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
-        image, intrinsics = self._framing.image(rgb, self._lens.at(native), self._framing.size_of(native))
+    def _item(self, index: int, number: int, seconds: float, capture: cv2.VideoCapture) -> Item | None:
+        try:
+            decoded, frame = capture.retrieve()
+            if not decoded:
+                raise ValueError("the decoder gave no picture")
+            native = frame.shape[0], frame.shape[1]
+            if not same_shape(native, self._native):
+                raise ValueError(f"{native[1]}x{native[0]} after {self._native[1]}x{self._native[0]}")
+            rgb = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+        except (ValueError, cv2.error) as error:
+            what = f"frames of {self._path.name} left out because they could not be decoded"
+            self._notices.tally(what, f"frame {number}: {brief(error)}")
+            return None
+        image, intrinsics = self._framing.image(rgb, self._lens.at(native), self._framing.size_of(self._native))
         return Item(index, seconds, image, intrinsics, intrinsics_guessed=self._lens.guessed)
 
+    def _judge_end(self, frames: int, seconds: float) -> None:
+        """Warns where the file ends after `frames`, the last `seconds` after the first, and promised more than that."""
+        missing = self._count - frames
+        missing_time = (self._count - 1) / self._rate - seconds
+        allowed = max(_GAP_FRAMES, _GAP_SHARE * self._count)
+        if missing > allowed and missing_time * self._rate > allowed:
+            self.warnings.append(
+                f"{self._path.name} ends after {frames} of {self._count} frames: it is cut off or damaged"
+            )
+
     def _open(self) -> cv2.VideoCapture:
-        capture = cv2.VideoCapture(str(self._path))
+        with reading(self._path, "cannot be opened by OpenCV"):
+            capture = cv2.VideoCapture(str(self._path))
         if not capture.isOpened():
-            raise ValueError(
-                f"OpenCV cannot open {self._path}: no video, damaged, or a codec that it was built without"
+            raise BadFileError(
+                f"OpenCV cannot open {self._path}: no video, cut off before its index was written (record it again, or "
+                "repair it with untrunc), or a codec that OpenCV was built without (ffmpeg -i FILE out.mp4 converts it)"
             )
         return capture

@@ -11,6 +11,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from mvsgs_core.bad_file import reading
+from mvsgs_core.networks.checkpoints import read
+
 _TAPS = (1, 4, 7, 9, 10, 11, 12)  # layers of the trunk whose outputs are compared
 _CHANNELS = (64, 128, 256, 384, 384, 512, 512)
 
@@ -34,7 +37,7 @@ class Lpips(nn.Module):
     scale: Tensor
 
     def __init__(self, trunk: Path, heads: Path) -> None:
-        """Raises ValueError where a file does not hold the weights that it should."""
+        """Raises BadFileError where a file is damaged or does not hold the weights that it should."""
         super().__init__()
         pool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
         self.features = nn.Sequential(
@@ -79,13 +82,10 @@ def _unit(features: Tensor) -> Tensor:
 def _load(
     module: nn.Module, file: Path, prefix: str, renamed: tuple[str, str] = ("", ""), ignored: tuple[str, ...] = ()
 ) -> None:
-    state = torch.load(file, map_location="cpu", weights_only=True)
     state = {
         key.removeprefix(prefix).replace(*renamed) if renamed[0] else key.removeprefix(prefix): value
-        for key, value in state.items()
+        for key, value in read(file).items()
         if not key.startswith(ignored)
     }
-    try:
+    with reading(file, "does not hold the LPIPS weights expected there"):
         module.load_state_dict(state, strict=True)
-    except RuntimeError as error:
-        raise ValueError(f"{file} does not hold the LPIPS weights expected there: {error}") from error

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mvsgs_core import weights
+from mvsgs_core.bad_file import BadFileError, reading
 
 _LONGEST = 400  # characters of what does not fit
 
@@ -18,26 +19,25 @@ _LONGEST = 400  # characters of what does not fit
 def read(file: Path, *, inside: str | None = None) -> dict[str, Tensor]:
     """State dict of a checkpoint: the prefix `module.` goes, and so does all that is no tensor.
 
-    inside: key under which the file keeps it ("state_dict", "model", ...). Raises FileNotFoundError, or ValueError,
+    inside: key under which the file keeps it ("state_dict", "model", ...). Raises FileNotFoundError, or BadFileError,
     saying what is wrong, for a file that is truncated, no checkpoint, or holds code.
     """
     if not file.is_file():
         raise FileNotFoundError(f"no weights at {file}")
-    try:
-        content: Any = torch.load(file, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, ValueError, KeyError) as error:
-        raise ValueError(f"{file} is truncated or no PyTorch checkpoint: {error}") from error
-    except pickle.UnpicklingError:
-        content = _with_configuration(file)
+    with reading(file, "is truncated or no PyTorch checkpoint"):
+        try:
+            content: Any = torch.load(file, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError:
+            content = _with_configuration(file)
     if inside is not None:
         if not isinstance(content, Mapping) or inside not in content:
-            raise ValueError(f"{file} has no {inside!r}: it is another checkpoint")
+            raise BadFileError(f"{file} has no {inside!r}: it is another checkpoint")
         content = content[inside]
     if not isinstance(content, Mapping):
-        raise ValueError(f"{file} holds a {type(content).__name__}, no state dict")
+        raise BadFileError(f"{file} holds a {type(content).__name__}, no state dict")
     state = {str(k).removeprefix("module."): v for k, v in content.items() if isinstance(v, Tensor)}
     if not state:
-        raise ValueError(f"{file} holds no tensors")
+        raise BadFileError(f"{file} holds no tensors")
     return state
 
 
@@ -61,7 +61,7 @@ def _with_configuration(file: Path) -> Any:
         with torch.serialization.safe_globals([(_Placeholder, name) for name in names]):
             return torch.load(file, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, ValueError, TypeError, AttributeError) as error:
-        raise ValueError(
+        raise BadFileError(
             f"{file} holds Python objects beside the weights, which are not executed ({str(error).splitlines()[0]}); "
             "save its state dict alone, in an environment that you trust: "
             "torch.save(torch.load(FILE, weights_only=False)['state_dict'], NEW_FILE)"
@@ -69,13 +69,13 @@ def _with_configuration(file: Path) -> Any:
 
 
 def load(net: nn.Module, state: Mapping[str, Tensor], file: Path) -> None:
-    """Loads strictly: every key used, every parameter set. Raises ValueError naming what does not fit."""
+    """Loads strictly: every key used, every parameter set. Raises BadFileError naming what does not fit."""
     try:
         net.load_state_dict(dict(state), strict=True)
     except RuntimeError as error:
         what = " ".join(str(error).split())  # of a wrong file, all keys on hundreds of lines
         what = what if len(what) < _LONGEST else f"{what[:_LONGEST]} ..."
-        raise ValueError(f"{file} does not fit {type(net).__name__}: {what}") from error
+        raise BadFileError(f"{file} does not fit {type(net).__name__}: {what}") from error
     net.eval().requires_grad_(False)
 
 
@@ -89,13 +89,13 @@ def load_registered(
 ) -> Path:
     """Loads the weights `name` of the registry, from `file` or where it finds them, and returns the file.
 
-    Raises FileNotFoundError, or ValueError for a truncated or wrong file; both say what to fetch from where.
+    Raises FileNotFoundError, or BadFileError for a truncated or wrong file; both say what to fetch from where.
     """
     path = weights.find(name, file)
     try:
         load(net, convert(read(path, inside=inside)), path)
     except ValueError as error:
-        raise ValueError(f"{error}; for the right one: {weights.remedy(name)}") from error
+        raise BadFileError(f"{error}; for the right one: {weights.remedy(name)}") from error
     return path
 
 

@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mvsgs_core.bad_file import reading
 from mvsgs_core.splats.densities import DENSITIES, gaussian_std_ratio, log_scale_shift, neutral_beta
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.snapshot import Snapshot
 from mvsgs_core.splats.spherical_harmonics import degree_of
 
+_LONGEST_HEADER = 2**16  # bytes
+_LARGEST_LOG = 40.0  # of a scale: the square of e^40 is about as large as float32 holds
 FAR = 1e3  # origins farther than this many scene extents stay a comment: float32 positions would lose the detail
 
 
@@ -74,26 +77,32 @@ def folded(splats: Splats, density: str) -> Splats:
 def read_ply(path: Path) -> Snapshot:
     """A map that any 3DGS program wrote, binary little endian; without keyframes, anchors -1.
 
-    Raises ValueError, saying what is wrong with the file.
+    Raises BadFileError, saying what is wrong with the file: also for numbers that are not finite, or no splat's.
     """
     data = path.read_bytes()
-    end = data.find(b"end_header\n")
+    with reading(path, "is no PLY file of splats that can be read"):
+        return _parse(data)
+
+
+def _parse(data: bytes) -> Snapshot:
+    end = data.find(b"end_header\n", 0, _LONGEST_HEADER)
     if not data.startswith(b"ply") or end < 0:
-        raise ValueError(f"{path} is no PLY file")
+        raise ValueError("it has no header of one")
     header = data[:end].decode("ascii", errors="replace").splitlines()
     if "format binary_little_endian 1.0" not in header:
-        raise ValueError(f"{path}: only binary_little_endian PLY files are read")
-    count, names, origin, density = _parse_header(header, path)
-    body = data[end + len(b"end_header\n") :]
-    dtype = np.dtype([(name, kind) for name, kind in names])
-    if len(body) < count * dtype.itemsize:
-        raise ValueError(f"{path} is cut short: {len(body)} bytes of {count * dtype.itemsize}")
-    rows = np.frombuffer(body, dtype=dtype, count=count)
+        raise ValueError("only binary_little_endian PLY files are read")
+    count, names, origin, density = _parse_header(header)
     available = {name for name, _ in names}
-    needed = ["x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_2", "rot_0", "rot_3"]
+    needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{k}" for k in range(3)),
+              *(f"rot_{k}" for k in range(4))]  # fmt: skip
+    dtype = np.dtype([(name, kind) for name, kind in names])
+    length = len(data) - end - len(b"end_header\n")
+    if length < count * dtype.itemsize:
+        raise ValueError(f"it is cut short: {length} bytes of {count * dtype.itemsize}")
     missing = [name for name in needed if name not in available]
     if missing:
-        raise ValueError(f"{path} holds no splats: it lacks {', '.join(missing)}")
+        raise ValueError(f"it holds no splats: it lacks {', '.join(missing)}")
+    rows = np.frombuffer(data, dtype=dtype, count=count, offset=end + len(b"end_header\n"))
     rest = sorted((name for name in available if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
     bases = 1 + len(rest) // 3
     degree_of(bases)
@@ -112,6 +121,7 @@ def read_ply(path: Path) -> Snapshot:
         sh=_tensor(sh),
         betas=_tensor(betas),
     )
+    _check_numbers(splats, origin)
     return Snapshot(
         splats=splats, anchors=np.full(count, -1, dtype=np.int64), origin=origin, density=density, iterations=0,
         keyframes=np.zeros(0, dtype=np.int64), world_from_cam=np.zeros((0, 4, 4)), scale=np.zeros(0),
@@ -119,7 +129,19 @@ def read_ply(path: Path) -> Snapshot:
     )  # fmt: skip
 
 
-def _parse_header(header: list[str], path: Path) -> tuple[int, list[tuple[str, str]], np.ndarray, str | None]:
+def _check_numbers(splats: Splats, origin: np.ndarray) -> None:
+    """Raises ValueError for numbers that are no splat's."""
+    good = (splats.log_scales.abs() < _LARGEST_LOG).all(dim=1) & (splats.quaternions != 0).any(dim=1)
+    for values in splats.tensors().values():
+        good &= values.isfinite().flatten(1).all(dim=1) if values.dim() > 1 else values.isfinite()
+    if not bool(good.all()):
+        bad = int((~good).sum())
+        raise ValueError(f"{bad} of {len(splats)} splats are none: numbers that are not finite, no size or no rotation")
+    if not np.all(np.isfinite(origin)):
+        raise ValueError(f"its origin is not finite, {origin}")
+
+
+def _parse_header(header: list[str]) -> tuple[int, list[tuple[str, str]], np.ndarray, str | None]:
     kinds = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1",
              "int": "<i4", "int32": "<i4"}  # fmt: skip
     count, names, origin, density = -1, [], np.zeros(3), None
@@ -129,17 +151,17 @@ def _parse_header(header: list[str], path: Path) -> tuple[int, list[tuple[str, s
             case ["element", "vertex", number]:
                 count = int(number)
             case ["element", other, _]:
-                raise ValueError(f"{path} has an element {other!r}: expected vertices only")
+                raise ValueError(f"it has an element {other!r}: expected vertices only")
             case ["property", kind, name] if kind in kinds:
                 names.append((name, kinds[kind]))
             case ["property", *_]:
-                raise ValueError(f"{path}: cannot read {line!r}")
+                raise ValueError(f"its property cannot be read, {line!r}")
             case ["comment", "origin", x, y, z]:
                 origin = np.array([float(x), float(y), float(z)])
             case ["comment", "density", name] if name in DENSITIES:
                 density = name
     if count < 0:
-        raise ValueError(f"{path} has no vertices")
+        raise ValueError("it has no vertices")
     return count, names, origin, density
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.files import UnreadableImageError
 from mvsgs_core.datasets.ros import rgb_of
@@ -132,13 +133,16 @@ def test_what_is_missing_is_said(tmp_path: Path, ros: Messages) -> None:
     path = ros.write(bag_path(tmp_path, ros), [("/left/image", 1.0, frame), ("/right/image", 1.0, frame)])
     with pytest.raises(ValueError, match=r"several image topics.*/left/image, /right/image"):
         open_dataset("bag", path=path)
-    with pytest.raises(ValueError, match=r"no camera_info for /left/image.*none in this bag"):
-        open_dataset("bag", path=path, topic="/left/image")
+    with pytest.raises(ValueError, match=r"no camera_info at /left/camera_info; it has it at: no topic"):
+        open_dataset("bag", path=path, topic="/left/image", info_topic="/left/camera_info")
+    uncalibrated = open_dataset("bag", path=path, topic="/left/image")
+    assert uncalibrated.warnings[0] == "no calibration: the bag has no camera_info for /left/image"
+    assert next(iter(uncalibrated)).intrinsics_guessed
     sequence = open_dataset("bag", path=path, topic="/left/image", intrinsics="auto", size=[12, 16])
     assert next(iter(sequence)).image.shape == (12, 16, 3)
     assert "guess" in sequence.warnings[0]
     (tmp_path / "other.bag").write_bytes(b"no bag")
-    with pytest.raises(FileNotFoundError, match="is no bag"):
+    with pytest.raises(BadFileError, match="is no bag"):
         open_dataset("bag", path=tmp_path / "other.bag")
 
 

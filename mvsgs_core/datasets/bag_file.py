@@ -1,0 +1,128 @@
+"""Opens a bag with `rosbags`, bounds what it decompresses, and reads on behind a damaged part.
+
+`rosbags` decompresses without a bound, and its messages end at the first damaged byte. Its tables of decompressors take
+ours; what it compresses by the message is decompressed here; and behind damage the messages go on at the end of the
+chunk that holds it.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import zstandard
+
+from mvsgs_core.bad_file import BadFileError, brief, reading
+from mvsgs_core.datasets.compression import decompress
+from mvsgs_core.datasets.sequence import Notices
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+
+MAX_BYTES = 2**28 + 2**21  # of a chunk or message, decompressed: an image of 89 million pixels, and what is beside it
+_MAX_FILE_BYTES = 2**36  # of a file that is compressed as a whole, decompressed into the folder for temporary files
+_BLOCK = 2**20
+
+
+@contextmanager
+def opened_bag(path: Path) -> Iterator[AnyReader]:
+    """The bag at `path`. Raises ImportError without rosbags, BadFileError for a bag that cannot be read."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError("bags are read by rosbags, which is optional: pip install rosbags") from error
+    _bound_decompression()
+    with reading(path, "is no bag that can be read"):
+        _check_compressed_files(path)
+        # ROS 2 bags before Iron hold no message definitions; image and camera_info have not changed since
+        bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        bag.open()
+    try:
+        yield bag
+    finally:
+        bag.close()
+
+
+def messages(bag: AnyReader, connections: Sequence[Connection], notices: Notices) -> Iterator[tuple[Any, int, bytes]]:
+    """(connection, nanoseconds, data) in the order of time. What is damaged is left out, and counted in `notices`."""
+    by_message = _decompresses_messages(bag)
+    ends = _chunk_ends(bag)
+    since: int | None = None
+    while True:
+        last = since if since is not None else -1
+        source = bag.messages(connections, start=since)
+        while True:
+            try:
+                connection, nanoseconds, data = next(source)
+            except StopIteration:
+                return
+            except Exception as error:  # the library raises what damaged bytes make of its code
+                following = bisect_right(ends, last)
+                notices.tally("parts of the bag left out because they are damaged", brief(error))
+                if following == len(ends):
+                    return
+                since = ends[following]
+                break
+            last = max(last, nanoseconds)
+            if by_message:
+                try:
+                    data = decompress(data, "zstd", MAX_BYTES)
+                except BadFileError as error:
+                    notices.tally("messages left out because they are damaged", str(error))
+                    continue
+            yield connection, nanoseconds, data
+
+
+def _bound_decompression() -> None:
+    """Puts our decompressors into the tables of rosbags, for each reader of this process."""
+    from rosbags.rosbag1 import reader
+    from rosbags.rosbag2 import storage_mcap
+
+    for method in ("bz2", "lz4"):
+        reader.decompressors[method] = partial(_decompress, method)
+    for method in ("lz4", "zstd"):
+        storage_mcap.DECOMPRESSORS[method] = partial(_decompress, method)
+
+
+def _decompress(method: str, data: bytes, _: int = 0) -> bytes:
+    """As both tables call it; MCAP's with the size that the file promises, which is not to be trusted."""
+    return decompress(data, method, MAX_BYTES)
+
+
+def _decompresses_messages(bag: AnyReader) -> bool:
+    """Whether the messages are compressed one by one; from now on the reader gives them as they are in the file."""
+    found = False
+    for reader in bag.readers:
+        storage = getattr(reader, "storage", None)  # ROS 2
+        if storage is not None and storage.metadata.compression_mode == "message":
+            storage.metadata = storage.metadata._replace(compression_mode="ours")
+        found = found or (storage is not None and storage.metadata.compression_mode == "ours")
+    return found
+
+
+def _chunk_ends(bag: AnyReader) -> list[int]:
+    """Times, in nanoseconds, at which all of a chunk has been read; none for formats without chunks."""
+    ends = set[int]()
+    for reader in bag.readers:
+        ends |= {chunk.end_time for chunk in getattr(reader, "chunk_infos", ())}  # ROS 1, one nanosecond later already
+        storage = getattr(reader, "storage", None)
+        for file in getattr(storage, "storages", (storage,)):
+            ends |= {chunk.message_end_time + 1 for chunk in getattr(file, "chunks", ())}  # MCAP
+    return sorted(ends)
+
+
+def _check_compressed_files(path: Path) -> None:
+    """Raises BadFileError where files that are compressed as a whole would fill the disk."""
+    for file in path.glob("*.zstd") if path.is_dir() else ():
+        total = 0
+        with file.open("rb") as data, zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as all:
+            while block := all.read(_BLOCK):
+                total += len(block)
+                if total > _MAX_FILE_BYTES:
+                    raise BadFileError(f"{file} would become more than {_MAX_FILE_BYTES} bytes: decompress it yourself")
