@@ -23,13 +23,10 @@ def reading(path: Path | str, otherwise: str) -> Iterator[None]:
     """
     try:
         yield
-    except BadFileError:
-        raise
-    except OSError as error:
-        if error.filename is not None:
-            raise
-        raise BadFileError(f"{path} {otherwise}: {brief(error)}") from error
     except Exception as error:
+        names_it = isinstance(error, BadFileError) and str(path) in str(error)
+        if names_it or (isinstance(error, OSError) and error.filename is not None):
+            raise
         raise BadFileError(f"{path} {otherwise}: {brief(error)}") from error
 
 

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
+from mcap.records import Chunk, Header
 
 from launch.compose import compose
 from msgs import Frame, GroundTruth, Trajectory
-from msgs.codec import decode
+from msgs.codec import decode, encode
+from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.datasets.mcap_file import MAGIC
 from nodes import handlers, is_source, outputs
+from nodes.parameters import make_config
 from nodes.player import Player
 from nodes.recorder import GraphRecorder, Recorder
 from tests.test_codec import MESSAGES, assert_equal, example
@@ -145,3 +152,89 @@ def test_both_recorders_and_the_player_fit_into_the_graph(tmp_path: Path, choice
     read = {edge.message for edge in graph.edges if edge.reader == "recorder"}
     assert {Frame, GroundTruth} <= read
     assert graph.slots["recorder"].config["path"] == "/tmp/x/recording.mcap"
+
+
+def damaged(path: Path, at: int, data: bytes) -> None:
+    with path.open("r+b") as file:
+        file.seek(at)
+        file.write(data)
+
+
+def chunk_starts(path: Path) -> list[int]:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
+@pytest.mark.parametrize(
+    ("offset", "data"),
+    [
+        (4000, b"\x00\xff\x00\xff"),  # of the content: its checksum, or the decompressor, tells
+        (
+            1,
+            b"\xff\xff\xff\xff\xff\xff\xff\x00",
+        ),  # of the length: only the index knows where the next chunk is
+        (0, b"\x00"),  # of the kind
+        (0, b"\x0f"),  # "the data end here"
+    ],
+)
+def test_behind_a_damaged_chunk_the_rest_is_played(tmp_path: Path, compression: str, offset: int, data: bytes) -> None:
+    path = tmp_path / "a.mcap"
+    messages = recorded(path, 200, compression=compression)
+    starts = chunk_starts(path)
+    assert len(starts) > 4
+    damaged(path, starts[2] + offset, data)
+    player, again = played(path)
+    assert 0.6 * len(messages) < len(again) < len(messages)
+    last = again[-1]
+    assert (type(last), last.index) == (type(messages[-1]), messages[-1].index)
+    assert any("a.mcap left out because they are damaged: 1" in warning for warning in player.stats.warnings)
+
+
+def test_a_message_that_is_none_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    recorder = Recorder(Recorder.Config(str(path)))
+    image = np.ones((4, 4, 3), np.uint8)
+    for index in range(4):
+        recorder.on_frame(Frame(index, 0.0, image, np.ones(4)))
+        if index == 1:
+            for data in (b"", b"no message", bytes(encode(Frame(9, 0.0, image, np.ones(4))))[:-20]):
+                recorder._writer.add_message(recorder._channels["Frame"], 0, data, 0, 2)
+    list(recorder.on_end())
+    player, again = played(path)
+    assert [message.index for message in again] == [0, 1, 2, 3]
+    assert any("left out because they are damaged: 3 (first: " in warning for warning in player.stats.warnings)
+
+
+@pytest.mark.parametrize("promised", [2**30, 2**20, 0])
+def test_a_chunk_that_would_fill_the_memory_is_left_out(tmp_path: Path, promised: int) -> None:
+    compressor = zstandard.ZstdCompressor().compressobj()
+    block = bytes(2**20)
+    bomb = b"".join(compressor.compress(block) for _ in range(2**10)) + compressor.flush()
+    assert len(bomb) < 2**16, "a gigabyte"
+    records = RecordBuilder()
+    records.write(MAGIC)
+    Header(profile="", library="").write(records)
+    Chunk("zstd", bomb, 0, 0, 0, promised).write(records)
+    (tmp_path / "a.mcap").write_bytes(records.end())
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(BadFileError, match=r"nothing of it can be played.*more than the"):
+        Player.check(Player.Config(str(tmp_path / "a.mcap")))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2**14, "kB"
+
+
+def test_a_recording_without_anything_to_play_is_refused_before_the_run(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    recorded(path, 3)
+    size = path.stat().st_size
+    damaged(path, 60, bytes(size - 60))
+    with pytest.raises(BadFileError, match=r"a\.mcap: nothing of it can be played: .*was cut off"):
+        compose_and_check(["dataset=player", f"dataset.path={path}"])
+
+
+def compose_and_check(overrides: list[str]) -> None:
+    graph = compose([*overrides, "output=/tmp/x"])
+    slot = graph.slots["dataset"]
+    slot.node.check(make_config(slot.node, slot.config))

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets.exif import read_exif_lens
 from mvsgs_core.datasets.files import UnreadableImageError, opened_image, upright_size
 from mvsgs_core.datasets.lens import Lens, guess_lens
@@ -53,11 +54,14 @@ def lens_for_images(
 
 
 def image_size(images: Iterable[Path]) -> tuple[int, int]:
-    """(height, width) of the first image whose header can be read. Raises ValueError if there is none."""
+    """(height, width) of the first image whose header can be read. Raises BadFileError if there is none."""
+    first = ""  # what is wrong with it
     for path in images:
         try:
             with opened_image(path, path.name) as opened:
                 return upright_size(opened)
-        except UnreadableImageError:
-            continue  # reading the sequence reports it
-    raise ValueError("intrinsics are for the size of the images, but none of them can be opened")
+        except UnreadableImageError as error:
+            first = first or str(error)
+    raise BadFileError(
+        f"no image could be read ({first or 'there is none'}): their size is needed for their calibration"
+    )

@@ -102,7 +102,11 @@ class McapFile:
     def _of_chunk(self, data: bytes) -> Iterator[Recorded]:
         try:
             chunk = Chunk.read(ReadDataStream(BytesIO(data)))
-            content = decompress(chunk.data, chunk.compression, self._largest)
+            if chunk.uncompressed_size > self._largest:
+                raise ValueError(
+                    f"{chunk.uncompressed_size} bytes, decompressed, are more than the {self._largest} read"
+                )
+            content = decompress(chunk.data, chunk.compression, chunk.uncompressed_size)
             if chunk.uncompressed_crc not in (0, zlib.crc32(content)):
                 raise ValueError("its checksum is another")
         except Exception as error:  # the library raises what damaged bytes make of its code

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mvsgs_core.datasets import open_dataset
+from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.datasets import check, open_dataset
 from tests.core.datasets.folders import truncate
 
 FRAMES, RATE = 30, 20.0
@@ -81,3 +82,71 @@ def test_what_is_no_video(tmp_path: Path) -> None:
     path.write_bytes(b"nothing of the kind")
     with pytest.raises(ValueError, match="cannot open"):
         open_dataset("video", path=path, intrinsics="auto")
+
+
+class Container:
+    """A capture whose container promises `count` frames, of which `there` can be read, at `rate` a second."""
+
+    count, there, rate, stretch = 30, 30, 20.0, 1.0
+
+    def __init__(self, _: str) -> None:
+        self.number = 0
+
+    def isOpened(self) -> bool:
+        return True
+
+    def release(self) -> None:
+        pass
+
+    def get(self, what: int) -> float:
+        milliseconds = 1e3 * self.stretch * (self.number - 1) / self.rate
+        known = {cv2.CAP_PROP_FRAME_COUNT: self.count, cv2.CAP_PROP_FPS: self.rate}
+        return float(known.get(what, milliseconds))
+
+    def grab(self) -> bool:
+        self.number += 1
+        return self.number <= self.there
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.zeros((48, 80 if self.number == 7 else 64, 3), np.uint8)
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        return self.grab(), self.retrieve()[1]
+
+
+@pytest.mark.parametrize(
+    ("count", "there", "stretch", "damaged"),
+    [
+        (30, 30, 1.0, False),
+        (30, 29, 1.0, False),  # off by one, as short mp4 files are
+        (30, 28, 1.0, False),
+        (30, 26, 1.0, True),
+        (3000, 2980, 1.0, False),  # a percent
+        (3000, 2900, 1.0, True),
+        (3000, 2000, 1.5, False),  # the count is the duration times a rate that is not kept: all of the time is there
+    ],
+)
+def test_a_frame_count_is_an_estimate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int, there: int, stretch: float, damaged: bool
+) -> None:
+    kind = type("Promising", (Container,), {"count": count, "there": there, "stretch": stretch})
+    monkeypatch.setattr(cv2, "VideoCapture", kind)
+    (tmp_path / "walk.mp4").touch()
+    sequence = open_dataset("video", path=tmp_path / "walk.mp4", intrinsics=[50, 50, 31.5, 23.5])
+    assert len(list(sequence)) == there - 1, "the one of another shape is left out"
+    assert any("could not be decoded: 1 (first: frame 6: 80x48 after 64x48)" in w for w in sequence.warnings)
+    assert any("cut off" in w for w in sequence.warnings) == damaged
+    stopped = open_dataset("video", path=tmp_path / "walk.mp4", intrinsics=[50, 50, 31.5, 23.5], stop=20)
+    assert len(list(stopped)) == 19
+    assert not any("cut off" in w for w in stopped.warnings)
+
+
+def test_a_video_without_its_index_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), RATE, (64, 48))
+    for _ in range(FRAMES):
+        writer.write(np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    writer.release()
+    truncate(path, 0.5)
+    with pytest.raises(BadFileError, match=r"walk\.mp4.*cut off before its index was written"):
+        check("video", path=path, intrinsics="auto")
