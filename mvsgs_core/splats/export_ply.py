@@ -14,7 +14,6 @@ from mvsgs_core.splats.snapshot import Snapshot
 from mvsgs_core.splats.spherical_harmonics import degree_of
 
 _LONGEST_HEADER = 2**16  # bytes
-_LARGEST_LOG = 40.0  # of a scale: the square of e^40 is about as large as float32 holds
 FAR = 1e3  # origins farther than this many scene extents stay a comment: float32 positions would lose the detail
 
 
@@ -77,7 +76,7 @@ def folded(splats: Splats, density: str) -> Splats:
 def read_ply(path: Path) -> Snapshot:
     """A map that any 3DGS program wrote, binary little endian; without keyframes, anchors -1.
 
-    Raises BadFileError, saying what is wrong with the file: also for numbers that are not finite, or no splat's.
+    Raises BadFileError, saying what is wrong with the file. Values of splats are as they are there, finite or not.
     """
     data = path.read_bytes()
     with reading(path, "is no PLY file of splats that can be read"):
@@ -121,24 +120,11 @@ def _parse(data: bytes) -> Snapshot:
         sh=_tensor(sh),
         betas=_tensor(betas),
     )
-    _check_numbers(splats, origin)
     return Snapshot(
         splats=splats, anchors=np.full(count, -1, dtype=np.int64), origin=origin, density=density, iterations=0,
         keyframes=np.zeros(0, dtype=np.int64), world_from_cam=np.zeros((0, 4, 4)), scale=np.zeros(0),
         exposures=np.zeros((0, 3, 4), dtype=np.float32),
     )  # fmt: skip
-
-
-def _check_numbers(splats: Splats, origin: np.ndarray) -> None:
-    """Raises ValueError for numbers that are no splat's."""
-    good = (splats.log_scales.abs() < _LARGEST_LOG).all(dim=1) & (splats.quaternions != 0).any(dim=1)
-    for values in splats.tensors().values():
-        good &= values.isfinite().flatten(1).all(dim=1) if values.dim() > 1 else values.isfinite()
-    if not bool(good.all()):
-        bad = int((~good).sum())
-        raise ValueError(f"{bad} of {len(splats)} splats are none: numbers that are not finite, no size or no rotation")
-    if not np.all(np.isfinite(origin)):
-        raise ValueError(f"its origin is not finite, {origin}")
 
 
 def _parse_header(header: list[str]) -> tuple[int, list[tuple[str, str]], np.ndarray, str | None]:
@@ -158,6 +144,8 @@ def _parse_header(header: list[str]) -> tuple[int, list[tuple[str, str]], np.nda
                 raise ValueError(f"its property cannot be read, {line!r}")
             case ["comment", "origin", x, y, z]:
                 origin = np.array([float(x), float(y), float(z)])
+                if not np.all(np.isfinite(origin)):
+                    raise ValueError(f"its origin is not finite, {origin}")
             case ["comment", "density", name] if name in DENSITIES:
                 density = name
     if count < 0:
