@@ -72,9 +72,16 @@ def _run(job: Job) -> int:
     try:
         output.begin(graph.resolved, resumed=job.resumed)
         screen = make_screen(graph.settings.screen)
-        outcome = _run_inline(graph, screen) if graph.settings.inline else Supervisor(graph, screen).run()
-        output.settle(outcome, scored=nodes_write_reports(graph))
-        _say(outcome, screen, output)
+        said: list[Outcome] = []
+
+        def over(outcome: Outcome) -> None:
+            output.settle(outcome, scored=nodes_write_reports(graph))
+            if outcome not in said:
+                _say(outcome, screen, output)
+            said.append(outcome)
+
+        outcome = _run_inline(graph, screen) if graph.settings.inline else Supervisor(graph, screen, over).run()
+        over(outcome)
         return outcome.code
     except GraphError as error:
         output.settle(Outcome(REFUSED, f"refused: {error}"), scored=False)

@@ -26,7 +26,7 @@ from mvsgs_core.splats.checkpoint_files import checkpoint_info
 
 LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
 MAP = ("map.ply", "trajectory.txt", "checkpoint")  # what is worth keeping of an earlier run
-BESIDE = ("report.html", REPORT, "comparison.png", "cameras.json", "config.yaml")  # and what belongs to it
+BESIDE = ("report.html", REPORT, "comparison.png", "cameras.json", "keyframes", "config.yaml")  # and what belongs to it
 RUN_ALL = Path(__file__).resolve().parent / "run_all.py"
 
 

@@ -23,7 +23,7 @@ class Screen:
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(highlight=False)
-        self._warned: set[str] = set()
+        self._noted: set[str] = set()
         self._nodes: dict[str, NodeStatus] = {}
 
     def start(self, graph: Graph, nodes: dict[str, NodeStatus], processes: dict[str, psutil.Process]) -> None:
@@ -38,10 +38,15 @@ class Screen:
 
     def refresh(self) -> None:
         for status in self._nodes.values():
+            if "url" in status.values:
+                self._note_once(f"{status.name}: {status.values['url']}")
             for text in status.warnings:
-                if f"{status.name}: {text}" not in self._warned:
-                    self._warned.add(f"{status.name}: {text}")
-                    self.note(f"warning: {status.name}: {text}")
+                self._note_once(f"warning: {status.name}: {text}")
+
+    def _note_once(self, text: str) -> None:
+        if text not in self._noted:
+            self._noted.add(text)
+            self.note(text)
 
     def note(self, text: str) -> None:
         self.console.print(text, markup=False, soft_wrap=True)

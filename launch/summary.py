@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-FILES = ("report.html", "report.json", "map.ply", "trajectory.txt", "config.yaml", "logs")
+FILES = ("report.html", "report.json", "map.ply", "cameras.json", "keyframes", "trajectory.txt", "config.yaml", "logs")
 
 
 def summary(output: Path) -> str:

@@ -15,7 +15,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -41,8 +41,11 @@ BLAME_SECONDS = 1.5  # how long to listen, after a node failed for want of a nei
 class Supervisor:
     """One run of a graph."""
 
-    def __init__(self, graph: Graph, screen: Screen) -> None:
+    def __init__(self, graph: Graph, screen: Screen, over: Callable[[Outcome], None] = lambda outcome: None) -> None:
+        """over: called as soon as the run has ended for all but those who only stay open, such as a viewer's page."""
         self._graph = graph
+        self._over = over
+        self._ended: Outcome | None = None  # what it was called with
         self._screen = screen
         self._children: dict[str, Child] = {}
         self._waker, self._wakeup = socket.socketpair()
@@ -104,6 +107,9 @@ class Supervisor:
                 return self._blame()
             while self._signals:
                 number = self._signals.pop(0)
+                if self._ended is not None:
+                    self._stop_by = time.monotonic()  # there is nothing left to save
+                    return self._ended
                 if number != signal.SIGINT:
                     return self._stopped(number)
                 self._interrupts += 1
@@ -125,6 +131,12 @@ class Supervisor:
             if not failed and not any(child.running for child in self._children.values()):
                 return self._finished()
             self._screen.refresh()
+            if self._ended is None and (kept := self._kept_open()):
+                self._ended = self._finished()
+                self._over(self._ended)
+                for status in kept:
+                    where = f" at {status.values['url']}" if "url" in status.values else ""
+                    self._screen.note(f"{status.name} stays open{where}: close it there, or press Ctrl-C")
 
     def _stages(self) -> list[Child]:
         """The nodes that make the map."""
@@ -134,6 +146,13 @@ class Supervisor:
         """The nodes that only observe, without those that were given up."""
         there = [child for name, child in self._children.items() if name in self._graph.observers]
         return [child for child in there if child.name not in self._failed_observers]
+
+    def _kept_open(self) -> list[NodeStatus]:
+        """The nodes that wait for their user to close them, once all others have ended well."""
+        running = [child for child in self._children.values() if child.running]
+        failed = any(child.failure() for child in (*self._stages(), *self._observers()))
+        waiting = all(child.status.values.get("kept_open") is True for child in running)
+        return [child.status for child in running] if waiting and not failed else []
 
     def _give_up(self, child: Child, failure: Failure, directory: RunDirectory) -> None:
         """The run goes on without this observer."""

@@ -30,7 +30,7 @@ class Viewer(Node):
     class Config:
         host: str = "127.0.0.1"  # address to listen at; 0.0.0.0 opens the page to the whole network, without password
         port: int = 8080  # of the page; the next free one if it is taken
-        keep_open: bool = False  # after the end of the run, until the page's button or Ctrl-C (twice) closes it
+        keep_open: bool = False  # after the end of the run, until the page's button or Ctrl-C closes it
         max_frustums: int = 200  # keyframes drawn; beyond, the oldest go
 
     config: Config
@@ -45,6 +45,7 @@ class Viewer(Node):
             self.stats.warn(f"port {c.port} is taken: the viewer is at {self.url}")
         logging.info("viewer at %s", self.url)
         self.closed = threading.Event()
+        self._iterations = 0  # of the map that is shown
         self.unit: float | None = None  # map units in one unit of the page
         self._frustums: dict[int, viser.CameraFrustumHandle] = {}  # by keyframe
         self._splats: viser.GaussianSplatHandle | None = None
@@ -64,6 +65,7 @@ class Viewer(Node):
             self._show_keyframe(preview)
             self._show_path()
             self._photo.image, self._render.image = _thumbnail(preview.image), _thumbnail(preview.render)
+            self._iterations = preview.iterations
             self._status.content = (
                 f"keyframe **{preview.index}**, {len(preview.means)} splats, {preview.iterations} iterations"
             )
@@ -72,11 +74,20 @@ class Viewer(Node):
 
     def on_end(self) -> Iterator[None]:
         if self.config.keep_open:
-            self._status.content += ": **finished**"
+            self._status.content += f": {self._ending()}"
             logging.info("the run is over; %s stays open until its button Close is pressed", self.url)
+            self.stats.values["kept_open"] = True  # the launcher waits for nothing else
             self.closed.wait()
         self.server.stop()
         yield from ()
+
+    def _ending(self) -> str:
+        """What is shown once nothing more comes: the map as the mapper left it, or an earlier state of it."""
+        done = [stats["values"].get("iterations") for stats in self.upstream.values() if "values" in stats]
+        whole = max((number for number in done if isinstance(number, int)), default=0)
+        if 0 < whole == self._iterations:
+            return "**finished**"
+        return f"the run is over; the map went on to {whole} iterations, which were not shown" if whole else "**over**"
 
     def _begin(self, preview: Preview) -> None:
         """Unit, up direction and first view of the page, all from the first keyframe."""

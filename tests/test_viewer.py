@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import msgpack
 import numpy as np
@@ -19,6 +26,7 @@ from websockets.typing import Subprotocol
 from msgs import Preview
 from nodes import handlers, outputs
 from nodes.viewer import Viewer
+from tests.shared_data import ROOT
 
 
 def free_port() -> int:
@@ -59,7 +67,11 @@ def show(viewer: Viewer, message: Preview) -> None:
 def received(viewer: Viewer) -> str:
     """What a browser gets on connecting, as text to search for names in."""
     viewer.server.flush()
-    address = viewer.url.replace("http", "ws")
+    return page(viewer.url)
+
+
+def page(url: str) -> str:
+    address = url.replace("http", "ws")
     got = ""
     with connect(address, subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None) as browser:
         while "ReplayDone" not in got:
@@ -151,6 +163,53 @@ def test_taken_port_is_said() -> None:
         assert node.server.get_port() != port
         assert str(port) in node.stats.warnings[0]
         node.server.stop()
+
+
+@pytest.mark.parametrize(("last", "said"), [(90, "**finished**"), (80, "the map went on to 90 iterations")])
+def test_finished_is_said_only_of_the_map_as_the_mapper_left_it(last: int, said: str) -> None:
+    node = Viewer(Viewer.Config(port=free_port(), keep_open=True))
+    show(node, replace(preview(1), iterations=last))
+    node.upstream = {"tracker": {"counts": {}, "values": {"frames": 9}}, "mapper": {"values": {"iterations": 90}}}
+    node.closed.set()
+    assert list(node.on_end()) == []
+    assert said in node._status.content
+    assert ("finished" in node._status.content) == (last == 90)
+
+
+def test_the_launcher_says_where_the_page_is_and_sums_up_before_it_is_closed(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        ROOT / "launch/run_all.py",
+        "dataset=synthetic",
+        "dataset.stop=10",
+        "dataset.size=[60,80]",
+    ]
+    command += ["mapper.iterations=3", "mapper.refinement=5", "viewer=viser", "viewer.keep_open=true"]
+    command += [f"viewer.port={free_port()}", f"output={tmp_path / 'out'}", "tracker=ground_truth"]
+    with (tmp_path / "said").open("wb") as said:
+        run = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, cwd=tmp_path, start_new_session=True)
+    try:
+        until = time.monotonic() + 120
+        while "stays open" not in (text := (tmp_path / "said").read_text()):
+            assert time.monotonic() < until, text
+            assert run.poll() is None, text
+            time.sleep(0.1)
+        place = text.index("viewer: http://127.0.0.1:")
+        assert (
+            place < text.index("keyframes   PSNR") < text.index(f"in {tmp_path / 'out'}: ") < text.index("stays open")
+        )
+        assert json.loads((tmp_path / "out/report.json").read_text()).get("finished", True)
+        url = text[place:].split()[1]
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            assert answer.status == 200
+        assert "keyframe **" in page(url)
+        run.send_signal(signal.SIGINT)
+        assert run.wait(10) == 0
+        assert (tmp_path / "said").read_text().count("keyframes   PSNR") == 1
+    finally:
+        if run.poll() is None:
+            os.killpg(run.pid, signal.SIGKILL)
+            run.wait()
 
 
 def test_ends_with_the_run_unless_kept_open() -> None:

@@ -58,7 +58,7 @@ def write_cameras(path: Path, cameras: Cameras) -> None:
         for k in range(len(cameras))
     ]
     text = json.dumps({"format": FORMAT, "version": VERSION, "keyframes": keyframes}, allow_nan=False)
-    replace_text(path, text.replace('{"index"', '\n{"index"') + "\n")  # a keyframe a line
+    replace_text(path, text.replace(' {"index"', '\n{"index"') + "\n")  # a keyframe a line
 
 
 def read_cameras(path: Path) -> Cameras:
