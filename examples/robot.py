@@ -21,9 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from msgs import Frame, GroundTruth
 from mvsgs_core.datasets import open_dataset
-from nodes.addresses import load_keys
+from nodes.addresses import TransportError, load_keys
 from nodes.camera import Camera
-from nodes.transport import Publisher
+from nodes.transport import LivePublisher
+
+GUESSED = "the intrinsics are a guess, and the frames say so: the tracker estimates the focal length (--intrinsics)"
 
 
 def frames(arguments: argparse.Namespace) -> Iterator[Frame]:
@@ -44,9 +46,24 @@ def frames(arguments: argparse.Namespace) -> Iterator[Frame]:
         began = now - item.timestamp if began is None else began
         if not arguments.fast:
             time.sleep(max(0.0, began + item.timestamp - now))
-        yield Frame(item.index, item.timestamp, item.image, item.intrinsics)
+        yield Frame(item.index, item.timestamp, item.image, item.intrinsics, item.intrinsics_guessed)
     for warning in sequence.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        say(f"warning: {warning}")
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def wait_for_reader(publisher: LivePublisher, keys: Path | None) -> None:
+    """Says at once if somebody comes who is turned away: from there it looks as if nobody published."""
+    refused = f"its keys are not those in {keys}" if keys else "it has keys: give the same ones with --keys"
+    told = False
+    while not publisher.ready(1):
+        if publisher.refused and not told:
+            told = True
+            say(f"warning: a reader was turned away: {refused}")
+        time.sleep(0.1)
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -64,13 +81,18 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def main() -> None:
     arguments = parse()
-    publisher = Publisher(arguments.address, keys=None if arguments.keys is None else load_keys(arguments.keys))
+    try:
+        keys = None if arguments.keys is None else load_keys(arguments.keys)
+        publisher = LivePublisher(arguments.address, keys=keys)
+    except TransportError as error:
+        sys.exit(f"error: {error}")
     sent = 0
     try:
         print(f"publishing at {arguments.address}, waiting for a reader; Ctrl-C ends", flush=True)
-        while not publisher.ready(1):
-            time.sleep(0.1)
+        wait_for_reader(publisher, arguments.keys)
         for frame in frames(arguments):
+            if frame.intrinsics_guessed and not sent:
+                say(f"warning: {GUESSED}")
             publisher.send(frame)
             sent += 1
     except KeyboardInterrupt:

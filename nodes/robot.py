@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +16,20 @@ from mvsgs_core.camera import resize_image, scale_intrinsics
 from mvsgs_core.datasets.framing import target_size
 from mvsgs_core.datasets.sequence import selection
 from nodes import Node
-from nodes.addresses import load_keys
-from nodes.transport import NewestReader
+from nodes.addresses import TransportError, check_address, load_keys
+from nodes.stream_times import LATEST, StreamTimes
+from nodes.transport import LiveReader
 
 POLL = 0.5  # s at most between two looks at the clock
+FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye and a telescope nothing can be tracked
+SMALLEST, LARGEST = 16, 16384  # pixels of a side
 
 
 class Robot(Node):
     """Frames published elsewhere -> Frame, numbered anew, and GroundTruth with the same image to score renders against.
 
-    Best effort: only the newest frame is taken, the robot is never held back.
+    Best effort: only the newest frame is taken, the robot is never held back. What it sends is not trusted: what is no
+    usable frame is left out and counted; the stream ends with an End that is one, or with silence.
     """
 
     @dataclass
@@ -35,7 +39,7 @@ class Robot(Node):
         stop: int | None = None  # end after so many frames from the first one on; null: until End or Ctrl-C
         stride: int = 1  # every which frame of those that are taken
         size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as sent
-        timeout: float = 30.0  # s without a frame before the robot counts as gone
+        timeout: float = 30.0  # s without a usable frame before the robot counts as gone
         keys: str | None = None  # folder with the CURVE keys that the publisher has too; null: none
 
     config: Config
@@ -46,64 +50,104 @@ class Robot(Node):
         selection(c.start, c.stop, c.stride)  # refuses what is none
         target_size(c.size, (480, 640))
         self._native: tuple[int, int] | None = None
+        self._times = StreamTimes()
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        try:
+            check_address(config.path)
+            if config.keys is not None:
+                load_keys(Path(config.keys))
+        except TransportError as error:
+            raise ValueError(str(error)) from error
 
     def run(self) -> Iterator[Frame | GroundTruth]:
-        """Ends with the publisher's End, or when it falls silent after it sent frames.
+        """Ends with the publisher's End, or when no usable frame comes any more after there were some.
 
-        Raises TransportError for an address that is none and TimeoutError if no frame ever comes.
+        Raises TransportError for an address that is none and for refused keys, and TimeoutError if no frame ever comes.
         """
         keys = None if self.config.keys is None else load_keys(Path(self.config.keys))
-        reader = NewestReader(self.config.path, Frame, topic=f"robot at {self.config.path}", keys=keys)
+        reader = LiveReader(self.config.path, Frame, topic=f"robot at {self.config.path}", keys=keys)
         taken = index = 0
         try:
             while self.config.stop is None or taken < self.config.stop:
                 frame = self._receive(reader, first=taken == 0)
-                self.stats.counts["dropped"] = reader.skipped
                 if frame is None:
                     return
                 number, taken = taken, taken + 1
                 if number < self.config.start or (number - self.config.start) % self.config.stride:
                     continue
-                framed = self._framed(frame, index)
-                if framed is not None:
-                    self.stats.count("frames")
-                    yield framed
-                    yield GroundTruth(index, framed.timestamp, framed.image, framed.intrinsics, None, None)
-                    index += 1
+                sized = self._sized(frame, index)
+                self.stats.count("frames")
+                yield sized
+                yield GroundTruth(index, sized.timestamp, sized.image, sized.intrinsics, None, None)
+                index += 1
         finally:
             reader.close()
 
-    def _receive(self, reader: NewestReader, first: bool) -> Frame | None:
-        """The next frame, None at the end of the stream."""
+    def _receive(self, reader: LiveReader, first: bool) -> Frame | None:
+        """The next usable frame, None at the end of the stream."""
         deadline = time.monotonic() + self.config.timeout
         while time.monotonic() < deadline:
-            reader.watch()
             try:
                 message = reader.receive(POLL)
             except CodecError as error:
                 self.stats.count("refused")
                 self.stats.warn(f"the robot sent what is no Frame, it was left out: {error}")
                 continue
-            if isinstance(message, Frame):
-                return message
+            finally:
+                self._watch(reader)
             if isinstance(message, End):
                 return None
-        silence = f"no frame from {self.config.path} for {self.config.timeout:g} s"
+            usable = self._usable(message) if isinstance(message, Frame) else None
+            if usable is not None:
+                return usable
+        silence = f"no usable frame from {self.config.path} for {self.config.timeout:g} s"
         if first:
-            raise TimeoutError(f"{silence}: is the program that publishes there running (see examples/robot.py)?")
+            hint = "is the program that publishes there running (see examples/robot.py)?"
+            raise TimeoutError(f"{silence}: {self.stats.warnings[0] if self.stats.warnings else hint}")
         self.stats.warn(f"{silence}: the stream ends here")
         return None
 
-    def _framed(self, frame: Frame, index: int) -> Frame | None:
-        """The frame at the wanted size; None, with a warning, if it cannot belong to the same stream."""
+    def _watch(self, reader: LiveReader) -> None:
+        self.stats.counts["dropped"] = reader.skipped
+        if reader.reconnected > self.stats.counts.get("reconnected", 0):
+            self.stats.counts["reconnected"] = reader.reconnected
+            self.stats.warn("the connection to the robot broke, as a frame too large makes it, and was made anew")
+        if reader.renumbered > self.stats.counts.get("renumbered", 0):
+            self.stats.counts["renumbered"] = reader.renumbered
+            self.stats.warn("the robot's sequence numbers jumped, as they do when its program starts again")
+
+    def _usable(self, frame: Frame) -> Frame | None:
+        """The frame at a time after all before it; None, with a warning, if it cannot belong to the same stream."""
+        wrong = self._fault(frame)
+        shown = None if wrong else self._times.accept(frame.timestamp)
+        if shown is None:
+            self.stats.count("unusable")
+            self.stats.warn(wrong or f"frames whose timestamp is no time in seconds (beyond {LATEST:g}) were left out")
+            return None
+        if self._times.repaired > self.stats.counts.get("times_repaired", 0):
+            self.stats.counts["times_repaired"] = self._times.repaired
+            self.stats.warn("the robot's timestamps stood still, went back or leapt: there the time here was taken")
+        self._native = self._native or (frame.image.shape[0], frame.image.shape[1])
+        return replace(frame, timestamp=shown)
+
+    def _fault(self, frame: Frame) -> str | None:
         native = frame.image.shape[0], frame.image.shape[1]
-        self._native = self._native or native
-        if native != self._native:
-            self.stats.warn(f"frames of another size than the first, {self._native}, were left out, such as {native}")
-            return None
-        if not np.all(np.isfinite(frame.intrinsics)) or np.any(frame.intrinsics[:2] <= 0):
-            self.stats.warn(f"frames without valid intrinsics were left out, such as {frame.intrinsics}")
-            return None
-        size = target_size(self.config.size, native)
-        intrinsics = scale_intrinsics(frame.intrinsics, native, size)
+        side = max(native)
+        focal, center = frame.intrinsics[:2], frame.intrinsics[2:]
+        if not SMALLEST <= min(native) <= side <= LARGEST:
+            return f"frames with sides outside of {SMALLEST} to {LARGEST} pixels were left out, such as {native}"
+        if self._native not in (None, native):
+            return f"frames of another size than the first, {self._native}, were left out, such as {native}"
+        in_view = np.all((FOCAL_RANGE[0] * side <= focal) & (focal <= FOCAL_RANGE[1] * side))
+        if not in_view or not np.all(np.abs(center) <= 2 * side):
+            return f"frames without valid intrinsics were left out, such as {frame.intrinsics.tolist()} for {native}"
+        return None
+
+    def _sized(self, frame: Frame, index: int) -> Frame:
+        """The frame at the wanted size."""
+        assert self._native is not None
+        size = target_size(self.config.size, self._native)
+        intrinsics = scale_intrinsics(frame.intrinsics, self._native, size)
         return Frame(index, frame.timestamp, resize_image(frame.image, size), intrinsics, frame.intrinsics_guessed)

@@ -23,6 +23,7 @@ class _Reader:
     """What both kinds of readers share: the connection, its monitor, and decoding."""
 
     delivery: bytes
+    monitored = LOST  # events of the connection
 
     def __init__(
         self,
@@ -48,7 +49,7 @@ class _Reader:
         self._socket = open_socket(zmq.SUB, address, keys, self._max_bytes)
         self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl = 50
-        self.monitor = self._socket.get_monitor_socket(LOST)
+        self.monitor = self._socket.get_monitor_socket(self.monitored)
         self._socket.connect(address)
         if observer is not None:  # first: it must not pass for another reader
             self._socket.subscribe(OBSERVER + self.delivery + observer.encode())
@@ -161,6 +162,7 @@ class NewestReader(_Reader):
         super().__init__(address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes, observer=observer)
         self._frames = deque(maxlen=1)  # a newer one takes the older one's place
         self._late = late
+        self.displaced = 0  # messages that a newer one replaced before they were taken
         self._end: zmq.Frame | None = None
         self._closing = False
         wake = f"inproc://newest-{id(self)}"
@@ -187,9 +189,7 @@ class NewestReader(_Reader):
             return None
         message, sequence, _ = self._decode(frame)
         self._count(message)
-        if not self._late or self.expected:
-            self.skipped += max(0, sequence - self.expected)
-        self.expected = sequence + 1
+        self._note(sequence)
         return message
 
     def receive(self, timeout_s: float | None = None) -> Message | None:
@@ -209,21 +209,36 @@ class NewestReader(_Reader):
         self.pollable.close()
         self._close_socket()
 
+    def _note(self, sequence: int) -> None:
+        """A message of that number was taken."""
+        if not self._late or self.expected:
+            self.skipped += max(0, sequence - self.expected)
+        self.expected = sequence + 1
+
+    def _attend(self) -> None:
+        """Called by the thread that reads, several times a second."""
+
     def _drain(self) -> None:
         while not self._closing:
+            self._attend()
             try:
                 frame = self._socket.recv(copy=False)
             except zmq.Again:
                 continue
-            try:
-                is_end = type_name(frame.buffer) == "End"
-            except CodecError:
-                is_end = False  # reported to the owner when it decodes the frame
-            if is_end:
+            if _is_end(frame):
                 self._end = frame
                 self._socket.unsubscribe(self.delivery)
             else:
+                self.displaced += len(self._frames)
                 self._frames.append(frame)
             if self._wake.poll(0, zmq.POLLOUT):
                 self._wake.send(b"")
         self._wake.close()
+
+
+def _is_end(frame: zmq.Frame) -> bool:
+    """Only what decodes as End ends a topic. What only says so is reported to the owner, as any frame that is none."""
+    try:
+        return type_name(frame.buffer) == "End" and isinstance(decode(frame.buffer, expect=(End,)).message, End)
+    except CodecError:
+        return False

@@ -1,0 +1,102 @@
+"""A stream between programs that are not one graph, such as a robot's frames: either end may fail, err or come back.
+
+What ZeroMQ does not do by itself: a SUB socket whose publisher sent more than a message may have gives the connection
+up for good, without a word; here it connects anew. An XPUB socket turns readers away silently; here they are counted.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from typing import Any
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from nodes.addresses import TransportError
+from nodes.transport.publisher import Publisher
+from nodes.transport.readers import LOST, REFUSED, NewestReader
+from nodes.transport.sockets import readable
+
+RETRY = 0.3  # s without ZeroMQ's own attempt after which a lost connection is made anew
+FASTEST = 1000  # frames a second: a larger jump of the sequence numbers is no loss, but a sender that counts anew
+BURST = 100  # frames that may come at once
+TURNED_AWAY = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
+
+
+class LiveReader(NewestReader):
+    """The newest message of a program elsewhere. Nothing but an End that is one ends it, nothing it sends breaks it.
+
+    `skipped` counts what can have been sent in the time that passed, whatever the sender's numbers say.
+    """
+
+    monitored = LOST | zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED
+
+    def __init__(self, address: str, type: type, **options: Any) -> None:
+        self.reconnected = 0  # connections that were given up because of what came, and made anew
+        self.renumbered = 0  # times that the sender's sequence numbers went on elsewhere
+        self._address = address
+        self._refusal: str | None = None
+        self._taken_at = 0.0
+        self._displaced_before = 0
+        self._broken_at: float | None = None
+        super().__init__(address, type, **options)
+
+    def watch(self) -> None:
+        """Raises TransportError if the publisher refuses this reader's keys and nothing ever came from there."""
+        if self._refusal is not None and not self.received:
+            raise TransportError(self._refusal)
+
+    def _note(self, sequence: int) -> None:
+        now, displaced, gap = time.monotonic(), self.displaced, sequence - self.expected
+        if self.received > 1:
+            plausible = 0 <= gap <= BURST + FASTEST * (now - self._taken_at)
+            self.renumbered += not plausible
+            self.skipped += gap if plausible else displaced - self._displaced_before
+        self._taken_at, self._displaced_before = now, displaced
+        self.expected = sequence + 1
+
+    def _attend(self) -> None:
+        """In the thread that reads: the socket is its own."""
+        while readable(self.monitor):
+            event = recv_monitor_message(self.monitor)["event"]
+            if event & REFUSED and self._keys is not None:
+                self._refusal = f"the publisher of {self.topic} refused the keys: both ends need the same file"
+            elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+                self._refusal = f"the publisher of {self.topic} speaks another protocol: keys on one side only?"
+            if event & (zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED):
+                self._broken_at = None
+            else:
+                self._broken_at = time.monotonic()
+        if self._broken_at is not None and time.monotonic() - self._broken_at > RETRY:
+            self._broken_at = None
+            self.reconnected += 1
+            with suppress(zmq.ZMQError):  # ZeroMQ may have forgotten it
+                self._socket.disconnect(self._address)
+            self._socket.connect(self._address)
+
+
+class LivePublisher(Publisher):
+    """A topic that programs elsewhere read; `refused` says how many of them were turned away."""
+
+    def __init__(self, address: str, **options: Any) -> None:
+        super().__init__(address, **options)
+        self._refused = 0
+        self._monitor = self.socket.get_monitor_socket(TURNED_AWAY)
+
+    @property
+    def refused(self) -> int:
+        """Attempts of readers without the right keys; one tries again several times a second."""
+        while readable(self._monitor):
+            recv_monitor_message(self._monitor)
+            self._refused += 1
+        return self._refused
+
+    def close(self) -> None:
+        if not self.socket.closed:
+            self.socket.disable_monitor()
+            self._monitor.close()
+        super().close()
+
+
+__all__ = ["LivePublisher", "LiveReader"]

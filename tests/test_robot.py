@@ -1,0 +1,312 @@
+"""A live stream that is attacked, broken off, renumbered and set back goes on, and says what happened."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import zmq
+
+from bench.frame_mutations import frame as false_frame
+from msgs import End, Frame
+from msgs.codec import NEWEST, encode
+from nodes.addresses import TransportError
+from nodes.robot import Robot
+from nodes.stream_times import StreamTimes
+from nodes.transport import create_keys
+from tests.shared_data import ROOT
+
+INTERVAL = 0.03  # s between two frames
+
+
+@pytest.fixture
+def address() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+
+
+def picture(number: int, timestamp: float | None = None) -> Frame:
+    image = np.full((24, 32, 3), number % 256, dtype=np.uint8)
+    return Frame(number, number / 10 if timestamp is None else timestamp, image, np.array([25.0, 25, 15.5, 11.5]))
+
+
+def data(number: int, sequence: int | None = None, timestamp: float | None = None) -> bytes:
+    sequence = number if sequence is None else sequence
+    return bytes(encode(picture(number, timestamp), sequence, delivery=NEWEST))
+
+
+END = bytes(encode(End(), 2**40, delivery=NEWEST))
+
+
+class Program:
+    """A publisher that knows nothing of this project and sends what it is told, a frame every `INTERVAL`."""
+
+    def __init__(self, address: str, frames: Iterator[bytes]) -> None:
+        self._thread = threading.Thread(target=self._work, args=(address, frames), daemon=True)
+        self._stop = threading.Event()
+        self._thread.start()
+
+    def _work(self, address: str, frames: Iterator[bytes]) -> None:
+        with zmq.Context() as context, context.socket(zmq.XPUB) as publisher:
+            publisher.linger = 200
+            publisher.bind(address)
+            publisher.poll(10_000)  # a reader has come
+            for frame in frames:
+                publisher.send(frame)
+                if self._stop.wait(INTERVAL):
+                    return
+            self._stop.wait(10.0)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def received(address: str, frames: Iterator[bytes], timeout: float = 5.0) -> tuple[list[Frame], Robot]:
+    """What the robot's node makes of a program's frames."""
+    robot = Robot(Robot.Config(path=address, timeout=timeout))
+    program = Program(address, frames)
+    try:
+        return [message for message in robot.run() if isinstance(message, Frame)], robot
+    finally:
+        program.close()
+
+
+def numbers(frames: list[Frame]) -> list[int]:
+    return [int(frame.image[0, 0, 0]) for frame in frames]
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        false_frame(b"End", b""),
+        false_frame(b"End", b"\x83", header_bytes=2**32 - 1),
+        false_frame(b"End", b"\xdc\x10\x00" * 1000),
+        END[:-1],
+        END + b"\0",
+        b"N",
+        b"NMVS\x01\x05\0\0",
+    ],
+    ids=["empty", "false length", "unfinished", "cut off", "longer", "a byte", "a prefix"],
+)
+def test_what_is_no_end_does_not_end_a_stream(address: str, garbage: bytes) -> None:
+    def frames() -> Iterator[bytes]:
+        for i in range(40):
+            yield garbage if i % 4 == 2 else data(i)
+        yield END
+
+    taken, robot = received(address, frames())
+    assert numbers(taken)[-1] == 39
+    assert len(taken) >= 20
+    assert robot.stats.counts["refused"] >= 5
+    assert all(text.isprintable() for text in robot.stats.warnings)
+
+
+def test_a_frame_of_300_megabytes_does_not_cut_the_stream_off(address: str) -> None:
+    def frames() -> Iterator[bytes]:
+        giant = b"N" + bytes(300 * 2**20)
+        for i in range(60):
+            if i in (20, 40):
+                yield giant
+            yield data(i)
+        yield END
+
+    taken, robot = received(address, frames(), timeout=20.0)
+    assert numbers(taken)[-1] == 59
+    assert min(numbers(taken)) < 20
+    assert any(20 < number < 40 for number in numbers(taken))
+    assert robot.stats.counts["reconnected"] == 2
+    assert any("was made anew" in text for text in robot.stats.warnings)
+
+
+def test_dropped_is_what_can_have_been_sent(address: str) -> None:
+    jumps = {10: 2**62, 11: 5, 20: 2**40, 30: 2**63 - 1}
+
+    def frames() -> Iterator[bytes]:
+        for i in range(40):
+            yield data(i, sequence=jumps.get(i, 100 + i))
+        yield bytes(encode(End(), 150, delivery=NEWEST))
+
+    taken, robot = received(address, frames())
+    assert numbers(taken)[-1] == 39
+    assert robot.stats.counts["dropped"] < 300
+    assert robot.stats.counts["renumbered"] >= 3
+    assert any("sequence numbers jumped" in text for text in robot.stats.warnings)
+
+
+def test_a_program_that_is_killed_and_starts_again_goes_on(address: str) -> None:
+    robot = Robot(Robot.Config(path=address, timeout=10.0))
+    first = Program(address, (data(i) for i in range(100, 200)))
+    taken: list[Frame] = []
+    again: Program | None = None
+    for message in robot.run():
+        if isinstance(message, Frame):
+            taken.append(message)
+            if len(taken) == 10:
+                first.close()
+                again = Program(
+                    address, iter([*(data(i) for i in range(20)), bytes(encode(End(), 20, delivery=NEWEST))])
+                )
+    assert again is not None
+    again.close()
+    assert numbers(taken)[:2] == [100, 101]
+    assert numbers(taken)[-1] == 19
+    assert len(taken) > 20
+    times = [frame.timestamp for frame in taken]
+    assert all(b > a for a, b in pairwise(times))
+    assert times[-1] - times[0] < 10.0
+    assert robot.stats.counts["times_repaired"] == 1
+    assert robot.stats.counts["renumbered"] == 1
+
+
+def test_times_always_go_forward() -> None:
+    now = [0.0]
+    times = StreamTimes(lambda: now[0])
+
+    def at(passed: float, timestamp: float) -> float | None:
+        now[0] += passed
+        return times.accept(timestamp)
+
+    assert at(0, 1e9) == 1e9
+    assert at(0.1, 1e9 + 0.1) == 1e9 + 0.1
+    assert times.repaired == 0
+    assert at(0.1, 1e9 + 0.1) == pytest.approx(1e9 + 0.2)  # the same again
+    assert at(0.1, 1e9 + 0.2) == pytest.approx(1e9 + 0.3)
+    assert times.repaired == 1
+    assert at(0.1, 0.0) == pytest.approx(1e9 + 0.4)  # back
+    assert at(0.1, 0.1) == pytest.approx(1e9 + 0.5)
+    assert times.repaired == 2
+    assert at(0.1, 9e10) == pytest.approx(1e9 + 0.6)  # ahead, by far more than passed
+    assert times.repaired == 3
+    for absurd in (1e300, -1e300, 1.7e18, float("inf"), float("nan")):
+        assert at(0.0, absurd) is None
+    assert at(0.0, 9e10) == pytest.approx(1e9 + 0.6, abs=1e-3)  # at the same moment, and still later
+    played_fast = StreamTimes(lambda: now[0])
+    assert [played_fast.accept(t) for t in (0.0, 0.5, 1000.0)] == [0.0, 0.5, 1000.0]
+    assert played_fast.repaired == 0
+
+
+def test_false_times_are_refused_or_repaired_and_said(address: str) -> None:
+    odd = {5: 1e300, 8: 0.2, 12: 1.2e18}
+
+    def frames() -> Iterator[bytes]:
+        for i in range(20):
+            yield data(i, timestamp=odd.get(i))
+        yield END
+
+    taken, robot = received(address, frames())
+    assert numbers(taken)[-1] == 19
+    assert not {5, 12} & set(numbers(taken))
+    times = [frame.timestamp for frame in taken]
+    assert all(b > a for a, b in pairwise(times))
+    assert max(times) < 10
+    assert robot.stats.counts["unusable"] == 2
+    assert robot.stats.counts["times_repaired"] >= 1
+    assert any("no time in seconds" in text for text in robot.stats.warnings)
+    assert any("stood still, went back or leapt" in text for text in robot.stats.warnings)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda f: replace(f, intrinsics=np.array([1e300, 1e300, 15.5, 11.5])),
+        lambda f: replace(f, intrinsics=np.array([1e-300, 25.0, 15.5, 11.5])),
+        lambda f: replace(f, intrinsics=np.array([25.0, 25.0, 1e9, 11.5])),
+        lambda f: replace(f, intrinsics=np.array([25.0, np.nan, 15.5, 11.5])),
+        lambda f: replace(f, image=np.zeros((1, 1, 3), np.uint8)),
+        lambda f: replace(f, image=np.zeros((1, 70_000, 3), np.uint8)),
+    ],
+    ids=["telescope", "no focal length", "center", "nan", "a pixel", "a line"],
+)
+def test_a_frame_that_no_camera_takes_is_left_out_even_as_the_first(
+    address: str, change: Callable[[Frame], Frame]
+) -> None:
+    def frames() -> Iterator[bytes]:
+        for i in range(20):
+            yield bytes(encode(change(picture(i)) if i in (0, 10) else picture(i), i, delivery=NEWEST))
+        yield END
+
+    taken, robot = received(address, frames())
+    assert not {0, 10} & set(numbers(taken))
+    assert numbers(taken)[-1] == 19
+    assert robot.stats.counts["unusable"] == 2
+
+
+def test_only_garbage_is_no_stream_and_the_error_says_what_came(address: str) -> None:
+    robot = Robot(Robot.Config(path=address, timeout=1.0))
+    program = Program(address, (data(i, timestamp=1e18) for i in range(1000)))
+    with pytest.raises(TimeoutError, match="no time in seconds"):
+        list(robot.run())
+    program.close()
+
+
+# ---------------------------------------------------------------- the program in examples/
+
+
+def example(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, str(ROOT / "examples/robot.py"), *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (64, 48))
+    for i in range(8):
+        writer.write(np.full((48, 64, 3), 8 * i, dtype=np.uint8))
+    writer.release()
+    return path
+
+
+def test_guessed_intrinsics_are_sent_as_guessed_and_said(address: str, video: Path) -> None:
+    for given, guessed in ((["--intrinsics", "50", "50", "31.5", "23.5"], False), ([], True)):
+        with example("--video", str(video), "--address", address, *given) as program:
+            robot = Robot(Robot.Config(path=address, timeout=30.0))
+            frames = [message for message in robot.run() if isinstance(message, Frame)]
+            errors = program.communicate(timeout=20)[1]
+        assert frames
+        assert {frame.intrinsics_guessed for frame in frames} == {guessed}
+        assert ("the intrinsics are a guess" in errors) == guessed
+
+
+def test_a_reader_with_other_keys_is_named_at_both_ends(address: str, video: Path, tmp_path: Path) -> None:
+    create_keys(tmp_path / "a")
+    create_keys(tmp_path / "b")
+    other = "its keys are not those in"
+    for ours, theirs, text in ((None, "a", other), ("b", "a", other), ("a", None, "it has keys")):
+        given = [] if theirs is None else ["--keys", str(tmp_path / theirs)]
+        with example("--video", str(video), "--address", address, *given) as program:
+            try:
+                config = Robot.Config(path=address, timeout=10.0, keys=None if ours is None else str(tmp_path / ours))
+                with pytest.raises(TransportError, match="keys"):
+                    list(Robot(config).run())
+                time.sleep(0.5)
+            finally:
+                os.kill(program.pid, signal.SIGINT)
+                errors = program.communicate(timeout=20)[1]
+        assert text in errors
+        assert "Traceback" not in errors
+
+
+def test_the_launcher_refuses_a_robot_without_its_keys(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="create_keys"):
+        Robot.check(Robot.Config(keys=str(tmp_path)))
+    with pytest.raises(ValueError, match="is no address"):
+        Robot.check(Robot.Config(path="localhost:5555"))
+    Robot.check(Robot.Config())
+    done = example("--video", "x.mp4", "--keys", str(tmp_path))
+    assert "error: no keys at" in done.communicate(timeout=60)[1]
+    assert done.returncode == 1
