@@ -92,11 +92,11 @@ class LivePublisher(Publisher):
             self._refused += 1
         return self._refused
 
-    def close(self) -> None:
+    def close(self, *, farewell: bool = True) -> None:
         if not self.socket.closed:
             self.socket.disable_monitor()
             self._monitor.close()
-        super().close()
+        super().close(farewell=farewell)
 
 
 __all__ = ["LivePublisher", "LiveReader"]
