@@ -12,6 +12,7 @@ import threading
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -59,6 +60,7 @@ def test_the_video_is_h264_as_browsers_decode_it_with_every_frame_and_its_colors
         assert stream.average_rate == 25
         frames = [frame.to_ndarray(format="rgb24", src_colorspace="ITU709") for frame in container.decode(video=0)]
     assert len(frames) == 5
+    assert cv2.VideoCapture(str(out)).get(cv2.CAP_PROP_FRAME_COUNT) == 5
     assert psnr(frames[0], rendered(0.0)) > 32.0
     assert psnr(frames[-1], rendered(1.0)) > 32.0
     assert psnr(frames[-1], rendered(0.0)) < 25.0
