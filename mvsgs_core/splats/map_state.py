@@ -8,6 +8,7 @@ from torch import Tensor
 from mvsgs_core.splats.model import Splats
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh", "betas")
+SINGLE = ("steps", "anchors", "screen_gradient", "screen_views")  # one value a splat beside the parameters
 
 
 class MapState:
@@ -33,12 +34,28 @@ class MapState:
     def __len__(self) -> int:
         return len(self.steps)
 
+    def tensors(self) -> dict[str, Tensor]:
+        """All that is kept for the splats, by name, detached; gradients, which live for an iteration, are left out."""
+        found = {name: value.detach() for name, value in self.splats.tensors().items()}
+        for moment, values in (("first", self.first), ("second", self.second)):
+            found |= {f"{moment}/{name}": values[name] for name in PARAMETERS}
+        return found | {name: getattr(self, name) for name in SINGLE}
+
+    @classmethod
+    def of(cls, tensors: dict[str, Tensor], device: torch.device) -> MapState:
+        """The state that has these `tensors()`, copied to `device`."""
+        state = cls(tensors["sh"].shape[1], device)
+        copies = {name: value.detach().to(device, copy=True) for name, value in tensors.items()}
+        state.splats = _leaves({name: copies[name] for name in PARAMETERS})
+        for name in PARAMETERS:
+            state.first[name], state.second[name] = copies[f"first/{name}"], copies[f"second/{name}"]
+        for name in SINGLE:
+            setattr(state, name, copies[name])
+        return state
+
     @property
     def bytes(self) -> int:
-        """Of all that is kept for the splats; gradients, which live for an iteration, are left out."""
-        kept = (self.splats.tensors(), self.first, self.second)
-        single = (self.steps, self.anchors, self.screen_gradient, self.screen_views)
-        return sum(t.nbytes for tensors in kept for t in tensors.values()) + sum(t.nbytes for t in single)
+        return sum(value.nbytes for value in self.tensors().values())
 
     @property
     def device(self) -> torch.device:

@@ -60,7 +60,7 @@ class OnlineMapper:
         self.config = config or MapperConfig()
         self.state = MapState((self.config.sh_degree + 1) ** 2, torch.device(self.config.device))
         self.views: list[TrainingView] = []
-        self._with_image: list[TrainingView] = []  # those of them that are trained on
+        self.with_image: list[TrainingView] = []  # those of them that are trained on
         self.schedule = Schedule(self.config.window, self.config.seed)
         self.log = log or Stats()
         self.iterations = 0
@@ -68,7 +68,7 @@ class OnlineMapper:
         self.unit: float | None = None  # median depth of the first keyframe that has depth, world units
         self.global_rate = 1.0  # factor on all learning rates: falls during refinement
         self.corrections = {} if corrections is None else corrections  # newest pose and scale of each keyframe
-        self._generator = torch.Generator().manual_seed(self.config.seed)
+        self.generator = torch.Generator().manual_seed(self.config.seed)
 
     @property
     def median_depth(self) -> float:
@@ -108,7 +108,7 @@ class OnlineMapper:
         added.world_from_cam, added.scale, added.median_depth = pose, scale, median / (self.unit or 1.0)
         added.fixed = not self.views
         self.views.append(added)
-        self._with_image.append(added)
+        self.with_image.append(added)
         self._bound_images()
         if added.valid is not None:
             self.log.refuse(
@@ -131,7 +131,7 @@ class OnlineMapper:
             self.schedule.drop()
             return False
         with self.log.time("optimization"):
-            view = self._with_image[self.schedule.next(len(self._with_image))]
+            view = self.with_image[self.schedule.next(len(self.with_image))]
             skip = self.config.skipping
             done = skip.converged and view.converged(skip.converged_visits, skip.converged_improvement)
             if done and not self.schedule.chance(skip.converged_keep):
@@ -146,7 +146,7 @@ class OnlineMapper:
             return
         with self.log.time("refinement"):
             self.global_rate = 0.1 ** (done / max(total, 1))
-            self._train(self._with_image[self.schedule.next_of_all(len(self._with_image))], refining=True)
+            self._train(self.with_image[self.schedule.next_of_all(len(self.with_image))], refining=True)
 
     def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> int:
         """Takes corrected absolute poses (K, 4, 4) and cumulative scales (K,) of the keyframes `index` (K,).
@@ -201,7 +201,7 @@ class OnlineMapper:
             view.rescale(change.scale)
             view.fixed = view.fixed and not self.views  # one holds the frame of reference
         self.views = sorted(self.views + other.views, key=lambda view: view.index)
-        self._with_image = sorted(self._with_image + other._with_image, key=lambda view: view.index)
+        self.with_image = sorted(self.with_image + other.with_image, key=lambda view: view.index)
         self._bound_images()
         self.schedule.forget()
         self.schedule.owe(other.schedule.drop())
@@ -219,7 +219,7 @@ class OnlineMapper:
 
     def self_check(self, most: int = 20) -> SelfCheck | None:
         """How well the map explains its keyframes, `most` of them, spread over the stream; None without any."""
-        views = self._with_image[:: -(-len(self._with_image) // most) or 1]
+        views = self.with_image[:: -(-len(self.with_image) // most) or 1]
         return check([(self.render(v).color.clamp(0.0, 1.0).cpu().numpy(), v.target(0).cpu().numpy()) for v in views])
 
     def snapshot(self) -> Snapshot:
@@ -229,20 +229,20 @@ class OnlineMapper:
     @property
     def image_bytes(self) -> int:
         """Of the keyframes' images that are kept for training: what grows with the length of a run, to a bound."""
-        return sum(level.numel() for view in self._with_image for level in view.levels)
+        return sum(level.numel() for view in self.with_image for level in view.levels)
 
     def _bound_images(self) -> None:
         """Lets go the images of the keyframes whose neighbors in time are closest, where there are too many.
 
         The newest ones, which the local half trains on, stay. Their splats stay, and move with their poses.
         """
-        while len(self._with_image) > self.config.max_keyframes:
-            last = len(self._with_image) - max(1, self.config.window)
+        while len(self.with_image) > self.config.max_keyframes:
+            last = len(self.with_image) - max(1, self.config.window)
             if last < 2:
                 return
-            order = [view.index for view in self._with_image]
+            order = [view.index for view in self.with_image]
             k = min(range(1, last), key=lambda k: order[k + 1] - order[k - 1])
-            self._with_image.pop(k).drop_images()
+            self.with_image.pop(k).drop_images()
             self.schedule.forget()
             self.log.refuse(
                 "images",
@@ -264,7 +264,7 @@ class OnlineMapper:
         self.log.count("iterations")
         if not refining and self.iterations % config.density_control.every == 0:
             with self.log.time("density_control"):
-                change = density_control.control(self.state, config.density_control, self.median_depth, self._generator)
+                change = density_control.control(self.state, config.density_control, self.median_depth, self.generator)
             for name, count in vars(change).items():
                 self.log.count(name, count)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 
@@ -51,3 +53,31 @@ class Schedule:
 
     def chance(self, probability: float) -> bool:
         return bool(self._random.random() < probability)
+
+    def state(self) -> dict[str, Any]:
+        """All that the next draws depend on, as JSON has it."""
+        return {
+            "owed": self.owed, "turn": self._turn, "local": list(self._local), "all": list(self._all),
+            "random": self._random.bit_generator.state,
+        }  # fmt: skip
+
+    def restore(self, state: dict[str, Any], count: int) -> None:
+        """Goes on where `state()` was taken, with `count` keyframes. Raises ValueError for what it never returns."""
+        self.owed, self._turn = (_at_least_zero(state.get(name)) for name in ("owed", "turn"))
+        self._local, self._all = (_positions(state.get(name), count) for name in ("local", "all"))
+        try:
+            self._random.bit_generator.state = state["random"]
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"no state of a random generator: {error}") from error
+
+
+def _at_least_zero(value: Any) -> int:
+    if type(value) is not int or value < 0:
+        raise ValueError(f"{value!r} is no number of iterations")
+    return value
+
+
+def _positions(values: Any, count: int) -> list[int]:
+    if not isinstance(values, list) or not all(type(v) is int and 0 <= v < count for v in values):
+        raise ValueError(f"positions of keyframes are not below {count}")
+    return list(values)

@@ -1,0 +1,85 @@
+"""The keyframes' images of a checkpoint: lossless PNGs that are written once, named after what is in them.
+
+An image never changes, so that a checkpoint only adds those of new keyframes. The name ends in the pixels' CRC-32: it
+says at once whether an image is written already, and a damaged or foreign one is noticed.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvsgs_core.atomic_file import replacing
+from mvsgs_core.splats.keyframes import TrainingView
+
+NAME = re.compile(r"-?\d{1,19}-\d{1,2}-[0-9a-f]{8}\.png", re.ASCII)  # frame index, pyramid level, checksum
+
+
+def image_names(view: TrainingView) -> list[str]:
+    """File names of a keyframe's pyramid, one a level; none where its images were let go."""
+    return [f"{view.index:06d}-{level}-{_checksum(pixels):08x}.png" for level, pixels in enumerate(_pixels(view))]
+
+
+def write_images(folder: Path, view: TrainingView, names: list[str], *, sync: bool) -> None:
+    """Those of a keyframe's images that are not there yet. Raises OSError."""
+    for name, pixels in zip(names, _pixels(view), strict=True):
+        if (folder / name).exists():
+            continue
+        channels = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
+        whole, data = cv2.imencode(".png", cv2.cvtColor(pixels, channels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        if not whole:
+            raise OSError(f"{name} cannot be encoded as PNG")
+        with replacing(folder / name, sync=sync) as aside:
+            aside.write_bytes(data.tobytes())
+
+
+def read_images(folder: Path, names: list[str], device: torch.device) -> tuple[list[Tensor], list[Tensor] | None]:
+    """The pyramid's levels (H, W, 3) uint8 and valid pixels (H, W) bool of each, None where all are.
+
+    Raises ValueError for an image that is missing, damaged or another than its name says.
+    """
+    levels, valid = [], []
+    for name in names:
+        if not NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is no name of a keyframe's image")
+        try:
+            data = np.fromfile(folder / name, dtype=np.uint8)
+            found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if _plausible(data) else None
+        except (OSError, cv2.error) as error:
+            raise ValueError(f"{folder / name} cannot be read: {error}") from error
+        if found is None or found.dtype != np.uint8 or found.ndim != 3:
+            raise ValueError(f"{folder / name} is damaged: no image of a keyframe")
+        pixels = cv2.cvtColor(found, cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+        if f"{_checksum(pixels):08x}" != name[-12:-4]:
+            raise ValueError(f"{folder / name} is damaged: it shows something else than its name says")
+        levels.append(torch.from_numpy(np.ascontiguousarray(pixels[..., :3])).to(device))
+        if pixels.shape[2] == 4:
+            valid.append(torch.from_numpy(pixels[..., 3] > 0).to(device))
+    if valid and len(valid) != len(levels):
+        raise ValueError(f"{folder}: only some of {', '.join(names)} have valid pixels")
+    return levels, valid or None
+
+
+def _pixels(view: TrainingView) -> list[np.ndarray]:
+    """(H, W, 3), or with the valid pixels as alpha (H, W, 4), uint8 of each level."""
+    images = [np.ascontiguousarray(level.cpu().numpy()) for level in view.levels]
+    if view.valid is None:
+        return images
+    masks = [mask.cpu().numpy().astype(np.uint8) * 255 for mask in view.valid]
+    return [np.dstack([image, mask]) for image, mask in zip(images, masks, strict=True)]
+
+
+def _plausible(data: np.ndarray) -> bool:
+    """Whether the header claims no more pixels than deflate can have made of so few bytes: 1,032 of one."""
+    width, height = np.frombuffer(data[16:24].tobytes().ljust(8, b"\0"), dtype=">u4").tolist()
+    return 0 < width * height <= 1032 * len(data)
+
+
+def _checksum(pixels: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(pixels).data, zlib.crc32(repr(pixels.shape).encode()))

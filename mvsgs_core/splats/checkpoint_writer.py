@@ -1,0 +1,133 @@
+"""Writes checkpoints in a thread of its own, so that the stream is held up for a copy of the map and no disk."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from mvsgs_core.splats.checkpoint_files import FOLDER, KEYFRAMES, number_of, state_file, state_files
+from mvsgs_core.splats.checkpoint_images import image_names, write_images
+from mvsgs_core.splats.keyframes import TrainingView
+from mvsgs_core.splats.mapper import MapperConfig
+from mvsgs_core.splats.results import write_results
+from mvsgs_core.splats.session import Session, images_of, save
+
+AHEAD = 8  # keyframes whose images may wait to be written before their checkpoint is
+ASIDE = (".map.*.ply", ".trajectory.*.txt")  # what a killed process left half written, see `atomic_file`
+
+
+class CheckpointWriter:
+    """One checkpoint after the other into `output`, of which the newest two stay, with map.ply and trajectory.txt.
+
+    What cannot be written is a line in `problems`; the checkpoint before then stays. No method raises OSError.
+    """
+
+    def __init__(self, output: Path, config: MapperConfig, resumed: Path | None = None) -> None:
+        """resumed: the state in `output` that the run goes on from; others there are another run's."""
+        self._output, self._config = output, config
+        self._number = max((number_of(file) for file in state_files(output)), default=0)
+        self._before = resumed  # newest whole state of this run,
+        self._images_before: set[str] = set() if resumed is None else images_of(resumed)  # and what it refers to
+        self._names: dict[int, tuple[object, list[str]]] = {}  # by keyframe: its image, and the files of it
+        self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._changed = threading.Condition()
+        self._pending = 0  # checkpoints that are not done
+        self._thread: threading.Thread | None = None
+        self.problems: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    @property
+    def busy(self) -> bool:
+        return self._pending > 0
+
+    def prepare(self, view: TrainingView) -> None:
+        """Writes a new keyframe's images ahead of its checkpoint; not where the disk is behind."""
+        if self._jobs.qsize() < AHEAD:
+            kept = replace(view, levels=list(view.levels))  # should they be let go meanwhile
+            self._do(lambda: self._write_images(kept, sync=True))
+
+    def submit(self, session: Session, *, sync: bool = True) -> None:
+        """Begins to write a frozen session, after what is being written. sync: wait for the disk."""
+        with self._changed:
+            self._pending += 1
+        self._do(lambda: self._write(session, sync))
+
+    def wait(self, seconds: float | None = None) -> bool:
+        """Whether all that was submitted is done, by then. None: however long it takes."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._pending == 0, seconds)
+
+    def _do(self, job: Callable[[], object]) -> None:
+        self._jobs.put(job)
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
+            self._thread.start()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                self._jobs.get()()
+            except OSError as error:
+                self.problems.put(
+                    f"no checkpoint can be written to {self._output / FOLDER}: {error.strerror or error}; the run goes "
+                    "on and the last checkpoint stays: make room there"
+                )
+            except Exception as error:  # of the checkpoint only: the map is not lost for it, and nothing is hidden
+                logging.exception("checkpoint")
+                self.problems.put(f"a checkpoint failed, the run goes on: {type(error).__name__}: {error}")
+
+    def _write(self, session: Session, sync: bool) -> None:
+        try:
+            self._write_state(session, sync)
+            write_results(self._output, session.largest, sync=sync)
+        finally:
+            with self._changed:
+                self._pending -= 1
+                self._changed.notify_all()
+
+    def _write_state(self, session: Session, sync: bool) -> None:
+        (self._output / FOLDER / KEYFRAMES).mkdir(parents=True, exist_ok=True)
+        if self._number == 0 or self._before is None:
+            self._remove_parts()
+        known = {
+            segment: [self._write_images(view, sync=sync) for view in part.views]
+            for segment, part in session.parts.items()
+        }
+        file = state_file(self._output, self._number + 1)
+        save(session, self._config, file, known, sync=sync)
+        self._number += 1
+        images = {name for names in known.values() for view in names for name in view}
+        self._remove_others({file, self._before}, images | self._images_before)
+        self._before, self._images_before = file, images
+        present = {view.index for part in session.parts.values() for view in part.views if view.levels}
+        self._names = {index: entry for index, entry in self._names.items() if index in present}
+
+    def _write_images(self, view: TrainingView, sync: bool) -> list[str]:
+        """Names of a keyframe's image files, which are there then."""
+        if not view.levels:
+            return []
+        image, names = self._names.get(view.index, (None, []))
+        if image is not view.levels[0]:
+            names = image_names(view)
+            folder = self._output / FOLDER / KEYFRAMES
+            folder.mkdir(parents=True, exist_ok=True)
+            write_images(folder, view, names, sync=sync)
+            self._names[view.index] = (view.levels[0], names)
+        return names
+
+    def _remove_others(self, states: set[Path | None], images: set[str]) -> None:
+        for file in state_files(self._output):
+            if file not in states:
+                file.unlink(missing_ok=True)
+        for file in (self._output / FOLDER / KEYFRAMES).iterdir():
+            if file.name not in images:
+                file.unlink(missing_ok=True)
+
+    def _remove_parts(self) -> None:
+        """Of a process that was killed while it wrote."""
+        parts = [file for pattern in ASIDE for file in self._output.glob(pattern)]
+        for file in (*parts, *(self._output / FOLDER).glob(".state-*.npz")):
+            file.unlink(missing_ok=True)

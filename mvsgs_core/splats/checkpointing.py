@@ -1,0 +1,102 @@
+"""When checkpoints are made, and how little of the mapper's time they may take."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from mvsgs_core.splats.checkpoint_files import FOLDER
+from mvsgs_core.splats.checkpoint_writer import CheckpointWriter
+from mvsgs_core.splats.keyframes import TrainingView
+from mvsgs_core.splats.results import write_results
+from mvsgs_core.splats.session import Session
+from mvsgs_core.stats import Stats
+
+SHARE = 0.02  # of the mapper's time, at most, that copying the map for checkpoints holds it up
+LAST = 2.5  # seconds for the last checkpoint of a run that ends early
+
+
+class Checkpointing:
+    """Saves a session every `period` seconds of the stream or of the clock, and as soon as there is a map.
+
+    Less often where that would take more than `SHARE` of the time, or the disk is still writing the last one.
+    """
+
+    def __init__(
+        self, output: Path, period: float, session: Session, resumed: Path | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:  # fmt: skip
+        """output: the run's directory. period: 0: no checkpoints. resumed: the state that the run goes on from."""
+        self._output, self._period, self._clock = output, period, clock
+        own = resumed if resumed is not None and resumed.parent.parent == output else None
+        self._writer = CheckpointWriter(output, session.current.config, own)
+        self._began = self._saved_at = clock()
+        self._saved_stream = session.stream_seconds
+        self._never = resumed is None  # saved
+        self._held = self._last = 0.0  # seconds that copying took: all, the last one
+
+    def keep(self, session: Session) -> None:
+        """Saves if it is time to. Cheap where it is not: to be called after every view, slice and iteration."""
+        log = session.current.log
+        self._pass_problems_on(log)
+        if not self._due(session):
+            return
+        start = self._clock()
+        with log.time("checkpoint"):
+            log.count("checkpoints")
+            self._writer.submit(session.frozen())
+        self._saved_at, self._saved_stream, self._never = self._clock(), session.stream_seconds, False
+        self._last = self._saved_at - start
+        self._held += self._last
+
+    def added(self, view: TrainingView) -> None:
+        """A keyframe's images go to the disk at once: so the last checkpoint of a run that ends early is quick."""
+        if self._period > 0:
+            self._writer.prepare(view)
+
+    def last(self, session: Session) -> None:
+        """What there is, for a run that ends early: within `LAST` seconds, or the checkpoint before stays."""
+        log = session.current.log
+        if not len(session.largest.state):
+            return
+        try:
+            if self._period > 0:
+                self._writer.submit(session.frozen(), sync=False)
+                if not self._writer.wait(LAST):
+                    log.refuse("checkpoints", 1, "there was no time for a last checkpoint: the one before stays")
+            else:
+                write_results(self._output, session.largest, sync=False)
+        except (OSError, ValueError) as error:
+            log.refuse("checkpoints", 1, f"no last checkpoint: {error}")
+        self._pass_problems_on(log)
+
+    def finish(self, session: Session) -> int:
+        """The finished map: its files are whole and on the disk then; the bytes of map.ply. Raises OSError."""
+        self._writer.wait()
+        self._pass_problems_on(session.current.log)
+        return write_results(self._output, session.current)
+
+    def close(self, session: Session, *, keep: bool) -> None:
+        """After a run that is complete: nothing is left to resume, unless what is finished is to be kept."""
+        if keep and self._period > 0 and len(session.largest.state):
+            self._writer.submit(session.frozen())
+        self._writer.wait()
+        self._pass_problems_on(session.current.log)
+        if not keep:
+            shutil.rmtree(self._output / FOLDER, ignore_errors=True)
+
+    def _due(self, session: Session) -> bool:
+        if self._period <= 0 or self._writer.busy or not any(len(part.state) for part in session.parts.values()):
+            return False
+        now = self._clock()
+        if self._never:
+            return True
+        if self._held + self._last > SHARE * (now - self._began):
+            return False
+        return max(now - self._saved_at, abs(session.stream_seconds - self._saved_stream)) >= self._period
+
+    def _pass_problems_on(self, log: Stats) -> None:
+        while not self._writer.problems.empty():
+            log.refuse("checkpoints", 1, self._writer.problems.get())
