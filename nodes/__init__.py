@@ -17,8 +17,9 @@ The parameter's type declares the input, the yielded type the output. Hooks:
   None when there is nothing to do until the next message.
 - `on_end(self) -> Iterator[U]`: every input has ended.
 - `on_abort(self, reason)`: the run ends early for this node, by SIGTERM, a lost neighbor or an exception of its own:
-  save what must not be lost, within 3 s, or be killed. Called once, between two hooks or at a `yield` of one (after an
-  exception, where that left the node); nothing can be sent any more.
+  save what must not be lost, within 3 s, or be killed. Called once, between two hooks, at a `yield` of one or in a call
+  of `self.rest()`, which a hook that works for long makes where nothing is half changed (after an exception, where that
+  left the node); nothing can be sent any more.
 - `check(cls, config)`: before any process starts, on the launcher's machine: raises OSError or ValueError, saying what
   to do, where it is plain that the node cannot run (its file is missing, or cannot be read). A source opens its input
   and reads one frame of it, no more: quick, and nothing is written or sent.
@@ -33,7 +34,7 @@ from __future__ import annotations
 
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, is_dataclass
 from typing import Any, ClassVar
 
@@ -56,6 +57,7 @@ class Node:
         self.config = self.Config() if config is None else config
         self.stats = Stats()
         self.upstream: dict[str, Any] = {}  # what each node upstream counted, by name: complete when on_end runs
+        self.rest: Callable[[], object] = _go_on  # to be called in long work where nothing is half changed, see above
 
     @classmethod
     def check(cls, config: Any) -> None:
@@ -73,6 +75,10 @@ class Node:
 
     def on_abort(self, reason: str) -> None:
         """Nothing to save."""
+
+
+def _go_on() -> None:
+    """Nobody asks a node to stop that runs in no process of its own."""
 
 
 _OUTPUT_HOOKS: tuple[str, ...] = ("run", "on_idle", "on_end")

@@ -29,6 +29,7 @@ class LearnedMvs(StereoNode):
         least_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
         device: str = "auto"  # auto (CUDA if there is one), cpu, cuda
         threads: int | None = None  # of PyTorch; null: as the launcher sets it
+        resume_after: int | None = None  # keyframes up to this frame are in a resumed map: neighbors of others only
 
     config: Config
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from msgs import MapView, Poses, Preview, SplatMap, View
-from mvsgs_core.splats import keyframe_images
-from mvsgs_core.splats.cameras import cameras_of, write_cameras
+from mvsgs_core.splats import checkpoint, keyframe_images
+from mvsgs_core.splats.checkpoint_files import checkpoint_info
+from mvsgs_core.splats.checkpointing import Checkpointing
 from mvsgs_core.splats.density_control import DensityConfig
-from mvsgs_core.splats.export_ply import write_ply
 from mvsgs_core.splats.insertion import InsertionConfig
 from mvsgs_core.splats.keyframe_images import write_image
 from mvsgs_core.splats.keyframes import PosedView
@@ -21,6 +21,8 @@ from mvsgs_core.splats.losses import LossConfig
 from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.splats.optimizer import LearningRates
 from mvsgs_core.splats.preview import preview_arrays
+from mvsgs_core.splats.replay import Replay
+from mvsgs_core.splats.session import Session
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig
 from nodes import Node
 
@@ -68,6 +70,9 @@ class Mapper(Node):
         preview_splats: int = 100000  # at most so many in a preview
         map_views: bool = False  # send what the map shows from each keyframe, as mvs=skipping reads it
         output: str | None = None  # folder for map.ply and cameras.json; null: none is written
+        checkpoint: float = 30.0  # seconds of the stream or the clock between checkpoints in the output; 0: none
+        keep_checkpoint: bool = False  # after a complete run, too
+        resume: str | None = None  # output of a run whose checkpoint is gone on with; null: a new map
         save_images: bool = False  # write each keyframe's image to output/keyframes, for a COLMAP model
         seed: int = 0
         threads: int | None = None  # of the rasterizer; null: all
@@ -78,20 +83,37 @@ class Mapper(Node):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         self._core_config = mapper_config(self.config)
-        self.mapper = OnlineMapper(self._core_config)
-        self.stats = self.mapper.log  # one set of counters: what the core counts is what the node reports
-        self._by_segment: dict[int, OnlineMapper] = {}
-        self._segment_of: dict[int, int] = {}  # by keyframe, as the newest Poses that named it say
+        self.session, resumed = Session(OnlineMapper(self._core_config, self.stats)), None
+        self._replay: Replay | None = None
+        if self.config.resume is not None:
+            self.session, resumed = checkpoint.load(Path(self.config.resume), self._core_config, self.stats)
+            self._replay = Replay(self.session)
+        self._checkpoints: Checkpointing | None = None
+        if self.config.output is not None:
+            self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.session, resumed)
         self._last_preview = 0.0
 
+    @classmethod
+    def check(cls, config: Config) -> None:
+        if config.resume is not None:
+            checkpoint_info(config.resume)
+
+    @property
+    def mapper(self) -> OnlineMapper:
+        return self.session.current
+
     def on_view(self, view: View) -> Iterator[Preview | MapView]:
+        if not self._is_new_view(view):
+            return
         # sent on its way before its segment was joined: by keyframe and not by number, as the pose is corrected so, too
-        segment = self._segment_of.get(view.index, view.segment)
-        self._enter(segment)
+        segment = self.session.segment_of.get(view.index, view.segment)
+        self._settle()
+        self.session.enter(segment)
         if self.config.map_views:
-            while not self.config.realtime and self.mapper.step():  # as add_view would
-                pass
+            self._settle()
             yield from self._map_view(segment)
+        self.session.came(view.index, view.timestamp)
+        known = len(self.mapper.views)
         self.mapper.add_view(
             PosedView(
                 index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
@@ -101,16 +123,23 @@ class Mapper(Node):
         )  # fmt: skip
         self._save_image(view)
         self._report()
+        if self._checkpoints is not None:
+            for added in self.mapper.views[known:]:
+                self._checkpoints.added(added)
+            self._checkpoints.keep(self.session)
         yield from self._preview()
 
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
-        while not self.config.realtime and self.mapper.step():  # the map must not depend on when they come
-            pass
-        for mapper in self._by_segment.values() or [self.mapper]:
+        if self._replay and not self._replay.poses(poses.revision, poses.index, poses.world_from_cam, poses.scale):
+            self._say_what_does_not_fit()
+            return
+        self._settle()  # the map must not depend on when they come
+        self.session.revision = max(self.session.revision, poses.revision)
+        for mapper in self.session.parts.values() or [self.mapper]:
             mapper.correct(poses.index, poses.world_from_cam, poses.scale)
         if poses.segment is not None:
-            self._segment_of.update(zip(poses.index.tolist(), poses.segment.tolist()))
-            self._join()
+            self.session.segment_of.update(zip(poses.index.tolist(), poses.segment.tolist()))
+            self.session.join()
         yield from ()
 
     def on_idle(self) -> list[Preview] | None:
@@ -119,27 +148,74 @@ class Mapper(Node):
             return None
         while time.perf_counter() < deadline and self.mapper.step():
             pass
+        self._keep()
         self._report()
         return list(self._preview())
 
-    def on_end(self) -> Iterator[SplatMap]:
-        while self.mapper.step():
-            pass
+    def on_end(self) -> Iterator[SplatMap | Preview]:
+        self._settle(realtime=False)
+        self.session.stream_ended = True
         self._choose_largest()
-        self.stats.values["segments_apart"] = len(self._by_segment)
+        self.stats.values["segments_apart"] = len(self.session.parts)
         yield self._map(refined=False)
-        for done in range(self.config.refinement):
-            self.mapper.refine(done, self.config.refinement)
+        while self.session.refined < self.config.refinement:
+            self.mapper.refine(self.session.refined, self.config.refinement)
+            self.session.refined += 1
+            self._keep()
         self._report()
         self._check()
-        if self.config.output is not None:
-            path = Path(self.config.output) / "map.ply"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            final = self.mapper.snapshot()
-            write_ply(path, final)
-            write_cameras(path.with_name("cameras.json"), cameras_of(final, self.mapper.views))
-            self.stats.values["map_bytes"] = path.stat().st_size
+        if not len(self.mapper.state):
+            self.stats.nothing(self._why_nothing())
+        elif self._checkpoints is not None:
+            self.stats.values["map_bytes"] = self._checkpoints.finish(self.session)
+        yield from self._preview(due=True)  # who watches is left with the map as it is now
         yield self._map(refined=True)
+        if self._checkpoints is not None:
+            self._checkpoints.close(self.session, keep=self.config.keep_checkpoint)
+            self._checkpoints = None
+
+    def on_abort(self, reason: str) -> None:
+        if self._checkpoints is not None:
+            self._checkpoints.last(self.session)
+
+    def _is_new_view(self, view: View) -> bool:
+        if self._replay is None or self._replay.view(view.index, view.world_from_cam, view.scale):
+            return True
+        self.stats.skip(
+            "keyframes that the checkpoint has" if not self._replay.problem else "keyframes that do not fit"
+        )
+        self._say_what_does_not_fit()
+        return False
+
+    def _say_what_does_not_fit(self) -> None:
+        if self._replay is not None and self._replay.problem:
+            self.stats.warn(self._replay.problem)
+
+    def _settle(self, realtime: bool = True) -> None:
+        """Does what keyframes are owed. realtime: where the mapper is, it is left for the next keyframe to cancel."""
+        while not (realtime and self.config.realtime) and self.mapper.step():
+            self._keep()
+
+    def _keep(self) -> None:
+        """Between two iterations, where nothing is half changed."""
+        self.rest()
+        if self._checkpoints is not None:
+            self._checkpoints.keep(self.session)
+
+    def _why_nothing(self) -> str:
+        counts = self.stats.counts
+        views, refused = int(counts.get("views", 0)), int(counts.get("refused_views", 0))
+        if not views and not refused:
+            return "the mapper made no splat: no keyframe with depth came to it"
+        if not views:
+            return f"the mapper made no splat: all {refused} keyframes were refused ({self.stats.warnings[0]})"
+        blind = int(counts.get("views_without_depth", 0))
+        if blind == views:
+            return f"the mapper made no splat: none of {views} keyframes had a pixel with depth after the filters"
+        return (
+            f"the mapper has no splat left: {views} keyframes, {views - blind} of them with depth, gave "
+            f"{int(counts.get('inserted', 0))} splats; all of them faded out"
+        )
 
     def _save_image(self, view: View) -> None:
         """A disk that is full costs images, not the map."""
@@ -152,36 +228,11 @@ class Mapper(Node):
             self.stats.skip("images_not_saved")
             self.stats.warn(f"images of keyframes cannot be saved: {error.strerror or error}")
 
-    def _enter(self, segment: int) -> None:
-        """Goes on with the map of this part of the stream, or begins it."""
-        if not self._by_segment:
-            self._by_segment[segment] = self.mapper
-        if segment not in self._by_segment:
-            while self.mapper.step():  # what the part before is owed
-                pass
-            self._by_segment[segment] = OnlineMapper(self._core_config, self.stats, self.mapper.corrections)
-        self.mapper = self._by_segment[segment]
-
-    def _join(self) -> None:
-        """Joins the maps of segments whose keyframes now belong to another one; the tracker joins whole segments."""
-        for old, part in list(self._by_segment.items()):
-            new = {self._segment_of.get(view.index, old) for view in part.views} - {old}
-            if not new:
-                continue
-            del self._by_segment[old]
-            whole = self._by_segment.setdefault(new.pop(), part)  # nothing of the other one may have come yet
-            if whole is part:
-                continue
-            whole.join(part)
-            if self.mapper is part:
-                self.mapper = whole
-            self.stats.count("segments_joined")
-
     def _choose_largest(self) -> None:
-        parts = list(self._by_segment.values())
+        parts = list(self.session.parts.values())
         if len(parts) < 2:
             return
-        self.mapper = max(parts, key=lambda mapper: len(mapper.views))
+        self.session.current = self.session.largest
         total = sum(len(mapper.views) for mapper in parts)
         self.stats.warn(
             f"tracking was lost: the map shows the largest of {len(parts)} parts, "
@@ -225,10 +276,11 @@ class Mapper(Node):
                 depth=np.where(shown.opacity.cpu().numpy() > 0.5, depth, np.float32(0)),
             )  # fmt: skip
 
-    def _preview(self) -> Iterator[Preview]:
+    def _preview(self, due: bool = False) -> Iterator[Preview]:
         now = time.monotonic()
         period = self.config.preview_period
-        if period <= 0 or now - self._last_preview < period or not self.mapper.views or not len(self.mapper.state):
+        due |= now - self._last_preview >= period
+        if period <= 0 or not due or not self.mapper.views or not len(self.mapper.state):
             return
         self._last_preview = now
         view = self.mapper.views[-1]

@@ -31,7 +31,11 @@ class StereoNode(Node, ABC):
     def _make_cascade(self) -> Cascade: ...
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
-        self._keyframes[keyframe.index] = keyframe
+        passed_over = self.config.resume_after is not None and keyframe.index <= self.config.resume_after
+        if passed_over:
+            self.stats.skip("keyframes that the checkpoint has")
+        else:
+            self._keyframes[keyframe.index] = keyframe
         with self.stats.time("prepare"):
             view = self._cascade.prepare(
                 keyframe.index,
@@ -45,7 +49,7 @@ class StereoNode(Node, ABC):
             )
         if keyframe.index in self._poses:  # corrected before it came
             view = view.moved(*self._poses[keyframe.index])
-        yield from self._timed(self._cascade.add(view))
+        yield from self._timed(self._cascade.add(view, wanted=not passed_over))
 
     def on_poses(self, poses: Poses) -> Iterator[Poses]:
         """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
@@ -111,6 +115,7 @@ class Mvs(StereoNode):
         skip_certain: float = 1.0  # later stages where the one before was more certain than this; 1: nowhere
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
         threads: int | None = None  # of the C++ kernels; null: all
+        resume_after: int | None = None  # keyframes up to this frame are in a resumed map: neighbors of others only
 
     config: Config
 

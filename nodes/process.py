@@ -103,6 +103,7 @@ class _Process:
         node_type = load_node(self._spec.target)
         self._seed()
         runner = self._runner = Runner(self._spec.name, node_type(make_config(node_type, self._spec.config)))
+        runner.node.rest = self._rest
         inbox = self._open()
         self.status.set("waiting")
         for given in self._spec.outputs:
@@ -121,6 +122,11 @@ class _Process:
             self._send(message)
         self._finish(runner, inbox)
         self.status.set("done")
+
+    def _rest(self) -> None:
+        """In the midst of a hook's long work."""
+        self._signals.check()
+        self._step.next("working")
 
     def abort(self, state: str, error: str, **details: Any) -> None:
         """Tells the launcher, then lets the node save what it has."""

@@ -76,14 +76,18 @@ class Cascade:
             segment=segment,
         )
 
-    def add(self, view: StereoView) -> Iterator[CascadeDepth]:
-        """Depth of the keyframe `lag` before this one; of all that wait if this one starts a new segment or size."""
+    def add(self, view: StereoView, wanted: bool = True) -> Iterator[CascadeDepth]:
+        """Depth of the keyframe `lag` before this one; of all that wait if this one starts a new segment or size.
+
+        wanted: whether this one is to get depth too; else it is a neighbor of others only.
+        """
         if self._views and (view.segment != self._views[-1].segment or view.size != self._views[-1].size):
             yield from self.flush()
             self._views.clear()
             self._previous_range = None
         self._views.append(view)
-        self._waiting.append(view.index)
+        if wanted:
+            self._waiting.append(view.index)
         while len(self._waiting) > self.config.lag:
             yield self._next()
         keep = self.config.window + self.config.lag + 1

@@ -116,6 +116,10 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise ValueError(f"{path} is no checkpoint of a mapper")
     if meta.get("version") != VERSION:
         raise ValueError(f"{path} has version {meta.get('version')!r} of the format: this program reads {VERSION}")
+    try:
+        _check_head(meta, arrays.get("keyframes"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
     return meta, arrays
 
 
@@ -147,13 +151,23 @@ def _array(data: bytes, name: str) -> np.ndarray:
 
 def _info(file: Path) -> CheckpointInfo:
     meta, arrays = read_state(file)
-    keyframes, newest, seconds = arrays.get("keyframes"), meta.get("newest_view"), meta.get("stream_seconds")
-    splats, ended = meta.get("splats"), meta.get("stream_ended")
-    if not isinstance(keyframes, np.ndarray) or keyframes.dtype != np.int64 or keyframes.ndim != 1:
-        raise ValueError(f"{file} is no checkpoint of a mapper")
-    if not (isinstance(newest, int) and isinstance(seconds, float) and isinstance(splats, int)):
-        raise ValueError(f"{file} is no checkpoint of a mapper")
-    return CheckpointInfo(file, newest, seconds, np.sort(keyframes), splats, ended is True)
+    keyframes = np.sort(arrays["keyframes"])
+    return CheckpointInfo(
+        file, meta["newest_view"], meta["stream_seconds"], keyframes, meta["splats"], meta["stream_ended"]
+    )
+
+
+def _check_head(meta: dict[str, Any], keyframes: np.ndarray | None) -> None:
+    """How far the stream had come: what the launcher reads, and the mapper. Raises ValueError."""
+    for name in ("newest_view", "revision", "splats", "refined"):
+        value = meta.get(name)
+        if type(value) is not int or not -1 <= value < 2**63:
+            raise ValueError(f"{name} is {value!r}")
+    if keyframes is None or keyframes.dtype != np.int64 or keyframes.ndim != 1:
+        raise ValueError("its keyframes are missing")
+    seconds = meta.get("stream_seconds")
+    if type(seconds) is not float or not math.isfinite(seconds) or type(meta.get("stream_ended")) is not bool:
+        raise ValueError("how far the stream had come is not said")
 
 
 def _refuse(constant: str) -> float:

@@ -123,6 +123,7 @@ class OnlineMapper:
         self.schedule.owe(self.config.iterations)
         self.log.count("inserted", inserted)
         self.log.count("views")
+        self.log.count("views_without_depth", float(median == 0))
         return inserted
 
     def step(self) -> bool:

@@ -72,7 +72,7 @@ class Schedule:
 
 
 def _at_least_zero(value: Any) -> int:
-    if type(value) is not int or value < 0:
+    if type(value) is not int or not 0 <= value < 2**63:
         raise ValueError(f"{value!r} is no number of iterations")
     return value
 

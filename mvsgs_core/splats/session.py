@@ -1,31 +1,13 @@
-"""All that the mapping of one stream has come to, written to a folder and read back: see `checkpoint_files`."""
+"""The mapping of one stream: a mapper for each part between which tracking was lost, and how far it has come."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, is_dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field
 
-import numpy as np
-
-from mvsgs_core.atomic_file import replacing
-from mvsgs_core.splats.checkpoint_files import (
-    KEYFRAMES,
-    nothing_there,
-    read_state,
-    state_files,
-    write_state,
-)  # fmt: skip
-from mvsgs_core.splats.checkpoint_state import Arrays, Corrections, copy_of, pack, unpack, whole
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.splats.checkpoint_state import copy_of
+from mvsgs_core.splats.mapper import OnlineMapper
 from mvsgs_core.stats import Stats
-
-# What the state's arrays depend on; everything else may be another one when a run goes on, and then is said.
-FIXED = ("sh_degree", "max_pixels", "training.density", "skipping.levels")
-LOGGED = ("counts", "skipped", "seconds", "warnings")
-OF_THE_MACHINE = ("device", "training.threads", "training.backend")
 
 
 @dataclass
@@ -46,6 +28,40 @@ class Session:
         """The part with the most keyframes; the current one where there is none yet."""
         return max(self.parts.values(), key=lambda part: len(part.views), default=self.current)
 
+    def enter(self, segment: int) -> None:
+        """Goes on with the map of this part of the stream, or begins it."""
+        if not self.parts:
+            self.parts[segment] = self.current
+        if segment not in self.parts:
+            while self.current.step():  # what the part before is owed
+                pass
+            before = self.current
+            self.parts[segment] = OnlineMapper(before.config, before.log, before.corrections)
+        self.current = self.parts[segment]
+
+    def join(self) -> None:
+        """Joins the maps of segments whose keyframes now belong to another one; the tracker joins whole segments."""
+        for old, part in list(self.parts.items()):
+            new = {self.segment_of.get(view.index, old) for view in part.views} - {old}
+            if not new:
+                continue
+            del self.parts[old]
+            joined = self.parts.setdefault(new.pop(), part)  # nothing of the other one may have come yet
+            if joined is part:
+                continue
+            joined.join(part)
+            if self.current is part:
+                self.current = joined
+            self.current.log.count("segments_joined")
+
+    def came(self, index: int, seconds: float) -> None:
+        """A new keyframe; where the map was being refined already, that begins anew after it."""
+        self.newest_view = max(self.newest_view, index)
+        self.stream_seconds = seconds if math.isfinite(seconds) else self.stream_seconds
+        self.stream_ended, self.refined = False, 0
+        for part in self.parts.values():
+            part.global_rate = 1.0
+
     def frozen(self) -> Session:
         """A copy that shares nothing that changes, on the CPU. Raises ValueError in the middle of a change."""
         log, corrections = Stats(), dict(self.current.corrections)
@@ -56,136 +72,3 @@ class Session:
             current or OnlineMapper(self.current.config, log, corrections), parts, dict(self.segment_of),
             self.newest_view, self.stream_seconds, self.revision, self.stream_ended, self.refined,
         )  # fmt: skip
-
-
-def save(session: Session, config: MapperConfig, file: Path, names: dict[int, list[list[str]]], *, sync: bool) -> None:
-    """Writes a frozen session's state. config: of its mappers, with their device; names: image files by segment.
-
-    Raises OSError.
-    """
-    log, corrections = session.current.log, session.current.corrections
-    index = sorted(corrections)
-    poses = np.array([corrections[k][0] for k in index], dtype=np.float64).reshape(-1, 4, 4)
-    arrays: dict[str, np.ndarray] = {
-        "keyframes": np.array([view.index for part in session.parts.values() for view in part.views], dtype=np.int64),
-        "segment_of": np.array(sorted(session.segment_of.items()), dtype=np.int64).reshape(-1, 2),
-        "corrections/index": np.array(index, dtype=np.int64),
-        "corrections/world_from_cam": poses,
-        "corrections/scale": np.array([corrections[k][1] for k in index], dtype=np.float64),
-    }
-    mappers: list[dict[str, Any]] = []
-    for segment, part in session.parts.items():
-        head, own = pack(part, f"map{len(mappers)}", names[segment])
-        mappers.append({"segment": segment, "current": part is session.current, **head})
-        arrays |= own
-    meta = {
-        "config": described(config), "newest_view": session.newest_view, "stream_seconds": session.stream_seconds,
-        "revision": session.revision, "stream_ended": session.stream_ended, "refined": session.refined,
-        "splats": len(session.largest.state), "mappers": mappers,
-        "log": {name: getattr(log, name) for name in LOGGED},
-    }  # fmt: skip
-    with replacing(file, sync=sync) as aside:
-        write_state(aside, meta, arrays)
-
-
-def load(output: Path, config: MapperConfig, log: Stats) -> tuple[Session, Path]:
-    """The session of the newest whole checkpoint in a run's output directory, and its file.
-
-    `log` gets what that run had counted, and warnings of what was wrong with newer checkpoints and of what of `config`
-    is not as it was. Raises ValueError where there is none, or `config` does not fit.
-    """
-    problems: list[str] = []
-    for file in state_files(output):
-        try:
-            session = _load(file, config, log)
-        except ValueError as error:
-            problems.append(f"{file}: {error}")
-            continue
-        for problem in problems:
-            log.warn(f"an older checkpoint was taken: {problem}")
-        return session, file
-    raise ValueError("; ".join(problems) or nothing_there(output))
-
-
-def images_of(file: Path) -> set[str]:
-    """Names of the image files that a state refers to; none where it is damaged."""
-    try:
-        mappers = read_state(file)[0].get("mappers")
-        return {name for part in mappers for names in part["images"] for name in names}  # type: ignore[union-attr]
-    except (ValueError, TypeError, KeyError):
-        return set()
-
-
-def described(config: Any, prefix: str = "") -> dict[str, str]:
-    """All parameters as text, by name with dots."""
-    found: dict[str, str] = {}
-    for entry in fields(config):
-        value = getattr(config, entry.name)
-        name = prefix + entry.name
-        found |= described(value, f"{name}.") if is_dataclass(value) else {name: repr(value)}
-    return found
-
-
-def _load(file: Path, config: MapperConfig, log: Stats) -> Session:
-    meta, raw = read_state(file)
-    arrays, parts = Arrays(raw), meta.get("mappers")
-    differing = list(_differences(meta.get("config"), config))
-    logged = _logged(meta.get("log"))
-    corrections = _corrections(arrays.of("corrections"))
-    if not isinstance(parts, list) or not parts or not all(isinstance(part, dict) for part in parts):
-        raise ValueError("it has no mappers")
-    segments = [part.get("segment") for part in parts]
-    chosen = [k for k, part in enumerate(parts) if part.get("current") is True]
-    if not all(type(s) is int for s in segments) or len(set(segments)) < len(segments) or len(chosen) != 1:
-        raise ValueError("its segments are not clear")
-    images = file.parent / KEYFRAMES
-    mappers = [unpack(part, arrays.of(f"map{k}"), config, log, corrections, images) for k, part in enumerate(parts)]
-    newest, revision, seconds = meta.get("newest_view"), meta.get("revision"), meta.get("stream_seconds")
-    if not (type(newest) is int and type(revision) is int and isinstance(seconds, float) and math.isfinite(seconds)):
-        raise ValueError("how far the stream had come is not said")
-    pairs = arrays.take("segment_of", np.int64, (None, 2))
-    session = Session(
-        mappers[chosen[0]], dict(zip(segments, mappers)), dict(pairs.tolist()), newest, seconds, revision,
-        meta.get("stream_ended") is True, whole(meta.get("refined"), "refined"),
-    )  # fmt: skip
-    log.include(logged)
-    if differing:
-        log.warn(f"the run goes on with other parameters than it had: {', '.join(differing)}")
-    return session
-
-
-def _differences(saved: Any, config: MapperConfig) -> Iterator[str]:
-    if not isinstance(saved, dict):
-        raise ValueError("its configuration is missing")
-    for name, value in described(config).items():
-        before = saved.get(name)
-        if before == value or name in OF_THE_MACHINE:
-            continue
-        if name in FIXED:
-            raise ValueError(f"{name} was {before} in that run and is {value} now: resume with that run's parameters")
-        yield f"{name}={value} (was {before})"
-
-
-def _logged(saved: Any) -> Stats:
-    if not isinstance(saved, dict):
-        raise ValueError("its log is missing")
-    log = Stats()
-    for name, into in (("counts", log.counts), ("skipped", log.skipped), ("seconds", log.seconds)):
-        values = saved.get(name)
-        if not isinstance(values, dict) or not all(type(value) in (int, float) for value in values.values()):
-            raise ValueError(f"its log has no {name}")
-        into |= values
-    warnings = saved.get("warnings")
-    if not isinstance(warnings, list) or not all(isinstance(text, str) for text in warnings):
-        raise ValueError("its log has no warnings")
-    log.warnings.include(warnings)
-    return log
-
-
-def _corrections(arrays: Arrays) -> Corrections:
-    index = arrays.take("index", np.int64, (None,))
-    poses = arrays.take("world_from_cam", np.float64, (len(index), 4, 4))
-    scale = arrays.take("scale", np.float64, (len(index),))
-    if (scale <= 0).any():
-        raise ValueError("a correction's scale is not above 0")
-    return {int(k): (pose.copy(), float(s)) for k, pose, s in zip(index, poses, scale)}

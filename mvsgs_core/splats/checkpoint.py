@@ -1,0 +1,156 @@
+"""A session as a checkpoint: written to a folder and read back, every value checked. See `checkpoint_files`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvsgs_core.atomic_file import replacing
+from mvsgs_core.splats.checkpoint_files import KEYFRAMES, nothing_there, read_state, state_files, write_state
+from mvsgs_core.splats.checkpoint_state import Arrays, Corrections, pack, unpack, whole
+from mvsgs_core.splats.mapper import MapperConfig
+from mvsgs_core.splats.session import Session
+from mvsgs_core.stats import Stats
+
+# What the state's arrays depend on; everything else may be another one when a run goes on, and then is said.
+FIXED = ("sh_degree", "max_pixels", "training.density", "skipping.levels")
+OF_THE_MACHINE = ("device", "training.threads", "training.backend")
+LOGGED = ("counts", "skipped", "seconds", "warnings")
+
+
+def save(session: Session, config: MapperConfig, file: Path, names: dict[int, list[list[str]]], *, sync: bool) -> None:
+    """Writes a frozen session's state. config: of its mappers, with their device; names: image files by segment.
+
+    Raises OSError.
+    """
+    log, corrections = session.current.log, session.current.corrections
+    index = sorted(corrections)
+    poses = np.array([corrections[k][0] for k in index], dtype=np.float64).reshape(-1, 4, 4)
+    arrays: dict[str, np.ndarray] = {
+        "keyframes": np.array([view.index for part in session.parts.values() for view in part.views], dtype=np.int64),
+        "segment_of": np.array(sorted(session.segment_of.items()), dtype=np.int64).reshape(-1, 2),
+        "corrections/index": np.array(index, dtype=np.int64),
+        "corrections/world_from_cam": poses,
+        "corrections/scale": np.array([corrections[k][1] for k in index], dtype=np.float64),
+    }
+    mappers: list[dict[str, Any]] = []
+    for segment, part in session.parts.items():
+        head, own = pack(part, f"map{len(mappers)}", names[segment])
+        mappers.append({"segment": segment, "current": part is session.current, **head})
+        arrays |= own
+    meta = {
+        "config": described(config), "newest_view": session.newest_view, "stream_seconds": session.stream_seconds,
+        "revision": session.revision, "stream_ended": session.stream_ended, "refined": session.refined,
+        "splats": len(session.largest.state), "mappers": mappers,
+        "log": {name: getattr(log, name) for name in LOGGED},
+    }  # fmt: skip
+    with replacing(file, sync=sync) as aside:
+        write_state(aside, meta, arrays)
+
+
+def load(output: Path, config: MapperConfig, log: Stats) -> tuple[Session, Path]:
+    """The session of the newest whole checkpoint in a run's output directory, and its file.
+
+    `log` gets what that run had counted, and warnings of what was wrong with newer checkpoints and of what of `config`
+    is not as it was. Raises ValueError where there is none, or `config` does not fit.
+    """
+    problems: list[str] = []
+    for file in state_files(output):
+        try:
+            session = _load(file, config, log)
+        except ValueError as error:
+            problems.append(f"{file}: {error}")
+            continue
+        for problem in problems:
+            log.warn(f"an older checkpoint was taken: {problem}")
+        return session, file
+    raise ValueError("; ".join(problems) or nothing_there(output))
+
+
+def images_of(file: Path) -> set[str]:
+    """Names of the image files that a state refers to; none where it is damaged."""
+    try:
+        mappers = read_state(file)[0].get("mappers")
+        return {name for part in mappers for names in part["images"] for name in names}  # type: ignore[union-attr]
+    except (ValueError, TypeError, KeyError):
+        return set()
+
+
+def described(config: Any, prefix: str = "") -> dict[str, str]:
+    """All parameters as text, by name with dots."""
+    found: dict[str, str] = {}
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        name = prefix + entry.name
+        found |= described(value, f"{name}.") if is_dataclass(value) else {name: repr(value)}
+    return found
+
+
+def _load(file: Path, config: MapperConfig, log: Stats) -> Session:
+    meta, raw = read_state(file)
+    arrays, parts = Arrays(raw), meta.get("mappers")
+    differing = list(_differences(meta.get("config"), config))
+    logged = _logged(meta.get("log"))
+    corrections = _corrections(arrays.of("corrections"))
+    if not isinstance(parts, list) or not parts or not all(isinstance(part, dict) for part in parts):
+        raise ValueError("it has no mappers")
+    segments = [part.get("segment") for part in parts]
+    chosen = [k for k, part in enumerate(parts) if part.get("current") is True]
+    if (
+        not all(type(s) is int and abs(s) < 2**31 for s in segments)
+        or len(set(segments)) < len(segments)
+        or len(chosen) != 1
+    ):
+        raise ValueError("its segments are not clear")
+    images = file.parent / KEYFRAMES
+    mappers = [unpack(part, arrays.of(f"map{k}"), config, log, corrections, images) for k, part in enumerate(parts)]
+    pairs = arrays.take("segment_of", np.int64, (None, 2))
+    session = Session(
+        mappers[chosen[0]], dict(zip(segments, mappers)), dict(pairs.tolist()), meta["newest_view"],
+        meta["stream_seconds"], meta["revision"], meta["stream_ended"], whole(meta["refined"], "refined"),
+    )  # fmt: skip
+    log.include(logged)
+    if differing:
+        log.warn(f"the run goes on with other parameters than it had: {', '.join(differing)}")
+    return session
+
+
+def _differences(saved: Any, config: MapperConfig) -> Iterator[str]:
+    if not isinstance(saved, dict):
+        raise ValueError("its configuration is missing")
+    for name, value in described(config).items():
+        before = saved.get(name)
+        if before == value or name in OF_THE_MACHINE:
+            continue
+        if name in FIXED:
+            raise ValueError(f"{name} was {before} in that run and is {value} now: resume with that run's parameters")
+        yield f"{name}={value} (was {before})"
+
+
+def _logged(saved: Any) -> Stats:
+    if not isinstance(saved, dict):
+        raise ValueError("its log is missing")
+    log = Stats()
+    for name, into in (("counts", log.counts), ("skipped", log.skipped), ("seconds", log.seconds)):
+        values = saved.get(name)
+        if not isinstance(values, dict) or not all(type(value) in (int, float) for value in values.values()):
+            raise ValueError(f"its log has no {name}")
+        into |= values
+    warnings = saved.get("warnings")
+    if not isinstance(warnings, list) or not all(isinstance(text, str) for text in warnings):
+        raise ValueError("its log has no warnings")
+    log.warnings.include(warnings)
+    return log
+
+
+def _corrections(arrays: Arrays) -> Corrections:
+    index = arrays.take("index", np.int64, (None,))
+    poses = arrays.take("world_from_cam", np.float64, (len(index), 4, 4))
+    scale = arrays.take("scale", np.float64, (len(index),))
+    if (scale <= 0).any():
+        raise ValueError("a correction's scale is not above 0")
+    return {int(k): (pose.copy(), float(s)) for k, pose, s in zip(index, poses, scale)}

@@ -1,0 +1,67 @@
+"""The keyframes of a checkpoint as they were seen: what a map can be scored with where its stream is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mvsgs_core.splats.checkpoint_files import KEYFRAMES, checkpoint_info, read_state
+from mvsgs_core.splats.checkpoint_images import read_images
+from mvsgs_core.splats.checkpoint_state import VIEWS, Arrays
+
+
+@dataclass(frozen=True)
+class KeptKeyframe:
+    """A keyframe of a checkpoint."""
+
+    index: int  # of the frame in its stream
+    timestamp: float  # seconds
+    intrinsics: np.ndarray  # (4,) in pixels of the training image
+    world_from_cam: np.ndarray  # (4, 4) float64, the tracker's
+    segment: int  # part of the map
+    images: tuple[Path, list[str]]  # folder and files of its pyramid; no files where its images were let go
+
+    def image(self) -> np.ndarray | None:
+        """(H, W, 3) uint8 RGB as it is trained on; None: let go. Raises ValueError for a damaged file."""
+        folder, names = self.images
+        return read_images(folder, names[:1], torch.device("cpu"))[0][0].numpy() if names else None
+
+
+def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
+    """Of the newest whole checkpoint in a run's output directory, in the order of the stream.
+
+    Raises ValueError where there is none.
+    """
+    file = checkpoint_info(output).file
+    meta, raw = read_state(file)
+    try:
+        found = [
+            keyframe
+            for k, part in enumerate(meta["mappers"])
+            for keyframe in _of_part(part, Arrays(raw).of(f"map{k}").of("views"), file.parent / KEYFRAMES)
+        ]
+    except (KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"{file} is no checkpoint of a mapper: {error!r}") from error
+    return sorted(found, key=lambda keyframe: keyframe.index)
+
+
+def _of_part(part: dict[str, object], arrays: Arrays, folder: Path) -> Iterator[KeptKeyframe]:
+    names = part["images"]
+    segment = part["segment"]
+    if not isinstance(names, list) or type(segment) is not int:
+        raise TypeError("images or segment are missing")
+    count = len(names)
+    columns = {
+        name: arrays.take(name, VIEWS[name][0], (count, *VIEWS[name][1]), nan=name == "timestamp")
+        for name in ("index", "timestamp", "world_from_cam")
+    }
+    intrinsics = arrays.take("intrinsics", np.float64, (count, None, 4))
+    for k in range(count):
+        yield KeptKeyframe(
+            int(columns["index"][k]), float(columns["timestamp"][k]), intrinsics[k, 0].copy(),
+            columns["world_from_cam"][k].copy(), segment, (folder, list(names[k])),
+        )  # fmt: skip

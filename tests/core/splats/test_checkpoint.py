@@ -1,0 +1,320 @@
+"""A checkpoint gives the map back to the bit, and a damaged one is refused with a sentence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mvsgs_core.splats.checkpoint import load
+from mvsgs_core.splats.checkpoint_files import FOLDER, KEYFRAMES, checkpoint_info, read_state, state_files, write_state
+from mvsgs_core.splats.checkpoint_keyframes import kept_keyframes
+from mvsgs_core.splats.checkpoint_writer import CheckpointWriter
+from mvsgs_core.splats.density_control import DensityConfig
+from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.splats.session import Session
+from mvsgs_core.splats.training import SkipConfig, TrainingConfig
+from mvsgs_core.stats import Stats
+from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+
+SIZE = (24, 32)
+PLAIN = MapperConfig(iterations=10, refinement=6, window=2, training=TrainingConfig(threads=1))
+EVERYTHING = replace(
+    PLAIN,
+    sh_degree=1,
+    max_pixels=500,
+    max_keyframes=4,
+    training=TrainingConfig(threads=1, density="exact", betas=True, exposure=True, poses=True, pose_visits=1),
+    skipping=SkipConfig(tiles=True, coarse_to_fine=True, converged_visits=3),
+    density_control=DensityConfig(mode="relocate", every=7, prune_opacity=0.3),
+)
+
+
+def view(index: int) -> PosedView:
+    found = posed_view(index, pose_on_arc(index / 8), SIZE)
+    if index != 1:
+        return replace(found, timestamp=0.1 * index)
+    image = found.image.astype(np.float32) / np.float32(255)
+    image[3:6, 4:9] = np.nan  # pixels to leave out
+    return replace(found, image=image, timestamp=0.1)
+
+
+def begun(config: MapperConfig) -> Session:
+    """Two segments, corrections, and iterations that are still owed."""
+    session = Session(OnlineMapper(config))
+    for index in range(6):
+        session.enter(int(index == 3))
+        session.current.add_view(view(index))
+        session.came(index, 0.1 * index)
+        for _ in range(4):
+            session.current.step()
+    moved = pose_on_arc(0.3)
+    moved[:3, 3] += 0.02
+    for part in session.parts.values():
+        part.correct(np.array([2, 7]), np.stack([moved, moved]), np.array([1.1, 1.2]))
+    session.segment_of.update({3: 1, 2: 0})
+    session.revision = 4
+    return session
+
+
+def ended(session: Session) -> dict[str, torch.Tensor]:
+    """The map that comes of it: views, a correction, a join, the rest of the iterations and the refinement."""
+    for index in range(6, 9):
+        session.enter(0)
+        session.current.add_view(view(index))
+        session.came(index, 0.1 * index)
+    session.current.correct(np.array([6]), pose_on_arc(0.76)[None], np.ones(1))
+    session.segment_of[3] = 0
+    session.join()
+    while session.current.step():
+        pass
+    for done in range(session.current.config.refinement):
+        session.current.refine(done, session.current.config.refinement)
+    final = session.current.snapshot()
+    poses = {"poses": torch.from_numpy(final.world_from_cam), "exposures": torch.from_numpy(final.exposures)}
+    return session.current.state.tensors() | poses
+
+
+def written(session: Session, output: Path) -> Path:
+    """The folder with its checkpoint."""
+    writer = CheckpointWriter(output, session.current.config)
+    writer.submit(session.frozen(), sync=False)
+    assert writer.wait(20.0)
+    assert writer.problems.empty(), writer.problems.get()
+    return output
+
+
+@pytest.mark.parametrize("config", [PLAIN, EVERYTHING], ids=["plain", "everything"])
+def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_map_to_the_bit(
+    config: MapperConfig, tmp_path: Path
+) -> None:
+    session = begun(config)
+    written(session, tmp_path)
+    expected = ended(session)
+    log = Stats()
+    again, file = load(tmp_path, config, log)
+    assert (again.newest_view, again.revision, again.segment_of) == (5, 4, {3: 1, 2: 0})
+    assert log.counts["views"] == 6
+    assert any("not finite" in text for text in log.warnings)  # of the run so far
+    assert file == state_files(tmp_path)[0]
+    found = ended(again)
+    assert len(expected["steps"]) > 100
+    for name, value in expected.items():
+        assert torch.equal(found[name], value), name
+    assert log.counts == session.current.log.counts
+
+
+def test_the_stream_goes_on_while_a_frozen_session_stays_as_it_was(tmp_path: Path) -> None:
+    session = begun(PLAIN)
+    frozen = session.frozen()
+    before = {name: value.clone() for name, value in frozen.current.state.tensors().items()}
+    views = [replace(v, pose_delta=v.pose_delta.copy()) for v in frozen.current.views]
+    ended(session)
+    for name, value in frozen.current.state.tensors().items():
+        assert torch.equal(value, before[name]), name
+    for one, other in zip(frozen.current.views, views):
+        assert one.levels == other.levels
+        np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
+        np.testing.assert_array_equal(one.pose_delta, other.pose_delta)
+
+
+def test_what_a_checkpoint_says_of_itself_needs_no_mapper(tmp_path: Path) -> None:
+    info = checkpoint_info(written(begun(PLAIN), tmp_path))
+    assert (info.newest_keyframe_index, info.keyframes.tolist(), info.finished) == (5, [0, 1, 2, 3, 4, 5], False)
+    assert info.stream_seconds == pytest.approx(0.5)
+    assert info.splats > 100
+    assert info.stereo_after() is None
+    assert info.stereo_after(2) == 3
+
+
+def test_the_keyframes_of_a_checkpoint_are_what_the_mapper_was_given(tmp_path: Path) -> None:
+    found = kept_keyframes(written(begun(PLAIN), tmp_path))
+    assert [(k.index, k.segment) for k in found] == [(0, 0), (1, 0), (2, 0), (3, 1), (4, 0), (5, 0)]
+    image = found[4].image()
+    assert image is not None
+    np.testing.assert_array_equal(image, view(4).image)
+    np.testing.assert_array_equal(found[4].intrinsics, view(4).intrinsics)
+    np.testing.assert_array_equal(found[4].world_from_cam, view(4).world_from_cam)
+    assert found[4].timestamp == 0.4
+
+
+def test_images_are_written_once_and_two_states_are_kept(tmp_path: Path) -> None:
+    session, config = begun(EVERYTHING), EVERYTHING
+    writer = CheckpointWriter(tmp_path, config)
+    times = []
+    for _ in range(3):
+        writer.submit(session.frozen())
+        assert writer.wait(20.0)
+        times.append({f.name: f.stat().st_mtime_ns for f in (tmp_path / FOLDER / KEYFRAMES).iterdir()})
+    assert times[0] == times[1] == times[2]
+    assert len(times[0]) == 2 * (4 + 1)  # two levels of four keyframes, max_keyframes, and of the other segment's one
+    assert [file.name for file in state_files(tmp_path)] == ["state-00000003.npz", "state-00000002.npz"]
+    for index in range(6, 9):
+        session.current.add_view(view(index))
+    for _ in range(2):  # the state before the last one still needs what was let go
+        writer.submit(session.frozen())
+        assert writer.wait(20.0)
+    left = {f.name for f in (tmp_path / FOLDER / KEYFRAMES).iterdir()}
+    assert len(left) == 2 * (4 + 1)
+    assert left != set(times[0])
+    load(tmp_path, config, Stats())
+
+
+def test_another_runs_checkpoint_is_replaced_by_the_first_of_this_one(tmp_path: Path) -> None:
+    written(begun(EVERYTHING), tmp_path)
+    foreign = {f.name for f in (tmp_path / FOLDER / KEYFRAMES).iterdir()}
+    (tmp_path / ".map.123.ply").write_text("of a process that was killed")
+    written(begun(PLAIN), tmp_path)
+    assert [file.name for file in state_files(tmp_path)] == ["state-00000002.npz"]
+    assert not {f.name for f in (tmp_path / FOLDER / KEYFRAMES).iterdir()} & foreign
+    assert not (tmp_path / ".map.123.ply").exists()
+    load(tmp_path, PLAIN, Stats())
+
+
+def test_a_damaged_state_is_said_and_the_one_before_taken(tmp_path: Path) -> None:
+    session = begun(PLAIN)
+    writer = CheckpointWriter(tmp_path, PLAIN)
+    for _ in range(2):
+        writer.submit(session.frozen())
+        assert writer.wait(20.0)
+    newest, before = state_files(tmp_path)
+    data = bytearray(newest.read_bytes())
+    data[len(data) // 2] ^= 1
+    newest.write_bytes(data)
+    log = Stats()
+    _, file = load(tmp_path, PLAIN, log)
+    assert file == before
+    assert any("an older checkpoint was taken" in text and "damaged" in text for text in log.warnings)
+    assert checkpoint_info(tmp_path).file == before
+    before.write_bytes(data[:1000])
+    with pytest.raises(ValueError, match="damaged"):
+        load(tmp_path, PLAIN, Stats())
+    with pytest.raises(ValueError, match="damaged"):
+        checkpoint_info(tmp_path)
+
+
+def test_an_image_that_is_missing_or_another_is_refused(tmp_path: Path) -> None:
+    written(begun(PLAIN), tmp_path)
+    first, second, *_ = sorted((tmp_path / FOLDER / KEYFRAMES).glob("*-0-*.png"))
+    whole = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    with pytest.raises(ValueError, match="shows something else than its name says"):
+        load(tmp_path, PLAIN, Stats())
+    first.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="damaged"):
+        load(tmp_path, PLAIN, Stats())
+    first.unlink()
+    with pytest.raises(ValueError, match="cannot be read"):
+        load(tmp_path, PLAIN, Stats())
+
+
+def test_other_parameters_are_said_and_refused_where_the_map_depends_on_them(tmp_path: Path) -> None:
+    written(begun(PLAIN), tmp_path)
+    log = Stats()
+    load(tmp_path, replace(PLAIN, refinement=500), log)
+    assert log.warnings[-1] == "the run goes on with other parameters than it had: refinement=500 (was 6)"
+    with pytest.raises(ValueError, match="sh_degree was 0 in that run and is 2 now"):
+        load(tmp_path, replace(PLAIN, sh_degree=2), Stats())
+
+
+def test_a_folder_without_a_checkpoint_says_why(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="has no checkpoint: the run ended before its first map"):
+        load(tmp_path, PLAIN, Stats())
+    with pytest.raises(ValueError, match="is no directory"):
+        checkpoint_info(tmp_path / "nowhere")
+
+
+def test_a_map_in_the_middle_of_a_change_is_not_frozen() -> None:
+    session = begun(PLAIN)
+    session.current.state.anchors = session.current.state.anchors[:-1]
+    with pytest.raises(ValueError, match="middle of a change"):
+        session.frozen()
+
+
+def test_no_mutated_byte_raises_anything_but_a_value_error(tmp_path: Path) -> None:
+    file = state_files(written(begun(EVERYTHING), tmp_path))[0]
+    whole = file.read_bytes()
+    random = np.random.default_rng(1)
+    refused = 0
+    for round in range(150):
+        data = bytearray(whole)
+        for _ in range(random.integers(1, 4)):
+            at = int(random.integers(len(data)))
+            match round % 4:
+                case 0:
+                    data[at] = random.integers(256)
+                case 1:
+                    del data[at:]
+                    data += b"\0"
+                case 2:
+                    del data[at : at + int(random.integers(1, 64))]
+                case 3:
+                    data[at:at] = random.bytes(8)
+        file.write_bytes(data)
+        try:
+            load(tmp_path, EVERYTHING, Stats())
+        except ValueError:
+            refused += 1
+    assert refused > 140
+
+
+def test_no_mutated_value_raises_anything_but_a_value_error(tmp_path: Path) -> None:
+    """Whole files with a value that no mapper writes: wrong types, sizes, numbers that are not finite, none at all."""
+    file = state_files(written(begun(EVERYTHING), tmp_path))[0]
+    meta, arrays = read_state(file)
+    del meta["format"], meta["version"]
+    texts = (None, -2, 1.5, "x", [[]], 2**70)
+    bad = [({**meta, key: value}, arrays) for key in meta for value in texts]
+    for key in meta["mappers"][0]:
+        bad += [({**meta, "mappers": [{**meta["mappers"][0], key: v}, *meta["mappers"][1:]]}, arrays) for v in texts]
+    for key in meta["mappers"][0]["schedule"]:
+        for value in texts:
+            part = {**meta["mappers"][0], "schedule": {**meta["mappers"][0]["schedule"], key: value}}
+            bad.append(({**meta, "mappers": [part, *meta["mappers"][1:]]}, arrays))
+    for name, value in arrays.items():
+        if name.startswith("map1"):
+            continue  # as map0
+        bad.append((meta, {k: v for k, v in arrays.items() if k != name}))
+        bad.append((meta, {**arrays, name: value.astype(np.complex64)}))
+        bad.append((meta, {**arrays, name: value[..., None]}))
+        if value.dtype.kind == "f" and value.size:
+            wrong = value.copy()
+            wrong.flat[0] = np.inf
+            bad.append((meta, {**arrays, name: wrong}))
+    assert len(bad) > 250
+    taken: list[dict[str, Any]] = []
+    for head, columns in bad:
+        write_state(file, head, columns)
+        try:
+            load(tmp_path, EVERYTHING, Stats())
+            taken.append(head)
+        except ValueError:
+            continue
+    changed = {key for head in taken for key in head if head[key] != meta[key]}
+    assert changed <= {"splats", "stream_ended", "revision", "config", "mappers", "stream_seconds", "newest_view"}, (
+        changed
+    )
+    assert len(taken) < 8
+
+
+def test_another_version_is_refused_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvsgs_core.splats.checkpoint_files.VERSION", 2)
+    written(begun(PLAIN), tmp_path)
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match="version 2 of the format: this program reads 1"):
+        load(tmp_path, PLAIN, Stats())
+
+
+def test_numpy_reads_it_without_pickle(tmp_path: Path) -> None:
+    file = state_files(written(begun(PLAIN), tmp_path))[0]
+    shutil.copy(file, tmp_path / "copy.npz")
+    with np.load(tmp_path / "copy.npz", allow_pickle=False) as content:
+        assert json.loads(content["meta"].tobytes())["format"] == "mvsgs checkpoint"
+        assert len(content["map0/splats/means"]) == len(content["map0/splats/steps"])

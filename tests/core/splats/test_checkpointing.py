@@ -1,0 +1,179 @@
+"""When checkpoints are made, what they cost, and what is left where one cannot be."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvsgs_core.evaluation.trajectory import read_tum
+from mvsgs_core.splats.checkpoint_files import FOLDER, checkpoint_info, state_files
+from mvsgs_core.splats.checkpointing import SHARE, Checkpointing
+from mvsgs_core.splats.export_ply import read_ply
+from mvsgs_core.splats.mapper import OnlineMapper
+from mvsgs_core.splats.session import Session
+from tests.core.splats.test_checkpoint import PLAIN, begun, view
+
+
+class Clock:
+    """Goes on by what each look at it takes, and by hand."""
+
+    def __init__(self, look: float = 0.0) -> None:
+        self.now, self.look = 100.0, look
+
+    def __call__(self) -> float:
+        self.now += self.look
+        return self.now
+
+
+def times(checkpoints: Checkpointing, session: Session) -> float:
+    """How often was saved so far, after a look."""
+    checkpoints.keep(session)
+    assert checkpoints._writer.wait(20.0)
+    return session.current.log.counts.get("checkpoints", 0)
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """As on a disk that is full: no process's file gets longer."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_the_first_checkpoint_is_made_as_soon_as_there_is_a_map(tmp_path: Path) -> None:
+    session = Session(OnlineMapper(PLAIN))
+    checkpoints = Checkpointing(tmp_path, 30.0, session, clock=Clock())
+    assert times(checkpoints, session) == 0
+    session.enter(0)
+    session.current.add_view(replace(view(0), depth=np.zeros((24, 32), np.float32), normals=None))
+    assert times(checkpoints, session) == 0
+    session.current.add_view(view(2))
+    assert times(checkpoints, session) == 1
+    assert times(checkpoints, session) == 1
+    assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 2]
+
+
+def test_the_period_is_of_the_stream_or_of_the_clock(tmp_path: Path) -> None:
+    session, clock = begun(PLAIN), Clock()
+    checkpoints = Checkpointing(tmp_path, 30.0, session, clock=clock)
+    assert times(checkpoints, session) == 1
+    clock.now += 29.0
+    assert times(checkpoints, session) == 1
+    clock.now += 2.0
+    assert times(checkpoints, session) == 2
+    session.came(6, 29.0)
+    assert times(checkpoints, session) == 2
+    session.came(7, 30.6)
+    assert times(checkpoints, session) == 3
+    session.came(8, float("nan"))
+    assert times(checkpoints, session) == 3
+
+
+def test_the_period_grows_where_checkpoints_would_take_too_much_of_the_time(tmp_path: Path) -> None:
+    session, clock = begun(PLAIN), Clock(look=1.0)  # two looks in each: a second a checkpoint
+    checkpoints = Checkpointing(tmp_path, 10.0, session, clock=clock)
+    began, made = clock.now, []
+    while clock.now < began + 1000.0:
+        if times(checkpoints, session) > len(made):
+            made.append(clock.now - began)
+    assert made[0] < 5.0
+    assert np.diff(made).min() >= 1.0 / SHARE * 0.9
+    assert 15 <= len(made) <= SHARE * 1000.0
+
+
+def test_no_checkpoint_is_made_without_a_period(tmp_path: Path) -> None:
+    session = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 0.0, session)
+    assert times(checkpoints, session) == 0
+    checkpoints.last(session)
+    assert not (tmp_path / FOLDER).exists()
+    assert len(read_ply(tmp_path / "map.ply").splats) == len(session.largest.state)
+
+
+def test_every_checkpoint_leaves_a_map_and_the_keyframes_poses(tmp_path: Path) -> None:
+    session = begun(PLAIN)
+    assert times(Checkpointing(tmp_path, 30.0, session), session) == 1
+    found, final = read_ply(tmp_path / "map.ply"), session.largest.snapshot()
+    np.testing.assert_allclose(found.splats.means.numpy(), final.splats.means.numpy() + final.origin, atol=1e-5)
+    seconds, poses = read_tum(tmp_path / "trajectory.txt")
+    np.testing.assert_allclose(seconds, [0.0, 0.1, 0.2, 0.4, 0.5])  # of the largest part
+    np.testing.assert_allclose(poses, final.world_from_cam, atol=1e-6)
+
+
+def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> None:
+    session, clock = begun(PLAIN), Clock()
+    checkpoints = Checkpointing(tmp_path, 30.0, session, clock=clock)
+    assert times(checkpoints, session) == 1
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    clock.now += 40.0
+    session.current.add_view(view(7))
+    with files_of_at_most(20_000):
+        assert times(checkpoints, session) == 2
+        checkpoints.keep(session)
+    assert any("make room" in text and "File too large" in text for text in session.current.log.warnings)
+    after = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    assert {file: after[file] for file in before} == before
+    assert not any(file.name.startswith(".") for file in after)
+    clock.now += 40.0
+    assert times(checkpoints, session) == 3
+    assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 1, 2, 3, 4, 5, 7]
+
+
+def test_a_final_map_that_cannot_be_written_is_an_error_and_leaves_the_one_before(tmp_path: Path) -> None:
+    session = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, session)
+    assert times(checkpoints, session) == 1
+    before = (tmp_path / "map.ply").read_bytes()
+    with files_of_at_most(20_000), pytest.raises(OSError, match="File too large"):
+        checkpoints.finish(session)
+    assert (tmp_path / "map.ply").read_bytes() == before
+    assert checkpoint_info(tmp_path).splats == len(session.largest.state)
+
+
+def test_the_last_checkpoint_of_a_run_that_ends_early_is_there_at_once(tmp_path: Path) -> None:
+    session = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, session)
+    checkpoints.keep(session)  # is being written, perhaps
+    session.current.add_view(view(8))
+    session.came(8, 0.8)
+    for added in session.current.views:
+        checkpoints.added(added)
+    start = time.perf_counter()
+    checkpoints.last(session)
+    assert time.perf_counter() - start < 3.0
+    assert checkpoint_info(tmp_path).newest_keyframe_index == 8
+    assert len(read_ply(tmp_path / "map.ply").splats) == len(session.current.state)
+    assert not session.current.log.counts.get("refused_checkpoints")
+
+
+def test_a_map_that_was_cut_off_in_a_change_leaves_the_checkpoint_before(tmp_path: Path) -> None:
+    session = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, session)
+    assert times(checkpoints, session) == 1
+    session.current.state.anchors = session.current.state.anchors[:-1]
+    checkpoints.last(session)
+    assert any("middle of a change" in text for text in session.current.log.warnings)
+    assert [file.name for file in state_files(tmp_path)] == ["state-00000001.npz"]
+
+
+def test_nothing_is_left_to_resume_after_a_complete_run_unless_wanted(tmp_path: Path) -> None:
+    session = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, session)
+    assert times(checkpoints, session) == 1
+    session.stream_ended, session.refined = True, 6
+    checkpoints.finish(session)
+    checkpoints.close(session, keep=True)
+    assert checkpoint_info(tmp_path).finished
+    checkpoints.close(session, keep=False)
+    assert not (tmp_path / FOLDER).exists()
+    assert (tmp_path / "map.ply").exists()
