@@ -206,6 +206,12 @@ def test_a_value_is_converted_to_its_type_or_refused(value: object) -> None:
 def test_every_choice_file_of_the_project_composes() -> None:
     """One at a time, with the default choices elsewhere: its node exists, its parameters and reads hold."""
     slots, _ = vocabulary(CONF)
+    stands_for_the_stages = [
+        *(f"{slot}._target_=null" for slot in ("tracker", "mvs", "depth_fusion")),
+        "mapper.reads={View: dataset, Poses: dataset}",
+        "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, View: dataset, SplatMap: mapper}",
+    ]
     for slot in slots:
         for path in sorted((CONF / slot).glob("*.yaml")):
-            compose([f"{slot}={path.stem}", "device=cpu"])
+            others = stands_for_the_stages if (slot, path.stem) == ("dataset", "resumed") else []
+            compose([f"{slot}={path.stem}", "device=cpu", *others])
