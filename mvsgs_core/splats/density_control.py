@@ -1,7 +1,7 @@
 """Adaptive density control for a map that never stops growing: clone, split, prune; or relocation of dead splats.
 
-3DGS (Kerbl et al. 2023), section 5, resets all opacities every 3,000 iterations and prunes after; an online map has no
-such rhythm, so that opacities decay by a small factor at each round instead, and what no view holds up fades out.
+As in 3DGS (Kerbl et al. 2023), section 5, but opacities are never reset: that needs a rhythm of thousands of iterations
+in which the map may be worse, and an online map is looked at all the time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ class DensityConfig:
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
     prune_opacity: float = 0.02  # 0 to 1; below: removed
     prune_scale: float = 0.5  # largest standard deviation in median depths; above: removed
-    opacity_decay: float = 1.0  # factor on all opacities at each round; 1: none
     max_splats: int = 1_000_000  # no growth beyond
 
 
@@ -52,8 +51,6 @@ def control(state: MapState, config: DensityConfig, median_depth: float, generat
         change = _relocate(state, config, median_depth, generator)
     else:
         change = _adapt(state, config, median_depth, generator)
-    if config.opacity_decay < 1.0 and config.mode != "none":
-        decay_opacities(state, config.opacity_decay)
     state.reset_screen()
     return change
 
@@ -165,13 +162,6 @@ def relocation(opacity: Tensor, copies: Tensor, largest: int = 51) -> tuple[Tens
             term += math.comb(i - 1, k) * (-1.0) ** k / math.sqrt(k + 1) * shared ** (k + 1)
         denominator += torch.where(n >= i, term, 0.0)
     return shared, opacity / denominator.clamp(min=1e-12)
-
-
-@torch.no_grad()
-def decay_opacities(state: MapState, factor: float) -> None:
-    """Multiplies every opacity by `factor` in (0, 1]."""
-    logits = state.splats.opacity_logits
-    logits.copy_(torch.logit((torch.sigmoid(logits) * factor).clamp(1e-5, 1.0 - 1e-5)))
 
 
 def _select(splats: Splats, mask: Tensor) -> Splats:

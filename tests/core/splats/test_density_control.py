@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvsgs_core.splats.density_control import DensityConfig, control, decay_opacities, relocation
+from mvsgs_core.splats.density_control import DensityConfig, control, relocation
 from mvsgs_core.splats.map_state import PARAMETERS, MapState
 from mvsgs_core.splats.model import Splats
 
@@ -62,7 +62,9 @@ def test_growth_stops_at_the_limit_with_the_worst_first() -> None:
 def test_none_leaves_everything_alone_and_an_unknown_mode_is_refused() -> None:
     state = state_of(5)
     before = state.splats.opacity_logits.clone()
-    control(state, DensityConfig(mode="none", opacity_decay=0.5), 1.0, torch.Generator())
+    state.screen_views += 1.0
+    state.screen_gradient += 1.0
+    control(state, DensityConfig(mode="none"), 1.0, torch.Generator())
     assert torch.equal(before, state.splats.opacity_logits)
     with pytest.raises(ValueError, match="adaptive, relocate, none"):
         control(state, DensityConfig(mode="sometimes"), 1.0, torch.Generator())
@@ -91,10 +93,3 @@ def test_copies_blend_to_the_opacity_of_the_original(copies: int) -> None:
         original = torch.trapezoid(o * torch.exp(-0.5 * x * x), x)
         blended = torch.trapezoid(1 - (1 - s * torch.exp(-0.5 * (x / f) ** 2)) ** copies, x)
         torch.testing.assert_close(blended, original, rtol=1e-6, atol=0.0)
-
-
-def test_decay_multiplies_opacities() -> None:
-    state = state_of(4)
-    before = torch.sigmoid(state.splats.opacity_logits.detach().clone())
-    decay_opacities(state, 0.8)
-    torch.testing.assert_close(torch.sigmoid(state.splats.opacity_logits.detach()), 0.8 * before)
