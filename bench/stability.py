@@ -2,8 +2,8 @@
 
 `python -m bench.stability [--quick] [--json FILE]`. Each row says what happened, what was refused and how it was
 reported. The first rows take one render, one backward pass and one optimizer step; the last ones the whole mapper. A
-row's goal says what it looks at: that all values are finite, and where the map must be good in spite of what was done to
-it, how well it renders its keyframes.
+row's goal says what it looks at: that all values are finite, and where the map must be good in spite of what was done
+to it, how well it renders its keyframes.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def box_view(index: int, x: float, size: tuple[int, int] = SIZE, origin: float =
 
 
 def mapped(name: str, views: list[PosedView], config: MapperConfig, least: float | None = None) -> Row:
-    """The whole mapper on these views; `least`: dB that the keyframes must reach, None: only finiteness is looked at."""
+    """The whole mapper on these views; least: dB that its keyframes must reach, None: only finiteness is looked at."""
     mapper = OnlineMapper(config)
     for posed in views:
         mapper.add_view(posed)
