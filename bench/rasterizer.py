@@ -4,7 +4,8 @@
 
 Scenes are random: splats spread evenly over the view, about 10 px in radius, half of them seen through others, color by
 spherical harmonics of degree 0; the gradient is of the color. Everything that is compared runs in turns, one after the
-other in every round, and medians are over the rounds.
+other in every round, the peaks of the machine too; a figure is the median of the rounds, with their spread, and a goal
+is met where the whole spread meets it.
 
 Roofline: what an ideal implementation needs at the peaks measured here with the same threads, the sum of
 
@@ -30,7 +31,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from bench.table import Row, at_least, at_most, main
+from bench.table import Row, at_most, main, timed
 from mvsgs_core import camera, native
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.splats import densities, spherical_harmonics, ssim
@@ -38,6 +39,7 @@ from mvsgs_core.splats.densities import DENSITIES
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.rasterizer import rasterize
 
+PASSES = 3  # of the kernel in a round
 SPEEDUP = 4.0  # over the plain loops
 ROOFLINE = 35.0  # %
 FORWARD_VECTORS, BACKWARD_VECTORS = 10, 10  # 64-byte loads and stores of a tile's state per block and splat
@@ -187,43 +189,66 @@ def roofline(done: Work, count: int, size: tuple[int, int], density: str, thread
     return Roofline(bound(done.contributed), bound(done.evaluated), simple)
 
 
+@dataclass
+class Round:
+    """What is compared, measured in turns: medians of a few passes each, and the peaks of the machine right after."""
+
+    fast: Times = field(default_factory=Times)
+    plain: Times = field(default_factory=Times)
+    one: Times = field(default_factory=Times)  # thread
+    bound: Roofline | None = None
+    alone: Roofline | None = None  # with one thread
+
+    def share(self, which: str = "necessary") -> float:
+        """Of the roofline, %."""
+        return 100.0 * float(getattr(self.bound, which)) / self.fast.total()
+
+    def share_alone(self) -> float:
+        assert self.alone is not None
+        return 100.0 * self.alone.necessary / self.one.total()
+
+
 def compare(size: tuple[int, int], count: int, threads: int, rounds: int) -> list[Row]:
     """C++ kernel, plain loops and roofline at one size, and what the density forms cost."""
     rows = []
     totals = {}
     for density in DENSITIES:
         splats = scene(count, size[1], density)
-        fast, plain, one = Times(), Times(), Times()
-        for i in range(rounds):
-            image = run(splats, size, density, "cpu", threads, fast)
-            if density != "ges_scale" and i % 4 == 0:
-                other = run_baseline(splats, size, density, threads, plain)
-                run(splats, size, density, "cpu", 1, one)
-        forward, backward = fast.milliseconds()
-        totals[density] = fast.total()
+        done = work(splats, size, density)
+        measured = [Round() for _ in range(rounds)]
+        for each in measured:
+            for i in range(PASSES):
+                image = run(splats, size, density, "cpu", threads, each.fast)
+                if density != "ges_scale" and i == 0:
+                    other = run_baseline(splats, size, density, threads, each.plain)
+                    run(splats, size, density, "cpu", 1, each.one)
+            if density != "ges_scale":
+                each.bound = roofline(done, count, size, density, threads)
+                each.alone = roofline(done, count, size, density, 1)
+        both = [each.fast.total() for each in measured]
+        totals[density] = statistics.median(both)
         label = f"{size[1]}x{size[0]} {count // 1000}k {density}"
-        rows += [Row(f"{label}: forward", forward, "ms"), Row(f"{label}: backward", backward, "ms")]
+        forward, backward = zip(*(each.fast.milliseconds() for each in measured), strict=True)
+        rows += [timed(f"{label}: forward", forward, "ms"), timed(f"{label}: backward", backward, "ms")]
         if density == "ges_scale":
             continue
+        plain = [each.plain.milliseconds() for each in measured]
+        faster = [each.plain.total() / each.fast.total() for each in measured]
+        alone = [each.one.total() / each.fast.total() for each in measured]
         rows += [
-            at_most(f"{label}: both", totals[density], "ms", MARKS[size[0], density]),
-            Row(f"{label}: plain loops, forward", plain.milliseconds()[0], "ms"),
-            Row(f"{label}: plain loops, backward", plain.milliseconds()[1], "ms"),
-            at_least(f"{label}: times faster than plain loops", plain.total() / totals[density], "x", SPEEDUP),
+            timed(f"{label}: both", both, "ms", most=MARKS[size[0], density]),
+            timed(f"{label}: plain loops, forward", [ms for ms, _ in plain], "ms"),
+            timed(f"{label}: plain loops, backward", [ms for _, ms in plain], "ms"),
+            timed(f"{label}: times faster than plain loops", faster, "x", least=SPEEDUP),
             Row(f"{label}: mean difference to plain loops", float((image - other).abs().mean()), ""),
-            Row(f"{label}: times faster than with 1 thread", one.total() / totals[density], "x"),
-        ]
-        done = work(splats, size, density)
-        bound, alone = (roofline(done, count, size, density, n) for n in (threads, 1))
-        total = totals[density]
-        rows += [
+            timed(f"{label}: times faster than with 1 thread", alone, "x"),
             Row(f"{label}: pairs of splat and pixel that get color", done.contributed / 1e6, "million"),
             Row(f"{label}: pairs evaluated", done.evaluated / 1e6, "million"),
-            Row(f"{label}: roofline", bound.necessary, "ms"),
-            at_least(f"{label}: share of the roofline", 100.0 * bound.necessary / total, "%", ROOFLINE),
-            Row(f"{label}: share if all lanes counted", 100.0 * bound.evaluated / total, "%"),
-            Row(f"{label}: share by exponentials and bytes only", 100.0 * bound.simple / total, "%"),
-            Row(f"{label}: share of the roofline, 1 thread", 100.0 * alone.necessary / one.total(), "%"),
+            timed(f"{label}: roofline", [e.bound.necessary for e in measured if e.bound], "ms"),
+            timed(f"{label}: share of the roofline", [e.share() for e in measured], "%", least=ROOFLINE),
+            timed(f"{label}: share if all lanes counted", [e.share("evaluated") for e in measured], "%"),
+            timed(f"{label}: share by exponentials and bytes only", [e.share("simple") for e in measured], "%"),
+            timed(f"{label}: share of the roofline, 1 thread", [e.share_alone() for e in measured], "%"),
         ]
     for density in DENSITIES[1:]:
         price = totals[density] / totals["gaussian"]
@@ -346,12 +371,12 @@ def antialiasing(threads: int, rounds: int, seconds: float) -> list[Row]:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     threads = options.threads
-    rounds = 9 if options.quick else 25
+    rounds = 3 if options.quick else 7
     rows = compare((240, 320), 20_000, threads, rounds)
     rows += compare((480, 640), 50_000, threads, rounds)
     seconds = 2.0 if options.quick else 8.0
     rows += beside_reference(threads) + similarity() + worth(seconds)
-    return rows + antialiasing(threads, rounds, seconds)
+    return rows + antialiasing(threads, rounds * PASSES, seconds)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

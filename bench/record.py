@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import operator
 import re
 import shutil
 import sys
@@ -32,7 +33,7 @@ _BLOCK = re.compile(r"(<!-- bench:([\w/.-]+) -->\n).*?(<!-- /bench:\2 -->)", re.
 
 @dataclass(frozen=True)
 class Record:
-    """Rows as in bench.table, each with `spread` (half the range over the runs, None for a single one)."""
+    """Rows as in bench.table, each with `spread`: half the range, over the runs too where there are several."""
 
     name: str
     command: str
@@ -74,10 +75,11 @@ def merge(runs: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
     for same in found.values():
         values = [row["value"] for row in same]
         numbers = [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
-        row = {**same[-1], "spread": None}
+        row = {**same[-1], "spread": same[-1].get("spread")}
         if len(numbers) == len(values) > 1:
+            spreads = [row.get("spread") or 0.0 for row in same]
             row["value"] = sum(numbers) / len(numbers)
-            row["spread"] = (max(numbers) - min(numbers)) / 2
+            row["spread"] = (max(map(operator.add, numbers, spreads)) - min(map(operator.sub, numbers, spreads))) / 2
         met = [row["met"] for row in same if row["met"] is not None]
         row["met"] = all(met) if met else None
         merged.append(row)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+import statistics
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -21,6 +22,7 @@ class Row:
     unit: str = ""
     goal: str = ""
     met: bool | None = None
+    spread: float | None = None  # half the range of repeated measurements; None: measured once
 
 
 def at_most(name: str, value: float, unit: str, limit: float) -> Row:
@@ -31,12 +33,27 @@ def at_least(name: str, value: float, unit: str, limit: float) -> Row:
     return Row(name, value, unit, f">= {limit:g}", bool(value >= limit))
 
 
+def timed(name: str, values: Sequence[float], unit: str, most: float | None = None, least: float | None = None) -> Row:
+    """The median of repeated measurements with their spread. A goal is met where all of them meet it.
+
+    values: one a round; what is compared runs in turns within each round, so that whatever else the machine does meets
+    both. Of the goals `most` and `least` at most one is given.
+    """
+    value, spread = statistics.median(values), (max(values) - min(values)) / 2
+    if most is not None:
+        return Row(name, value, unit, f"<= {most:g}, all of {len(values)}", max(values) <= most, spread)
+    if least is not None:
+        return Row(name, value, unit, f">= {least:g}, all of {len(values)}", min(values) >= least, spread)
+    return Row(name, value, unit, spread=spread)
+
+
 def show(rows: list[Row], title: str) -> None:
     table = Table(title=title)
     for column in ("name", "value", "unit", "goal", "met"):
         table.add_column(column, justify="right" if column == "value" else "left")
     for row in rows:
         value = f"{row.value:.4g}" if isinstance(row.value, float) else str(row.value)
+        value += "" if row.spread is None else f" ± {row.spread:.2g}"
         table.add_row(row.name, value, row.unit, row.goal, {True: "yes", False: "NO", None: ""}[row.met])
     Console(width=140).print(table)
 

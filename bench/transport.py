@@ -2,8 +2,9 @@
 
 Ours is what nodes use: one checked frame, publish/subscribe without loss, arrival and departure watched. Plain is the
 least that pyzmq needs for the same arrays: XPUB with NODROP, a msgpack header and one part an array, no copy on either
-side and no check. Both run at the same time in the same two processes, message by message in turns, so that whatever
-else the machine does meets both. Latency runs from before packing to after unpacking, at a rate that leaves no queue.
+side and no check. Both run at the same time in the same two processes, message by message or burst by burst in turns,
+so that whatever else the machine does meets both. Latency runs from before packing to after unpacking, at a rate that
+leaves no queue. All is measured in rounds: a figure is the median of the rounds', with their spread.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import socket
+import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,7 +25,7 @@ import msgpack
 import numpy as np
 import zmq
 
-from bench.table import Row, at_most, main
+from bench.table import Row, main, timed
 from msgs import End, Frame, GroundTruth
 from nodes.transport import Publisher, ReliableReader, shut_down, wait
 
@@ -32,7 +35,7 @@ BUFFER = 8  # messages, of both
 FRESH = 32  # images sent in turns: a source gives each once, so none waits in a cache
 GOAL = 1.5  # times plain pyzmq
 WARM_UP = 10  # first messages that do not count: they wake connections and fill caches
-ROUNDS = 20  # of the throughput, short ones; the best counts: other work on the machine only ever slows
+BURSTS = 9  # of the throughput in a round
 
 
 def samples() -> dict[str, Callable[[int, float], Sample]]:
@@ -127,78 +130,108 @@ def in_turn(ways: Sequence[T], index: int) -> Iterable[T]:
     return ways if index % 2 == 0 else reversed(ways)
 
 
-def _read(addresses: tuple[str, str], kind: type, counts: tuple[int, int], results: Connection) -> None:
-    """The reading process: seconds of each message by way, then seconds for all messages by way."""
+@dataclass(frozen=True)
+class Amount:
+    rounds: int
+    messages: int  # of each way in a round, for the latency
+    burst: int  # messages, for the throughput
+
+
+@dataclass(frozen=True)
+class Round:
+    """Of ours and of plain, measured in turns."""
+
+    latencies: list[np.ndarray]  # s
+    rates: list[list[float]]  # messages a second of each burst
+
+    def latency(self, quantile: float) -> tuple[float, float]:
+        ours, plain = (float(np.quantile(seconds, quantile)) for seconds in self.latencies)
+        return ours, plain
+
+    def rate(self) -> tuple[float, float]:
+        return statistics.median(self.rates[0]), statistics.median(self.rates[1])
+
+    def times_faster(self) -> float:
+        """Plain, by pairs of bursts that followed each other."""
+        return statistics.median(plain / ours for ours, plain in zip(*self.rates, strict=True))
+
+
+def _read(addresses: tuple[str, str], kind: type, amount: Amount, results: Connection) -> None:
+    """The reading process: in each round seconds of each message by way, then seconds of each burst by way."""
     ways: tuple[OursIn | PlainIn, ...] = (OursIn(addresses[0], kind), PlainIn(addresses[1], kind))
-    latencies: tuple[list[float], list[float]] = ([], [])
-    for index in range(counts[0]):
-        for way, seconds in in_turn(list(zip(ways, latencies, strict=True)), index):
-            sent = way.receive()
-            seconds.append(time.monotonic() - sent)
-    results.send(latencies)
-    for _ in range(ROUNDS):
-        for way in ways:
-            results.recv()
-            results.send("ready")
-            way.receive()
-            start = time.monotonic()
-            for _ in range(counts[1] - 1):
+    for number in range(amount.rounds):
+        latencies: tuple[list[float], list[float]] = ([], [])
+        for index in range(amount.messages + (WARM_UP if number == 0 else 0)):
+            for way, seconds in in_turn(list(zip(ways, latencies, strict=True)), index):
+                sent = way.receive()
+                seconds.append(time.monotonic() - sent)
+        results.send(latencies)
+        for burst in range(BURSTS):
+            for way in in_turn(ways, burst):
+                results.recv()
+                results.send("ready")
                 way.receive()
-            results.send(time.monotonic() - start)
+                start = time.monotonic()
+                for _ in range(amount.burst - 1):
+                    way.receive()
+                results.send(time.monotonic() - start)
     for way in ways:
         way.close()
     shut_down()
 
 
-def measure_pair(
-    addresses: tuple[str, str], sample: Callable[[int, float], Sample], counts: tuple[int, int]
-) -> tuple[list[np.ndarray], list[float]]:
-    """Latencies in s of ours and of plain, and the messages per second of both."""
+def measure_pair(addresses: tuple[str, str], sample: Callable[[int, float], Sample], amount: Amount) -> list[Round]:
+    """The same messages by ours and by plain."""
     context = multiprocessing.get_context("spawn")
     ours_end, their_end = context.Pipe()
-    process = context.Process(target=_read, args=(addresses, type(sample(0, 0.0)), counts, their_end))
+    process = context.Process(target=_read, args=(addresses, type(sample(0, 0.0)), amount, their_end))
     process.start()
     ways: tuple[OursOut | PlainOut, ...] = (OursOut(addresses[0]), PlainOut(addresses[1]))
     gap = 0.004 + sample(0, 0.0).image.nbytes * 2e-9  # s between messages: several times what one takes
-    for index in range(counts[0]):
-        for way in in_turn(ways, index):
-            time.sleep(gap)
-            way.send(sample(index, time.monotonic()))
-    latencies = [np.array(seconds[WARM_UP:]) for seconds in ours_end.recv()]
-    rates = [0.0, 0.0]
-    for _ in range(ROUNDS):
-        for i, way in enumerate(ways):
-            ours_end.send("go")
-            ours_end.recv()
-            for index in range(counts[1]):
+    rounds = []
+    for number in range(amount.rounds):
+        unseen = WARM_UP if number == 0 else 0
+        for index in range(amount.messages + unseen):
+            for way in in_turn(ways, index):
+                time.sleep(gap)
                 way.send(sample(index, time.monotonic()))
-            rates[i] = max(rates[i], (counts[1] - 1) / ours_end.recv())
+        latencies = [np.array(seconds[unseen:]) for seconds in ours_end.recv()]
+        rates: list[list[float]] = [[], []]
+        for burst in range(BURSTS):
+            for way, found in in_turn(list(zip(ways, rates, strict=True)), burst):
+                ours_end.send("go")
+                ours_end.recv()
+                for index in range(amount.burst):
+                    way.send(sample(index, time.monotonic()))
+                found.append((amount.burst - 1) / ours_end.recv())
+        rounds.append(Round(latencies, rates))
     for way in ways:
         way.close()
     process.join()
-    return latencies, rates
+    return rounds
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     rows: list[Row] = []
-    counts = (50, 30) if options.quick else (500, 100)
+    amount = Amount(3, 50, 30) if options.quick else Amount(7, 200, 100)
     for transport in ("ipc", "tcp"):
         for name, sample in samples().items():
             with tempfile.TemporaryDirectory(prefix="mvsgs-") as folder:
-                latencies, rates = measure_pair(_addresses(transport, Path(folder)), sample, counts)
+                rounds = measure_pair(_addresses(transport, Path(folder)), sample, amount)
             megabytes = sum(v.nbytes for v in vars(sample(0, 0.0)).values() if isinstance(v, np.ndarray)) / 1e6
             title = f"{transport}, {name}"
             for label, quantile in (("median", 0.5), ("99th percentile", 0.99)):
-                ours, plain = (float(np.quantile(seconds, quantile)) for seconds in latencies)
+                pairs = [each.latency(quantile) for each in rounds]
                 rows += [
-                    Row(f"{title}: latency, {label}", ours * 1e3, "ms"),
-                    Row(f"{title}: latency, {label}, plain pyzmq", plain * 1e3, "ms"),
-                    at_most(f"{title}: latency, {label}, ratio", ours / plain, "x", GOAL),
+                    timed(f"{title}: latency, {label}", [1e3 * ours for ours, _ in pairs], "ms"),
+                    timed(f"{title}: latency, {label}, plain pyzmq", [1e3 * plain for _, plain in pairs], "ms"),
+                    timed(f"{title}: latency, {label}, ratio", [o / p for o, p in pairs], "x", most=GOAL),
                 ]
+            rates = [each.rate() for each in rounds]
             rows += [
-                Row(f"{title}: throughput", rates[0] * megabytes, "MB/s"),
-                Row(f"{title}: throughput, plain pyzmq", rates[1] * megabytes, "MB/s"),
-                at_most(f"{title}: throughput, plain / ours", rates[1] / rates[0], "x", GOAL),
+                timed(f"{title}: throughput", [megabytes * ours for ours, _ in rates], "MB/s"),
+                timed(f"{title}: throughput, plain pyzmq", [megabytes * plain for _, plain in rates], "MB/s"),
+                timed(f"{title}: throughput, plain / ours", [e.times_faster() for e in rounds], "x", most=GOAL),
             ]
     shut_down()
     return rows
