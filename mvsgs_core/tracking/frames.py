@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -12,6 +12,9 @@ from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.flow import Matches
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.localization import localize
+from mvsgs_core.tracking.sample import restored, sample
+
+AGREEMENT = 0.7  # of a frame's points, all of which agreed once: fewer after the map's corrections, and it is lost
 
 
 class State(IntEnum):
@@ -23,17 +26,28 @@ class State(IntEnum):
     DEGENERATE = 3
 
 
-@dataclass
+@dataclass(slots=True)
 class FrameRecord:
-    """A frame's state and its matches with one keyframe."""
+    """A frame's state and where it was seen from one keyframe; about a kilobyte, kept for every frame of the stream."""
 
     index: int
     timestamp: float  # seconds
     state: State
-    reference: int | None = None  # keyframe
-    matches: Matches | None = None  # of the reference's points; None: it stands where the frame `same_as` stands
+    reference: int | None = None  # keyframe that the frame's pose was found against; None: no pose, or as `same_as`
+    points: bytes = b""  # of its matches, see sample.py
+    cam_from_reference: bytes = b""  # (4, 4) float32: where the search for the pose begins
     same_as: int | None = None  # frame that this one did not move against
-    cam_from_reference: np.ndarray = field(default_factory=lambda: np.eye(4))  # (4, 4)
+
+    def follow(self, graph: KeyframeGraph, reference: int, matches: Matches, cam_from_world: np.ndarray) -> None:
+        """Keeps what gives the frame's pose (4, 4) again, from its matches of a keyframe's points."""
+        self.reference, self.same_as = reference, None
+        self.points = sample(graph, reference, matches, cam_from_world)
+        relative = cam_from_world @ graph.world_from_cam(reference)
+        self.cam_from_reference = relative.astype(np.float32).tobytes()
+
+    def forget(self) -> None:
+        """The frame has no pose."""
+        self.reference, self.same_as, self.points, self.cam_from_reference = None, None, b"", b""
 
 
 @dataclass(frozen=True)
@@ -46,12 +60,6 @@ class Path:
     keyframe: np.ndarray  # (N,) bool
     state: np.ndarray  # (N,) uint8
     segment: np.ndarray  # (N,) int32
-
-
-def compact(matches: Matches) -> Matches:
-    """The same in a third of the memory: kept for every frame."""
-    shift = None if matches.shift is None else matches.shift.astype(np.float16)
-    return Matches(matches.target.astype(np.float32), matches.weight.astype(np.float16), shift)
 
 
 def solve_path(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver) -> Path:
@@ -72,17 +80,18 @@ def solve_path(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver)
             other = place[record.same_as]
             poses[k], segment[k], state[k] = poses[other], segment[other], state[other]
             continue
-        if record.reference not in graph.keyframes or record.matches is None or record.state == State.LOST:
+        if record.reference is None or record.reference not in graph.keyframes:
+            state[k] = State.NOT_STARTED if state[k] == State.NOT_STARTED else State.LOST
             continue
-        assert record.reference is not None
-        start = record.cam_from_reference @ graph.keyframes[record.reference].cam_from_world
-        found = localize(graph, {record.reference: record.matches}, start, solver)
-        if found.failure or found.inliers < 0.4:
+        reference = graph.keyframes[record.reference]
+        relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
+        matches = restored(record.points, len(reference.inverse_depth))
+        found = localize(graph, {record.reference: matches}, relative @ reference.cam_from_world, solver)
+        if found.failure or found.inliers < AGREEMENT:
             state[k] = State.LOST
             continue
-        poses[k] = geometry.inverse(found.cam_from_world)
-        segment[k] = graph.keyframes[record.reference].segment
-        if state[k] == State.NOT_STARTED:
+        poses[k], segment[k] = geometry.inverse(found.cam_from_world), reference.segment
+        if state[k] != State.DEGENERATE:
             state[k] = State.TRACKED
     return Path(
         index=np.array([r.index for r in records], np.int64).reshape(n),
@@ -94,4 +103,4 @@ def solve_path(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver)
     )
 
 
-__all__ = ["FrameRecord", "Path", "State", "compact", "solve_path"]
+__all__ = ["FrameRecord", "Path", "State", "solve_path"]

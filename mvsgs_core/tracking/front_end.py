@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mvsgs_core import geometry
 from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.flow import DenseInverseSearch, Matches, sample_field, spread
 from mvsgs_core.tracking.graph import KeyframeGraph
@@ -111,14 +110,6 @@ class FrontEnd:
         """flow: share of the width that the image must have moved."""
         assert self.reference is not None
         return step.flow > flow * self.reference.size[1] or step.share < self.config.keyframe_share
-
-    def cam_from_reference(self, step: Step) -> np.ndarray:
-        """(4, 4) identity before the start."""
-        if step.localization is None or self.reference is None:
-            return np.eye(4)
-        return step.localization.cam_from_world @ geometry.inverse(
-            self.graph.keyframes[self.reference.index].cam_from_world
-        )
 
     def _set_velocity(self, image: TrackingImage, field: np.ndarray) -> None:
         """Image velocity from the flow since the last frame, for the rolling shutter."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import cv2
@@ -44,6 +44,10 @@ class TrackingImage:
             resized = resize_image(image, size)
         gray = cv2.cvtColor(resized, cv2.COLOR_RGB2GRAY)
         return TrackingImage(index, timestamp, gray, resized if color else None)
+
+    def bare(self) -> TrackingImage:
+        """The same with nothing computed yet: what is kept of a frame that may not be needed again."""
+        return replace(self, _features=None)
 
     @property
     def size(self) -> tuple[int, int]:

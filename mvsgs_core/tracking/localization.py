@@ -22,12 +22,14 @@ class Localization:
     failure: str = ""
 
 
+INLIER = 2.0  # pixels: a match that is further from where the pose puts it does not agree with it
+
+
 def localize(
     graph: KeyframeGraph,
     matches: dict[int, Matches],
     start: np.ndarray,
     solver: Solver,
-    inlier_pixels: float = 2.0,
 ) -> Localization:
     """The pose (4, 4) that explains where the points of keyframes (by index) were found, from a start near it.
 
@@ -63,9 +65,15 @@ def localize(
     error = np.where(z > 0, np.linalg.norm(pixels - target, axis=1), np.inf)[used]
     if len(error) == 0:
         return Localization(start, 0.0, 0, np.inf, "no match has a known depth")
-    return Localization(
-        pose, float(np.mean(error < inlier_pixels)), len(error), float(np.median(error)), solution.failure
-    )
+    return Localization(pose, float(np.mean(error < INLIER)), len(error), float(np.median(error)), solution.failure)
+
+
+def located(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: np.ndarray) -> np.ndarray:
+    """Which points of keyframe `index` were found where a camera (4, 4) should see them: (M,) bool."""
+    expected, _ = graph.predict_pose(index, cam_from_world)
+    with np.errstate(invalid="ignore"):
+        apart = np.linalg.norm(expected - _unrolled(matches, graph.readout), axis=1)
+    return np.asarray(matches.alive & (apart < INLIER))
 
 
 def _unrolled(matches: Matches, readout: float) -> np.ndarray:
@@ -73,4 +81,4 @@ def _unrolled(matches: Matches, readout: float) -> np.ndarray:
     return matches.target if matches.shift is None else matches.target - readout * matches.shift
 
 
-__all__ = ["Localization", "localize"]
+__all__ = ["INLIER", "Localization", "localize", "located"]

@@ -12,7 +12,8 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.pose_graph import SimilarityEdges, scale_of, solve_pose_graph
 from mvsgs_core.tracking.retrieval import Retrieval
-from mvsgs_core.tracking.sighting import Sighting, SightingCriteria, relative_scale, sight
+from mvsgs_core.tracking.sighting import Sighting, relative_scale, sight
+from mvsgs_core.tracking.verification import Criteria
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class LoopConfig:
     candidates: int = 2  # keyframes that are looked at, for each new one
     apart: int = 10  # keyframes: nearer ones are no loop
     agreement: float = 0.03  # of depth, radians, half of the scale: below, the map is right and only gains an edge
-    criteria: SightingCriteria = field(default_factory=SightingCriteria)
+    criteria: Criteria = field(default_factory=Criteria)
 
 
 @dataclass(frozen=True)

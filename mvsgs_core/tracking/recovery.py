@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from mvsgs_core.tracking.frames import FrameRecord, State, compact
+from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matcher import Matcher
 from mvsgs_core.tracking.retrieval import Retrieval
-from mvsgs_core.tracking.sighting import Sighting, SightingCriteria, sight
+from mvsgs_core.tracking.sighting import Sighting, sight
+from mvsgs_core.tracking.verification import Criteria, verified
 
 
 @dataclass(frozen=True)
 class RecoveryConfig:
     candidates: int = 3  # keyframes that a lost frame is compared with
     patience: int = 6  # lost frames in a row after which a new segment begins
-    kept: int = 400  # images of frames without a pose, for another try in the end
-    criteria: SightingCriteria = field(default_factory=SightingCriteria)
+    kept: int = 400  # images of frames without a pose, for another try in the end; the oldest goes first
+    criteria: Criteria = field(default_factory=Criteria)
 
 
 class Recovery:
@@ -48,8 +50,9 @@ class Recovery:
 
     def keep(self, frame: TrackingImage) -> None:
         """The image of a frame that has no pose (yet)."""
-        if len(self._kept) < self.config.kept:
-            self._kept[frame.index] = frame
+        self._kept[frame.index] = frame.bare()
+        if len(self._kept) > self.config.kept:
+            del self._kept[next(iter(self._kept))]
 
     def lost(self, frame: TrackingImage) -> Sighting | None:
         """One more lost frame: where it was found, if it was."""
@@ -70,40 +73,44 @@ class Recovery:
     def fill_in(self, records: list[FrameRecord]) -> int:
         """Frames without a pose, followed backward from the next keyframe and forward from the one before.
 
-        Returns how many were found.
+        Each is verified; returns how many were found.
         """
         found = 0
-        keyframes = sorted(self.graph.keyframes)
         for forward in (False, True):
+            start: int | None = None  # the keyframe that was passed last
             run: list[FrameRecord] = []
-            for record in records if forward else reversed(records):
-                if self._has_pose(record):
-                    run = []
+            for record in [*(records if forward else reversed(records)), None]:
+                if record is not None and not self._has_pose(record):
+                    run.append(record)
                     continue
-                run.append(record)
-                image = self._kept.get(record.index)
-                around = [k for k in keyframes if (k < record.index) == forward and k != record.index]
-                if image is None or not around:
-                    continue
-                if len(run) == 1:
-                    follower = FrontEnd(self.graph, self.matcher, self.front_end_config, 1)
-                    start = self.graph.keyframes[max(around) if forward else min(around)]
-                    follower.refer_to(start.image)
-                    follower.pose = start.cam_from_world
-                assert follower.reference is not None
-                step = follower.follow(image, True)
-                if step.still or follower.is_lost(step) or step.localization is None:
-                    continue
-                record.reference, record.matches = follower.reference.index, compact(step.matches)
-                record.cam_from_reference = follower.cam_from_reference(step)
-                record.state, record.same_as = State.TRACKED, None
+                if run and start is not None:
+                    found += self._follow(start, run)
+                run = []
+                if record is not None and record.index in self.graph.keyframes:
+                    start = record.index
+        return found
+
+    def _follow(self, start: int, run: Iterable[FrameRecord]) -> int:
+        """One run of frames without a pose, from the keyframe at its side; returns how many were found."""
+        follower = FrontEnd(self.graph, self.matcher, self.front_end_config, 1)
+        follower.refer_to(self.graph.keyframes[start].image)
+        follower.pose = self.graph.keyframes[start].cam_from_world
+        found = 0
+        for record in run:
+            image = self._kept.get(record.index)
+            if image is None:
+                continue
+            step = follower.follow(image, True)
+            if follower.is_lost(step) or step.localization is None:
+                continue
+            if verified(self.graph, start, step.matches, step.localization, self.config.criteria):
+                record.follow(self.graph, start, step.matches, step.localization.cam_from_world)
                 found += 1
+            image.release()
         return found
 
     def _has_pose(self, record: FrameRecord) -> bool:
-        if record.index in self.graph.keyframes or record.same_as is not None:
-            return True
-        return record.state != State.LOST and record.reference in self.graph.keyframes
+        return record.index in self.graph.keyframes or record.same_as is not None or record.reference is not None
 
 
 __all__ = ["Recovery", "RecoveryConfig"]

@@ -16,16 +16,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.localization import Localization, localize
 from mvsgs_core.tracking.matcher import Matcher
-
-
-@dataclass(frozen=True)
-class SightingCriteria:
-    """What makes it certain enough to move the map."""
-
-    share: float = 0.12  # of the keyframe's textured points, found
-    count: int = 50  # matches with known depth
-    inliers: float = 0.7  # of these, within 2 pixels of the pose
-    spread: float = 0.1  # of the image area: hull of the inliers
+from mvsgs_core.tracking.verification import Criteria, verified
 
 
 @dataclass(frozen=True)
@@ -38,15 +29,14 @@ class Sighting:
 
 
 def sight(
-    graph: KeyframeGraph, matcher: Matcher, index: int, image: TrackingImage, criteria: SightingCriteria
+    graph: KeyframeGraph, matcher: Matcher, index: int, image: TrackingImage, criteria: Criteria
 ) -> Sighting | None:
     """None where the keyframe's points are not found or no pose explains them."""
     keyframe = graph.keyframes[index]
     from_keyframe, in_image = match_features(keyframe.image, image, threshold=1.5)
     if len(from_keyframe) < 15:
         return None
-    height, width = image.size
-    guess = spread(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * width)
+    guess = spread(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * image.size[1])
     matches, share = matcher.match(keyframe.image, image, guess, 0.0)
     known = matches.alive & keyframe.triangulated
     if share < criteria.share or known.sum() < criteria.count:
@@ -70,10 +60,7 @@ def sight(
     relative = np.eye(4)
     relative[:3, :3], relative[:3, 3] = geometry.so3_exp(rotation.ravel()), translation.ravel()
     localization = localize(graph, {index: matches}, relative @ keyframe.cam_from_world, Solver(steps=10))
-    if localization.failure or localization.inliers < criteria.inliers or localization.count < criteria.count:
-        return None
-    hull = cv2.convexHull(matches.target[known].astype(np.float32))
-    if cv2.contourArea(hull) < criteria.spread * height * width:
+    if not verified(graph, index, matches, localization, criteria):
         return None
     return Sighting(index, matches, localization)
 
@@ -100,4 +87,4 @@ def relative_scale(graph: KeyframeGraph, sighting: Sighting, index: int) -> floa
     return float(np.median(ratio))
 
 
-__all__ = ["Sighting", "SightingCriteria", "relative_scale", "sight"]
+__all__ = ["Sighting", "relative_scale", "sight"]

@@ -10,51 +10,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
-from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
+from mvsgs_core.tracking.back_end import BackEnd
 from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.calibration import READOUT_AGAIN, Calibration
+from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.flow import make_flow
 from mvsgs_core.tracking.focal import FocalConfig
-from mvsgs_core.tracking.frames import FrameRecord, Path, State, compact, solve_path
-from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
+from mvsgs_core.tracking.frames import FrameRecord, Path, State, solve_path
+from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
-from mvsgs_core.tracking.known_ground import KnownGround, KnownGroundConfig
-from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
-from mvsgs_core.tracking.loop_closure import LoopCloser, LoopConfig
+from mvsgs_core.tracking.known_ground import KnownGround
+from mvsgs_core.tracking.local_map import LocalMap
+from mvsgs_core.tracking.loop_closure import LoopCloser
 from mvsgs_core.tracking.matcher import Matcher
 from mvsgs_core.tracking.publish import Correction, Publisher
-from mvsgs_core.tracking.recovery import Recovery, RecoveryConfig
+from mvsgs_core.tracking.recovery import Recovery
 from mvsgs_core.tracking.sighting import Sighting
-from mvsgs_core.tracking.starting import Starter, StartingConfig
-
-
-@dataclass(frozen=True)
-class TrackerConfig:
-    area: int = 320 * 240  # pixels of the tracker's image, same aspect as the input
-    flow: str = "lucas_kanade"  # mvsgs_core.tracking.flow.FLOWS, or module:Class
-    tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
-    loops: bool = True  # look for old keyframes by appearance
-    readout: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated
-    texture: float = 0.05  # share of the cells that must be textured for an image to be of any use
-    matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is told
-    threads: int = 1
-    device: str = "cpu"  # of the local and global bundle adjustment, see Solver; single frames stay on the CPU
-    front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
-    starting: StartingConfig = field(default_factory=StartingConfig)
-    local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
-    focal: FocalConfig = field(default_factory=FocalConfig)
-    loop: LoopConfig = field(default_factory=LoopConfig)
-    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
-    back_end: BackEndConfig = field(default_factory=BackEndConfig)
-    known_ground: KnownGroundConfig = field(default_factory=KnownGroundConfig)
+from mvsgs_core.tracking.starting import Starter
 
 
 @dataclass(frozen=True)
@@ -91,7 +71,7 @@ class Tracker:
         guessed: the focal length is to be estimated; keyframes are told when it is settled, see `focal_factor`.
         """
         if self.graph is None:
-            self._set_up(image.shape[0], image.shape[1], intrinsics, guessed)
+            self.set_up(image.shape[0], image.shape[1], intrinsics, guessed)
         here = scale_intrinsics(intrinsics, (image.shape[0], image.shape[1]), self.size)
         if not np.allclose(here, self.intrinsics, rtol=1e-3):
             self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
@@ -113,9 +93,6 @@ class Tracker:
         if self.front_end.is_lost(step):
             return self._lose(frame, record)
         self.recovery.found_again()
-        record.reference = self.front_end.reference.index
-        record.matches = compact(step.matches)
-        record.cam_from_reference = self.front_end.cam_from_reference(step)
         return self._go_on(frame, step, record) if self.started else self._wait(frame, step, record)
 
     @property
@@ -172,7 +149,7 @@ class Tracker:
         assert self.graph is not None
         return self.graph.keyframes[index]
 
-    def _set_up(self, height: int, width: int, intrinsics: np.ndarray, guessed: bool) -> None:
+    def set_up(self, height: int, width: int, intrinsics: np.ndarray, guessed: bool) -> None:
         config = self.config
         self.size = tracking_size(height, width, config.area)
         self.intrinsics = scale_intrinsics(intrinsics, (height, width), self.size)
@@ -247,6 +224,7 @@ class Tracker:
         record.state = State.TRACKED
         pose = step.localization.cam_from_world
         reference = self.front_end.reference.index
+        record.follow(self.graph, reference, step.matches, pose)
         limit = self.known_ground.limit(reference, self.config.front_end.keyframe_flow)
         if not self.front_end.wants_keyframe(step, limit) or self._known_here(frame, pose, reference):
             return Update(State.TRACKED)
@@ -329,7 +307,7 @@ class Tracker:
     def _lose(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The frame could not be matched: look for it in the map, else begin anew."""
         record.state = State.LOST if self.started else State.NOT_STARTED
-        record.reference = record.matches = None
+        record.forget()
         if frame.cells.textured.mean() < self.config.texture:
             self.stats.count("frames without texture")
             return Update(record.state)
@@ -360,8 +338,8 @@ class Tracker:
         self.front_end.resume(keyframe.image, frame, sighting.matches, sighting.localization.cam_from_world)
         self.recovery.found_again()
         self.stats.count("relocalized")
-        record.state, record.reference = State.TRACKED, sighting.index
-        record.matches = compact(sighting.matches)
+        record.state = State.TRACKED
+        record.follow(self.graph, sighting.index, sighting.matches, sighting.localization.cam_from_world)
         return Update(State.TRACKED)
 
     def _force_start(self) -> Iterator[Update]:

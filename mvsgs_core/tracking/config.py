@@ -1,0 +1,38 @@
+"""What can be set of the tracker, its parts' settings among it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mvsgs_core.tracking.back_end import BackEndConfig
+from mvsgs_core.tracking.focal import FocalConfig
+from mvsgs_core.tracking.front_end import FrontEndConfig
+from mvsgs_core.tracking.known_ground import KnownGroundConfig
+from mvsgs_core.tracking.local_map import LocalMapConfig
+from mvsgs_core.tracking.loop_closure import LoopConfig
+from mvsgs_core.tracking.recovery import RecoveryConfig
+from mvsgs_core.tracking.starting import StartingConfig
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    area: int = 320 * 240  # pixels of the tracker's image, same aspect as the input
+    flow: str = "lucas_kanade"  # mvsgs_core.tracking.flow.FLOWS, or module:Class
+    tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
+    loops: bool = True  # look for old keyframes by appearance
+    readout: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated
+    texture: float = 0.05  # share of the cells that must be textured for an image to be of any use
+    matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is told
+    threads: int = 1
+    device: str = "cpu"  # of the local and global bundle adjustment, see Solver; single frames stay on the CPU
+    front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
+    starting: StartingConfig = field(default_factory=StartingConfig)
+    local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
+    focal: FocalConfig = field(default_factory=FocalConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    back_end: BackEndConfig = field(default_factory=BackEndConfig)
+    known_ground: KnownGroundConfig = field(default_factory=KnownGroundConfig)
+
+
+__all__ = ["TrackerConfig"]

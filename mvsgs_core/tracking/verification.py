@@ -1,0 +1,44 @@
+"""Whether a pose is known: a keyframe's triangulated points are found where it says they are, enough and widely spread.
+
+The same is asked of a lost camera that was found again, of an old keyframe that closes a loop, and of frames that were
+posed afterwards: a pose that only matches of a guess or points of unknown depth speak for is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.localization import Localization, located
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """What makes a pose certain."""
+
+    share: float = 0.12  # of the keyframe's textured points, found
+    count: int = 50  # matches with known depth
+    inliers: float = 0.7  # of these, within 2 pixels of the pose
+    spread: float = 0.1  # of the image area: hull of the inliers
+
+
+def verified(graph: KeyframeGraph, index: int, matches: Matches, found: Localization, criteria: Criteria) -> bool:
+    """Whether the matches of the points of keyframe `index` verify the pose that was found from them."""
+    keyframe = graph.keyframes[index]
+    known = matches.alive & keyframe.triangulated
+    share = matches.alive.sum() / max(1, keyframe.image.cells.textured.sum())
+    if found.failure or share < criteria.share or known.sum() < criteria.count:
+        return False
+    agree = known & located(graph, index, matches, found.cam_from_world)
+    if agree.sum() < criteria.inliers * known.sum():
+        return False
+    height, width = keyframe.image.size
+    hull = cv2.convexHull(matches.target[agree].astype(np.float32))
+    return bool(cv2.contourArea(hull) >= criteria.spread * height * width)
+
+
+__all__ = ["Criteria", "verified"]

@@ -1,0 +1,87 @@
+"""Frames that had no pose when they came: found in the end where the map verifies them, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.datasets import Item, open_dataset
+from mvsgs_core.tracking.config import TrackerConfig
+from mvsgs_core.tracking.frames import FrameRecord, State
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.recovery import RecoveryConfig
+from mvsgs_core.tracking.tracker import Tracker
+from tests.core.tracking.sequences import synthetic, track
+from tests.shared_data import shared
+
+
+def covered(items: list[Item], noisy: range, black: range) -> list[Item]:
+    """Images of noise, which are textured, and black ones, which are not."""
+    random = np.random.default_rng(0)
+    result = list(items)
+    for n in noisy:
+        image = random.integers(0, 256, items[n].image.shape, np.uint8)
+        result[n] = replace(items[n], image=image)
+    for n in black:
+        result[n] = replace(items[n], image=np.zeros_like(items[n].image))
+    return result
+
+
+def test_a_lost_run_that_begins_with_black_frames_does_not_end_the_tracker() -> None:
+    items = covered(list(synthetic(frames=80)), range(44, 47), range(47, 50))[:60]
+    _, path, _ = track(items)
+    known = np.isfinite(path.world_from_cam).all(axis=(1, 2))
+    assert known[:44].all()
+    assert not known[44:50].any()
+    assert known[51:].all()
+    assert (path.state[44:50] == State.LOST).all()
+
+
+def test_each_lost_run_is_followed_from_its_own_keyframes() -> None:
+    """The second run's first frame has no image: it must not go on from where the first run was followed to."""
+    items = covered(list(synthetic(frames=80)), range(30, 32), range(0))
+    items = covered(items, range(47, 49), range(49, 51))[:62]
+    _, path, _ = track(items)
+    known = np.isfinite(path.world_from_cam).all(axis=(1, 2))
+    lost = [*range(30, 32), *range(47, 51)]
+    assert not known[lost].any()
+    truth = np.stack([np.asarray(i.world_from_cam) for i in items])
+    scale, rotation, shift = geometry.umeyama(path.world_from_cam[known, :3, 3], truth[known, :3, 3])
+    errors = np.linalg.norm(
+        scale * path.world_from_cam[known, :3, 3] @ rotation.T + shift - truth[known, :3, 3], axis=1
+    )
+    assert errors.max() < 0.02, "meters"
+
+
+def test_only_the_newest_images_of_frames_without_a_pose_are_kept() -> None:
+    items = covered(list(synthetic(frames=80)), range(40, 52), range(0))[:60]
+    tracker, _, _ = track(items, TrackerConfig(recovery=RecoveryConfig(kept=5, patience=100)))
+    assert len(tracker.recovery._kept) == 5
+    assert min(tracker.recovery._kept) >= 40
+
+
+def test_frames_before_the_start_are_verified_or_have_no_pose() -> None:
+    """A car drives straight on: 12 frames before the first keyframe, what is found of it no longer tells where."""
+    before = 12
+    items = list(open_dataset("tum", path=shared("data/kitti_piece")))
+    tracker = Tracker()
+    tracker.set_up(items[0].image.shape[0], items[0].image.shape[1], items[0].intrinsics, False)
+    for item in items[:before]:  # as a start leaves them that was given up
+        tracker.records.append(FrameRecord(item.index, item.timestamp, State.NOT_STARTED))
+        tracker.recovery.keep(TrackingImage.of(item.index, item.timestamp, item.image, tracker.size, False))
+    for item in items[before:]:
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+    list(tracker.finish())
+    path = tracker.path()
+    known = np.isfinite(path.world_from_cam).all(axis=(1, 2))
+    np.testing.assert_array_equal(known, np.isin(path.state, (State.TRACKED, State.DEGENERATE)))
+    assert known[8:].all(), "what is verified is posed"
+    truth = np.stack([np.asarray(i.world_from_cam) for i in items])
+    scale, rotation, shift = geometry.umeyama(path.world_from_cam[path.keyframe, :3, 3], truth[path.keyframe, :3, 3])
+    errors = np.linalg.norm(
+        scale * path.world_from_cam[known, :3, 3] @ rotation.T + shift - truth[known, :3, 3], axis=1
+    )
+    assert errors.max() < 0.2, "meters: frames that nothing verified were up to 0.32 off"
+    assert any("have no pose" in warning for warning in tracker.stats.warnings)

@@ -1,0 +1,63 @@
+"""What is kept of a frame's matches: little, and enough."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.tracking.bundle_adjustment import Solver
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.frames import FrameRecord, State
+from mvsgs_core.tracking.localization import localize
+from mvsgs_core.tracking.sample import restored, sample
+from tests.core.tracking.sequences import tracked_room
+
+
+def matches_of(reference: int, frame: int) -> tuple[Matches, np.ndarray]:
+    """Noisy matches of a keyframe's points in another keyframe's image, and the pose that all of them give."""
+    tracker, _, _ = tracked_room()
+    graph = tracker.graph
+    assert graph is not None
+    expected, inside = graph.predict(reference, frame)
+    noise = np.random.default_rng(1).normal(0, 0.5, expected.shape)
+    weight = np.where(inside & graph.keyframes[reference].image.cells.textured, 1.0, 0.0)
+    matches = Matches(np.where(weight[:, None] > 0, expected + noise, np.nan), weight)
+    found = localize(graph, {reference: matches}, graph.keyframes[frame].cam_from_world, Solver(steps=8))
+    return matches, found.cam_from_world
+
+
+def test_a_few_points_give_the_pose_of_all() -> None:
+    tracker, _, _ = tracked_room()
+    graph = tracker.graph
+    assert graph is not None
+    reference, frame = sorted(graph.keyframes)[4:6]
+    matches, pose = matches_of(reference, frame)
+    few = restored(sample(graph, reference, matches, pose), len(matches.weight))
+    assert 20 <= few.alive.sum() <= 48
+    again = localize(graph, {reference: few}, pose, Solver(steps=8)).cam_from_world
+    plain = localize(
+        graph, {reference: Matches(matches.target, matches.weight * few.alive)}, pose, Solver(steps=8)
+    ).cam_from_world
+    off = np.linalg.norm(geometry.se3_log(again @ geometry.inverse(pose)))
+    assert off < 0.1 * np.linalg.norm(geometry.se3_log(plain @ geometry.inverse(pose)))
+
+
+def test_a_frame_needs_a_kilobyte() -> None:
+    tracker, _, _ = tracked_room()
+    graph = tracker.graph
+    assert graph is not None
+    reference, frame = sorted(graph.keyframes)[4:6]
+    matches, pose = matches_of(reference, frame)
+    tracemalloc.start()
+    try:
+        records = []
+        for n in range(1000, 1200):
+            record = FrameRecord(n, n / 30.0, State.TRACKED)
+            record.follow(graph, reference, matches, pose)
+            records.append(record)
+        size, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert size / len(records) < 1200, "bytes; all matches took 16,800"
