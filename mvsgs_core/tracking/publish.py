@@ -8,6 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
+from mvsgs_core.tracking.frames import State
+
 
 class Tracked(Protocol):
     """A keyframe as far as it is told."""
@@ -41,6 +43,15 @@ class Correction:
     segment: np.ndarray | None = None  # (K,) int32 part of the map that it belongs to now; None: there is only one
 
 
+@dataclass(frozen=True)
+class Update:
+    """What one frame changed."""
+
+    state: State
+    keyframes: tuple[int, ...] = ()  # indices of frames that became keyframes, in order
+    correction: Correction | None = None  # of keyframes told before
+
+
 @dataclass
 class _Told:
     world_from_cam: np.ndarray
@@ -60,6 +71,7 @@ class Publisher:
         self.graph = graph
         self.tolerance = tolerance
         self.segment_of = segment_of
+        self.held: list[int] = []  # keyframes that are not told yet
         self.highest_segment = 0  # that was ever told: a number is not given twice
         self._told: dict[int, _Told] = {}
 
@@ -75,6 +87,16 @@ class Publisher:
     @property
     def told(self) -> set[int]:
         return set(self._told)
+
+    def tell_all(self, indices: list[int], settled: bool) -> tuple[int, ...]:
+        """Keyframes that may go out now: these, and those held back before; none until the focal length is settled."""
+        self.held += indices
+        if not settled:
+            return ()
+        out, self.held = tuple(self.held), []
+        for index in out:
+            self.tell(index)
+        return out
 
     def corrections(self, everything: bool = False) -> Correction | None:
         """Every keyframe that moved noticeably, or joined another segment, since it was last told; None: none did."""
@@ -111,4 +133,4 @@ class Publisher:
         return float(np.median(told.inverse_depth[known] / keyframe.inverse_depth[known]))
 
 
-__all__ = ["Correction", "Keyframes", "Publisher", "Tracked"]
+__all__ = ["Correction", "Keyframes", "Publisher", "Tracked", "Update"]

@@ -80,8 +80,8 @@ class Recovery:
             start: int | None = None  # the keyframe that was passed last
             run: list[FrameRecord] = []
             for record in [*(records if forward else reversed(records)), None]:
-                if record is not None and not self._has_pose(record):
-                    run.append(record)
+                if record is not None and (record.same_as is not None or not self._has_pose(record)):
+                    run += [] if record.same_as is not None else [record]  # it stands where its model stands
                     continue
                 if run and start is not None:
                     found += self._follow(start, run)
@@ -110,7 +110,7 @@ class Recovery:
         return found
 
     def _has_pose(self, record: FrameRecord) -> bool:
-        return record.index in self.graph.keyframes or record.same_as is not None or record.reference is not None
+        return record.index in self.graph.keyframes or record.reference is not None
 
 
 __all__ = ["Recovery", "RecoveryConfig"]

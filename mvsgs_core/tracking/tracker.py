@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.back_end import BackEnd
@@ -27,23 +27,15 @@ from mvsgs_core.tracking.frames import FrameRecord, Path, State, solve_path
 from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
+from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
 from mvsgs_core.tracking.known_ground import KnownGround
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.loop_closure import LoopCloser
 from mvsgs_core.tracking.matcher import Matcher
-from mvsgs_core.tracking.publish import Correction, Publisher
+from mvsgs_core.tracking.publish import Publisher, Update
 from mvsgs_core.tracking.recovery import Recovery
 from mvsgs_core.tracking.sighting import Sighting
 from mvsgs_core.tracking.starting import Starter
-
-
-@dataclass(frozen=True)
-class Update:
-    """What one frame changed."""
-
-    state: State
-    keyframes: tuple[int, ...] = ()  # indices of frames that became keyframes, in order
-    correction: Correction | None = None  # of keyframes told before
 
 
 class Tracker:
@@ -60,7 +52,7 @@ class Tracker:
         self.segment = 0
         self.graph: KeyframeGraph | None = None
         self._since = 0  # frames since the last keyframe
-        self._held: list[int] = []  # keyframes that are not told yet: the focal length is not settled
+        self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
         self._path = solve_path([], KeyframeGraph(np.ones(4)), Solver())
 
     def add(
@@ -100,9 +92,11 @@ class Tracker:
         """Frames that may still become keyframes that are told: their images are needed until then."""
         if self.graph is None:
             return set()
+        waiting = set(self.starter.waiting) | set(self.publisher.held)
+        if self.started:
+            return waiting | set(self._tail)
         last = self.front_end.last  # the end of the stream may force a start with it
-        waiting = set(self.starter.waiting) | set(self._held)
-        return waiting | ({last.index} if last is not None and not self.started else set())
+        return waiting | (set() if last is None else {last.index})
 
     @property
     def focal_factor(self) -> float:
@@ -120,9 +114,11 @@ class Tracker:
             return
         if not self.started:
             yield from self._force_start()
+        else:
+            yield from self._end_with_a_keyframe()
         if self.started:
             self.calibration.estimate_readout(self.local_map.members(self.segment)[-40:])
-        if self._held:
+        if self.publisher.held:
             yield Update(State.TRACKED, self._settle())
         with self.stats.time("global bundle adjustment"):
             for segment in sorted({k.segment for k in self.graph.keyframes.values()}):
@@ -131,6 +127,7 @@ class Tracker:
             found = self.recovery.fill_in(self.records)
             self._path = solve_path(self.records, self.graph, Solver(steps=8, threads=self.config.threads))
         self.stats.count("frames posed in the end", found)
+        self.stats.count(HELD_OUT, sum(is_held_out(k.index) for k in self._keyframes()))
         if self.started:
             self.calibration.check(self.local_map.members(self.segment))
         self.stats.counts["matches"] = self.matcher.calls
@@ -161,6 +158,7 @@ class Tracker:
         self.flow = make_flow(config.flow)
         self.matcher = Matcher(self.flow)
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, config.threads)
+        self.choice = KeyframeChoice(config.front_end)
         self.starter = Starter(self.graph, self.matcher, config.starting, config.threads)
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, config.threads)
         self.loops = LoopCloser(self.graph, self.local_map, config.loop)
@@ -177,19 +175,24 @@ class Tracker:
             return Update(record.state)
         self.recovery.keep(frame)
         self.starter.add(frame, self.segment)
-        self.front_end.refer_to(frame)
+        self._refer_to(frame)
         self.front_end.pose = None
         self._since = 0
         return Update(record.state)
 
     def _wait(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """Before the start: keyframes are collected until they can be solved."""
+        assert self.front_end.reference is not None
         self.recovery.keep(frame)
-        if not self.front_end.wants_keyframe(step, self.starter.flow(self._since)):
+        reference, width = self.front_end.reference.index, frame.size[1]
+        if not self.choice.wants(frame.index, reference, step, width, self.starter.flow(self._since)):
+            if self.starter.waiting == [reference] and is_held_out(reference) and not is_held_out(frame.index):
+                self.starter.abandon()
+                return self._begin(frame, record)
             return Update(State.NOT_STARTED)
         with self.stats.time("start"):
             self.starter.add(frame, self.segment, step.matches)
-            self.front_end.refer_to(frame)
+            self._refer_to(frame)
             self._since = 0
             waiting = list(self.starter.waiting)
             started = self.starter.try_start(focal=self._unknown_focal())
@@ -226,10 +229,23 @@ class Tracker:
         reference = self.front_end.reference.index
         record.follow(self.graph, reference, step.matches, pose)
         limit = self.known_ground.limit(reference, self.config.front_end.keyframe_flow)
-        if not self.front_end.wants_keyframe(step, limit) or self._known_here(frame, pose, reference):
+        moved = self.front_end.wants_keyframe(step, limit)
+        wanted = self.choice.wants(frame.index, reference, step, frame.size[1], limit)
+        if moved and self._known_here(frame, pose, reference):
             return Update(State.TRACKED)
+        if not wanted:
+            self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
+            return Update(State.TRACKED)
+        return self._keyframe_of(frame, step, record) or self._lose(frame, record)
+
+    def _keyframe_of(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update | None:
+        """A tracked frame becomes a keyframe; None, and it is none, where the map contradicts its pose."""
+        assert self.graph is not None
+        assert record.reference is not None
+        assert step.localization is not None
         with self.stats.time("local map"):
-            self.local_map.insert(frame, pose, self.segment, {reference: step.matches})
+            pose = step.localization.cam_from_world
+            self.local_map.insert(frame, pose, self.segment, {record.reference: step.matches})
         with self.stats.time("local bundle adjustment"):
             solution = self.local_map.adjust_window(frame.index)
         if solution.failure:
@@ -237,7 +253,7 @@ class Tracker:
         if self.local_map.agreement(frame.index) < self.config.front_end.lost_inliers:
             self.graph.remove(frame.index)
             self.stats.count("keyframes taken back")
-            return self._lose(frame, record)
+            return None
         if self.graph.keyframes[frame.index].triangulated.mean() < 0.3 * frame.cells.textured.mean():
             record.state = State.DEGENERATE
             self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
@@ -250,24 +266,32 @@ class Tracker:
         self._close_loops(frame.index)
         for index in self.local_map.members(self.segment)[: -self.config.local_map.window]:
             self.graph.keyframes[index].image.release()
-        self.front_end.refer_to(frame)
+        self._refer_to(frame)
         self.front_end.pose = self.graph.keyframes[frame.index].cam_from_world
         correction = self.publisher.corrections()
         return Update(record.state, self._tell([frame.index]), correction)
 
+    def _end_with_a_keyframe(self) -> Iterator[Update]:
+        """The last frames show what no keyframe does: one of them becomes one."""
+        tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[1], t[0].size[1])}
+        last = newest(tail)
+        if last is not None:
+            record = next(r for r in reversed(self.records) if r.index == last)
+            update = self._keyframe_of(*tail[last], record)
+            if update is not None:
+                yield update
+
+    def _refer_to(self, image: TrackingImage) -> None:
+        """A new keyframe is followed from here on."""
+        self.front_end.refer_to(image)
+        self._tail = {}
+
     def _tell(self, keyframes: list[int]) -> tuple[int, ...]:
-        """Keyframes, and those held back before, if they may go out."""
-        self._held += keyframes
-        if not self.calibration.settled:
-            return ()
-        told, self._held = tuple(self._held), []
-        for index in told:
-            self.publisher.tell(index)
-        return told
+        return self.publisher.tell_all(keyframes, self.calibration.settled)
 
     def _settle(self) -> tuple[int, ...]:
         """Keyframes that were held back, with the focal length as far as it is known."""
-        self.calibration.settle(list(self._held))
+        self.calibration.settle(list(self.publisher.held))
         return self._tell([])
 
     def _unknown_focal(self) -> FocalConfig | None:
@@ -279,6 +303,7 @@ class Tracker:
             known = self.known_ground.find(frame, pose, reference)
         if known is None:
             return False
+        self._tail = {}
         image = self.keyframe(known.index).image
         self.front_end.resume(image, frame, known.matches, known.localization.cam_from_world)
         self.stats.skip("keyframes on known ground")
@@ -325,7 +350,7 @@ class Tracker:
         if self.recovery.hopeless:
             self.started = False
             self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self._keyframes()))
-            told = self._settle() if self._held else ()
+            told = self._settle() if self.publisher.held else ()
             return Update(self._begin(frame, record).state, told)
         return Update(record.state)
 
@@ -333,7 +358,7 @@ class Tracker:
         """Tracking goes on from a keyframe that was found in a frame."""
         assert self.graph is not None
         keyframe = self.graph.keyframes[sighting.index]
-        self.started = True
+        self.started, self._tail = True, {}
         self.segment = keyframe.segment
         self.front_end.resume(keyframe.image, frame, sighting.matches, sighting.localization.cam_from_world)
         self.recovery.found_again()
