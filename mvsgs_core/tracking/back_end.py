@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
@@ -54,6 +55,18 @@ class BackEnd:
             matched += 1
             self.local_map.match_edge(source, to)
         return matched
+
+    def put_right(self, segment: int, stats: Stats) -> None:
+        """At the end of the stream: edges matched again, found by proximity, then global bundle adjustment."""
+        members = self.local_map.members(segment)
+        if len(members) < 3:
+            return
+        for index in members:
+            stats.count("edges matched again", self.rematch_edges(index))
+            stats.count("edges by proximity", self.extend_edges(index, segment))
+        for solution in self.adjust(segment):
+            if solution.failure:
+                stats.warn(f"global bundle adjustment failed: {solution.failure}")
 
     def adjust(self, segment: int) -> list[Solution]:
         """Global bundle adjustment; the median depth of the segment is kept."""

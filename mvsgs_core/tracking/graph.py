@@ -94,12 +94,14 @@ class KeyframeGraph:
         at, inside = self.predict_pose(source, self.keyframes[to].cam_from_world)
         return at + self.readout * self.keyframes[to].image.shutter(at), inside
 
-    def predict_pose(self, source: int, cam_from_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same for a camera (4, 4) without a rolling shutter."""
+    def predict_pose(
+        self, source: int, cam_from_world: np.ndarray, at_infinity: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same for a camera (4, 4) without a rolling shutter; at_infinity: were the points infinitely far."""
         keyframe = self.keyframes[source]
         pixels, z = reproject(
             np.stack([keyframe.cam_from_world, cam_from_world]),
-            keyframe.inverse_depth[None],
+            keyframe.inverse_depth[None] * (0.0 if at_infinity else 1.0),
             self.pixels(source)[None],
             self.intrinsics,
             np.array([0]),

@@ -68,9 +68,14 @@ def localize(
     return Localization(pose, float(np.mean(error < INLIER)), len(error), float(np.median(error)), solution.failure)
 
 
-def located(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: np.ndarray) -> np.ndarray:
-    """Which points of keyframe `index` were found where a camera (4, 4) should see them: (M,) bool."""
-    expected, _ = graph.predict_pose(index, cam_from_world)
+def located(
+    graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: np.ndarray, at_infinity: bool = False
+) -> np.ndarray:
+    """Which points of keyframe `index` were found where a camera (4, 4) should see them: (M,) bool.
+
+    at_infinity: as if they all were that far away, so that the camera's rotation alone counts.
+    """
+    expected, _ = graph.predict_pose(index, cam_from_world, at_infinity)
     with np.errstate(invalid="ignore"):
         apart = np.linalg.norm(expected - _unrolled(matches, graph.readout), axis=1)
     return np.asarray(matches.alive & (apart < INLIER))

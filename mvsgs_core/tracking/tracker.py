@@ -122,17 +122,18 @@ class Tracker:
             yield Update(State.TRACKED, self._settle())
         with self.stats.time("global bundle adjustment"):
             for segment in sorted({k.segment for k in self.graph.keyframes.values()}):
-                self._adjust_globally(segment)
+                if set(self.local_map.members(segment)) <= self.publisher.told:
+                    self.back_end.put_right(segment, self.stats)
         with self.stats.time("frames without a pose"):
             found = self.recovery.fill_in(self.records)
             self._path = solve_path(self.records, self.graph, Solver(steps=8, threads=self.config.threads))
         self.stats.count("frames posed in the end", found)
-        self.stats.count(HELD_OUT, sum(is_held_out(k.index) for k in self._keyframes()))
+        self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.graph.keyframes))
         if self.started:
             self.calibration.check(self.local_map.members(self.segment))
         self.stats.counts["matches"] = self.matcher.calls
         self.stats.counts["matches that needed features"] = self.matcher.feature_calls
-        if not self._keyframes():
+        if not self.graph.keyframes:
             self.stats.warn(f"tracking never started: {self.starter.reason}")
         warn_of_gaps(self.stats, self._path)
         warn_of_few_matches(self.stats, self.graph, self.config.matches)
@@ -331,6 +332,7 @@ class Tracker:
 
     def _lose(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The frame could not be matched: look for it in the map, else begin anew."""
+        assert self.graph is not None
         record.state = State.LOST if self.started else State.NOT_STARTED
         record.forget()
         if frame.cells.textured.mean() < self.config.texture:
@@ -349,7 +351,7 @@ class Tracker:
             return self._begin(frame, record)
         if self.recovery.hopeless:
             self.started = False
-            self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self._keyframes()))
+            self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self.graph.keyframes.values()))
             told = self._settle() if self.publisher.held else ()
             return Update(self._begin(frame, record).state, told)
         return Update(record.state)
@@ -384,20 +386,6 @@ class Tracker:
             yield self._started(waiting, record)
         else:
             self.starter.abandon()
-
-    def _adjust_globally(self, segment: int) -> None:
-        members = self.local_map.members(segment)
-        if len(members) < 3 or not set(members) <= self.publisher.told:
-            return
-        for index in members:
-            self.stats.count("edges matched again", self.back_end.rematch_edges(index))
-            self.stats.count("edges by proximity", self.back_end.extend_edges(index, segment))
-        for solution in self.back_end.adjust(segment):
-            if solution.failure:
-                self.stats.warn(f"global bundle adjustment failed: {solution.failure}")
-
-    def _keyframes(self) -> list[Keyframe]:
-        return [] if self.graph is None else list(self.graph.keyframes.values())
 
 
 __all__ = ["Tracker", "TrackerConfig", "Update"]

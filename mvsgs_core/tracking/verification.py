@@ -1,7 +1,8 @@
 """Whether a pose is known: a keyframe's triangulated points are found where it says they are, enough and widely spread.
 
 The same is asked of a lost camera that was found again, of an old keyframe that closes a loop, and of frames that were
-posed afterwards: a pose that only matches of a guess or points of unknown depth speak for is none.
+posed afterwards: a pose that only points of unknown depth speak for is none. But of a camera that only turned nothing
+can be triangulated: a frame that a rotation alone explains, against such a keyframe, stands where that stands.
 """
 
 from __future__ import annotations
@@ -30,10 +31,13 @@ def verified(graph: KeyframeGraph, index: int, matches: Matches, found: Localiza
     """Whether the matches of the points of keyframe `index` verify the pose that was found from them."""
     keyframe = graph.keyframes[index]
     known = matches.alive & keyframe.triangulated
+    turned = keyframe.triangulated.sum() < criteria.count
+    if turned:
+        known = matches.alive
     share = matches.alive.sum() / max(1, keyframe.image.cells.textured.sum())
     if found.failure or share < criteria.share or known.sum() < criteria.count:
         return False
-    agree = known & located(graph, index, matches, found.cam_from_world)
+    agree = known & located(graph, index, matches, found.cam_from_world, at_infinity=turned)
     if agree.sum() < criteria.inliers * known.sum():
         return False
     height, width = keyframe.image.size

@@ -1,0 +1,71 @@
+"""Held-out frames are no keyframes where the next frame can be; the stream's last frames become one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core.held_out import is_held_out
+from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.front_end import FrontEndConfig, Step
+from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
+from tests.core.tracking.sequences import synthetic, track, tracked_room
+
+WIDTH, LIMIT = 320, 0.05  # a keyframe after 16 pixels
+
+
+def step(flow: float, share: float = 0.9) -> Step:
+    return Step(Matches(np.zeros((0, 2)), np.zeros(0)), share, flow, False, None)
+
+
+def chosen(flows: list[float], shares: list[float] | None = None, first: int = 1) -> list[int]:
+    """Frames that are wanted as keyframes, all of them seen from one reference."""
+    choice = KeyframeChoice(FrontEndConfig())
+    steps = [step(f, s) for f, s in zip(flows, shares or [0.9] * len(flows))]
+    return [n for n, s in enumerate(steps, start=first) if choice.wants(n, 0, s, WIDTH, LIMIT)]
+
+
+def test_a_held_out_frame_leaves_its_place_to_the_next() -> None:
+    assert chosen([4, 8, 12, 15, 18, 21]) == [6]
+    assert chosen([4, 8, 12, 17, 18, 21])[0] == 4
+
+
+def test_a_held_out_frame_stays_where_the_next_would_be_too_late() -> None:
+    assert chosen([15.9, 30.0], first=4)[0] == 5, "the next would have moved by 44 pixels"
+    assert chosen([5, 10], [0.8, 0.45], first=4)[0] == 5, "of the next, too few points would be found"
+    assert chosen([20.0], first=5) == [5], "wide steps: the next moves by 40"
+
+
+def test_the_newest_frame_that_is_not_held_out_ends_the_stream() -> None:
+    assert newest([]) is None
+    assert newest([18, 19]) == 19
+    assert newest([19, 20]) == 19
+    assert newest([20]) == 20
+
+
+def test_no_frame_of_the_room_that_is_held_out_is_mapped() -> None:
+    tracker, path, _ = tracked_room()
+    keyframes = path.index[path.keyframe].tolist()
+    assert not [k for k in keyframes if is_held_out(k)]
+    assert tracker.stats.counts[HELD_OUT] == 0
+    assert np.isfinite(path.world_from_cam).all()
+    assert keyframes[-1] == len(path.index) - 1, "the newest view"
+
+
+def test_frames_that_had_to_stay_are_counted() -> None:
+    items = [replace(i, index=n, timestamp=n / 20.0) for n, i in enumerate(synthetic(frames=80)[::5])]
+    tracker, path, _ = track(items)
+    stayed = [k for k in path.index[path.keyframe].tolist() if is_held_out(k)]
+    assert stayed, "one keyframe follows the other"
+    assert tracker.stats.counts[HELD_OUT] == len(stayed)
+
+
+def test_a_camera_that_comes_to_rest_makes_no_keyframe_in_the_end() -> None:
+    items = synthetic(frames=80)
+    moving = list(items[:41])
+    still = [replace(items[40], index=n, timestamp=n / 20.0) for n in range(41, 50)]
+    _, path, _ = track([*moving, *still])
+    last = path.index[path.keyframe].tolist()[-1]
+    assert last <= 40
+    assert last >= 39, "the newest view that is not held out, or the last frame before the rest"
