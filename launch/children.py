@@ -18,9 +18,10 @@ from nodes.signals import STARTING
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def python_path() -> str:
-    """PYTHONPATH of a node: the repository, the user's directory (for a node of theirs), then what was set."""
-    return os.pathsep.join(dict.fromkeys(p for p in (str(ROOT), str(Path.cwd()), os.environ.get("PYTHONPATH")) if p))
+def python_environment() -> dict[str, str]:
+    """Where a node's interpreter finds modules: in the repository and what PYTHONPATH names, not where it starts."""
+    named = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    return {"PYTHONPATH": os.pathsep.join(dict.fromkeys([str(ROOT), *named])), "PYTHONSAFEPATH": "1"}
 
 
 class Child:
@@ -46,7 +47,7 @@ class Child:
                 stderr=subprocess.STDOUT,
                 pass_fds=[pipe[1]],
                 start_new_session=True,
-                env={**os.environ, "PYTHONPATH": python_path(), "PYTHONUNBUFFERED": "1", **environment},
+                env={**os.environ, **python_environment(), "PYTHONUNBUFFERED": "1", **environment},
             )
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         os.close(pipe[1])

@@ -6,7 +6,6 @@ choices and edges all come from `conf/`.
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,6 +15,7 @@ from typing import Any, Literal
 import msgs
 import nodes
 from launch.parameters import GraphError, check_parameters, did_you_mean
+from mvsgs_core.named_modules import import_named
 
 # A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have. Where
 # some slot is their origin, an edge that misses them is an error all the same: corrections would be lost in silence.
@@ -181,7 +181,7 @@ def load_node(slot: str, target: str) -> type[nodes.Node]:
     """The node class `module.Class`. Raises GraphError where there is none."""
     module_name, _, class_name = target.rpartition(".")
     try:
-        module = importlib.import_module(module_name)
+        module = import_named(module_name)
     except ValueError:
         raise GraphError(f"{slot}._target_={target}: must be module.Class, as in nodes.tracker.Tracker") from None
     except ModuleNotFoundError as error:

@@ -5,28 +5,32 @@ From any directory. `--help` lists slots, choices and parameters; `-m` sweeps; `
 
 from __future__ import annotations
 
-import os
-import signal
+# ruff: noqa: E402, PTH100, PTH109, PTH118, PTH120
+import os  # this and sys are loaded already: nothing else is imported before the path is in order
 import sys
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+# The workspace first: `launch`, `nodes` and `msgs` are generic names. The current directory only where PYTHONPATH names
+# it: nothing that lies among a user's data may take a module's place (`mvsgs_core.named_modules` looks there, last).
+_NAMED = {os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path}
+_LEFT_OUT = {ROOT, os.path.join(ROOT, "launch"), ""} | ({os.getcwd()} - _NAMED)
+sys.path[:] = [ROOT] + [path for path in sys.path if path not in _LEFT_OUT]
+
+import signal
 from collections.abc import Sequence
 from pathlib import Path
-
-ROOT = Path(__file__).resolve().parent.parent
-# The workspace first (`launch`, `nodes` and `msgs` are generic names), then the user's directory with their own nodes.
-_FIRST = [str(ROOT), str(Path.cwd())]
-sys.path[:] = _FIRST + [path for path in sys.path if path not in (*_FIRST, str(ROOT / "launch"))]
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # before a run there is nothing to finish: no traceback of an import
 
-import hydra  # noqa: E402
-from hydra.core.hydra_config import HydraConfig  # noqa: E402
-from omegaconf import DictConfig  # noqa: E402
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
 
-from launch.children import python_path  # noqa: E402
-from launch.compose import CONF, prepare  # noqa: E402
-from launch.jobs import Job, run  # noqa: E402
-from launch.parameters import GraphError  # noqa: E402
+from launch.children import python_environment
+from launch.compose import CONF, prepare
+from launch.jobs import Job, run
+from launch.parameters import GraphError
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -36,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
     except GraphError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    os.environ["PYTHONPATH"] = python_path()  # Hydra's launchers start workers that need the workspace too
+    os.environ |= python_environment()  # Hydra's launchers start workers that need the workspace too
     codes: list[int] = []
 
     @hydra.main(version_base="1.3", config_path="conf", config_name="config")

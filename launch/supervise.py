@@ -23,7 +23,7 @@ from typing import Any
 
 import psutil
 
-from launch.children import Child, python_path
+from launch.children import Child, python_environment
 from launch.graph import Graph
 from launch.outcome import BY_SIGNAL, FAILED, Failure, Outcome, finished
 from launch.placement import thread_environment, thread_plan
@@ -88,7 +88,8 @@ class Supervisor:
                 write_spec(spec(self._graph, name, address, plan[name], None), path)
                 statuses[name].state = "external"
                 command = shlex.join([sys.executable, "-m", "nodes", str(path)])
-                self._screen.note(f"{name} is external: run it with\n  PYTHONPATH={python_path()} {command}")
+                environment = " ".join(f"{key}={shlex.quote(value)}" for key, value in python_environment().items())
+                self._screen.note(f"{name} is external: run it with\n  {environment} {command}")
                 continue
             if self._signals:
                 return  # stopped while starting: _watch acts on it

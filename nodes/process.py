@@ -8,7 +8,6 @@ and fail as well. SIGTERM ends it in the same way at the next safe point, with e
 
 from __future__ import annotations
 
-import importlib
 import logging
 import queue
 import random
@@ -27,6 +26,7 @@ import numpy as np
 
 import msgs
 from msgs import Message
+from mvsgs_core.named_modules import import_named
 from nodes import Node, is_source
 from nodes.addresses import PeerLost, load_keys
 from nodes.freed_memory import FreedMemory
@@ -68,7 +68,7 @@ def run(spec: Spec, signals: Signals) -> int:
 def load_node(target: str) -> type[Node]:
     """The class `module.Class`. Raises TypeError if it is no node, ImportError if it does not exist."""
     module, _, name = target.rpartition(".")
-    found = getattr(importlib.import_module(module), name, None) if module else None
+    found = getattr(import_named(module), name, None) if module else None
     if not (isinstance(found, type) and issubclass(found, Node)):
         raise TypeError(f"{target} is no node (a subclass of nodes.Node); give module.Class")
     return found

@@ -8,7 +8,6 @@ the configuration as "module:Class".
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -17,6 +16,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core import native
+from mvsgs_core.named_modules import import_named
 from mvsgs_core.tracking.features import match_features
 from mvsgs_core.tracking.image import BORDER, TrackingImage
 
@@ -183,7 +183,7 @@ def make_flow(name: str, **options: Any) -> Flow:
     module, _, attribute = path.partition(":")
     if not attribute:
         raise ValueError(f"no flow {name!r}: give one of {', '.join(FLOWS)}, or module:Class")
-    flow: Flow = getattr(importlib.import_module(module), attribute)(**options)
+    flow: Flow = getattr(import_named(module), attribute)(**options)
     return flow
 
 
