@@ -202,7 +202,7 @@ def test_the_launcher_says_where_the_page_is_and_sums_up_before_it_is_closed(tmp
         url = text[place:].split()[1]
         with urllib.request.urlopen(url, timeout=10) as answer:
             assert answer.status == 200
-        assert "keyframe **" in page(url)
+        assert "**finished**" in page(url)
         run.send_signal(signal.SIGINT)
         assert run.wait(10) == 0
         assert (tmp_path / "said").read_text().count("keyframes   PSNR") == 1
