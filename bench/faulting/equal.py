@@ -55,7 +55,7 @@ def _all(name: str, equal: int, pairs: int) -> Row:
 
 def _map(output: Path, overrides: tuple[str, ...]) -> bytes:
     """The bytes of the map that a run leaves. Raises CalledProcessError where it fails."""
-    command = [
+    command: list[str | Path] = [
         sys.executable, ROOT / "launch/run_all.py", f"output={output}", "device=cpu", "evaluator.max_frames=0",
         "tracker.threads=1", "mvs.threads=1", "depth_fusion.threads=1", "mapper.threads=1", "screen=off", *overrides,
     ]  # fmt: skip
