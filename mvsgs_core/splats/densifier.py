@@ -15,6 +15,7 @@ from mvsgs_core.splats.insertion import (
     InsertionConfig,
     Points,
     depth_colors,
+    near_points,
     outliers,
     points_from_depth,
     splats_from_points,
@@ -65,11 +66,13 @@ class Densifier:
         colors = self._colors(added, size)
         assert self.unit is not None
         points = points_from_depth(depth / self.unit, intrinsics, colors, view.normals, mask)
+        near = self._near(points)
+        points, standing_out = points.where(near), standing_out[mask][near]
         if occupancy and len(points):
             pose = added.local_from_cam
             positions = points.positions @ pose[:3, :3].T + pose[:3, 3]
             means = self.state.splats.means.detach().cpu().numpy()
-            free = unoccupied(positions, means, config.map_voxel * self.median_depth) | standing_out[mask]
+            free = unoccupied(positions, means, config.map_voxel * self.median_depth) | standing_out
             self.log.skip("points_occupied", int((~free).sum()))
             points = points.where(free)
         if config.voxel > 0 and len(points):
@@ -94,6 +97,7 @@ class Densifier:
         intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
         colors = self._colors(added, size)
         points = fill_points(depth, confidence, intrinsics, colors, empty, config.fill)
+        points = points.where(self._near(points))
         filled = self._append(points, added, config.fill_opacity)
         self.log.count("filled", filled)
         return filled
@@ -116,6 +120,12 @@ class Densifier:
         if not self.training.exposure:
             return colors
         return colors_of_map(colors, added.exposure.detach().cpu().numpy())
+
+    def _near(self, points: Points) -> np.ndarray:
+        near = near_points(points, self.config, self.median_depth)
+        if not near.all():
+            self.log.refuse("far_points", int((~near).sum()), "points too far away for the map's voxels were left out")
+        return near
 
     def _append(self, points: Points, added: TrainingView, opacity: float) -> int:
         """Makes splats of camera-frame points, as many as the map has room for; returns their number."""

@@ -16,6 +16,7 @@ from mvsgs_core.splats.densities import neutral_beta
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.spherical_harmonics import C0
 
+VOXELS = 1 << 21  # along an axis: what three of them in 63 bits can number
 CHUNK = 65536  # of the map's splats that are sorted into voxels at once, in float64
 
 
@@ -99,6 +100,16 @@ def points_from_depth(
     return Points(positions, chosen, image[mask].astype(np.float64), spacing)
 
 
+def near_points(points: Points, config: InsertionConfig, median_depth: float) -> np.ndarray:
+    """Camera-frame points (N,) bool that are near enough to be numbered by voxels, and for float32 to hold them.
+
+    One far pixel, a mismatch, would else be all that a view adds: its voxels are as many as the rest's are small.
+    """
+    edges = [edge for edge in (config.voxel, config.map_voxel) if edge > 0]
+    reach = min([1e6, *((VOXELS / 2 - 2) * edge for edge in edges)]) * median_depth
+    return np.asarray(np.linalg.norm(points.positions, axis=1) < reach)
+
+
 def voxel_filter(points: Points, edge: float) -> Points:
     """One point a voxel: the mean position, normal and color, and the side of the surface of all together.
 
@@ -106,9 +117,7 @@ def voxel_filter(points: Points, edge: float) -> Points:
     """
     if len(points) == 0:
         return points
-    cells = np.floor((points.positions - points.positions.min(axis=0)) / edge).astype(np.int64)
-    if cells.max() >= 1 << 21:
-        raise ValueError(f"voxels of {edge:g} are too small for points that span {cells.max() * edge:g}: enlarge voxel")
+    cells = _cells(points.positions, points.positions.min(axis=0), edge)
     keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
     _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
 
@@ -131,12 +140,13 @@ def unoccupied(positions: np.ndarray, means: np.ndarray, edge: float) -> np.ndar
     """Positions (N, 3) whose voxel of side `edge` holds none of the map's means (M, 3): (N,) bool.
 
     The surface there is in the map already, and what its color lacks is the optimization's to find. Without this a
-    noisy or blurred keyframe, which nothing explains to the decibel, lays a second skin over what is mapped.
+    noisy or blurred keyframe, which nothing explains to the decibel, lays a second skin over what is mapped. Raises
+    ValueError where the positions span more than 2^21 voxels along an axis.
     """
     if len(positions) == 0 or len(means) == 0:
         return np.ones(len(positions), dtype=bool)
     low = positions.min(axis=0)
-    cells = np.floor((positions - low) / edge).astype(np.int64)
+    cells = _cells(positions, low, edge)
     count = cells.max(axis=0) + 1
 
     def key(cell: np.ndarray) -> np.ndarray:
@@ -147,6 +157,14 @@ def unoccupied(positions: np.ndarray, means: np.ndarray, edge: float) -> np.ndar
         others = np.floor((some - low) / edge)
         taken.append(key(others[((others >= 0) & (others < count)).all(axis=1)].astype(np.int64)))
     return ~np.isin(key(cells), np.concatenate(taken))
+
+
+def _cells(positions: np.ndarray, low: np.ndarray, edge: float) -> np.ndarray:
+    """Voxels (N, 3) int64 of positions (N, 3) from `low` (3,) on. Raises ValueError beyond `VOXELS`."""
+    cells = np.floor((positions - low) / edge)
+    if not cells.max() < VOXELS:
+        raise ValueError(f"voxels of {edge:g} are too small for points that span {cells.max() * edge:g}: enlarge voxel")
+    return cells.astype(np.int64)
 
 
 def splats_from_points(

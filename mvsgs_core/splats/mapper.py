@@ -24,6 +24,7 @@ from mvsgs_core.splats.schedule import Schedule
 from mvsgs_core.splats.self_check import SelfCheck, check
 from mvsgs_core.splats.snapshot import Snapshot, snapshot
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.splats.view_checks import LARGEST, checked_view, is_near, is_pose
 from mvsgs_core.stats import Stats
 
 
@@ -80,24 +81,28 @@ class OnlineMapper:
         """Takes in a keyframe and adds splats where the map does not explain it; returns their number.
 
         Without `realtime`, what earlier keyframes are owed is done first, so that the result does not depend on how
-        fast keyframes come. A view with a non-finite pose or intrinsics is refused and counted.
+        fast keyframes come. A view that no camera gives is refused and counted, see `view_checks`.
         """
         if self.config.realtime:
             self.log.skip("iterations_realtime", self.schedule.drop())
         else:
             while self.step():
                 pass
-        if not (np.isfinite(view.world_from_cam).all() and np.isfinite(view.intrinsics).all() and view.scale > 0):
-            self.log.refuse("views", 1, "a keyframe with a pose or intrinsics that are not finite was refused")
-            return 0
+        checked = checked_view(view, self.log)
+        return 0 if checked is None else self._take_in(checked)
+
+    def _take_in(self, view: PosedView) -> int:
         depth = checked_depth(view.depth, self.log)
         pose, scale = np.asarray(view.world_from_cam, dtype=np.float64), view.scale
         if view.index in self.corrections:
             pose, scale = self.corrections[view.index]
             depth = depth * np.float32(scale / view.scale)
+        median = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
+        if median >= LARGEST or (self.unit is not None and not is_near(self._local(pose)[:3, 3], median / self.unit)):
+            self.log.refuse("views", 1, "a keyframe far away from all others, or with depth so large, was refused")
+            return 0
         if self.origin is None:
             self.origin = pose[:3, 3].copy()
-        median = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
         if self.unit is None and median > 0:
             self.unit = median
             for earlier in self.views:
@@ -157,8 +162,8 @@ class OnlineMapper:
         moved: dict[int, Similarity] = {}
         by_index = {view.index: view for view in self.views}
         for key, pose, s in zip(index.tolist(), np.asarray(world_from_cam, dtype=np.float64), scale.tolist()):
-            if not (np.isfinite(pose).all() and np.isfinite(s) and s > 0):
-                self.log.refuse("poses", 1, "a corrected pose that is not finite was refused")
+            if not is_pose(pose, s) or (self.unit is not None and not is_near(self._local(pose)[:3, 3])):
+                self.log.refuse("poses", 1, "a corrected pose that is not finite, or none at all, was refused")
                 continue
             self.corrections[key] = (pose, s)
             view = by_index.get(key)

@@ -1,0 +1,78 @@
+"""What a keyframe must be to be mapped. What is not is refused and counted before it reaches the map.
+
+Everything here is finite or nearly so: a number that no camera gives is as bad as NaN, as squares and products of it
+overflow, and one such pixel or pose would move the whole map's bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.stats import Stats
+
+LEAST_SIDE = 8  # pixels of an image
+FOCAL = (0.05, 100.0)  # focal lengths over the image's larger side: 170 degrees to half a degree
+OFF_CENTER = 1.0  # image sizes that the principal point may lie outside of the image
+FAR = 1e6  # median depths from the origin, and between scales: float32 has no detail left there
+LARGEST = 1e18  # of depths, in the world's unit: their squares are finite in float32
+
+
+def checked_view(view: PosedView, log: Stats) -> PosedView | None:
+    """The view without normals and confidences that are none; None, and counted, where it cannot be mapped."""
+    problem = _problem(view)
+    if problem:
+        log.refuse("views", 1, f"a keyframe with {problem} was refused")
+        return None
+    normals, confidence = view.normals, view.confidence
+    if normals is not None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = np.linalg.norm(normals, axis=-1)
+            bad = ~np.isfinite(length) | (length > 1.5)
+        if bad.any():
+            log.refuse("normals", int(bad.sum()), "normals that are not finite or no unit vectors were left out")
+            normals = np.where(bad[..., None], np.float32(0), normals)
+    if confidence is not None and not np.isfinite(confidence).all():
+        confidence = np.where(np.isfinite(confidence), confidence, np.float32(0))
+    return replace(view, normals=normals, confidence=confidence)
+
+
+def is_pose(world_from_cam: np.ndarray, scale: float) -> bool:
+    """Whether that is a rigid transform (4, 4), and the scale one that a map may have."""
+    if not (np.isfinite(world_from_cam).all() and 1.0 / FAR < scale < FAR):
+        return False
+    rotation = world_from_cam[:3, :3]
+    if np.abs(rotation).max() > 2.0 or not np.array_equal(world_from_cam[3], [0.0, 0.0, 0.0, 1.0]):
+        return False
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0)
+
+
+def is_near(position: np.ndarray, depth: float = 0.0) -> bool:
+    """Whether a camera (3,), in median depths from the origin, and what it sees are where float32 has detail."""
+    return bool(np.abs(position).max() < FAR and depth < FAR)
+
+
+def _problem(view: PosedView) -> str:
+    """Why it cannot be mapped; empty if it can."""
+    height, width = view.image.shape[:2]
+    size, fx, fy, cx, cy = max(height, width), *np.asarray(view.intrinsics, dtype=np.float64)
+    if min(height, width) < LEAST_SIDE:
+        return f"an image smaller than {LEAST_SIDE} pixels"
+    if view.depth.ndim != 2 or view.depth.size == 0:
+        return "an empty depth map"
+    maps = (view.confidence, view.normals, view.unfiltered)
+    if any(given is not None and given.shape[:2] != view.depth.shape for given in maps):
+        return "maps of different sizes"
+    if not np.isfinite(view.intrinsics).all():
+        return "a pose or intrinsics that are not finite"
+    if not all(FOCAL[0] * size <= f <= FOCAL[1] * size for f in (fx, fy)):
+        return "a focal length that no camera has"
+    if not (abs(cx - width / 2) < (0.5 + OFF_CENTER) * width and abs(cy - height / 2) < (0.5 + OFF_CENTER) * height):
+        return "a principal point far outside of the image"
+    if not (np.isfinite(view.world_from_cam).all() and np.isfinite(view.scale)):
+        return "a pose or intrinsics that are not finite"
+    if not is_pose(np.asarray(view.world_from_cam, dtype=np.float64), view.scale):
+        return "a pose that is no rotation and position, or a scale that no map has"
+    return ""

@@ -1,0 +1,150 @@
+"""Keyframes that no camera gives: refused and counted, and the map goes on as if they had not come."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mvsgs_core.splats.insertion import InsertionConfig, unoccupied
+from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.splats.training import TrainingConfig
+from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+
+CONFIG = MapperConfig(iterations=2, training=TrainingConfig(threads=1))
+VIEWS = [
+    replace(posed_view(k, pose_on_arc(k / 4), (24, 32)), confidence=np.ones((24, 32), np.float32)) for k in range(4)
+]
+
+
+def mapped(views: list[PosedView], config: MapperConfig = CONFIG) -> OnlineMapper:
+    mapper = OnlineMapper(config)
+    for view in views:
+        mapper.add_view(view)
+    while mapper.step():
+        pass
+    return mapper
+
+
+def is_sound(mapper: OnlineMapper) -> bool:
+    return all(bool(torch.isfinite(value).all()) for value in mapper.state.tensors().values())
+
+
+def with_far_pixels(view: PosedView, factor: float) -> PosedView:
+    depth = view.depth.copy()
+    depth[0, 0] = depth[-1, -1] = factor * np.median(depth)
+    return replace(view, depth=depth)
+
+
+@pytest.mark.parametrize("factor", [3e4, 1e9, 1e30])
+@pytest.mark.parametrize("voxel", [0.01, 0.0])
+@pytest.mark.parametrize("map_voxel", [0.01, 0.0])
+def test_a_far_pixel_of_depth_is_left_out_and_the_rest_is_mapped(factor: float, voxel: float, map_voxel: float) -> None:
+    config = replace(CONFIG, insertion=InsertionConfig(voxel=voxel, map_voxel=map_voxel))
+    views = [VIEWS[0], with_far_pixels(VIEWS[1], factor), VIEWS[2]]
+    mapper, calm = mapped(views, config), mapped(VIEWS[:3], config)
+    assert len(mapper.views) == 3
+    assert is_sound(mapper)
+    assert abs(len(mapper.state) - len(calm.state)) <= 4
+    if voxel or map_voxel or factor > 1e6:
+        assert mapper.log.counts["refused_far_points"] in (1, 2)  # one may be explained already
+        assert any("too far away" in text for text in mapper.log.warnings)
+
+
+def test_a_far_pixel_of_doubtful_depth_is_left_out_too() -> None:
+    unfiltered = np.full((24, 32), 1e9, np.float32)
+    depth = VIEWS[1].depth.copy()
+    depth[:, 16:] = 0
+    mapper = mapped([VIEWS[0], replace(VIEWS[1], depth=depth, unfiltered=unfiltered)])
+    assert is_sound(mapper)
+    assert float(mapper.state.splats.means.detach().abs().max()) < 1e6
+
+
+def test_voxels_are_numbered_without_overflow() -> None:
+    positions = np.array([[0.0, 0.0, 0.0], [2e4, 2e4, 2e4], [1.0, 2.0, 3.0]])
+    assert unoccupied(positions, positions[1:2] + 0.001, 0.01).tolist() == [True, False, True]
+    with pytest.raises(ValueError, match="enlarge voxel"):
+        unoccupied(np.array([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9]]), positions, 0.01)
+
+
+BAD: dict[str, dict[str, Any]] = {
+    "a principal point far outside of the image": {"intrinsics": np.array([25.6, 25.6, 1e9, 11.5])},
+    "a focal length that no camera has": {"intrinsics": np.array([1e-9, 1e-9, 15.5, 11.5])},
+    "a focal length that no camera has ": {"intrinsics": np.array([-25.6, 25.6, 15.5, 11.5])},
+    "a focal length that no camera has  ": {"intrinsics": np.array([25.6, 1e9, 15.5, 11.5])},
+    "a pose or intrinsics that are not finite": {"intrinsics": np.array([25.6, np.nan, 15.5, 11.5])},
+    "a pose that is no rotation": {"world_from_cam": np.diag([1.0, 1.0, 0.0, 1.0])},
+    "a pose that is no rotation ": {"world_from_cam": np.diag([1e200, 1e200, 1e200, 1.0])},
+    "a pose that is no rotation and position": {"world_from_cam": np.diag([1.0, 1.0, -1.0, 1.0])},
+    "a scale that no map has": {"scale": 1e300},
+    "a pose or intrinsics that are not finite ": {"scale": float("inf")},
+    "an image smaller than": {"image": np.zeros((2, 32, 3), np.uint8)},
+    "an empty depth map": {"depth": np.zeros((0, 4), np.float32)},
+    "far away from all others": {"world_from_cam": np.block([[np.eye(3), np.full((3, 1), 1e30)], [0, 0, 0, 1]])},
+    "or with depth so large": {"depth": np.full((24, 32), 1e30, np.float32)},
+}
+
+
+@pytest.mark.parametrize("problem", BAD)
+@pytest.mark.parametrize("first", [True, False])
+def test_a_keyframe_that_no_camera_gives_is_refused_by_its_reason(problem: str, first: bool) -> None:
+    bad = replace(VIEWS[1], **BAD[problem])
+    if first and "far away" in problem:
+        pytest.skip("the first one is where the map begins")
+    mapper = mapped([bad, VIEWS[0], VIEWS[2]] if first else [VIEWS[0], bad, VIEWS[2]])
+    assert [view.index for view in mapper.views] == [0, 2]
+    assert mapper.log.counts["refused_views"] == 1
+    assert problem.strip() in mapper.log.warnings[0]
+    calm = mapped([VIEWS[0], VIEWS[2]])
+    assert torch.equal(mapper.state.splats.means, calm.state.splats.means)
+
+
+def test_a_correction_that_is_no_pose_is_refused() -> None:
+    mapper = mapped(VIEWS[:2])
+    before = mapper.state.splats.means.detach().clone()
+    far, flat = pose_on_arc(0.25), np.diag([1.0, 1.0, 0.0, 1.0])
+    far[0, 3] = 1e300
+    assert mapper.correct(np.array([0, 1, 1]), np.stack([far, flat, pose_on_arc(0.25)]), np.array([1, 1, 1e300])) == 0
+    assert mapper.log.counts["refused_poses"] == 3
+    assert torch.equal(mapper.state.splats.means, before)
+
+
+def test_no_mutated_keyframe_ends_the_map_or_makes_it_unsound() -> None:
+    """Every field with what no camera gives, singly and at a few pixels; the map goes on after each."""
+    random = np.random.default_rng(0)
+    wild = np.array([0.0, -1.0, 1e-40, 1e-9, 1e9, 3e4, 1e19, 3e38, -3e38, np.nan, np.inf, -np.inf])
+    training = TrainingConfig(threads=1, exposure=True, poses=True, pose_visits=1)
+    mapper = OnlineMapper(replace(CONFIG, iterations=1, sh_degree=1, training=training))
+    mapper.add_view(VIEWS[0])
+    for index in range(1, 120):
+        view = replace(posed_view(index, pose_on_arc(random.random()), (24, 32)), unfiltered=VIEWS[0].depth.copy())
+        changes: dict[str, Any] = {"confidence": np.ones((24, 32), np.float32)}
+        for name in random.choice(["depth", "confidence", "normals", "unfiltered", "intrinsics", "pose", "scale"], 2):
+            value = random.choice(wild)
+            if name == "scale":
+                changes["scale"] = float(value)
+                continue
+            field = "world_from_cam" if name == "pose" else str(name)
+            array = np.array(changes.get(field, getattr(view, field)))
+            if random.random() < 0.5:
+                array.flat[random.integers(array.size, size=3)] = value
+            else:
+                with np.errstate(all="ignore"):
+                    array = array * array.dtype.type(value)
+            changes[field] = array
+        with np.errstate(all="ignore"):
+            mapper.add_view(replace(view, **changes))
+            mapper.step()
+        if index % 20 == 0:
+            assert is_sound(mapper), changes
+            with np.errstate(all="ignore"):
+                mapper.correct(
+                    np.array([index - 1]), changes.get("world_from_cam", view.world_from_cam)[None], np.ones(1)
+                )
+    assert is_sound(mapper)
+    assert 15 < mapper.log.counts["refused_views"] < 100
+    assert torch.isfinite(mapper.render(mapper.views[0]).color).all()
