@@ -25,7 +25,7 @@ def reading(path: Path | str, otherwise: str) -> Iterator[None]:
         yield
     except Exception as error:
         names_it = isinstance(error, BadFileError) and str(path) in str(error)
-        if names_it or (isinstance(error, OSError) and error.filename is not None):
+        if names_it or (isinstance(error, OSError) and str(error.filename) == str(path)):
             raise
         raise BadFileError(f"{path} {otherwise}: {brief(error)}") from error
 

@@ -7,6 +7,7 @@ chunk that holds it.
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 MAX_BYTES = 2**28 + 2**21  # of a chunk or message, decompressed: an image of 89 million pixels, and what is beside it
 _MAX_FILE_BYTES = 2**36  # of a file that is compressed as a whole, decompressed into the folder for temporary files
+_MAX_COUNT = 2**40  # messages
+_MAX_METADATA_BYTES = 2**24
+_MAX_NESTING = 50
 _BLOCK = 2**20
 
 
@@ -39,11 +43,14 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
         raise ImportError("bags are read by rosbags, which is optional: pip install rosbags") from error
     _bound_decompression()
     with reading(path, "is no bag that can be read"):
+        _check_metadata(path / "metadata.yaml")
         _check_compressed_files(path)
         # ROS 2 bags before Iron hold no message definitions; image and camera_info have not changed since
         bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         bag.open()
     try:
+        if any(not isinstance(c.msgcount, int) or not 0 <= c.msgcount < _MAX_COUNT for c in bag.connections):
+            raise BadFileError(f"{path} is no bag that can be read: it counts messages by what is no number of them")
         yield bag
     finally:
         bag.close()
@@ -54,8 +61,8 @@ def messages(bag: AnyReader, connections: Sequence[Connection], notices: Notices
     by_message = _decompresses_messages(bag)
     ends = _chunk_ends(bag)
     since: int | None = None
+    done = 0  # all before this time has been read, or left out
     while True:
-        last = since if since is not None else -1
         source = bag.messages(connections, start=since)
         while True:
             try:
@@ -63,13 +70,13 @@ def messages(bag: AnyReader, connections: Sequence[Connection], notices: Notices
             except StopIteration:
                 return
             except Exception as error:  # the library raises what damaged bytes make of its code
-                following = bisect_right(ends, last)
+                following = bisect_right(ends, done)
                 notices.tally("parts of the bag left out because they are damaged", brief(error))
                 if following == len(ends):
                     return
-                since = ends[following]
+                since = done = ends[following]
                 break
-            last = max(last, nanoseconds)
+            done = max(done, nanoseconds + 1)
             if by_message:
                 try:
                     data = decompress(data, "zstd", MAX_BYTES)
@@ -115,6 +122,19 @@ def _chunk_ends(bag: AnyReader) -> list[int]:
         for file in getattr(storage, "storages", (storage,)):
             ends |= {chunk.message_end_time + 1 for chunk in getattr(file, "chunks", ())}  # MCAP
     return sorted(ends)
+
+
+def _check_metadata(path: Path) -> None:
+    """Raises ValueError for YAML that takes its parser minutes: it is long, or nested as no bag's is."""
+    if not path.is_file():
+        return
+    if path.stat().st_size > _MAX_METADATA_BYTES:
+        raise ValueError(f"metadata.yaml is longer than {_MAX_METADATA_BYTES} bytes")
+    depth = 0
+    for bracket in re.finditer(rb"[\[\]{}]", path.read_bytes()):
+        depth += 1 if bracket[0] in b"[{" else -1
+        if depth > _MAX_NESTING:
+            raise ValueError(f"metadata.yaml is nested deeper than {_MAX_NESTING}")
 
 
 def _check_compressed_files(path: Path) -> None:

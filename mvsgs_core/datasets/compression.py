@@ -19,7 +19,7 @@ def decompress(data: bytes, method: str, limit: int) -> bytes:
     those are ever in memory.
     """
     if method in ("", "none"):
-        content = data
+        content: bytes | None = data if len(data) <= limit else None
     elif method not in _METHODS:
         raise BadFileError(f"compressed by {method[:20]!r}; known are {', '.join(_METHODS)}")
     else:
@@ -27,34 +27,42 @@ def decompress(data: bytes, method: str, limit: int) -> bytes:
             content = _METHODS[method](data, limit)
         except Exception as error:  # each library has errors of its own
             raise BadFileError(f"damaged {method} data: {brief(error)}") from error
-    if len(content) > limit:
+    if content is None:
         raise BadFileError(f"{len(data)} bytes of {method} would become more than the {limit} that are read")
     return content
 
 
-def _zstd(data: bytes, limit: int) -> bytes:
-    content = bytearray()
-    with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-        while len(content) <= limit and (block := stream.read(_BLOCK)):
-            content += block
+def _zstd(data: bytes, limit: int) -> bytes | None:
+    """None: longer than `limit`, as with the others."""
     promised = zstandard.frame_content_size(data)  # -1 where the frame does not say
-    if len(content) <= limit and promised not in (-1, len(content)):
+    blocks, length = list[bytes](), 0
+    with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+        while block := stream.read(_BLOCK):
+            blocks.append(block)
+            length += len(block)
+            if length > limit:
+                return None
+    if promised not in (-1, length):
         raise ValueError("the frame ends early")
-    return bytes(content)
+    return b"".join(blocks)
 
 
-def _lz4(data: bytes, limit: int) -> bytes:
+def _lz4(data: bytes, limit: int) -> bytes | None:
     decompressor = lz4.frame.LZ4FrameDecompressor()
-    content = decompressor.decompress(data, max_length=limit + 1)
-    if len(content) <= limit and not decompressor.eof:
+    content: bytes = decompressor.decompress(data, max_length=limit + 1)
+    if len(content) > limit:
+        return None
+    if not decompressor.eof:
         raise ValueError("the frame ends early")
-    return bytes(content)
+    return content
 
 
-def _bz2(data: bytes, limit: int) -> bytes:
+def _bz2(data: bytes, limit: int) -> bytes | None:
     decompressor = bz2.BZ2Decompressor()
     content = decompressor.decompress(data, max_length=limit + 1)
-    if len(content) <= limit and not decompressor.eof:
+    if len(content) > limit:
+        return None
+    if not decompressor.eof:
         raise ValueError("the stream ends early")
     return content
 

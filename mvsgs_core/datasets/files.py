@@ -67,9 +67,9 @@ def opened_image(source: Path | BinaryIO, name: str) -> Iterator[Image.Image]:
     Raises UnreadableImageError, naming it `name`, for more than MAX_PIXELS pixels, and for whatever Pillow raises while
     it is open.
     """
-    if isinstance(source, Path) and source.exists() and not source.is_file():
-        raise UnreadableImageError(f"{name}: is no file")  # a pipe would be waited for
     try:
+        if isinstance(source, Path) and source.exists() and not source.is_file():
+            raise UnreadableImageError(f"{name}: is no file")  # a pipe would be waited for
         with Image.open(source, formats=_FORMATS) as image:
             width, height = image.size
             if not 0 < width * height <= MAX_PIXELS:
@@ -135,6 +135,7 @@ def inside(folder: Path, name: str, listing: Path) -> Path:
     """
     with reading(listing, f"names {brief(ValueError(name))!r}"):
         path = folder / name
+        path.exists()  # raises for what can be no name of a file
         if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
             raise ValueError("that is outside of its folder; copy the file into it and name it from there")
         return path

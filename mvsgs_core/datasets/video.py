@@ -22,6 +22,7 @@ LAYOUT = Layout(
     "your own camera or phone; walk slowly, move sideways rather than turn on the spot, lock exposure and focus",
 )
 _DEFAULT_RATE = 30.0
+_MAX_COUNT = 2**40  # frames: more is no count
 # A container's frame count is an estimate: of mkv its duration times a rate, of mp4 with the frames that are not shown.
 # A gap is worth a word where it is more than both of these, in frames and in time.
 _GAP_FRAMES, _GAP_SHARE = 2, 0.01
@@ -69,7 +70,7 @@ class Video:
             raise BadFileError(f"{self._path} opens but has no frame: it is damaged, or no video")
         self._lens, notes = lens_from_option(intrinsics, distortion, (frame.shape[0], frame.shape[1]))
         self._native = frame.shape[0], frame.shape[1]
-        self._count = int(count) if math.isfinite(count) and count > 0 else 0
+        self._count = int(count) if 0 < count < _MAX_COUNT else 0
         self._rate = rate if math.isfinite(rate) and 0 < rate < 1000 else _DEFAULT_RATE
         self.warnings += notes
         if self._count and start >= self._count:

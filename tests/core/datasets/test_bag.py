@@ -12,12 +12,14 @@ from PIL import Image
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets.bag_file import opened_bag
 from mvsgs_core.datasets.files import UnreadableImageError
 from mvsgs_core.datasets.ros import rgb_of
 
 pytest.importorskip("rosbags")
 
 from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
@@ -58,7 +60,9 @@ class Messages:
         t = self.store.types
         region = t["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
         cls = t["sensor_msgs/msg/CameraInfo"]
-        return cls(self.header(100), HEIGHT, WIDTH, "plumb_bob", np.array(D), K, np.eye(3).ravel(), P, 0, 0, region)
+        return cls(
+            self.header(100), HEIGHT, WIDTH, "plumb_bob", np.array(D), K.copy(), np.eye(3).ravel(), P, 0, 0, region
+        )
 
     def write(self, path: Path, messages: list[tuple[str, float, Any]]) -> Path:
         store, ros = self.store, self.ros
@@ -180,3 +184,78 @@ def test_encodings(encoding: str, data: np.ndarray, expected: tuple[int, int, in
 def test_damaged_or_unknown_images_are_refused(encoding: str, size: int) -> None:
     with pytest.raises(UnreadableImageError, match=r"no 32x24 image|no color or gray image"):
         rgb_of(Messages(2).image(0, encoding, np.zeros(size, np.uint8), 3 * WIDTH))
+
+
+def walk(ros: Messages, path: Path, frames: int = 6) -> Path:
+    images = [("/camera/image_raw", 1.0 + i, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in range(frames)]
+    return ros.write(path, [("/camera/camera_info", 1.0, ros.info()), *images])
+
+
+def test_an_empty_calibration_is_a_guess(tmp_path: Path, ros: Messages) -> None:
+    zeros = ros.info()
+    (zeros.K if ros.ros == 1 else zeros.k)[:] = 0
+    frame = ros.image(0, "rgb8", picture(0), 3 * WIDTH)
+    path = ros.write(bag_path(tmp_path, ros), [("/camera/camera_info", 1.0, zeros), ("/camera/image_raw", 1.0, frame)])
+    sequence = open_dataset("bag", path=path)
+    assert "the camera was not calibrated" in sequence.warnings[0]
+    assert next(iter(sequence)).intrinsics_guessed
+
+
+def test_a_calibration_that_cannot_be_is_refused(tmp_path: Path, ros: Messages) -> None:
+    info = ros.info()
+    (info.K if ros.ros == 1 else info.k)[2] = 1e9
+    frame = ros.image(0, "rgb8", picture(0), 3 * WIDTH)
+    path = ros.write(bag_path(tmp_path, ros), [("/camera/camera_info", 1.0, info), ("/camera/image_raw", 1.0, frame)])
+    with pytest.raises(BadFileError, match=r"/camera/camera_info in the bag .*principal point.*far outside"):
+        open_dataset("bag", path=path)
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4"])
+def test_behind_a_damaged_chunk_of_ros_1_the_rest_is_read(tmp_path: Path, compression: str) -> None:
+    ros = Messages(1)
+    path = tmp_path / "walk.bag"
+    writer = Writer1(path)
+    writer.set_compression(getattr(Writer1.CompressionFormat, compression.upper()))
+    writer.chunk_threshold = 1  # a chunk a message
+    with writer:
+        connections: dict[str, Any] = {}
+        messages = [("/c/camera_info", 1.0, ros.info())]
+        messages += [("/c/image_raw", 2.0 + i, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in range(6)]
+        for topic, seconds, message in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
+            data = ros.store.serialize_ros1(message, message.__msgtype__)
+            writer.write(connections[topic], int(1e9 * seconds), data)
+    with opened_bag(path) as bag:
+        chunk = list(bag.readers[0].chunks.values())[3]
+    content = bytearray(path.read_bytes())
+    content[chunk.datapos + 4 : chunk.datapos + 40] = bytes(36)
+    path.write_bytes(content)
+    sequence = open_dataset("bag", path=path)
+    assert [item.image[0, 0, 0] for item in sequence] == [20, 21, 23, 24, 25]
+    assert any("parts of the bag left out because they are damaged: 1 (first: damaged" in w for w in sequence.warnings)
+
+
+@pytest.mark.parametrize("mode", ["MESSAGE", "STORAGE"])
+def test_compressed_bags_are_bounded(tmp_path: Path, mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    ros = Messages(2)
+    path = tmp_path / "packed"
+    writer = Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP if mode == "STORAGE" else StoragePlugin.SQLITE3)
+    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with writer:
+        kind = "sensor_msgs/msg/Image"
+        connection = writer.add_connection("/c/image_raw", kind, typestore=ros.store)
+        for i in range(3):
+            data = ros.store.serialize_cdr(ros.image(i, "rgb8", picture(i), 3 * WIDTH), kind)
+            writer.write(connection, 10**9 * (i + 1), data)
+    assert [item.image[0, 0, 0] for item in open_dataset("bag", path=path, intrinsics="auto")] == [20, 21, 22]
+    monkeypatch.setattr("mvsgs_core.datasets.bag_file.MAX_BYTES", 1000)
+    with pytest.raises(BadFileError, match="no image of /c/image_raw can be read"):
+        open_dataset("bag", path=path, intrinsics="auto")
+
+
+def test_metadata_that_would_take_its_parser_minutes(tmp_path: Path) -> None:
+    path = walk(Messages(2), tmp_path / "walk")
+    (path / "metadata.yaml").write_text("a: " + 10_000 * "[")
+    with pytest.raises(BadFileError, match="nested deeper"):
+        open_dataset("bag", path=path)
