@@ -65,7 +65,7 @@ def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: b
 
 
 def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str], all_choices_known: bool) -> str:
-    override = _parse(text)
+    override = parse(text)
     key = override.key_or_group
     root, _, rest = key.partition(".")
     if root == "hydra" or root.startswith("hydra/") or override.type is not OverrideType.CHANGE:
@@ -103,7 +103,7 @@ def vocabulary(conf: Path) -> tuple[list[str], list[str]]:
 def _replaced(config: DictConfig, overrides: Sequence[str]) -> dict[str, Replaced]:
     """The slots whose `_target_` the overrides give, with the parameters that are not left from the old choice."""
     given: dict[str, set[str]] = {}
-    for override in map(_parse, overrides):
+    for override in map(parse, overrides):
         root, _, rest = override.key_or_group.partition(".")
         if rest:
             given.setdefault(root, set()).add(rest.split(".")[0])
@@ -115,7 +115,8 @@ def _replaced(config: DictConfig, overrides: Sequence[str]) -> dict[str, Replace
     return replaced
 
 
-def _parse(text: str) -> Override:
+def parse(text: str) -> Override:
+    """One override. Raises GraphError for what is none."""
     try:
         return OverridesParser.create().parse_override(text)
     except HydraException as error:

@@ -68,7 +68,7 @@ def _run(job: Job) -> int:
         _check_nodes(graph)
         output = Output(Path(graph.settings.output))
     except GraphError as error:
-        return _refused(error)
+        return refused(error)
     try:
         output.begin(graph.resolved, resumed=job.resumed)
         screen = make_screen(graph.settings.screen)
@@ -85,7 +85,7 @@ def _run(job: Job) -> int:
         return outcome.code
     except GraphError as error:
         output.settle(Outcome(REFUSED, f"refused: {error}"), scored=False)
-        return _refused(error)
+        return refused(error)
     except BaseException as error:
         output.settle(Outcome(FAILED, f"{type(error).__name__}: {error}"), scored=False)
         raise
@@ -93,7 +93,8 @@ def _run(job: Job) -> int:
         output.release()
 
 
-def _refused(error: GraphError) -> int:
+def refused(error: GraphError) -> int:
+    """Says why nothing runs; the exit code."""
     print(f"error: {error}", file=sys.stderr)
     return REFUSED
 

@@ -61,7 +61,7 @@ class Output:
 
     def settle(self, outcome: Outcome, scored: bool) -> None:
         """Writes how the run ended, where no evaluator's report does. `scored`: the graph has who writes one."""
-        report = self.report()
+        report = read_report(self.path)
         if report and report.get("finished", True):
             if outcome.nothing and "nothing" not in report:
                 self.write_report(report | {"nothing": dict(outcome.nothing)})
@@ -81,14 +81,6 @@ class Output:
         if not outcome.whole:
             report["resume"] = self.resume_command()
         self.write_report(report)
-
-    def report(self) -> dict[str, Any]:
-        """report.json; empty where there is none that can be read."""
-        try:
-            found = json.loads((self.path / REPORT).read_text())
-        except (OSError, ValueError):
-            return {}
-        return found if isinstance(found, dict) else {}
 
     def write_report(self, content: Mapping[str, Any]) -> None:
         """Raises OSError."""
@@ -117,6 +109,15 @@ class Output:
         for name in (*MAP, *BESIDE):
             if (self.path / name).exists():
                 (self.path / name).rename(previous / name)
+
+
+def read_report(output: Path) -> dict[str, Any]:
+    """report.json; empty where there is none that can be read."""
+    try:
+        found = json.loads((output / REPORT).read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _lock(path: Path) -> int:

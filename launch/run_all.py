@@ -1,6 +1,7 @@
 """Starts the whole graph: `python launch/run_all.py dataset=tum dataset.path=... mapper.iterations=300 viewer=off`.
 
-From any directory. `--help` lists slots, choices and parameters; `-m` sweeps; `--inline` runs all in this process.
+From any directory. `--help` lists slots, choices and parameters; `-m` sweeps; `--inline` runs all in this process;
+`resume=DIR` goes on with an interrupted run in its own directory.
 """
 
 from __future__ import annotations
@@ -29,17 +30,20 @@ from omegaconf import DictConfig
 
 from launch.children import python_environment
 from launch.compose import CONF, prepare
-from launch.jobs import Job, run
+from launch.jobs import Job, refused, run
 from launch.parameters import GraphError
+from launch.resume import WORD as RESUME
+from launch.resume import resumed_config
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs the command line; returns the exit code: 0, 1 a node failed, 2 refused, 130 stopped by Ctrl-C."""
+    """Runs the command line; returns the exit code, see launch/outcome.py."""
     try:
+        if any(word.startswith(RESUME) for word in arguments):
+            return run(resumed_job(arguments))
         sys.argv[1:] = hydra_arguments(arguments)
     except GraphError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return refused(error)
     os.environ |= python_environment()  # Hydra's launchers start workers that need the workspace too
     codes: list[int] = []
 
@@ -49,6 +53,17 @@ def main(arguments: Sequence[str]) -> int:
 
     job()
     return codes[-1] if codes else 0
+
+
+def resumed_job(arguments: Sequence[str]) -> Job:
+    """What goes on with the run that `resume=DIR` names. Raises GraphError."""
+    words = ["inline=true" if word == "--inline" else word for word in arguments]
+    folder = Path(next(word for word in words if word.startswith(RESUME)).removeprefix(RESUME))
+    overrides = [word for word in words if not word.startswith(RESUME)]
+    for word in overrides:
+        if word.startswith("-"):
+            raise GraphError(f"{word}: {RESUME}{folder} takes slot=choice, slot.parameter=value and --inline only")
+    return Job(resumed_config(folder, overrides), overrides, {}, None, resumed=True)
 
 
 def hydra_arguments(arguments: Sequence[str]) -> list[str]:

@@ -1,0 +1,118 @@
+"""`resume=DIR`: the graph of an interrupted run, to go on in the same directory from its checkpoint.
+
+Where the sources can be read again, the whole graph runs from the stream's beginning, and passes over what the map has.
+Where they cannot (a live camera), the checkpoint's keyframes are the source, and what is left is to refine and score.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.types import OverrideType
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+import nodes
+from launch.compose import CONF, parse, prepare, vocabulary
+from launch.graph import load_node
+from launch.output import REPORT, read_report
+from launch.parameters import GraphError
+from mvsgs_core.splats.checkpoint_files import CheckpointInfo, checkpoint_info
+
+WORD = "resume="
+SOURCE = "dataset"  # the slot of the choice that gives a checkpoint's keyframes
+CHOICE = "resumed"
+
+
+def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) -> DictConfig:
+    """What runs to go on with the run in `folder`, with overrides as on any command line.
+
+    Raises GraphError where there is nothing to go on with.
+    """
+    folder = folder.expanduser().absolute()
+    config = _interrupted(folder)
+    info = _checkpoint(folder)
+    slots, _ = vocabulary(conf)
+    for text in prepare(overrides, conf):
+        _apply(config, text, slots, conf)
+    config.output = str(folder)
+    if not all(node.replayable for node in _classes(config).values() if nodes.is_source(node)):
+        _without_stream(config, folder, conf)
+    for slot, node in _classes(config).items():
+        known = inspect.signature(node.Config).parameters
+        if "resume" in known:
+            config[slot].resume = str(folder)
+        if "resume_after" in known:
+            config[slot].resume_after = info.stereo_after()
+    return config
+
+
+def _interrupted(folder: Path) -> DictConfig:
+    """The configuration of the run in that folder, which has not reached its end."""
+    if not folder.is_dir():
+        raise GraphError(f"{WORD}{folder}: no such directory; give the output directory of a run")
+    file = folder / "config.yaml"
+    try:
+        config = OmegaConf.load(file)
+    except FileNotFoundError:
+        raise GraphError(f"{WORD}{folder}: no config.yaml there: it is not the output directory of a run") from None
+    except (OSError, YAMLError, OmegaConfBaseException) as error:
+        raise GraphError(f"{WORD}{folder}: {file} cannot be read: {error}") from error
+    if not isinstance(config, DictConfig):
+        raise GraphError(f"{WORD}{folder}: {file} is no configuration of a run")
+    if read_report(folder).get("finished"):
+        raise GraphError(f"{WORD}{folder}: that run has reached its end (see {folder / REPORT}): nothing is left to do")
+    return config
+
+
+def _checkpoint(folder: Path) -> CheckpointInfo:
+    try:
+        return checkpoint_info(folder)
+    except ValueError as error:
+        raise GraphError(f"{WORD}{folder}: {error}") from error
+
+
+def _apply(config: DictConfig, text: str, slots: Sequence[str], conf: Path) -> None:
+    """One override: another choice for a slot, or a value."""
+    override = parse(text.lstrip("+"))
+    if override.type is not OverrideType.CHANGE or override.is_sweep_override():
+        raise GraphError(f"{text}: with {WORD}DIR only slot=choice and slot.parameter=value")
+    key, value = override.key_or_group, override.value()
+    if key in slots:
+        config[key] = OmegaConf.load(conf / key / f"{value}.yaml")
+    elif key == "output":
+        raise GraphError(f"{text}: a run is resumed in its own directory")
+    else:
+        OmegaConf.update(config, key, value, force_add=True)
+
+
+def _classes(config: DictConfig) -> dict[str, type[nodes.Node]]:
+    """The node in each slot that has one."""
+    targets = {
+        str(slot): section.get("_target_") for slot, section in config.items() if isinstance(section, DictConfig)
+    }
+    return {slot: load_node(slot, str(target)) for slot, target in targets.items() if target is not None}
+
+
+def _without_stream(config: DictConfig, folder: Path, conf: Path) -> None:
+    """The checkpoint's keyframes in the sources' place; the stages up to the mapper are off."""
+    config[SOURCE] = OmegaConf.load(conf / SOURCE / f"{CHOICE}.yaml")
+    config[SOURCE].path = str(folder)
+    classes = _classes(config)
+    given = {message.__name__ for message in nodes.outputs(classes[SOURCE])}
+    kept = {SOURCE}
+    for slot, node in classes.items():
+        section = config[slot]
+        if "resume" in inspect.signature(node.Config).parameters or section.get("observer"):
+            kept.add(slot)
+    for slot in classes.keys() - {SOURCE}:
+        reads: dict[str, Any] = dict(config[slot].get("reads") or {})
+        gone = [name for name, sender in reads.items() if sender.rstrip("?") not in kept]
+        if slot in kept and given >= set(gone):
+            config[slot].reads = reads | dict.fromkeys(gone, SOURCE)
+        else:
+            config[slot] = {"_target_": None}
