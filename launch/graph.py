@@ -149,7 +149,10 @@ def _settings(config: Mapping[str, Any]) -> tuple[Settings, dict[str, Mapping[st
     sections = {key: value for key, value in config.items() if isinstance(value, Mapping) and key not in own}
     given = {key: value for key, value in config.items() if key not in sections}
     checked = check_parameters("", "config.yaml", Settings, given)
-    return Settings(**(checked | {"supervise": Supervise(**checked["supervise"])})), sections
+    supervise = Supervise(**checked["supervise"])
+    if not 0.0 < supervise.silent < supervise.dead:
+        raise GraphError(f"supervise.silent={supervise.silent:g}: must be above 0 and below dead={supervise.dead:g}")
+    return Settings(**(checked | {"supervise": supervise})), sections
 
 
 def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None, device: _Device) -> Slot:

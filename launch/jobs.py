@@ -75,8 +75,10 @@ def _run(job: Job) -> int:
         said: list[Outcome] = []
 
         def over(outcome: Outcome) -> None:
-            output.settle(outcome, scored=nodes_write_reports(graph))
+            problem = output.settle(outcome, scored=_scored(graph))
             if outcome not in said:
+                if problem:
+                    screen.note(problem)
                 _say(outcome, screen, output)
             said.append(outcome)
 
@@ -99,8 +101,8 @@ def refused(error: GraphError) -> int:
     return REFUSED
 
 
-def nodes_write_reports(graph: Graph) -> bool:
-    """Whether some node of the graph scores the run: it takes the finished map and is no source of it."""
+def _scored(graph: Graph) -> bool:
+    """Whether some node writes the report of a finished run: an observer that takes the map."""
     return any(edge.message is msgs.SplatMap and edge.reader in graph.observers for edge in graph.edges)
 
 

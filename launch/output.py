@@ -59,8 +59,18 @@ class Output:
         except OSError as error:
             raise GraphError(f"output={self.path}: {error.strerror or error}") from error
 
-    def settle(self, outcome: Outcome, scored: bool) -> None:
-        """Writes how the run ended, where no evaluator's report does. `scored`: the graph has who writes one."""
+    def settle(self, outcome: Outcome, scored: bool) -> str | None:
+        """Writes how the run ended, where no evaluator's report does. `scored`: the graph has who writes one.
+
+        What went wrong where that cannot be written, else None.
+        """
+        try:
+            self._settle(outcome, scored)
+        except OSError as error:
+            return f"{self.path / REPORT} cannot be written: {error.strerror or error}"
+        return None
+
+    def _settle(self, outcome: Outcome, scored: bool) -> None:
         report = read_report(self.path)
         if report and report.get("finished", True):
             if outcome.nothing and "nothing" not in report:

@@ -16,6 +16,7 @@ from launch.children import Child
 from launch.graph import Supervise
 from launch.status import printable_lines
 
+STARTING_SECONDS = 20.0  # more that a node has until it is constructed: libraries are loaded in one call, from a disk
 DUMP_SECONDS = 0.5  # that a process has to write where its threads stand
 ABSENCE_SECONDS = 2.0  # between two looks: the launcher itself was stopped, or the machine slept
 DUMP_LINES = 40
@@ -70,6 +71,8 @@ class Watchdog:
     def _silent(self, watched: _Watched, now: float) -> str | None:
         """Names a node that has not been heard of; a reason once that has lasted too long."""
         child, silence = watched.child, now - watched.child.heard
+        if child.status.state == "starting":
+            silence -= STARTING_SECONDS
         if silence < self.limits.silent:
             if watched.named:
                 self.note(f"{child.name} is heard of again")

@@ -76,6 +76,8 @@ REFUSED = [
     (["relay.threads=x"], "relay.threads=x", "must be int or null"),
     (["relay.device=cpu"], "no parameter 'device'", "stride: int"),
     (["buffer=many"], "buffer=many", "must be int"),
+    (["supervise.silent=70"], "supervise.silent=70", "below dead=60"),
+    (["supervise.slow=1"], "supervise.slow", ""),
     (["transport=udp"], "transport=udp", "'ipc' or 'tcp'"),
     (["device=tpu"], "device=tpu", "auto, cpu, cuda"),
     (["device=cuda:99", "source.device=auto"], "device=cuda:99", "CUDA devices"),

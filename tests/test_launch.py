@@ -148,6 +148,7 @@ def test_a_second_ctrl_c_stops_everything(launch: type[Launch], delay: float) ->
     assert time.monotonic() - began < DOWN
     assert code == 130
     assert "stopped" in out
+    assert (run.report()["finished"], run.report()["reason"]) == (False, "stopped by Ctrl-C")
 
 
 @pytest.mark.parametrize("delay", [0.6, 1.2, 1.8])

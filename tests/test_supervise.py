@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import time
 from pathlib import Path
 
@@ -95,6 +96,17 @@ def test_a_slow_stage_is_not_a_dead_one(launch: type[Launch], how: str) -> None:
     assert code == 0, out + err
     assert "silent" not in out
     assert "relay has been at the same piece of work for 2 s; it is alive, so it is left alone" in out
+
+
+def test_a_launcher_that_was_stopped_itself_takes_nobody_for_dead(launch: type[Launch]) -> None:
+    run = launch("source.count=500", "source.period=0.01", *SHORT)
+    run.wait_until_running()
+    run.process.send_signal(signal.SIGSTOP)
+    time.sleep(4.0)
+    run.process.send_signal(signal.SIGCONT)
+    code, out, err = run.finish()
+    assert code == 0, err
+    assert "silent" not in out
 
 
 @pytest.mark.parametrize("victim", ["source", "relay", "sink"])

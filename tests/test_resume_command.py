@@ -1,0 +1,112 @@
+"""`resume=DIR`: what is made of an interrupted run's configuration, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from launch.compose import compose, graph_of
+from launch.graph import Graph
+from launch.parameters import GraphError
+from launch.resume import resumed_config
+from mvsgs_core.splats.checkpoint_files import state_file, write_state
+from tests.shared_data import ROOT
+
+
+def interrupted(folder: Path, *overrides: str, report: str = '{"finished": false}') -> Path:
+    """What a run leaves that was killed after its checkpoint of keyframes 0, 5, ..., 95."""
+    graph = compose([*overrides, f"output={folder}"])
+    OmegaConf.save(OmegaConf.create(graph.resolved), folder / "config.yaml")
+    (folder / "report.json").write_text(report)
+    state = state_file(folder, 3)
+    state.parent.mkdir()
+    meta = {"newest_view": 95, "stream_seconds": 4.75, "splats": 10, "stream_ended": False}
+    write_state(state, meta, {"keyframes": np.arange(0, 100, 5)})
+    return folder
+
+
+def resumed(folder: Path, *overrides: str) -> Graph:
+    return graph_of(resumed_config(folder, overrides), overrides, {})
+
+
+def test_a_stream_that_can_be_read_again_runs_through_the_whole_graph(tmp_path: Path) -> None:
+    before = compose([f"output={tmp_path}", "mapper.iterations=7", "viewer=viser", "dataset.options.frames=33"])
+    after = resumed(interrupted(tmp_path, "mapper.iterations=7", "viewer=viser", "dataset.options.frames=33"))
+    assert after.slots.keys() == before.slots.keys()
+    assert set(after.edges) == set(before.edges)
+    assert after.slots["dataset"] == before.slots["dataset"]
+    assert after.slots["mapper"].config == before.slots["mapper"].config | {"resume": str(tmp_path)}
+    assert after.slots["mvs"].config["resume_after"] == 15  # of 20 keyframes the last 16 are neighbors of new ones
+    assert after.settings.output == str(tmp_path)
+    assert after.observers == before.observers
+
+
+def test_a_stream_that_is_gone_leaves_the_checkpoint_to_be_refined(tmp_path: Path) -> None:
+    after = resumed(interrupted(tmp_path, "dataset=camera", "recorder=mcap"))
+    assert list(after.slots) == ["dataset", "mapper", "evaluator"]
+    assert after.slots["dataset"].config == {"path": str(tmp_path)}
+    assert {(e.message.__name__, e.sender, e.reader) for e in after.edges if e.reader == "evaluator"} == {
+        ("GroundTruth", "dataset", "evaluator"),
+        ("Trajectory", "dataset", "evaluator"),
+        ("View", "dataset", "evaluator"),
+        ("SplatMap", "mapper", "evaluator"),
+    }
+
+
+def test_overrides_hold_as_on_any_command_line(tmp_path: Path) -> None:
+    overrides = ("mapper.refinement=9", "viewer=viser", "viewer.port=99", "seed=3")
+    after = resumed(interrupted(tmp_path), *overrides)
+    assert after.slots["mapper"].config["refinement"] == 9
+    assert after.slots["viewer"].config["port"] == 99
+    assert after.settings.seed == 3
+    for wrong, why in (
+        ("mapper.refinment=9", "did you mean refinement"),
+        ("viewer=visr", "did you mean viser"),
+        ("nothing=1", "no slot or key 'nothing'"),
+        ("output=elsewhere", "resumed in its own directory"),
+        ("~viewer", "only slot=choice"),
+    ):
+        with pytest.raises(GraphError, match=why):
+            resumed(tmp_path, wrong)
+
+
+def test_what_cannot_be_resumed_is_refused_with_the_reason(tmp_path: Path) -> None:
+    def refusal(folder: Path) -> str:
+        with pytest.raises(GraphError) as refused:
+            resumed_config(folder, ())
+        return str(refused.value)
+
+    assert "no such directory" in refusal(tmp_path / "nowhere")
+    assert "no config.yaml there" in refusal(tmp_path)
+    folder = interrupted(tmp_path, report='{"finished": true}')
+    assert "has reached its end" in refusal(folder)
+    (folder / "report.json").write_text("{")  # cut off: not finished
+    assert resumed_config(folder, ()).mapper.resume == str(folder)
+    state_file(folder, 3).write_bytes(b"nonsense")
+    assert "is damaged" in refusal(folder)
+    state_file(folder, 3).unlink()
+    assert "has no checkpoint" in refusal(folder)
+    for text in ("[1, 2]", "a: b: c", "dataset: {_target_: nowhere.Nobody}"):
+        (folder / "config.yaml").write_text(text)
+        write_state(
+            state_file(folder, 3),
+            {"newest_view": 0, "stream_seconds": 0.0, "splats": 1, "stream_ended": False},
+            {"keyframes": np.arange(1)},
+        )
+        assert "config" in refusal(folder) or "no module 'nowhere'" in refusal(folder)
+
+
+def test_a_refused_resume_touches_nothing(tmp_path: Path) -> None:
+    folder = interrupted(tmp_path, report=json.dumps({"finished": True}))
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    command = [sys.executable, ROOT / "launch/run_all.py", f"resume={folder}"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path.parent)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: resume=")
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
