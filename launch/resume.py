@@ -111,8 +111,8 @@ def _without_stream(config: DictConfig, folder: Path, conf: Path) -> None:
             kept.add(slot)
     for slot in classes.keys() - {SOURCE}:
         reads: dict[str, Any] = dict(config[slot].get("reads") or {})
-        gone = [name for name, sender in reads.items() if sender.rstrip("?") not in kept]
-        if slot in kept and given >= set(gone):
-            config[slot].reads = reads | dict.fromkeys(gone, SOURCE)
+        wanted = [name for name, sender in reads.items() if sender.rstrip("?") not in kept - {SOURCE}]
+        if slot in kept and given >= set(wanted):
+            config[slot].reads = reads | dict.fromkeys(wanted, SOURCE)
         else:
             config[slot] = {"_target_": None}

@@ -19,6 +19,11 @@ from mvsgs_core.splats.checkpoint_files import state_file, write_state
 from tests.shared_data import ROOT
 
 
+META = {
+    "newest_view": 95, "stream_seconds": 4.75, "splats": 10, "stream_ended": False, "revision": 1, "refined": 0,
+}  # fmt: skip
+
+
 def interrupted(folder: Path, *overrides: str, report: str = '{"finished": false}') -> Path:
     """What a run leaves that was killed after its checkpoint of keyframes 0, 5, ..., 95."""
     graph = compose([*overrides, f"output={folder}"])
@@ -26,8 +31,7 @@ def interrupted(folder: Path, *overrides: str, report: str = '{"finished": false
     (folder / "report.json").write_text(report)
     state = state_file(folder, 3)
     state.parent.mkdir()
-    meta = {"newest_view": 95, "stream_seconds": 4.75, "splats": 10, "stream_ended": False}
-    write_state(state, meta, {"keyframes": np.arange(0, 100, 5)})
+    write_state(state, META, {"keyframes": np.arange(0, 100, 5)})
     return folder
 
 
@@ -94,11 +98,7 @@ def test_what_cannot_be_resumed_is_refused_with_the_reason(tmp_path: Path) -> No
     assert "has no checkpoint" in refusal(folder)
     for text in ("[1, 2]", "a: b: c", "dataset: {_target_: nowhere.Nobody}"):
         (folder / "config.yaml").write_text(text)
-        write_state(
-            state_file(folder, 3),
-            {"newest_view": 0, "stream_seconds": 0.0, "splats": 1, "stream_ended": False},
-            {"keyframes": np.arange(1)},
-        )
+        write_state(state_file(folder, 3), META, {"keyframes": np.arange(1)})
         assert "config" in refusal(folder) or "no module 'nowhere'" in refusal(folder)
 
 
