@@ -18,7 +18,6 @@ from launch.resume import resumed_config
 from mvsgs_core.splats.checkpoint_files import state_file, write_state
 from tests.shared_data import ROOT
 
-
 META = {
     "newest_view": 95, "stream_seconds": 4.75, "splats": 10, "stream_ended": False, "revision": 1, "refined": 0,
 }  # fmt: skip
