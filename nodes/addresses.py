@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import stat
 from pathlib import Path
 from typing import NamedTuple
 
 IPC_PATH_BYTES = 107  # the kernel's limit of a socket's path
 KEY_FILE = "graph.key"
+MAX_KEY_BYTES = 1000
 
 
 class TransportError(RuntimeError):
@@ -29,20 +31,44 @@ class Keys(NamedTuple):
 def load_keys(folder: Path) -> Keys:
     """The keys that `nodes.transport.create_keys` wrote.
 
-    Raises TransportError if there are none, if other users can read them, or if the file holds no key pair.
+    Raises TransportError if there are none, if the file holds no key pair, or where somebody else could have made,
+    changed or read them, as ssh does: another user's file, a link, a mode or a folder that lets others in.
     """
     path = folder / KEY_FILE
-    if not path.is_file():
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
         raise TransportError(
             f"no keys at {path}: make them with "
             f'python -c "from nodes.transport import create_keys; create_keys({str(folder)!r})"'
-        )
-    if path.stat().st_mode & 0o077:
-        raise TransportError(f"{path} can be read by other users: chmod 600 {path}")
-    lines = path.read_bytes().split()
+        ) from None
+    except OSError as error:
+        what = "is a link: put the file itself there" if path.is_symlink() else f"cannot be read: {error.strerror}"
+        raise TransportError(f"{path} {what}") from None
+    with os.fdopen(descriptor, "rb") as file:  # what is checked is what is read: the file that is open
+        _check_private(path, os.fstat(file.fileno()), folder.stat())
+        lines = file.read(MAX_KEY_BYTES).split()
     if len(lines) != 2 or any(len(line) != 40 for line in lines):
         raise TransportError(f"{path} holds no key pair: two lines of 40 characters, public and secret")
     return Keys(*lines)
+
+
+def _check_private(path: Path, file: os.stat_result, folder: os.stat_result) -> None:
+    """Raises TransportError, saying what to do."""
+    if not stat.S_ISREG(file.st_mode):
+        raise TransportError(f"{path} is no file")
+    for place, owner in ((path, file.st_uid), (path.parent, folder.st_uid)):
+        if owner not in (os.getuid(), 0):
+            raise TransportError(
+                f"{place} belongs to another user (number {owner}), who could change the keys: "
+                f"copy them into a folder of your own, or chown {os.getuid()} {place}"
+            )
+    if file.st_mode & 0o077:
+        raise TransportError(f"{path} can be read by other users: chmod 600 {path}")
+    if folder.st_mode & 0o022:
+        raise TransportError(
+            f"{path.parent} can be written by other users, who could put other keys there: chmod go-w {path.parent}"
+        )
 
 
 def save_keys(folder: Path, keys: Keys) -> None:

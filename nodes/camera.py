@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from nodes import Node
 
 POLL = 0.5  # s at most between two looks at whether the stream goes on
 RETRY = 0.5  # s between two attempts to open a device that was lost
+SILENT = 2.0  # s without a picture after which a user is told, if the camera may be silent that long
 
 
 class CameraError(RuntimeError):
@@ -58,7 +59,7 @@ class Camera(Node):
 
         Raises CameraError if it cannot be opened or never gives one.
         """
-        feed = _Feed(self.config)
+        feed = _Feed(self.config, self.stats.warn)
         index = 0
         taken = 0
         try:
@@ -82,8 +83,6 @@ class Camera(Node):
                 index += 1
         finally:
             feed.close()
-            if feed.reopened:
-                self.stats.warn(f"camera {self.config.path} was lost and found again: {feed.reopened} times")
 
     def _frame(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """BGR picture -> RGB image as delivered, with its intrinsics."""
@@ -99,11 +98,15 @@ class Camera(Node):
 
 
 class _Feed:
-    """A thread that reads the camera as fast as it delivers, and keeps the newest picture only."""
+    """A thread that reads the camera as fast as it delivers, and keeps the newest picture only.
 
-    def __init__(self, config: Camera.Config) -> None:
+    `warn` is called when the camera is lost and when it is found again, from either thread.
+    """
+
+    def __init__(self, config: Camera.Config, warn: Callable[[str], None]) -> None:
         self.dropped = 0
-        self.reopened = 0
+        self._warn = warn
+        self._taken = 0
         self._config = config
         self._closing = False
         self._fresh = threading.Condition()
@@ -114,14 +117,19 @@ class _Feed:
 
     def newest(self, timeout_s: float) -> tuple[np.ndarray, float] | None:
         """The newest picture that was not taken yet and its time; None when none comes in time."""
-        deadline = time.monotonic() + timeout_s
+        began = time.monotonic()
+        told = self._taken == 0  # the first picture may take its time
         with self._fresh:
             while self._newest is None:
-                left = deadline - time.monotonic()
-                if left <= 0:
+                waited = time.monotonic() - began
+                if waited >= timeout_s:
                     return None
-                self._fresh.wait(min(left, POLL))
+                if not told and waited >= min(SILENT, timeout_s / 2):
+                    told = True
+                    self._warn(f"camera {self._config.path} gives no picture: it is waited for up to {timeout_s:g} s")
+                self._fresh.wait(min(timeout_s - waited, POLL, timeout_s / 4))
             shot, self._newest = self._newest, None
+            self._taken += 1
             return shot
 
     def close(self) -> None:
@@ -141,6 +149,8 @@ class _Feed:
         self._capture.release()
 
     def _reopen(self) -> None:
+        if not self._closing:
+            self._warn(f"camera {self._config.path} was lost: it is opened again until it is found")
         self._capture.release()
         while not self._closing:
             time.sleep(RETRY)
@@ -148,7 +158,7 @@ class _Feed:
                 self._capture = _open(self._config)
             except CameraError:
                 continue
-            self.reopened += 1
+            self._warn(f"camera {self._config.path} was lost and found again")
             return
 
 

@@ -157,6 +157,29 @@ def test_a_camera_that_comes_back(capture: type[FakeCapture]) -> None:
     assert any("was lost and found again" in w for w in camera.stats.warnings)
 
 
+def test_a_loss_is_told_when_it_happens_and_so_is_the_return(capture: type[FakeCapture]) -> None:
+    capture.lost_after = 4
+    camera = Camera(Camera.Config(stop=10))
+    told: list[int] = []  # warnings at each frame
+    for message in camera.run():
+        if isinstance(message, Frame):
+            told.append(sum("lost" in w for w in camera.stats.warnings))
+    assert told[0] == 0
+    assert told[-1] == 2  # lost, found: both while frames still came
+    assert camera.stats.warnings[-2].endswith("was lost: it is opened again until it is found")
+
+
+def test_a_camera_that_hangs_is_told_before_it_is_given_up(capture: type[FakeCapture]) -> None:
+    capture.dead_after = 3
+    camera = Camera(Camera.Config(timeout=1.0))
+    when: dict[str, float] = {}
+    camera.stats.warn = lambda text: when.setdefault(text, time.monotonic()) and None  # type: ignore[method-assign]
+    list(camera.run())
+    given_up = when["camera 0 was lost: no picture for 1 s"]
+    assert given_up - when["camera 0 gives no picture: it is waited for up to 1 s"] > 0.2
+    assert given_up - when["camera 0 was lost: it is opened again until it is found"] > 0.5
+
+
 def test_a_camera_that_dies_ends_the_stream_and_not_the_run(capture: type[FakeCapture]) -> None:
     capture.dead_after = 3
     camera = Camera(Camera.Config(timeout=0.3))
