@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import secrets
 import socket
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,14 @@ def _free_ports(count: int) -> list[int]:
             each.close()
 
 
-def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_fd: int | None) -> dict[str, Any]:
+def new_token(graph: Graph) -> str:
+    """By which the nodes of one run know each other where anybody on the machine may connect: tcp without keys."""
+    return secrets.token_hex(16) if graph.settings.transport == "tcp" and graph.settings.keys is None else ""
+
+
+def spec(
+    graph: Graph, name: str, address: dict[str, str], threads: int, status_fd: int | None, token: str = ""
+) -> dict[str, Any]:
     """The JSON that `python -m nodes` runs a node from."""
     slot = graph.slots[name]
     settings = graph.settings
@@ -83,6 +91,7 @@ def spec(graph: Graph, name: str, address: dict[str, str], threads: int, status_
         "threads": threads,
         "cpu": slot.placement.cpu,
         "keys": None if settings.keys is None else str(Path(settings.keys).absolute()),
+        "token": token,
         "status_fd": status_fd,
     }
 

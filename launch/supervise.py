@@ -29,7 +29,7 @@ from launch.outcome import BY_SIGNAL, FAILED, Failure, Outcome, finished
 from launch.placement import thread_environment, thread_plan
 from launch.run_directory import RunDirectory, remove_orphans
 from launch.screen import Screen
-from launch.specs import addresses, spec, write_spec
+from launch.specs import addresses, new_token, spec, write_spec
 from launch.status import NodeStatus
 from launch.watchdog import Watchdog
 
@@ -78,14 +78,14 @@ class Supervisor:
         logs = Path(self._graph.settings.output) / "logs"
         logs.mkdir(parents=True, exist_ok=True)
         plan = thread_plan(self._graph)
-        address = addresses(self._graph, directory.path)
+        address, token = addresses(self._graph, directory.path), new_token(self._graph)
         statuses = {name: NodeStatus(name) for name in self._graph.slots}
         processes: dict[str, psutil.Process] = {}
         self._screen.start(self._graph, statuses, processes)
         for name, slot in self._graph.slots.items():
             path = directory.path / f"{name}.json"
             if slot.placement.external:
-                write_spec(spec(self._graph, name, address, plan[name], None), path)
+                write_spec(spec(self._graph, name, address, plan[name], None, token), path)
                 statuses[name].state = "external"
                 command = shlex.join([sys.executable, "-m", "nodes", str(path)])
                 environment = " ".join(f"{key}={shlex.quote(value)}" for key, value in python_environment().items())
@@ -94,7 +94,7 @@ class Supervisor:
             if self._signals:
                 return  # stopped while starting: _watch acts on it
             pipe = os.pipe()
-            write_spec(spec(self._graph, name, address, plan[name], pipe[1]), path)
+            write_spec(spec(self._graph, name, address, plan[name], pipe[1], token), path)
             child = Child(statuses[name], path, pipe, logs / f"{name}.log", thread_environment(plan[name]))
             self._children[name] = child
             self._selector.register(child.pipe, selectors.EVENT_READ, child)

@@ -150,21 +150,22 @@ class _Process:
     def _open(self) -> Inbox:
         """Readers first: the nodes upstream wait for them, whoever waits here for others."""
         spec = self._spec
-        keys = None if spec.keys is None else load_keys(Path(spec.keys))
+        shared: dict[str, Any] = {
+            "keys": None if spec.keys is None else load_keys(Path(spec.keys)),
+            "token": spec.token,
+        }
         observer = spec.name if spec.observer else None
         for i in spec.inputs:
             kind = msgs.TYPES[i.type]
             if i.best_effort:
-                reader: Reader = NewestReader(i.address, kind, topic=i.topic, late=False, keys=keys, observer=observer)
+                reader: Reader = NewestReader(i.address, kind, topic=i.topic, late=False, observer=observer, **shared)
             else:
-                reader = ReliableReader(
-                    i.address, kind, topic=i.topic, buffer=spec.buffer, keys=keys, observer=observer
-                )
+                reader = ReliableReader(i.address, kind, topic=i.topic, buffer=spec.buffer, observer=observer, **shared)
             self._readers.append(reader)
         for o in spec.outputs:
             topic = f"{spec.name}.{o.type}"
             self._publishers[o.type] = Publisher(
-                o.address, topic=topic, buffer=spec.buffer, keys=keys, held_back=partial(self._held_back, topic)
+                o.address, topic=topic, buffer=spec.buffer, held_back=partial(self._held_back, topic), **shared
             )
         return Inbox(self._readers, list(self._publishers.values()))
 

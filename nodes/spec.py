@@ -4,10 +4,12 @@
      "inputs": [{"type": "Keyframe", "slot": "tracker", "address": "ipc:///tmp/x/tracker.Keyframe",
                  "best_effort": false}],
      "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1, "observers": []}],
-     "observer": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "keys": null, "status_fd": null}
+     "observer": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "keys": null, "token": "",
+     "status_fd": null}
 
 `readers` counts those of both kinds without observers, which are named; `buffer` is in messages; `keys` is a folder,
-see `nodes.addresses.load_keys`. A file NAME.gone beside this one says that the observer NAME is gone.
+see `nodes.addresses.load_keys`; `token` is a secret of the run, without which a publisher takes nobody for a reader. A
+file NAME.gone beside this one says that the observer NAME is gone.
 """
 
 from __future__ import annotations
@@ -55,6 +57,7 @@ class Spec:
     threads: int | None = None
     cpu: tuple[int, ...] | None = None  # cores; None: all
     keys: str | None = None
+    token: str = ""
     status_fd: int | None = None
     folder: Path | None = None  # of the file it was read from
 

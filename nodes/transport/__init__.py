@@ -6,9 +6,10 @@ A topic has one publisher, one message type and one address. What ZeroMQ does no
   nothing was lost.
 - A best-effort reader must never slow the publisher, which NODROP would let it do on the same socket. The first byte
   of a frame says for whom it is ("R" or "N"), readers subscribe to theirs, and the "N" copy is sent with NODROP off.
-- XPUB_VERBOSER reports each reader's arrival and departure: a publisher waits for its readers at the start and for
-  their goodbyes after `End`, because closing earlier throws away what a stalled reader has not read yet
-  (libzmq issue 4660), whatever the linger.
+- XPUB_MANUAL reports each reader's arrival and departure and leaves it to the publisher whom it serves: a stranger who
+  does not begin its subscription with the graph's token gets nothing and holds nobody up. A publisher waits for its
+  readers at the start and for their goodbyes after `End`, because closing earlier throws away what a stalled reader
+  has not read yet (libzmq issue 4660), whatever the linger.
 - A reader whose publisher disappears without `End`, and a publisher whose reader leaves before it, raise PeerLost. A
   reader that only observes says so in a second subscription (`OBSERVER`), which no frame matches: it may leave.
 """

@@ -37,6 +37,7 @@ class Publisher:
         buffer: int = 8,
         keys: Keys | None = None,
         max_bytes: int | None = None,
+        token: str = "",  # with which a reader's subscription must begin: who has none gets nothing
         held_back: Callable[[], None] = lambda: None,
     ) -> None:
         check_address(address, bind=True, keys=keys)
@@ -50,6 +51,7 @@ class Publisher:
         self._started = self._ended = False
         self._pool = FramePool()
         self._keys = keys
+        self._token = token.encode()
         self._file = Path(address.removeprefix("ipc://")) if address.startswith("ipc") else None
         if keys is not None:
             guard.enter(keys)
@@ -57,7 +59,7 @@ class Publisher:
         self.socket.sndhwm = max(1, buffer)
         self.socket.sndtimeo = HELD_BACK_MS
         self.socket.setsockopt(zmq.XPUB_NODROP, 1)
-        self.socket.setsockopt(zmq.XPUB_VERBOSER, 1)
+        self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
         try:
             self.socket.bind(address)
         except zmq.ZMQError as error:
@@ -82,6 +84,9 @@ class Publisher:
             raise PeerLost(f"a reader of {self.topic} left before the end")
 
     def _note(self, arrived: bool, what: bytes) -> None:
+        if not what.startswith(self._token):
+            return  # a stranger
+        what = what[len(self._token) :]
         if what[:1] == OBSERVER:
             name = what[2:].decode(errors="replace")
             if arrived:
@@ -90,6 +95,7 @@ class Publisher:
                 self.observers.pop(name, None)
         elif what in (RELIABLE, NEWEST):  # else it is no reader of ours
             self.readers[what] = max(0, self.readers[what] + (1 if arrived else -1))
+            self.socket.setsockopt(zmq.SUBSCRIBE if arrived else zmq.UNSUBSCRIBE, what)  # of the one who just spoke
 
     def _reliable_readers(self) -> int:
         """Without observers."""

@@ -34,6 +34,7 @@ class _Reader:
         buffer: int = 8,
         keys: Keys | None = None,
         max_bytes: int | None = None,
+        token: str = "",  # of the publisher
         observer: str | None = None,  # the name of one that only observes: its loss does not concern the publisher
     ) -> None:
         check_address(address)
@@ -51,9 +52,12 @@ class _Reader:
         self._socket.reconnect_ivl = 50
         self.monitor = self._socket.get_monitor_socket(self.monitored)
         self._socket.connect(address)
+        self._subscription = token.encode() + self.delivery
         if observer is not None:  # first: it must not pass for another reader
-            self._socket.subscribe(OBSERVER + self.delivery + observer.encode())
-        self._socket.subscribe(self.delivery)
+            self._socket.subscribe(token.encode() + OBSERVER + self.delivery + observer.encode())
+        self._socket.subscribe(self._subscription)
+        if token:  # what frames begin with, for this socket's own filter: to the publisher it says nothing
+            self._socket.subscribe(self.delivery)
 
     def watch(self) -> None:
         """Takes note of a lost connection. Raises TransportError if the publisher refuses this reader's keys."""
@@ -83,6 +87,10 @@ class _Reader:
     @property
     def waiting(self) -> int:
         return len(self._frames)
+
+    def _say_goodbye(self) -> None:
+        """What the publisher waits for."""
+        self._socket.unsubscribe(self._subscription)
 
     def _close_socket(self) -> None:
         if not self._socket.closed:
@@ -133,7 +141,7 @@ class ReliableReader(_Reader):
         self.expected += 1
         self._count(head.message)
         if self.ended:
-            self._socket.unsubscribe(self.delivery)  # the goodbye that the publisher waits for
+            self._say_goodbye()
         return head.message
 
     def close(self) -> None:
@@ -157,9 +165,12 @@ class NewestReader(_Reader):
         late: bool = True,  # what was sent before the first message that it gets is not "skipped"
         keys: Keys | None = None,
         max_bytes: int | None = None,
+        token: str = "",
         observer: str | None = None,
     ) -> None:
-        super().__init__(address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes, observer=observer)
+        super().__init__(
+            address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes, token=token, observer=observer
+        )
         self._frames = deque(maxlen=1)  # a newer one takes the older one's place
         self._late = late
         self.displaced = 0  # messages that a newer one replaced before they were taken
@@ -227,7 +238,7 @@ class NewestReader(_Reader):
                 continue
             if _is_end(frame):
                 self._end = frame
-                self._socket.unsubscribe(self.delivery)
+                self._say_goodbye()
             else:
                 self.displaced += len(self._frames)
                 self._frames.append(frame)
