@@ -30,14 +30,14 @@ def sampled(matrix: Matrix, output: Path) -> Samples:
     start = time.monotonic()
     samples: Samples = {}
     while process.poll() is None:
-        for name, megabytes in _resident(process.pid).items():
+        for name, megabytes in resident(process.pid).items():
             samples.setdefault(name, []).append((time.monotonic() - start, megabytes))
         time.sleep(PERIOD)
     (output / "memory.json").write_text(json.dumps(samples))
     return samples
 
 
-def _resident(launcher: int) -> dict[str, float]:
+def resident(launcher: int) -> dict[str, float]:
     """Resident MB by node: a node's process is `python -m nodes .../NODE.json`."""
     found: dict[str, float] = {}
     try:
