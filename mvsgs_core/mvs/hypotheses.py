@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core import camera
+from mvsgs_core.membrane import membrane
 from mvsgs_core.mvs.interface import Choice
 from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.mvs.warp import apply_warp, relative_warp
@@ -116,9 +117,5 @@ def fill_uncertain(
     plane stays a plane, so it bridges textureless walls and furniture.
     """
     guide = np.clip(gray + 128.0, 0.0, 255.0).astype(np.uint8)
-    weight = sure + np.float32(1e-4)
-    smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, stiffness, edge)
-    total = smoother.filter(weight)
-    mixed = smoother.filter(np.ascontiguousarray(weight * inverse_depth, dtype=np.float32))
-    membrane = mixed / np.maximum(total, 1e-9)
-    return np.where(sure < least, membrane, inverse_depth).astype(np.float32)
+    sheet = membrane(inverse_depth, sure + np.float32(1e-4), guide, stiffness, edge)
+    return np.where(sure < least, sheet, inverse_depth).astype(np.float32)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 
 from mvsgs_core import camera
 from mvsgs_core.splats.exposure import colors_of_map, fitted_exposure
-from mvsgs_core.splats.filling import fill_points
+from mvsgs_core.splats.filling import continued_depth, fill_points
 from mvsgs_core.splats.insertion import (
     InsertionConfig,
     Points,
@@ -28,6 +29,8 @@ from mvsgs_core.splats.map_state import MapState
 from mvsgs_core.splats.rasterizer import Render
 from mvsgs_core.splats.training import TrainingConfig
 from mvsgs_core.stats import Stats
+
+SOLID = 0.9  # opacity from which the map's depth at a pixel is its surface's
 
 
 @dataclass(frozen=True)
@@ -79,26 +82,32 @@ class Densifier:
             before = len(points)
             points = voxel_filter(points, config.voxel * self.median_depth)
             self.log.skip("points_voxel_filter", before - len(points))
-        return self._append(points, added, config.initial_opacity)
+        return self._append(points, added, config.initial_opacity, config.initial_scale)
 
-    def fill(self, view: PosedView, added: TrainingView, missing: np.ndarray) -> int:
-        """Adds sparse splats from the depth before the filters where it is `missing` (h, w) bool after them, and the
-        map shows nothing, what was just inserted included."""
+    def fill(self, view: PosedView, added: TrainingView) -> int:
+        """Adds sparse splats wherever the map shows nothing, what was just inserted included: at the depth before the
+        filters, and where that says nothing continued from what surrounds it."""
         config = self.config
         if config.fill == 0 or view.unfiltered is None or self.unit is None:
             return 0
-        size = (missing.shape[0], missing.shape[1])
-        empty = missing & _valid_pixels(added, size)
-        if len(self.state):
-            opacity = self.render(added, _level_of(added, size)).opacity.cpu().numpy()
-            empty &= _resized(opacity < config.unexplored_opacity, size)
         depth = checked_depth(view.unfiltered, self.log) * np.float32(added.scale / view.scale / self.unit)
+        size = (depth.shape[0], depth.shape[1])
+        empty, shown = _valid_pixels(added, size), np.zeros(size, dtype=np.float32)
+        if len(self.state):
+            render = self.render(added, _level_of(added, size))
+            opacity = render.opacity.cpu().numpy()
+            empty = empty & _resized(opacity < config.unexplored_opacity, size)
+            solid = np.where(opacity > SOLID, render.depth.cpu().numpy(), 0.0).astype(np.float32)
+            shown = np.asarray(cv2.resize(solid, size[::-1], interpolation=cv2.INTER_NEAREST))
+        if not empty.any():
+            return 0
         confidence = np.ones(size, dtype=np.float32) if view.confidence is None else view.confidence
         intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
         colors = self._colors(added, size)
+        depth = continued_depth(depth, confidence, shown, depth_colors(added.levels[0].cpu().numpy(), size))
         points = fill_points(depth, confidence, intrinsics, colors, empty, config.fill)
         points = points.where(self._near(points))
-        filled = self._append(points, added, config.fill_opacity)
+        filled = self._append(points, added, config.fill_opacity, config.fill_scale)
         self.log.count("filled", filled)
         return filled
 
@@ -127,15 +136,16 @@ class Densifier:
             self.log.refuse("far_points", int((~near).sum()), "points too far away for the map's voxels were left out")
         return near
 
-    def _append(self, points: Points, added: TrainingView, opacity: float) -> int:
+    def _append(self, points: Points, added: TrainingView, opacity: float, scale: float) -> int:
         """Makes splats of camera-frame points, as many as the map has room for; returns their number."""
         room = self.max_splats - len(self.state)
         if len(points) > room:
             self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
             points = points.first(max(0, room))
         new = splats_from_points(
-            points, added.local_from_cam, self.state.splats.sh.shape[1], self.training.density, self.config, opacity
-        )
+            points, added.local_from_cam, self.state.splats.sh.shape[1], self.training.density, self.config,
+            opacity, scale,
+        )  # fmt: skip
         self.state.append(new, torch.full((len(points),), added.index, dtype=torch.int64))
         return len(points)
 

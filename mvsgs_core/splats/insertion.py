@@ -33,8 +33,9 @@ class InsertionConfig:
     initial_scale: float = 0.5  # standard deviation in spacings of the points
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
-    fill: int = 4  # pixels, side of the cells that get one splat from unfiltered depth where the map is empty; 0: off
+    fill: int = 4  # pixels, side of the cells that get one splat of doubtful depth where the map is empty; 0: off
     fill_opacity: float = 0.4  # of these: doubtful ones must be outshone by what comes later, 0 to 1
+    fill_scale: float = 0.7  # of these, as initial_scale: so transparent, they leave no gap only where they overlap
     min_confidence: float = 0.0  # of the depth, 0 to 1; views come filtered already
 
 
@@ -174,18 +175,20 @@ def splats_from_points(
     density: str,
     config: InsertionConfig,
     opacity: float | None = None,
+    scale: float | None = None,
 ) -> Splats:
     """Splats in the world frame of `world_from_cam` (4, 4), float32 tensors on the CPU.
 
-    opacity: of all; None: `initial_opacity`. Standard deviations are `initial_scale` spacings, `flatten` of that along
-    a known normal. The shape starts as a Gaussian: beta = 2, or b = 0 for density "ges_scale".
+    opacity: of all; None: `initial_opacity`. Standard deviations are `scale` (None: `initial_scale`) spacings,
+    `flatten` of that along a known normal. The shape starts as a Gaussian: beta = 2, or b = 0 for density "ges_scale".
     """
     count = len(points)
     rotation, translation = world_from_cam[:3, :3], world_from_cam[:3, 3]
     means = points.positions @ rotation.T + translation
     normals = points.normals @ rotation.T
     known = np.linalg.norm(normals, axis=1) > 0.5
-    log_scales = np.repeat(np.log(np.maximum(points.spacing * config.initial_scale, 1e-30))[:, None], 3, axis=1)
+    scale = config.initial_scale if scale is None else scale
+    log_scales = np.repeat(np.log(np.maximum(points.spacing * scale, 1e-30))[:, None], 3, axis=1)
     log_scales[known, 2] += np.log(config.flatten)
     opacity = min(max(config.initial_opacity if opacity is None else opacity, 1e-4), 1.0 - 1e-4)
     sh = np.zeros((count, sh_bases, 3))

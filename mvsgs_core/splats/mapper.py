@@ -93,11 +93,11 @@ class OnlineMapper:
 
     def _take_in(self, view: PosedView) -> int:
         depth = checked_depth(view.depth, self.log)
-        pose, scale = np.asarray(view.world_from_cam, dtype=np.float64), view.scale
-        if view.index in self.corrections:
-            pose, scale = self.corrections[view.index]
-            depth = depth * np.float32(scale / view.scale)
-        median = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
+        pose, scale = self.corrections.get(view.index, (np.asarray(view.world_from_cam, dtype=np.float64), view.scale))
+        depth = depth * np.float32(scale / view.scale)
+        median = _median(depth)
+        if median == 0 and view.unfiltered is not None:  # the filters kept nothing: doubtful depth gives the scale
+            median = _median(view.unfiltered) * scale / view.scale
         if median >= LARGEST or (self.unit is not None and not is_near(self._local(pose)[:3, 3], median / self.unit)):
             self.log.refuse("views", 1, "a keyframe far away from all others, or with depth so large, was refused")
             return 0
@@ -123,8 +123,8 @@ class OnlineMapper:
             densifier = self._densifier()
             if self.config.training.exposure:
                 densifier.expose(added, self.views[-2] if len(self.views) > 1 else None)
-            inserted = densifier.insert(view, added, depth) if median > 0 else 0
-            inserted += densifier.fill(view, added, depth == 0)
+            inserted = densifier.insert(view, added, depth) if (depth > 0).any() else 0
+            inserted += densifier.fill(view, added)
         self.schedule.owe(self.config.iterations)
         self.log.count("inserted", inserted)
         self.log.count("views")
@@ -285,3 +285,9 @@ class OnlineMapper:
         local = world_from_cam.copy()
         local[:3, 3] = (local[:3, 3] - self.origin) / (self.unit or 1.0)
         return local
+
+
+def _median(depth: np.ndarray) -> float:
+    """Of the depths that are known, 0 where none is."""
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    return float(np.median(known)) if len(known) else 0.0
