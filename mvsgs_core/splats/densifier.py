@@ -99,8 +99,6 @@ class Densifier:
             empty = empty & _resized(opacity < config.unexplored_opacity, size)
             solid = np.where(opacity > SOLID, render.depth.cpu().numpy(), 0.0).astype(np.float32)
             shown = np.asarray(cv2.resize(solid, size[::-1], interpolation=cv2.INTER_NEAREST))
-        if not empty.any():
-            return 0
         confidence = np.ones(size, dtype=np.float32) if view.confidence is None else view.confidence
         intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
         colors = self._colors(added, size)

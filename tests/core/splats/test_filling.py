@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+import torch
 
 from mvsgs_core import camera
-from mvsgs_core.splats.filling import fill_points
+from mvsgs_core.splats.filling import continued_depth, fill_points
 from mvsgs_core.splats.insertion import InsertionConfig
 from mvsgs_core.splats.keyframes import PosedView
 from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
@@ -100,12 +102,73 @@ def test_a_corrected_scale_holds_for_the_filling_too() -> None:
     np.testing.assert_allclose(ratio.numpy(), 2.0, rtol=1e-4)
 
 
-def test_depth_that_is_not_finite_is_refused_and_fills_nothing() -> None:
+def test_depth_that_is_not_finite_is_refused_and_what_surrounds_it_goes_on() -> None:
     view = with_hole(0, 0.5)
     assert view.unfiltered is not None
     broken = view.unfiltered.copy()
     broken[:, HOLE] = np.nan
     mapper = mapper_with(4)
     mapper.add_view(replace(view, unfiltered=broken))
-    assert mapper.log.counts["filled"] == 0
     assert mapper.log.counts["refused_depths"] == 48 * 24
+    assert mapper.log.counts["filled"] == 12 * 6
+    assert torch.isfinite(mapper.state.splats.means).all()
+
+
+def test_where_matching_says_nothing_what_surrounds_it_goes_on() -> None:
+    """A strip that no other view sees: its depth is noise, and its confidence says so."""
+    view = posed_view(0, pose_on_arc(0.5))
+    strip = np.zeros(view.depth.shape, dtype=bool)
+    strip[:, 52:] = True
+    random = np.random.default_rng(0)
+    depth = np.where(strip, random.uniform(0.1, 20.0, strip.shape), view.depth).astype(np.float32)
+    confidence = np.where(strip, 0.05, 0.9).astype(np.float32)
+    nothing = np.zeros_like(view.depth)
+    continued = continued_depth(depth, confidence, nothing, view.image / 255.0)
+    np.testing.assert_array_equal(continued[~strip], view.depth[~strip])
+    error = np.abs(continued / view.depth - 1.0)[strip]
+    assert np.median(error) < 0.1 < 0.5 < np.median(np.abs(depth / view.depth - 1.0)[strip])
+    filtered = np.where(strip, 0.0, view.depth).astype(np.float32)
+    mapper = mapper_with(4)
+    mapper.add_view(replace(view, depth=filtered, normals=None, confidence=confidence, unfiltered=depth))
+    opacity = mapper.render(mapper.views[0]).opacity.numpy()
+    assert (opacity > 0.5).mean() > 0.99
+    assert mapper.log.counts["filled"] >= 12 * 3
+
+
+def test_what_the_map_shows_goes_on_where_a_view_has_no_depth_at_all() -> None:
+    """A camera that only turned: no neighbor has a baseline, but a part of its view is mapped."""
+    first = posed_view(0, pose_on_arc(0.5))
+    mapper = mapper_with(4)
+    mapper.add_view(first)
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.25, 0.0]))[0]
+    turned = posed_view(5, first.world_from_cam @ turn)
+    nothing = np.zeros_like(turned.depth)
+    shown = mapper.add_view(replace(turned, depth=nothing, normals=None, confidence=nothing, unfiltered=nothing))
+    assert shown > 0
+    assert (mapper.render(mapper.views[1]).opacity.numpy() > 0.5).mean() > 0.99
+
+
+def test_doubtful_depth_is_mapped_where_the_filters_kept_nothing() -> None:
+    view = posed_view(0, pose_on_arc(0.5))
+    low, nothing = np.full(view.depth.shape, 0.1, np.float32), np.zeros_like(view.depth)
+    mapper = mapper_with(4)
+    assert mapper.add_view(replace(view, depth=nothing, normals=None, confidence=low, unfiltered=view.depth)) == 12 * 16
+    assert mapper.unit == pytest.approx(float(np.median(view.depth)))
+    assert (mapper.render(mapper.views[0]).opacity.numpy() > 0.5).mean() > 0.99
+
+
+def test_a_view_without_any_depth_adds_nothing_to_an_empty_map() -> None:
+    view = posed_view(0, pose_on_arc(0.5))
+    nothing = np.zeros_like(view.depth)
+    mapper = mapper_with(4)
+    assert mapper.add_view(replace(view, depth=nothing, confidence=nothing, unfiltered=nothing)) == 0
+    assert not continued_depth(nothing, nothing, nothing, view.image / 255.0).any()
+
+
+def test_a_cell_that_the_border_cuts_is_filled_too() -> None:
+    depth, sure = np.full((6, 10), 2.0), np.ones((6, 10))
+    intrinsics = np.array([10.0, 10.0, 4.5, 2.5])
+    points = fill_points(depth, sure, intrinsics, np.full((6, 10, 3), 0.5), np.ones((6, 10), dtype=bool), 4)
+    assert len(points) == 2 * 3
+    np.testing.assert_allclose(points.colors, 0.5)
