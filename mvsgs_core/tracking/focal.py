@@ -39,7 +39,9 @@ def start_with_unknown_focal(
         graph.intrinsics = guess * [factor, factor, 1.0, 1.0]
         start = start_up(graph, order, criteria, threads, free_focal=True)
         if not start.failure and not config.bounds[0] < factor * start.focal_factor < config.bounds[1]:
-            start = replace(start, failure="no focal length in a sensible range explains the matches")
+            start = replace(
+                start, failure=f"no focal length in a sensible range: {factor * start.focal_factor:.2f} times the guess"
+            )
         if start.failure:
             failed = failed or start
         elif best is None or start.cost < best[0].cost:

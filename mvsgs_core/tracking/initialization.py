@@ -30,7 +30,7 @@ class StartCriteria:
 
 @dataclass(frozen=True)
 class Start:
-    """A start-up attempt; `failure` is empty where it may be used, else the reason why not."""
+    """A start-up attempt; `failure` is empty where it may be used, else the kind of reason, a colon, the figures."""
 
     cam_from_world: np.ndarray  # (K, 4, 4)
     inverse_depth: np.ndarray  # (K, M), median 1
@@ -53,7 +53,10 @@ def start_up(
     turned = _rotation_error(problem, threads, free_focal)
     if turned < criteria.min_turn_error:
         ones = np.ones((k, m))
-        reason = f"a camera that only turned explains the matches to {turned:.1f} pixels"
+        reason = (
+            f"no parallax: a camera that only turned explains the matches to {turned:.1f} pixels, "
+            f"{criteria.min_turn_error:.1f} or more are parallax"
+        )
         return Start(problem.cam_from_world, ones, 0.0 * ones, np.inf, turned, 0.0, reason)
     starts = [np.tile(np.eye(4), (k, 1, 1)), *_essential_starts(graph, order)]
     best: Solution | None = None
@@ -75,7 +78,15 @@ def start_up(
                 break
     if best is None:
         nothing = np.ones((k, m))
-        return Start(starts[0], nothing, 0.0 * nothing, np.inf, 0.0, 0.0, "no start could be solved")
+        return Start(
+            starts[0],
+            nothing,
+            0.0 * nothing,
+            np.inf,
+            0.0,
+            0.0,
+            "no start could be solved: every bundle adjustment failed",
+        )
     poses, depths = best.cam_from_world, best.inverse_depth
     known = best.information * depths**2 > 10.0
     scale = float(np.median(depths[known])) if known.sum() > 50 else float(np.median(depths))
@@ -89,11 +100,14 @@ def start_up(
     cost = best.cost / max(matched, 1.0)
     failure = ""
     if not np.isfinite(cost) or cost > criteria.max_cost:
-        failure = f"the matches do not agree (cost {cost:.2f} a match)"
+        failure = f"the matches do not agree: cost {cost:.2f} a match, {criteria.max_cost:.2f} at most"
     elif parallax < criteria.min_parallax or baseline < criteria.min_baseline:
-        failure = f"too little parallax ({parallax:.1f} pixels, baseline {baseline:.3f} of the depth)"
+        failure = (
+            f"too little parallax: {parallax:.1f} pixels of {criteria.min_parallax:.1f} needed, cameras {baseline:.3f} "
+            f"of the depth apart, {criteria.min_baseline:.3f} needed"
+        )
     elif known.sum() < 0.3 * np.mean(problem.information[:, 0] > 0) * k * m:
-        failure = "too few points could be triangulated"
+        failure = f"too few points could be triangulated: {known.sum()} of {k * m}"
     information = best.information * scale**2
     return Start(poses, depths, information, cost, parallax, baseline, failure, best.focal_factor)
 

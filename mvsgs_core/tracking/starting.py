@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.flow import Matches, spread
 from mvsgs_core.tracking.focal import FocalConfig, start_with_unknown_focal
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
@@ -31,14 +32,21 @@ class StartingConfig:
 class Starter:
     """The keyframes of a segment that has not started."""
 
-    def __init__(self, graph: KeyframeGraph, matcher: Matcher, config: StartingConfig, threads: int) -> None:
+    def __init__(
+        self, graph: KeyframeGraph, matcher: Matcher, config: StartingConfig, threads: int, diagnosis: Diagnosis
+    ) -> None:
         self.graph = graph
         self.matcher = matcher
         self.config = config
         self.threads = threads
         self.waiting: list[int] = []
         self.attempts = 0
-        self.reason = "too little motion"  # why there is no start yet
+        self.diagnosis = diagnosis
+
+    @property
+    def reason(self) -> str:
+        """Why there is no start yet."""
+        return self.diagnosis.reason(self.config.keyframes)
 
     def flow(self, since: int) -> float:
         """Share of the width that makes a keyframe, so many frames after the last one."""
@@ -50,6 +58,7 @@ class Starter:
         earlier = list(self.waiting)
         self.graph.add(Keyframe(image, np.eye(4), ones, 0.0 * ones, segment))
         self.waiting.append(image.index)
+        self.diagnosis.waiting(len(self.waiting))
         if matches is not None and earlier:
             self._connect(image, earlier, matches)
 
@@ -73,7 +82,7 @@ class Starter:
         else:
             start = start_with_unknown_focal(self.graph, self.waiting, criteria, focal, self.threads)
         if start.failure:
-            self.reason = start.failure
+            self.diagnosis.failed(start.failure)
             if len(self.waiting) >= self.config.limit:
                 self.graph.remove(self.waiting.pop(0))
             return False

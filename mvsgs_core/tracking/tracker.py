@@ -21,6 +21,7 @@ from mvsgs_core.tracking.back_end import BackEnd
 from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.calibration import READOUT_AGAIN, Calibration
 from mvsgs_core.tracking.config import TrackerConfig
+from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.flow import make_flow
 from mvsgs_core.tracking.focal import FocalConfig
 from mvsgs_core.tracking.frames import FrameRecord, Path, State, solve_path
@@ -50,6 +51,7 @@ class Tracker:
         self.stats = Stats(clock=clock)
         self.started = False
         self.segment = 0
+        self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
         self.graph: KeyframeGraph | None = None
         self._since = 0  # frames since the last keyframe
         self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
@@ -77,6 +79,8 @@ class Tracker:
             return self._begin(frame, record)
         with self.stats.time("front end"):
             step = self.front_end.follow(frame, self.started)
+        if not self.started:
+            self.diagnosis.saw(self.front_end.reference, frame, step, self.front_end.is_lost(step))
         if step.still:
             self.stats.skip("frames that did not move")
             last = self.records[-2]
@@ -133,8 +137,10 @@ class Tracker:
             self.calibration.check(self.local_map.members(self.segment))
         self.stats.counts["matches"] = self.matcher.calls
         self.stats.counts["matches that needed features"] = self.matcher.feature_calls
+        self.nothing = ""
         if not self.graph.keyframes:
-            self.stats.warn(f"tracking never started: {self.starter.reason}")
+            self.nothing = f"tracking never started: {self.starter.reason}"
+            self.stats.warn(self.nothing)
         warn_of_gaps(self.stats, self._path)
         warn_of_few_matches(self.stats, self.graph, self.config.matches)
         yield Update(State.TRACKED if self.started else State.NOT_STARTED, (), self.publisher.corrections(True))
@@ -160,7 +166,8 @@ class Tracker:
         self.matcher = Matcher(self.flow)
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, config.threads)
         self.choice = KeyframeChoice(config.front_end)
-        self.starter = Starter(self.graph, self.matcher, config.starting, config.threads)
+        self.diagnosis = Diagnosis(config.front_end, config.texture)
+        self.starter = Starter(self.graph, self.matcher, config.starting, config.threads, self.diagnosis)
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, config.threads)
         self.loops = LoopCloser(self.graph, self.local_map, config.loop)
         self.recovery = Recovery(self.graph, self.matcher, self.loops.retrieval, config.recovery, config.front_end)
@@ -170,9 +177,10 @@ class Tracker:
 
     def _begin(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """First keyframe of a segment that has not started yet."""
+        record.state = State.NOT_STARTED
         if frame.cells.textured.mean() < self.config.texture:
             self.stats.count("frames without texture")
-            record.state = State.NOT_STARTED
+            self.diagnosis.no_texture(frame)
             return Update(record.state)
         self.recovery.keep(frame)
         self.starter.add(frame, self.segment)

@@ -1,0 +1,54 @@
+"""A map that never began says why, with what was measured."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvsgs_core.datasets import Item, open_dataset
+from tests.core.tracking.sequences import synthetic, track
+
+
+def blank() -> list[Item]:
+    return [replace(i, image=np.full_like(i.image, 128)) for i in synthetic(frames=80)[:10]]
+
+
+def resting() -> list[Item]:
+    return [replace(synthetic(frames=80)[0], index=n, timestamp=n / 20.0) for n in range(10)]
+
+
+def turning() -> list[Item]:
+    return list(synthetic(frames=75, pure_rotation=20)[:12])
+
+
+def jumping() -> list[Item]:
+    """Views from all over the room: no frame shows what the one before does."""
+    every = synthetic(frames=80)[::16]
+    other = [open_dataset("synthetic", frames=4, threads=1, scene="aerial")]
+    far = [item for items in zip(every, list(other[0])) for item in items]
+    return [replace(i, index=n, timestamp=n / 20.0) for n, i in enumerate(far)]
+
+
+@pytest.mark.parametrize(
+    ("items", "kind", "figures"),
+    [
+        (blank, "no texture", r"10 of 10 frames .* 0\.0 %"),
+        (resting, "too little motion", r"0\.0 % of its width .* \d of 6 keyframes"),
+        (turning, "parallax", r"explains the matches to 0\.\d pixels|\d\.\d pixels of"),
+        (jumping, "steps too wide", r"\d of \d frames .* \d+ % of the matches survive, 20 % are needed"),
+    ],
+)
+def test_the_reason_is_what_was_measured(items: object, kind: str, figures: str) -> None:
+    tracker, path, _ = track(items())  # type: ignore[operator]
+    assert not np.isfinite(path.world_from_cam).any()
+    assert kind in tracker.nothing
+    assert re.search(figures, tracker.nothing), tracker.nothing
+    assert tracker.nothing in list(tracker.stats.warnings)
+
+
+def test_a_map_has_no_reason_to_be_none() -> None:
+    tracker, _, _ = track(synthetic(frames=80)[:30])
+    assert tracker.nothing == ""
