@@ -80,6 +80,8 @@ class PosedTracker(Node):
                 f"moves too little for tracker.keyframe_flow={self.config.keyframe_flow:g}; lower it"
             )
         self._report()
+        if not any(pose is not None for _, pose in self._path.values()):
+            self.stats.nothing(f"no frame came with a true pose, of {len(self._path)} frames: tracker=dense needs none")
         order = sorted(self._path)
         n = len(order)
         poses = np.full((n, 4, 4), np.nan)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from msgs import Frame, Keyframe, Poses
 from mvsgs_core import geometry
 from mvsgs_core.tracking import tracker as core
@@ -67,6 +69,8 @@ class Tracker(TrackerNode):
             )
         )
 
+        self._unrolled: list[float] = []  # seconds of readout that were taken out of each keyframe's image
+
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
         self._frames[frame.index] = frame
         update = self._tracker.add(
@@ -91,6 +95,9 @@ class Tracker(TrackerNode):
         inverse_depth, weight = coarse_map(keyframe)
         with self.stats.time("unrolling"):
             image = unrolled(frame.image, keyframe.image, self._readout)
+        self._unrolled.append(0.0 if keyframe.image.velocity is None else self._readout)
+        if max(self._unrolled) > 0.0:
+            self.stats.values["rolling shutter taken out of keyframes"] = spread(self._unrolled)
         if self._readout and keyframe.image.velocity is None:
             self.stats.count("keyframes with the rolling shutter still in: no velocity")
         return Keyframe(
@@ -104,6 +111,12 @@ class Tracker(TrackerNode):
             inverse_depth_weight=weight,
             segment=keyframe.segment,
         )
+
+
+def spread(readouts: list[float]) -> str:
+    """What keyframes were unrolled with, seconds: the estimate gets better while they go out."""
+    low, mean, high = (1e3 * float(f(readouts)) for f in (np.min, np.mean, np.max))
+    return f"{mean:.1f} ms" if high - low < 0.05 else f"{mean:.1f} ms in the mean, {low:.1f} to {high:.1f}"
 
 
 def _device(name: str) -> str:

@@ -25,6 +25,9 @@ class CoreTracker(Protocol):
     @property
     def pending(self) -> set[int]: ...  # frames that may still be sent as keyframes
 
+    @property
+    def nothing(self) -> str: ...  # why no frame has a pose, once the stream has ended; empty where one has
+
     def finish(self) -> Iterator[Update]: ...
 
     def path(self) -> Path: ...
@@ -60,6 +63,8 @@ class TrackerNode(Node, ABC):
             yield from self._send(update)
         path = self._core.path()
         self._report()
+        if self._core.nothing:
+            self.stats.nothing(self._core.nothing)
         yield Trajectory(
             index=path.index,
             timestamp=path.timestamp,

@@ -15,7 +15,7 @@ from mvsgs_core.evaluation.image_metrics import psnr
 from mvsgs_core.tracking.frames import State
 from nodes import Node, handlers, outputs
 from nodes.posed_tracker import PosedTracker
-from nodes.tracker import Tracker
+from nodes.tracker import Tracker, spread
 from tests.core.tracking.sequences import synthetic
 
 
@@ -114,6 +114,58 @@ def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
         sent = list(node.on_end())
         assert isinstance(sent[-1], Trajectory)
         assert sent[-1].world_from_cam.shape == (0, 4, 4)
+
+
+def test_no_pose_at_all_is_nothing_with_its_reason() -> None:
+    frames, truths = messages(12)
+    node = Tracker()
+    for frame in frames:
+        list(node.on_frame(replace(frame, image=np.full_like(frame.image, 128))))
+    list(node.on_end())
+    assert "no texture: 12 of 12 frames" in node.stats.values["nothing"]
+    posed = PosedTracker()
+    for frame, truth in zip(frames, truths):
+        list(posed.on_frame(frame))
+        list(posed.on_ground_truth(replace(truth, world_from_cam=None)))
+    list(posed.on_end())
+    assert "12 frames" in posed.stats.values["nothing"]
+
+
+def test_some_pose_is_something() -> None:
+    frames, _ = messages(30)
+    node = Tracker()
+    for frame in frames:
+        list(node.on_frame(frame))
+    list(node.on_end())
+    assert "nothing" not in node.stats.values
+
+
+def test_the_newest_view_is_sent() -> None:
+    """Its frame is still there at the end, and the map gets it."""
+    frames, truths = messages(40)
+    for node in (Tracker(), PosedTracker()):
+        sent = [m for frame in frames for m in node.on_frame(frame)]
+        if isinstance(node, PosedTracker):
+            sent += [m for truth in truths for m in node.on_ground_truth(truth)]
+        sent += list(node.on_end())
+        assert max(k.index for k in of_type(sent, Keyframe)) >= 38
+
+
+def test_what_was_taken_out_of_the_keyframes_is_told() -> None:
+    """The estimate of the readout changes while keyframes go out: the report has what each was sent with."""
+    frames, _ = rolling_messages(40)
+    node = Tracker(Tracker.Config(readout=0.5 / FPS))
+    for n, frame in enumerate(frames):
+        if n == 30:  # as the tracker does when it knows better
+            assert node._tracker.graph is not None
+            node._tracker.graph.readout = 0.4 / FPS
+        list(node.on_frame(frame))
+    list(node.on_end())
+    early, late = 0.5 / FPS, 0.4 / FPS
+    assert set(node._unrolled) == {early, late}
+    told = node.stats.values["rolling shutter taken out of keyframes"]
+    assert told == f"{1e3 * np.mean(node._unrolled):.1f} ms in the mean, {1e3 * late:.1f} to {1e3 * early:.1f}"
+    assert spread([0.02, 0.02]) == "20.0 ms"
 
 
 def run_posed(order: list[Frame | GroundTruth]) -> list[msgs.Message]:

@@ -22,11 +22,12 @@ from mvsgs_core.droid.networks import RANDOM, Networks, load
 from mvsgs_core.droid.presets import AREA, Preset
 from mvsgs_core.droid.trajectory_filler import StoredFrame, fill
 from mvsgs_core.droid.video import Video, VideoFrame
+from mvsgs_core.held_out import is_held_out
 from mvsgs_core.networks.droid import DroidNet
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.frames import Path, State
-from mvsgs_core.tracking.publish import Publisher
-from mvsgs_core.tracking.tracker import Update
+from mvsgs_core.tracking.keyframe_choice import HELD_OUT
+from mvsgs_core.tracking.publish import Publisher, Update
 
 _DEGENERATE = 0.05  # share of cells that agree with a neighbor, below which a keyframe's depth is none
 
@@ -54,6 +55,7 @@ class DroidSlam:
         self.framing: Framing | None = None
         self.frames: list[StoredFrame] = []
         self._states: list[State] = []
+        self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
         self._path = _empty_path()
 
     def add(self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> Update:
@@ -70,7 +72,7 @@ class DroidSlam:
             self.stats.skip("frames between strides")
             return Update(self._states[-1])
         with self.stats.time("motion filter"):
-            encoded = self.motion_filter.passes(small)
+            encoded = self.motion_filter.passes(small, is_held_out(index))
         if encoded is None:
             self.stats.skip("frames that moved too little")
             return Update(self._states[-1])
@@ -104,16 +106,19 @@ class DroidSlam:
         if not self.frontend.started and self.frontend.force_start():
             self.stats.warn("the start was forced at the end of the stream, on fewer keyframes than the warm-up takes")
         if not self.frontend.started:
-            self.stats.warn(
-                f"tracking never started: only {len(self.video)} frames moved enough to be keyframes "
-                f"(filter_threshold {self.config.preset.filter_threshold})"
+            self.nothing = (
+                f"tracking never started: too little motion: {len(self.video)} of {len(self.frames)} frames moved by "
+                f"{self.config.preset.filter_threshold:g} cells or more (filter_threshold) since the one before"
             )
+            self.stats.warn(self.nothing)
             self._path = self._collect(None)
             yield Update(State.NOT_STARTED)
             return
+        self.nothing = ""
         yield self._tell(len(self.video))
         self._adjust_globally(self.config.preset.backend_steps)
         self._path = self._collect(self._fill())
+        self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.video.keyframes))
         if self.networks.not_finite:
             self.stats.warn(f"{self.networks.not_finite} network outputs were not finite and were ignored")
         yield Update(State.TRACKED, (), self.publisher.corrections(True))

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.bundle_adjustment import Solver, reproject
 from mvsgs_core.tracking.flow import Matches, make_flow
-from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
+from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
+from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from mvsgs_core.tracking.matcher import Matcher
+
+FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to be apart where no match tells
 
 
 @dataclass(frozen=True)
@@ -29,13 +33,20 @@ class PosedConfig:
 
 
 class PosedTracker:
-    """Keyframes come one keyframe late: their depths are triangulated with one that follows."""
+    """Keyframes come one keyframe late: their depths are triangulated with one that follows.
+
+    The given poses' unit may be anything. Inside, the median depth of the first keyframe is the unit, as everywhere in
+    the tracker; what goes out is in the given one.
+    """
 
     def __init__(self, config: PosedConfig | None = None) -> None:
         self.config = config or PosedConfig()
         self.stats = Stats()
         self.graph: KeyframeGraph | None = None
-        self.pending: list[int] = []  # keyframes not given out yet
+        self.unit = 1.0  # of the given poses' units, one of the graph's
+        self._undecided = True  # about the unit: no two keyframes have told the first depth yet
+        self._complete: list[int] = []  # keyframes not given out yet
+        self._tail: dict[int, tuple[TrackingImage, np.ndarray, Step]] = {}  # the last two frames since
 
     def add(
         self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray, world_from_cam: np.ndarray
@@ -47,18 +58,60 @@ class PosedTracker:
         frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color)
         self.stats.count("frames")
         pose = geometry.inverse(world_from_cam)
+        pose[:3, 3] /= self.unit
         if self.front_end.reference is None:
             return self._first(frame, pose)
         with self.stats.time("front end"):
             step = self.front_end.follow(frame, started=False)
-        if not self.front_end.is_lost(step):
-            if not self.front_end.wants_keyframe(step, self.config.front_end.keyframe_flow):
-                return []
-            matches = {self.front_end.reference.index: step.matches}
-        else:
-            matches = {}
-        if len(self.graph.keyframes) == 1:
-            self._first_depth(pose, matches)
+        if self.front_end.is_lost(step):
+            return self._insert(frame, pose, {})
+        reference, width = self.front_end.reference.index, frame.size[1]
+        if not self.choice.wants(index, reference, step, width, self.config.front_end.keyframe_flow):
+            if self._complete == [reference] and is_held_out(reference) and not is_held_out(index):
+                self.graph.remove(reference)  # the first frame of all: this one is as good
+                return self._first(frame, pose)
+            self._tail = {i: self._tail[i] for i in sorted(self._tail)[-1:]} | {index: (frame, pose, step)}
+            return []
+        return self._insert(frame, pose, {reference: step.matches})
+
+    @property
+    def pending(self) -> set[int]:
+        """Frames that may still be given out as keyframes."""
+        return set(self._complete) | set(self._tail)
+
+    def finish(self) -> list[int]:
+        """The stream has ended: the last keyframes, one of them of the last frames if they show something new."""
+        complete: list[int] = []
+        if self.graph is not None:
+            width = self.size[1]
+            tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[2], width)}
+            last = newest(tail)
+            if last is not None:
+                frame, pose, step = tail[last]
+                assert self.front_end.reference is not None
+                complete = self._insert(frame, pose, {self.front_end.reference.index: step.matches})
+            self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.graph.keyframes))
+        complete, self._complete, self._tail = complete + self._complete, [], {}
+        return complete
+
+    def keyframe(self, index: int) -> Keyframe:
+        """A keyframe in the unit of the given poses."""
+        assert self.graph is not None
+        keyframe = self.graph.keyframes[index]
+        pose = keyframe.cam_from_world.copy()
+        pose[:3, 3] *= self.unit
+        return replace(
+            keyframe,
+            cam_from_world=pose,
+            inverse_depth=keyframe.inverse_depth / self.unit,
+            information=keyframe.information * self.unit**2,
+        )
+
+    def _insert(self, frame: TrackingImage, pose: np.ndarray, matches: dict[int, Matches]) -> list[int]:
+        """A frame becomes a keyframe; returns those that are complete now. matches: of the reference's points."""
+        assert self.graph is not None
+        if self._undecided:
+            pose = self._decide_unit(pose, matches)
         with self.stats.time("triangulation"):
             self.local_map.insert(frame, pose, 0, matches)
             members = self.local_map.members(0)
@@ -72,17 +125,8 @@ class PosedTracker:
             self.graph.keyframes[old].image.release()
         self.front_end.refer_to(frame)
         self.stats.count("keyframes")
-        complete, self.pending = self.pending, [index]
+        complete, self._complete, self._tail = self._complete, [frame.index], {}
         return complete
-
-    def finish(self) -> list[int]:
-        """The stream has ended: the last keyframe."""
-        complete, self.pending = self.pending, []
-        return complete
-
-    def keyframe(self, index: int) -> Keyframe:
-        assert self.graph is not None
-        return self.graph.keyframes[index]
 
     def _set_up(self, height: int, width: int, intrinsics: np.ndarray) -> None:
         self.size = tracking_size(height, width, self.config.area)
@@ -90,6 +134,7 @@ class PosedTracker:
         self.graph.readout = self.config.readout
         self.flow = make_flow(self.config.flow)
         matcher = Matcher(self.flow)
+        self.choice = KeyframeChoice(self.config.front_end)
         self.front_end = FrontEnd(self.graph, matcher, self.config.front_end, self.config.threads)
         self.local_map = LocalMap(self.graph, matcher, self.config.local_map, self.config.threads)
 
@@ -98,34 +143,41 @@ class PosedTracker:
         ones = np.ones(len(frame.cells.points))
         self.graph.add(Keyframe(frame, pose, ones, 0.0 * ones, 0))
         self.front_end.refer_to(frame)
-        self.stats.count("keyframes")
-        self.pending = [frame.index]
+        self.stats.counts["keyframes"] = 1
+        self._complete = [frame.index]
         return []
 
-    def _first_depth(self, pose: np.ndarray, matches: dict[int, Matches]) -> None:
-        """The unit of the given poses is unknown: the inverse depth that explains the first flow best is tried out."""
+    def _decide_unit(self, pose: np.ndarray, matches: dict[int, Matches]) -> np.ndarray:
+        """From the first two keyframes that are apart: the depth that explains the flow between them is the unit.
+
+        pose (4, 4): of the second; returned in the new unit, as all keyframes' are from then on.
+        """
         assert self.graph is not None
-        ((index, keyframe),) = self.graph.keyframes.items()
-        found = self.front_end.step.matches if self.front_end.step else None
-        if not matches or found is None:
-            return
-        baseline = float(np.linalg.norm((pose @ self.graph.world_from_cam(index))[:3, 3]))
+        assert self.front_end.reference is not None
+        first = self.graph.keyframes[self.front_end.reference.index]
+        baseline = float(np.linalg.norm((pose @ self.graph.world_from_cam(first.index))[:3, 3]))
         if baseline <= 0.0:
-            return
-        best = (np.inf, 1.0)
-        for ratio in np.geomspace(1e-3, 3.0, 40):
-            depths = np.full_like(keyframe.inverse_depth, ratio / baseline)
-            pixels, _ = reproject(
-                np.stack([keyframe.cam_from_world, pose]),
-                depths[None],
-                keyframe.points.T[None].astype(np.float64),
-                self.graph.intrinsics,
-                np.array([0]),
-                np.array([1]),
-            )
-            error = np.linalg.norm(pixels[0].T - found.target, axis=1)[found.alive]
-            best = min(best, (float(np.median(error)), float(ratio / baseline)))
-        keyframe.inverse_depth = np.full_like(keyframe.inverse_depth, best[1])
+            return pose
+        best = (np.inf, FIRST_RATIO)
+        for found in matches.values():
+            for ratio in np.geomspace(1e-3, 3.0, 40):
+                pixels, _ = reproject(
+                    np.stack([first.cam_from_world, pose]),
+                    np.full_like(first.inverse_depth, ratio / baseline)[None],
+                    first.points.T[None].astype(np.float64),
+                    self.graph.intrinsics,
+                    np.array([0]),
+                    np.array([1]),
+                )
+                error = np.linalg.norm(pixels[0].T - found.target, axis=1)[found.alive]
+                best = min(best, (float(np.median(error)), float(ratio)))
+        self._undecided, self.unit = False, baseline / best[1]
+        for keyframe in self.graph.keyframes.values():
+            keyframe.cam_from_world = keyframe.cam_from_world.copy()
+            keyframe.cam_from_world[:3, 3] /= self.unit
+        pose = pose.copy()
+        pose[:3, 3] /= self.unit
+        return pose
 
 
 __all__ = ["PosedConfig", "PosedTracker"]

@@ -24,7 +24,10 @@ LEAST_GAIN = 0.02  # of the robust cost: what a global shutter gains by chance i
 
 
 def estimate_readout(graph: KeyframeGraph, indices: Iterable[int], threads: int) -> float:
-    """Seconds, 0 for a global shutter or where the matches do not tell. Leaves the graph as it is."""
+    """Seconds, 0 for a global shutter or where the matches hardly tell. Leaves the graph as it is.
+
+    The graph's own readout where nothing can be said: an adjustment failed, or the cost has no least.
+    """
     order = sorted(indices)
     tried = np.linspace(0.0, LONGEST, 4)
     before, costs = graph.readout, []

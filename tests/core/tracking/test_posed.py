@@ -1,0 +1,44 @@
+"""The tracker with true poses: their unit may be anything."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mvsgs_core.held_out import is_held_out
+from mvsgs_core.tracking.posed import PosedTracker
+from tests.core.tracking.sequences import synthetic
+
+
+def depths(factor: float, count: int = 40) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """By keyframe: its depths, which of them are triangulated, and its position, poses being `factor` times larger."""
+    tracker = PosedTracker()
+    complete: list[int] = []
+    for item in synthetic(frames=80)[:count]:
+        pose = np.array(item.world_from_cam)
+        pose[:3, 3] *= factor
+        complete += tracker.add(item.index, item.timestamp, item.image, item.intrinsics, pose)
+    complete += tracker.finish()
+    keyframes = {index: tracker.keyframe(index) for index in complete}
+    return {
+        i: (1.0 / k.inverse_depth, k.triangulated, np.linalg.inv(k.cam_from_world)[:3, 3]) for i, k in keyframes.items()
+    }
+
+
+@pytest.mark.parametrize("factor", [1000.0, 1e-3])
+def test_the_unit_of_the_poses_does_not_matter(factor: float) -> None:
+    plain, scaled = depths(1.0), depths(factor)
+    assert plain.keys() == scaled.keys()
+    for index, (depth, known, position) in plain.items():
+        other, other_known, other_position = scaled[index]
+        assert np.mean(known == other_known) > 0.99
+        np.testing.assert_allclose(other_position, factor * position, rtol=1e-9, atol=1e-9 * factor)
+        both = known & other_known
+        assert np.quantile(np.abs(other[both] / (factor * depth[both]) - 1.0), 0.99) < 0.01
+
+
+def test_held_out_frames_are_no_keyframes_and_the_newest_view_is_one() -> None:
+    keyframes = list(depths(1.0))
+    assert len(keyframes) >= 5
+    assert not [k for k in keyframes if is_held_out(k)]
+    assert keyframes[-1] >= 38, "the newest view"
