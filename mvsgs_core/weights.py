@@ -275,7 +275,7 @@ def main() -> int:
         else:
             print(check(arguments.file))
     except (OSError, ValueError, KeyError) as error:
-        print(f"error: {error.args[0]}", file=sys.stderr)
+        print(f"error: {error.args[0] if isinstance(error, KeyError) else error}", file=sys.stderr)
         return 1
     return 0
 

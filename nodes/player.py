@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from msgs import Frame, GroundTruth
-from msgs.codec import MAX_MESSAGE_BYTES, CodecError, decode
+from msgs.codec import MAX_MESSAGE_BYTES, decode
 from mvsgs_core.bad_file import BadFileError, brief
+from mvsgs_core.camera import check_intrinsics
 from mvsgs_core.datasets.mcap_file import McapFile, Recorded
 from nodes import Node
 from nodes.recorder import ENCODING
@@ -93,10 +95,13 @@ class Player(Node):
     def _decoded(record: Recorded, recording: McapFile) -> Frame | GroundTruth | None:
         try:
             message = decode(record.data, expect=PLAYED).message
-        except CodecError as error:
+            assert isinstance(message, PLAYED)
+            check_intrinsics(message.intrinsics, (message.image.shape[0], message.image.shape[1]))
+            if not math.isfinite(message.timestamp):
+                raise ValueError(f"at {message.timestamp} s")
+        except ValueError as error:  # CodecError is one
             recording.leave_out(f"{record.topic} {record.sequence}: {brief(error)}")
             return None
-        assert isinstance(message, PLAYED)
         return message
 
 

@@ -77,3 +77,30 @@ def test_a_missing_path_is_refused_before_a_process_starts(
     assert said.startswith("error: dataset: ")
     assert "dataset.path" in said if path is None or choice == "player" else f"{path} is missing" in said
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("choice", "name", "said"),
+    [
+        ("video", "walk.mp4", "cut off before its index was written"),
+        ("player", "walk.mcap", "is no recording"),
+        ("bag", "walk.bag", "is no bag that can be read"),
+        ("images", "photos", "no image could be read"),
+    ],
+)
+def test_input_that_cannot_be_read_is_refused_before_a_process_starts(
+    choice: str, name: str, said: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    if choice == "images":
+        path.mkdir()
+        path = path / "0.jpg"
+    path.write_bytes(b"\x00\x00\x00\x20ftypisom" + bytes(2000))
+    given = [f"dataset={choice}", f"dataset.path={tmp_path / name}", f"output={tmp_path / 'out'}"]
+    config = OmegaConf.create(compose(given).resolved)
+    assert run(Job(config, [], {"dataset": choice}, None)) == 2
+    *before, error = capfd.readouterr().err.splitlines()
+    assert error.startswith("error: dataset: ")
+    assert said in error
+    assert all(line.startswith("[mov,mp4") for line in before), "what FFmpeg says of it, and no traceback"
+    assert not (tmp_path / "out").exists()

@@ -203,6 +203,13 @@ def test_a_message_that_is_none_is_left_out(tmp_path: Path) -> None:
             for data in (b"", b"no message", bytes(encode(Frame(9, 0.0, image, np.ones(4))))[:-20]):
                 recorder._writer.add_message(recorder._channels["Frame"], 0, data, 0, 2)
     list(recorder.on_end())
+    recorder = Recorder(Recorder.Config(str(tmp_path / "b.mcap")))
+    for intrinsics in ([2, 2, 2, 2], [2, 2, 1e9, 2], [0, 2, 2, 2], [np.nan, 2, 2, 2]):
+        recorder.on_frame(Frame(0, 0.0, image, np.array(intrinsics, np.float64)))
+    list(recorder.on_end())
+    impossible, kept = played(tmp_path / "b.mcap")
+    assert len(kept) == 1
+    assert "left out because they are damaged: 3 (first: Frame 1: principal point" in impossible.stats.warnings[0]
     player, again = played(path)
     assert [message.index for message in again] == [0, 1, 2, 3]
     assert any("left out because they are damaged: 3 (first: " in warning for warning in player.stats.warnings)

@@ -137,8 +137,12 @@ class Video:
             )
 
     def _open(self) -> cv2.VideoCapture:
-        with reading(self._path, "cannot be opened by OpenCV"):
-            capture = cv2.VideoCapture(str(self._path))
+        loud = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it in words
+        try:
+            with reading(self._path, "cannot be opened by OpenCV"):
+                capture = cv2.VideoCapture(str(self._path))
+        finally:
+            cv2.utils.logging.setLogLevel(loud)
         if not capture.isOpened():
             raise BadFileError(
                 f"OpenCV cannot open {self._path}: no video, cut off before its index was written (record it again, or "

@@ -205,6 +205,20 @@ def test_a_wrong_file_is_not_kept(url: str, monkeypatch: pytest.MonkeyPatch, tmp
     assert not list((tmp_path / "mvsgs").rglob("*.p*"))
 
 
+def test_what_cannot_be_read_is_said_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "folder.pth").mkdir()
+    for path, said in ((tmp_path / "none.pth", "there is no file"), (tmp_path / "folder.pth", "there is no file")):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("sys.argv", ["weights", "check", str(path)])
+            assert weights.main() == 1
+        assert said in capsys.readouterr().err
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["weights", "check", str(tmp_path)])
+        patch.setattr(weights, "check", lambda path: path.read_bytes())
+        assert weights.main() == 1
+    assert f"Is a directory: '{tmp_path}'" in capsys.readouterr().err, "not the number of the error alone"
+
+
 def test_files_that_come_by_hand_say_where_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("MVSGS_WEIGHTS", raising=False)

@@ -15,6 +15,7 @@ from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.bag_file import opened_bag
 from mvsgs_core.datasets.files import UnreadableImageError
 from mvsgs_core.datasets.ros import rgb_of
+from tests.core.datasets.test_hostile_files import huge_png
 
 pytest.importorskip("rosbags")
 
@@ -252,6 +253,15 @@ def test_compressed_bags_are_bounded(tmp_path: Path, mode: str, monkeypatch: pyt
     monkeypatch.setattr("mvsgs_core.datasets.bag_file.MAX_BYTES", 1000)
     with pytest.raises(BadFileError, match="no image of /c/image_raw can be read"):
         open_dataset("bag", path=path, intrinsics="auto")
+
+
+def test_images_in_messages_are_bounded_as_files_are(tmp_path: Path) -> None:
+    huge_png(tmp_path / "a.png")
+    with pytest.raises(UnreadableImageError, match=r"30000x30000|exceeds limit"):
+        rgb_of(Messages(2).compressed(0, (tmp_path / "a.png").read_bytes()))
+    wide = Messages(2).image(0, "mono8", np.zeros(10, np.uint8), 2**32 - 1)
+    wide.height, wide.width = 1, 10
+    assert rgb_of(wide).shape == (1, 10, 3), "the last row's padding may be missing, and is not made up"
 
 
 def test_metadata_that_would_take_its_parser_minutes(tmp_path: Path) -> None:

@@ -194,6 +194,16 @@ def test_intrinsics_that_no_camera_has(tmp_path: Path, intrinsics: tuple[float, 
         open_dataset("tum", path=tmp_path / "x")
 
 
+def test_an_image_whose_distortion_cannot_be_undone_is_left_out(tmp_path: Path) -> None:
+    write_photos(tmp_path, 2)
+    frames = [{**FRAME, "file_path": f"photo{i}.png", "k1": 300.0 * i} for i in range(2)]
+    content = {"fl_x": 50, "w": 64, "h": 48, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    sequence = open_dataset("images", path=tmp_path)
+    assert [item.image[0, 0, 0] for item in sequence] == [20]
+    assert any("cannot be undone: 1 (first: photo1.png" in w for w in sequence.warnings)
+
+
 def test_cropped_and_long_cameras_stay_possible() -> None:
     check_intrinsics(np.array([5000.0, 5000.0, -60.0, 110.0]), (48, 64))
 

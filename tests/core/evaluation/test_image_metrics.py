@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.evaluation import image_metrics
 from mvsgs_core.evaluation.lpips import Lpips
 from tests.shared_data import shared
@@ -62,3 +65,12 @@ def test_lpips_gives_the_documented_value() -> None:
 def test_lpips_refuses_other_weights() -> None:
     with pytest.raises(ValueError, match="does not hold the LPIPS weights"):
         Lpips(shared("weights/raft-small.pth"), shared("weights/lpips_v0.1/squeeze.pth"))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"<!doctype html>", b"PK\x03\x04" + bytes(100), b"cos\nsystem\n(S'true'\ntR."]
+)
+def test_lpips_weights_that_are_none_are_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "trunk.pth").write_bytes(content)
+    with pytest.raises(BadFileError, match=r"trunk\.pth (is truncated|holds Python)"):
+        Lpips(tmp_path / "trunk.pth", tmp_path / "trunk.pth")
