@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import msgpack
@@ -32,13 +32,17 @@ def good(message_type: type, rng: np.random.Generator) -> Message:
     return message
 
 
-def mutated(rng: np.random.Generator, types: tuple[type, ...] = tuple(msgs.TYPES.values())) -> Iterator[bytes]:
-    """Without end; almost none of them is a message. The same generator gives the same frames."""
+def mutated(rng: np.random.Generator, messages: Sequence[Message] = ()) -> Iterator[bytes]:
+    """Without end, made of these messages (none: of some of every type); almost none is a message.
+
+    The same generator gives the same frames.
+    """
     kinds: list[Callable[[np.random.Generator, bytes], bytes]] = [
         _damaged, _damaged, _false_header, _false_header, _false_header, _nested, _unfinished, _false_end, _crowded_end,
         _false_length, _renamed, _giant,
     ]  # fmt: skip
-    originals = [bytes(encode(good(t, rng))) for t in types for _ in range(4)]
+    messages = messages or [good(t, rng) for t in msgs.TYPES.values() for _ in range(4)]
+    originals = [bytes(encode(message)) for message in messages]
     while True:
         kind = kinds[rng.integers(len(kinds))]
         yield kind(rng, originals[rng.integers(len(originals))])[:LARGEST]

@@ -92,7 +92,6 @@ class Robot(Node):
             try:
                 message = reader.receive(POLL)
             except CodecError as error:
-                self.stats.count("refused")
                 self.stats.warn(f"the robot sent what is no Frame, it was left out: {error}")
                 continue
             finally:
@@ -111,6 +110,7 @@ class Robot(Node):
 
     def _watch(self, reader: LiveReader) -> None:
         self.stats.counts["dropped"] = reader.skipped
+        self.stats.counts["refused"] = reader.refused
         if reader.reconnected > self.stats.counts.get("reconnected", 0):
             self.stats.counts["reconnected"] = reader.reconnected
             self.stats.warn("the connection to the robot broke, as a frame too large makes it, and was made anew")

@@ -13,6 +13,7 @@ from typing import Any
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from msgs.codec import CodecError, decode
 from nodes.addresses import TransportError
 from nodes.transport.publisher import Publisher
 from nodes.transport.readers import LOST, REFUSED, NewestReader
@@ -33,6 +34,7 @@ class LiveReader(NewestReader):
     monitored = LOST | zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED
 
     def __init__(self, address: str, type: type, **options: Any) -> None:
+        self.refused = 0  # frames that are no message
         self.reconnected = 0  # connections that were given up because of what came, and made anew
         self.renumbered = 0  # times that the sender's sequence numbers went on elsewhere
         self._address = address
@@ -55,6 +57,15 @@ class LiveReader(NewestReader):
             self.skipped += gap if plausible else displaced - self._displaced_before
         self._taken_at, self._displaced_before = now, displaced
         self.expected = sequence + 1
+
+    def _accepts(self, frame: zmq.Frame) -> bool:
+        """A frame that is no message takes no good one's place."""
+        try:
+            decode(frame.buffer, expect=(self._type,), max_bytes=self._max_bytes)
+        except CodecError:
+            self.refused += 1
+            return False
+        return True
 
     def _attend(self) -> None:
         """In the thread that reads: the socket is its own."""

@@ -173,6 +173,7 @@ class NewestReader(_Reader):
         )
         self._frames = deque(maxlen=1)  # a newer one takes the older one's place
         self._late = late
+        self._odd: deque[zmq.Frame] = deque(maxlen=1)  # what took no message's place, to be reported
         self.displaced = 0  # messages that a newer one replaced before they were taken
         self._end: zmq.Frame | None = None
         self._closing = False
@@ -196,6 +197,8 @@ class NewestReader(_Reader):
             frame = self._frames.popleft()
         except IndexError:
             frame, self._end = self._end, None
+        if frame is None and self._odd:
+            frame = self._odd.popleft()
         if frame is None or self.ended:
             return None
         message, sequence, _ = self._decode(frame)
@@ -229,6 +232,10 @@ class NewestReader(_Reader):
     def _attend(self) -> None:
         """Called by the thread that reads, several times a second."""
 
+    def _accepts(self, frame: zmq.Frame) -> bool:
+        """Whether a frame may take the place of the one before it."""
+        return True
+
     def _drain(self) -> None:
         while not self._closing:
             self._attend()
@@ -239,6 +246,8 @@ class NewestReader(_Reader):
             if _is_end(frame):
                 self._end = frame
                 self._say_goodbye()
+            elif not self._accepts(frame):
+                self._odd.append(frame)
             else:
                 self.displaced += len(self._frames)
                 self._frames.append(frame)
