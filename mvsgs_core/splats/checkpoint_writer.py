@@ -35,6 +35,7 @@ class CheckpointWriter:
         self._images_before: set[str] = set() if resumed is None else images_of(resumed)  # and what it refers to
         self._names: dict[int, tuple[object, list[str]]] = {}  # by keyframe: its image, and the files of it
         self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._begun = False  # to write here
         self._changed = threading.Condition()
         self._pending = 0  # checkpoints that are not done
         self._thread: threading.Thread | None = None
@@ -91,8 +92,9 @@ class CheckpointWriter:
 
     def _write_state(self, session: Session, sync: bool) -> None:
         (self._output / FOLDER / KEYFRAMES).mkdir(parents=True, exist_ok=True)
-        if self._number == 0 or self._before is None:
+        if not self._begun:
             self._remove_parts()
+            self._begun = True
         known = {
             segment: [self._write_images(view, sync=sync) for view in part.views]
             for segment, part in session.parts.items()
