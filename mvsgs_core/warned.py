@@ -43,7 +43,8 @@ class Warnings(list[str]):
 
     def lines(self) -> list[str]:
         """For the report: how often each came, and how many further ones there were."""
-        lines = [text if n == 1 else f"{text} ({n} times)" for text, n in self._times.items()]
+        times = self._times.copy()  # another thread may add one
+        lines = [text if n == 1 else f"{text} ({n} times)" for text, n in times.items()]
         return lines + ([f"and {self._further} further warnings"] if self._further else [])
 
     def _enter(self, line: str, n: int) -> int:

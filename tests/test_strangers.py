@@ -116,12 +116,19 @@ def test_a_reader_with_another_token_waits_in_vain() -> None:
     publisher.close()
 
 
+@pytest.mark.parametrize("observer", ["false", "true"], ids=["stage", "observer"])
 @pytest.mark.parametrize("leave", [False, True], ids=["stay and never read", "leave in the middle"])
-def test_a_run_over_tcp_is_not_held_up_or_ended_by_strangers(tmp_path: Path, leave: bool) -> None:
+def test_a_run_over_tcp_is_not_held_up_or_ended_by_strangers(tmp_path: Path, leave: bool, observer: str) -> None:
     port = free_port()
     with strangers(list(range(port, port + 8))) as sockets:
         run = Launch(
-            tmp_path, "transport=tcp", f"port={port}", "source.count=60", "source.period=0.05", "source.size=[240,320]"
+            tmp_path,
+            "transport=tcp",
+            f"port={port}",
+            "source.count=60",
+            "source.period=0.05",
+            "source.size=[240,320]",
+            f"sink.observer={observer}",
         )
         if leave:
             until = time.monotonic() + 60
