@@ -44,6 +44,7 @@ class Evaluator(Node):
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
+        self.check(self.config)
         folder = Path(self.config.output) if self.config.output else None
         if folder:
             folder.mkdir(parents=True, exist_ok=True)
@@ -51,6 +52,18 @@ class Evaluator(Node):
         lpips = self._load_lpips()
         self.evaluation = Evaluation(self.config.max_frames, lpips, folder, self.config.max_bytes)
         self.report: dict[str, Any] = {}
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        if config.lpips not in ("auto", "on", "off"):
+            raise ValueError(f"lpips={config.lpips!r}: it is auto, on or off")
+        if config.lpips == "on":
+            weights.find("lpips_squeeze_trunk")
+            weights.find("lpips_squeeze_head")
+        if config.max_frames < 0:
+            raise ValueError(f"max_frames={config.max_frames}: frames to be scored at most, 0 for none")
+        if not config.max_bytes > 0:
+            raise ValueError(f"max_bytes={config.max_bytes}: bytes on disk, more than 0; max_frames=0 keeps no frame")
 
     def on_ground_truth(self, truth: GroundTruth) -> Iterator[None]:
         self.evaluation.add_frame(truth.index, truth.image, truth.intrinsics, truth.world_from_cam, truth.depth)
@@ -89,8 +102,6 @@ class Evaluator(Node):
         yield from ()
 
     def _load_lpips(self) -> Lpips | None:
-        if self.config.lpips not in ("auto", "on", "off"):
-            raise ValueError(f"evaluator.lpips={self.config.lpips!r}: it is auto, on or off")
         if self.config.lpips == "off":
             return None
         try:

@@ -211,6 +211,8 @@ def test_missing_lpips_weights_are_named(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(FileNotFoundError, match="set MVSGS_WEIGHTS to the folder"):
         Evaluator(Evaluator.Config(lpips="on"))
+    with pytest.raises(FileNotFoundError, match="set MVSGS_WEIGHTS to the folder"):
+        Evaluator.check(Evaluator.Config(lpips="on"))  # before a run
     node = Evaluator(Evaluator.Config(lpips="auto"))
     assert any("LPIPS is left out" in w for w in node.stats.warnings)
     node.evaluation.close()
@@ -356,3 +358,22 @@ def test_a_full_disk_costs_frames_and_not_the_report(tmp_path: Path) -> None:
     report = _feed(node)
     assert report["rendering"]["all"]["count"] == 6  # the last five, and the keyframe's own image
     assert any("other frames could not be kept" in note for note in report["notes"])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"max_frames": -1}, {"max_bytes": 0.0}, {"max_bytes": float("nan")}, {"lpips": "no"}]
+)
+def test_parameters_that_mean_nothing_are_refused_before_a_run(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Evaluator.check(Evaluator.Config(**wrong))
+    Evaluator.check(Evaluator.Config())
+
+
+def test_weights_that_are_damaged_cost_lpips_and_not_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("lpips_squeezenet1_1_features.pth", "squeeze.pth"):
+        (tmp_path / name).write_bytes(b"no weights")
+    monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path))
+    node = Evaluator(Evaluator.Config(lpips="auto"))
+    assert any("LPIPS is left out" in w for w in node.stats.warnings)
+    with pytest.raises(ValueError, match="lpips_squeezenet1_1_features"):
+        Evaluator(Evaluator.Config(lpips="on"))

@@ -12,11 +12,12 @@ from typing import Any
 
 
 def collected(stats: Mapping[str, Any]) -> dict[str, Any]:
-    """Parts of the report, from the statistics of each node by name."""
+    """Parts of the report, from the statistics of each node by name; "nothing" where a node had nothing to show."""
     nodes = {str(name): s for name, s in stats.items() if isinstance(s, Mapping)}
     cpu = {name: _number(s.get("cpu_seconds")) for name, s in nodes.items()}
     peak = {name: _number(s.get("peak_bytes")) for name, s in nodes.items()}
-    nothing = {name: _mapping(s.get("values")).get("nothing") for name, s in nodes.items()}
+    reasons = {name: _mapping(s.get("values")).get("nothing") for name, s in nodes.items()}
+    nothing = {name: str(reason) for name, reason in reasons.items() if reason}
     return {
         "time": {
             "stages": {name: _numbers(s.get("seconds")) for name, s in nodes.items()},
@@ -26,7 +27,7 @@ def collected(stats: Mapping[str, Any]) -> dict[str, Any]:
         "skipped": {name: found for name, s in nodes.items() if (found := _numbers(s.get("skipped")))},
         "counts": {name: found for name, s in nodes.items() if (found := _numbers(s.get("counts")))},
         "warnings": {name: texts for name, s in nodes.items() if (texts := _texts(s.get("warnings")))},
-        "nothing": {name: str(reason) for name, reason in nothing.items() if reason},
+        **({"nothing": nothing} if nothing else {}),
     }
 
 
