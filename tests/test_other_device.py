@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +13,16 @@ from bench import networks
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
 from mvsgs_core.mvs.interface import CostOptions, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
+from mvsgs_core.splats.checkpoint import load, save
+from mvsgs_core.splats.checkpoint_files import FOLDER, KEYFRAMES, state_file
+from mvsgs_core.splats.checkpoint_images import image_names, write_images
 from mvsgs_core.splats.density_control import DensityConfig
 from mvsgs_core.splats.losses import LossConfig
 from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.splats.preview import preview_arrays
+from mvsgs_core.splats.session import Session
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig
+from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
 from tests.core.fusion.test_consistency import view
 from tests.core.mvs.test_backends import SIZE, problem
@@ -109,3 +115,32 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
     assert all(tensor.device.type == "cpu" for tensor in final.splats.tensors().values())
     assert np.isfinite(final.splats.means.numpy()).all()
     assert isinstance(final.exposures, np.ndarray)
+
+
+def test_a_checkpoint_of_a_mapper_elsewhere_gives_it_back(tmp_path: Path) -> None:
+    training = TrainingConfig(backend="reference", exposure=True, poses=True, pose_visits=0)
+    config = MapperConfig(iterations=3, device=DEVICE, training=training, skipping=SkipConfig(tiles=True))
+    views = [posed_view(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(2)]
+    images = tmp_path / FOLDER / KEYFRAMES
+    images.mkdir(parents=True)
+    with PretendDevice():
+        mapper = OnlineMapper(config)
+        for one in views:
+            mapper.add_view(one)
+        mapper.step()
+        session = Session(mapper, {0: mapper})
+        frozen = session.frozen()
+        names = [image_names(view) for view in frozen.current.views]
+        for view, files in zip(frozen.current.views, names):
+            write_images(images, view, files, sync=False)
+        save(frozen, config, state_file(tmp_path, 1), {0: names}, sync=False)
+        again = load(tmp_path, config, Stats())[0].current
+        while mapper.step() and again.step():
+            pass
+        here, there = mapper.snapshot(), again.snapshot()
+    assert frozen.current.state.device.type == "cpu"
+    assert again.state.splats.means.device.type == DEVICE
+    assert again.views[0].levels[0].device.type == DEVICE
+    for name, value in here.splats.tensors().items():
+        assert torch.equal(there.splats.tensors()[name], value), name
+    np.testing.assert_array_equal(there.world_from_cam, here.world_from_cam)
