@@ -169,7 +169,8 @@ def _say(outcome: Outcome, screen: Screen, output: Output) -> None:
 def unfinished(output: Output) -> str:
     """Where the map so far is, and how to go on."""
     there = [name for name in ("map.ply", "trajectory.txt") if (output.path / name).exists()]
-    resume = output.resume_command()
     lines = [f"\nunfinished: the map so far is {output.path / 'map.ply'}" if "map.ply" in there else "\nno map yet"]
-    lines.append(f"go on with it: {resume}" if resume else f"nothing to go on with: no checkpoint in {output.path}")
+    lines.append(
+        f"go on with it: {output.resume}" if output.resume else f"nothing to go on with: no checkpoint in {output.path}"
+    )
     return "\n".join(lines)

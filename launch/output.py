@@ -36,6 +36,7 @@ class Output:
     def __init__(self, path: Path) -> None:
         """Raises GraphError where it cannot be made, or where another run is writing to it."""
         self.path = path
+        self.resume: str | None = None  # the command that goes on with the run, once it has ended early
         try:
             path.mkdir(parents=True, exist_ok=True)
             self._lock = _lock(path / LOCK)
@@ -89,7 +90,7 @@ class Output:
         if outcome.nothing:
             report["nothing"] = dict(outcome.nothing)
         if not outcome.whole:
-            report["resume"] = self.resume_command()
+            report["resume"] = self.resume = self._resume_command()
         self.write_report(report)
 
     def write_report(self, content: Mapping[str, Any]) -> None:
@@ -97,7 +98,7 @@ class Output:
         stamp = {"written": time.strftime("%Y-%m-%d %H:%M:%S %z")}
         replace_text(self.path / REPORT, json.dumps({**content, **stamp}, indent=1) + "\n")
 
-    def resume_command(self) -> str | None:
+    def _resume_command(self) -> str | None:
         """What goes on with an unfinished run; None where it left no checkpoint."""
         try:
             checkpoint_info(self.path)

@@ -88,4 +88,9 @@ def _option(words: Sequence[str], *names: str) -> str | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    code = main(sys.argv[1:])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(
+        code
+    )  # the interpreter takes seconds to take down libraries of which only the nodes' parameters were asked
