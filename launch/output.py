@@ -72,23 +72,23 @@ class Output:
         return None
 
     def _settle(self, outcome: Outcome, scored: bool) -> None:
+        alone = {failure.node: failure.error for failure in outcome.observers}
+        beside = ({"observers": alone} if alone else {}) | (
+            {"nothing": dict(outcome.nothing)} if outcome.nothing else {}
+        )
         report = read_report(self.path)
         if report and report.get("finished", True):
-            if outcome.nothing and "nothing" not in report:
-                self.write_report(report | {"nothing": dict(outcome.nothing)})
+            if not beside.items() <= report.items():
+                self.write_report(report | beside)
             return
-        report = {"finished": False, "reason": outcome.reason}
+        report = {"finished": False, "reason": outcome.reason, **beside}
         if outcome.failed:
             report |= {"failed": outcome.failed.node, "error": outcome.failed.error}
         if outcome.whole:
             report["map"] = "none" if outcome.nothing else "finished"
-            failed = ", ".join(f"{failure.node} failed: {failure.error}" for failure in outcome.observers)
+            failed = ", ".join(f"{node} failed: {error}" for node, error in alone.items())
             report["reason"] = failed or ("" if scored else "no slot of this graph writes a report")
             report["finished"] = not scored
-        if outcome.observers:
-            report["observers"] = {failure.node: failure.error for failure in outcome.observers}
-        if outcome.nothing:
-            report["nothing"] = dict(outcome.nothing)
         if not outcome.whole:
             report["resume"] = self.resume = self._resume_command()
         self.write_report(report)

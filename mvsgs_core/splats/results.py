@@ -17,15 +17,15 @@ def write_results(output: Path, mapper: OnlineMapper, *, sync: bool = True) -> i
     """Replaces them by what the mapper has now; the bytes of map.ply. Raises OSError.
 
     trajectory.txt: the keyframes' poses as the mapper has them, TUM format; those without a timestamp are left out.
+    The map comes last: where there is one, there are the others.
     """
     output.mkdir(parents=True, exist_ok=True)
     final = mapper.snapshot()
-    with replacing(output / "map.ply", sync=sync) as aside:
-        write_ply(aside, final)
-        size = aside.stat().st_size
-    write_cameras(output / "cameras.json", cameras_of(final, mapper.views))
     seconds = np.array([view.timestamp for view in mapper.views], dtype=np.float64)
     known = np.isfinite(seconds)
     with replacing(output / "trajectory.txt", sync=sync) as aside:
         write_tum(aside, seconds[known], final.world_from_cam[known])
-    return size
+    write_cameras(output / "cameras.json", cameras_of(final, mapper.views))
+    with replacing(output / "map.ply", sync=sync) as aside:
+        write_ply(aside, final)
+        return aside.stat().st_size

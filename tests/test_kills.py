@@ -1,0 +1,55 @@
+"""A run that loses a stage leaves a map and goes on from there; one that loses its observers does not mind."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+from pathlib import Path
+
+from bench.faulting.kills import SCENE
+from bench.launched import Launched, map_opens
+from tests.launches import DOWN
+
+SHORT = (*SCENE, "dataset.options.frames=50", "mapper.refinement=10", "evaluator.max_frames=10")
+
+
+def test_a_run_whose_mapper_was_killed_leaves_a_map_and_is_resumed(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    with Launched(output, (*SHORT, f"output={output}")) as run:
+        assert run.wait_for((output / "map.ply").exists), run.said()
+        assert run.send("mapper", signal.SIGKILL)
+        assert run.wait(DOWN) == 1
+        assert run.left() == []
+        report, said = run.report(), run.said()
+    assert map_opens(output)
+    assert (report["finished"], report["failed"]) == (False, "mapper")
+    assert report["error"].startswith("killed by signal 9")
+    assert report["resume"].endswith(f"run_all.py resume={output}")
+    assert said.rstrip().splitlines()[-2:] == [
+        f"unfinished: the map so far is {output / 'map.ply'}",
+        f"go on with it: {report['resume']}",
+    ]
+    with Launched(output, (f"resume={output}", "seed=0")) as run:
+        assert run.wait() == 0, run.said()
+        report = run.report()
+    assert report["finished"] is True
+    assert report["rendering"]["held_out"]["count"] > 0
+    assert report["trajectory"]["frames"] == 50
+    assert not (output / "previous").exists()
+    with Launched(output, (f"resume={output}",)) as run:
+        assert run.wait() == 2
+        assert "has reached its end" in run.said()
+
+
+def test_observers_without_room_on_their_disk_cost_no_map(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    full = ("recorder._target_=bench.full_disk.FullRecorder", "evaluator._target_=bench.full_disk.FullEvaluator")
+    with Launched(output, (*SHORT, f"output={output}", "recorder=mcap", *full)) as run:
+        assert run.wait() == 4, run.said()
+        said = run.said()
+    for observer in ("recorder", "evaluator"):
+        assert re.search(rf"{observer} failed: OSError: .*; the run goes on without it", said), said
+    report = json.loads((output / "report.json").read_text())
+    assert set(report["observers"]) == {"recorder", "evaluator"}
+    assert map_opens(output)
