@@ -87,7 +87,7 @@ class Output:
         if outcome.whole:
             report["map"] = "none" if outcome.nothing else "finished"
             failed = ", ".join(f"{node} failed: {error}" for node, error in alone.items())
-            report["reason"] = failed or ("" if scored else "no slot of this graph writes a report")
+            report["reason"] = failed or ("no report came" if scored else "no slot of this graph writes a report")
             report["finished"] = not scored
         if not outcome.whole:
             report["resume"] = self.resume = self._resume_command()
