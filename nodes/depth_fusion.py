@@ -53,6 +53,21 @@ class FusionNode(Node, ABC):
 
     def on_end(self) -> Iterator[View]:
         yield from self._timed(self._fusion.flush())
+        if self.stats.counts.get("keyframes") and not self.stats.counts["pixels kept"]:
+            self.stats.nothing(self._why_nothing())
+
+    def _why_nothing(self) -> str:
+        counts = self.stats.counts
+        keyframes, known = f"{int(counts['keyframes'])} keyframes", counts["pixels known"]
+        if not known:
+            return f"none of {keyframes} has a pixel with stereo depth"
+        start = "pixels rejected: "
+        rejected = {name.removeprefix(start): n for name, n in counts.items() if name.startswith(start) and n}
+        shares = [f"{name} {100 * n / known:.0f} %" for name, n in sorted(rejected.items(), key=lambda item: -item[1])]
+        return (
+            f"all depth of {keyframes} was rejected, by these filters, of the pixels with stereo depth: "
+            f"{', '.join(shares)} (a pixel can fail more than one)"
+        )
 
     def _timed(self, fused: Iterator[FusedDepth]) -> Iterator[View]:
         while True:

@@ -167,3 +167,29 @@ def test_a_pose_that_is_not_finite_is_refused(bad: float) -> None:
     pose[0, 3] = bad
     with pytest.raises(ValueError, match="not finite"):
         list(stereo().on_keyframe(keyframe(0, world_from_cam=pose)))
+
+
+def ended(depth_fusion: DepthFusion, depths: list[Depth]) -> DepthFusion:
+    for depth in depths:
+        list(depth_fusion.on_depth(depth))
+    list(depth_fusion.on_end())
+    return depth_fusion
+
+
+def test_depth_that_is_all_rejected_is_nothing_and_the_filters_are_named() -> None:
+    """Neighbors that contradict each other, and a stereo that trusts none of them."""
+    mvs = stereo()
+    depths = [d for i in range(5) for d in mvs.on_keyframe(keyframe(i))] + list(mvs.on_end())
+    assert "nothing" not in ended(fusion(), depths).stats.values
+    random = np.random.default_rng(0)
+    wrong = [
+        replace(d, depth=random.uniform(1.0, 9.0, d.depth.shape).astype(np.float32), confidence=0.01 * d.confidence)
+        for d in depths
+    ]
+    reason = ended(fusion(), wrong).stats.values["nothing"]
+    assert reason.startswith("all depth of 5 keyframes was rejected")
+    assert "confidence 100 %" in reason
+    assert "consistency" in reason
+    empty = [replace(d, depth=np.zeros_like(d.depth)) for d in depths]
+    assert "none of 5 keyframes has a pixel with stereo depth" in ended(fusion(), empty).stats.values["nothing"]
+    assert "nothing" not in ended(fusion(), []).stats.values  # the tracker says why

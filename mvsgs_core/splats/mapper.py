@@ -128,7 +128,7 @@ class OnlineMapper:
         self.schedule.owe(self.config.iterations)
         self.log.count("inserted", inserted)
         self.log.count("views")
-        self.log.count("views_without_depth", float(median == 0))
+        self.log.count("views_without_depth", float(not (depth > 0).any()))
         return inserted
 
     def step(self) -> bool:
