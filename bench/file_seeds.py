@@ -27,6 +27,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from msgs import Frame, GroundTruth
 from msgs.codec import encode
+from mvsgs_core.splats.cameras import Cameras, write_cameras
+from mvsgs_core.splats.checkpoint_files import state_file, write_state
 from mvsgs_core.splats.export_ply import write_ply
 from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.snapshot import Snapshot
@@ -237,6 +239,23 @@ def ply(folder: Path) -> None:
     write_ply(folder / "map.ply", snapshot)
 
 
+def cameras(folder: Path) -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    known = {
+        "intrinsics": np.tile([_FOCAL, _FOCAL, 15.5, 11.5], (2, 1)), "sizes": np.tile([HEIGHT, WIDTH], (2, 1)),
+        "exposures": poses[:, :3], "world_from_cam": poses,
+    }  # fmt: skip
+    write_cameras(folder / "cameras.json", Cameras(np.arange(2), np.arange(2.0), **known))
+
+
+def checkpoint(folder: Path) -> None:
+    numbers = {"newest_view": 1, "revision": 1, "splats": 40, "refined": 0}
+    meta = {**numbers, "stream_seconds": 0.5, "stream_ended": False}
+    path = state_file(folder, 1)
+    path.parent.mkdir()
+    write_state(path, meta, {"keyframes": np.arange(2, dtype=np.int64), "means": np.zeros((40, 3), np.float32)})
+
+
 def weights(folder: Path) -> None:
     state = {f"layer{i}.weight": torch.arange(64.0).reshape(8, 8) for i in range(3)}
     torch.save({"state_dict": state, "epoch": 7}, folder / "weights.pth")
@@ -308,6 +327,8 @@ SEEDS: dict[str, tuple[str, str, Callable[[Path], None]]] = {
     "bag mcap": ("bag", "walk", _bag2("MCAP", "NONE")),
     "bag mcap zstd": ("bag", "walk", _bag2("MCAP", "STORAGE")),
     "ply": ("ply", "map.ply", ply),
+    "cameras.json": ("cameras", "cameras.json", cameras),
+    "checkpoint": ("checkpoint", ".", checkpoint),
     "weights": ("weights", "weights.pth", weights),
 }
 

@@ -18,6 +18,8 @@ from typing import Any
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.networks.checkpoints import read
+from mvsgs_core.splats.cameras import read_cameras
+from mvsgs_core.splats.checkpoint_files import checkpoint_info
 from mvsgs_core.splats.export_ply import read_ply
 from nodes.player import Player
 
@@ -31,6 +33,10 @@ def read_through(way: str, path: Path) -> int:
         return sum(1 for _ in Player(Player.Config(str(path))).run())
     if way == "ply":
         return int(len(read_ply(path).splats) >= 0)
+    if way == "cameras":
+        return len(read_cameras(path))
+    if way == "checkpoint":
+        return len(checkpoint_info(path).keyframes)
     if way == "weights":
         return int(bool(read(path, inside="state_dict")))
     options: dict[str, Any] = {"intrinsics": "auto"} if way == "video" else {}
