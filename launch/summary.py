@@ -71,11 +71,10 @@ def _worst(report: Mapping[str, Any], part: str) -> list[str]:
     worst, coverage = _get(report, part, "worst", "all"), _get(report, part, "coverage")
     if not worst or not coverage or coverage.get("min") is None:
         return []
-    kind = "keyframe" if worst.get("keyframe") else "held out" if worst.get("held_out") else "between keyframes"
     psnr = "" if worst.get("psnr") is None else f": {worst['psnr']:.2f} dB"
     return [
-        f"worst       frame {worst.get('index')} ({kind}){psnr}; least covered: frame {coverage.get('min_index')}, "
-        f"{100 * coverage['min']:.1f} % (of {coverage.get('count')} frames)"
+        f"worst       frame {worst.get('index')} ({worst.get('kind')}){psnr}; least covered: "
+        f"frame {coverage.get('min_index')}, {100 * coverage['min']:.1f} % (of {coverage.get('count')} frames)"
     ]
 
 

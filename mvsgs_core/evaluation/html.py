@@ -59,8 +59,7 @@ def worst_figures(rendering: Mapping[str, Any]) -> dict[str, str]:
         ("worst of all frames scored", rendering["worst"]["all"], rendering["all"]["count"]),
     ):
         if worst:
-            what = "keyframe" if worst["keyframe"] else "held out" if worst["held_out"] else "between keyframes"
-            figures[f"{name} ({count})"] = f"{worst['index']} ({what}): {number(worst['psnr'], 2)} dB"
+            figures[f"{name} ({count})"] = f"{worst['index']} ({worst['kind']}): {number(worst['psnr'], 2)} dB"
     if coverage["count"]:
         mean, least = (f"{100 * coverage[key]:.1f} %" for key in ("mean", "min"))
         figures[f"pixels covered by the map, of {coverage['count']} frames"] = (

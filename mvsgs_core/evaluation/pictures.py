@@ -27,7 +27,7 @@ def comparisons(evaluation: Evaluation) -> list[Row]:
     rows = []
     for name, score in _picks(scores):
         figures = f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}, {100 * score.coverage:.1f} % covered"
-        caption = f"{name}: {score.index} ({kind(score)}), {figures}"
+        caption = f"{name}: {score.index} ({score.kind}), {figures}"
         rows.append((caption, scoring.comparison(finished.splats, finished.density, views[score.index])))
     return rows
 
@@ -46,10 +46,6 @@ def _picks(scores: Sequence[scoring.Score]) -> list[tuple[str, scoring.Score]]:
     worst = min(scores, key=lambda s: s.psnr)
     picks.setdefault(worst.index, (f"worst of all {len(scores)} frames scored", worst))
     return list(picks.values())
-
-
-def kind(score: scoring.Score) -> str:
-    return "keyframe" if score.keyframe else "held out" if score.held_out else "between keyframes"
 
 
 def write_sheet(file: Path, rows: list[Row]) -> None:

@@ -48,9 +48,13 @@ class Score:
         """The map was not made of it: held out before the run, and no keyframe."""
         return not self.keyframe and is_held_out(self.index)
 
+    @property
+    def kind(self) -> str:
+        return "keyframe" if self.keyframe else "held out" if self.held_out else "between keyframes"
+
     def entry(self) -> dict[str, Any]:
         """As it stands in report.json."""
-        return {**vars(self), "held_out": self.held_out}
+        return {**vars(self), "held_out": self.held_out, "kind": self.kind}
 
 
 class Rendered(NamedTuple):

@@ -51,7 +51,8 @@ def test_the_worst_of_all_stands_beside_the_worst_of_the_held_out() -> None:
     assert found["coverage"] == {"mean": pytest.approx(0.954), "min": 0.8, "min_index": 4, "count": 5}
     assert [frame["index"] for frame in found["frames"]] == [0, 1, 4, 5, 10]
     assert [frame["held_out"] for frame in found["frames"]] == [True, False, False, True, False]  # 10 became a keyframe
-    assert set(found["frames"][0]) == {"index", "keyframe", "held_out", "psnr", "ssim", "lpips", "coverage"}
+    assert set(found["frames"][0]) == {"index", "keyframe", "held_out", "psnr", "ssim", "lpips", "coverage", "kind"}
+    assert [frame["kind"] for frame in found["frames"]][-3:] == ["between keyframes", "held out", "keyframe"]
 
 
 def test_of_no_frame_nothing_is_said() -> None:
