@@ -15,6 +15,7 @@ from pathlib import Path
 
 from bench.launched import Launched, map_opens
 from bench.table import Row, at_most
+from launch.outcome import OBSERVER_FAILED
 
 STAGES = ("dataset", "tracker", "mvs", "depth_fusion", "mapper")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP)
@@ -25,8 +26,32 @@ SCENE = (
 )  # fmt: skip
 SILENT, DEAD = 2.0, 5.0  # seconds: the watchdog's limits where a process is stopped
 MOMENTS = 3.0  # seconds after the first map within which the faults come
+QUICK = ("dataset.options.frames=50", "mapper.refinement=10", "evaluator.max_frames=10")
+QUICK_MOMENTS = 0.5
 LONGEST_END = 5.0  # seconds
 RESUMED_WITHIN = 0.3  # dB
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Runs of one scene, and when what befalls them comes."""
+
+    folder: Path
+    scene: tuple[str, ...]
+    moments: float  # seconds after the first map within which the faults come
+    random: random.Random
+
+    def run(self, name: str, *overrides: str) -> Launched:
+        output = self.folder / name
+        return Launched(output, (*self.scene, f"output={output}", *overrides))
+
+    def wait_for_a_moment(self, run: Launched) -> float:
+        """Some time after the first map; seconds. Raises RuntimeError where none comes."""
+        if not run.wait_for((run.output / "map.ply").exists):
+            raise RuntimeError(f"no map came: {run.said()}")
+        moment = self.random.uniform(0.0, self.moments)
+        time.sleep(moment)
+        return moment
 
 
 @dataclass
@@ -42,33 +67,35 @@ class Kills:
 
 
 def measure(quick: bool) -> list[Row]:
-    moments = random.Random(0)
+    scene, moments = ((*SCENE, *QUICK), QUICK_MOMENTS) if quick else (SCENE, MOMENTS)
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        whole = _run(folder / "whole")
-        rows = _killed(folder, moments, 3 if quick else 60)
-        rows += _observed(folder, moments, 2 if quick else 20, whole)
-        rows += _resumed(folder, moments, 1 if quick else 3, whole)
+        faults = Faults(Path(name), scene, moments, random.Random(0))
+        whole = _undisturbed(faults)
+        cases = [("mapper", signal.SIGKILL)] if quick else [(stage, n) for n in SIGNALS for stage in STAGES] * 4
+        rows, resumable = _killed(faults, cases, 1 if quick else 3)
+        rows += _observed(faults, 1 if quick else 20, whole)
+        rows += _resumed(resumable, whole)
     return rows
 
 
-def _run(output: Path, *overrides: str) -> Path:
-    """A run that nothing disturbs. Raises RuntimeError where it fails."""
-    with Launched(output, (*SCENE, f"output={output}", *overrides)) as run:
+def _undisturbed(faults: Faults) -> Path:
+    """The output of a run that nothing befell. Raises RuntimeError where it fails."""
+    with faults.run("whole") as run:
         if run.wait() != 0:
             raise RuntimeError(run.said())
-    return output
+        return run.output
 
 
-def _killed(folder: Path, moments: random.Random, runs: int) -> list[Row]:
+def _killed(faults: Faults, cases: list[tuple[str, signal.Signals]], resumable: int) -> tuple[list[Row], list[Path]]:
+    """Rows, and the outputs of the first runs that lost their mapper."""
     found = Kills()
-    cases = [(stage, number) for number in SIGNALS for stage in STAGES]
-    if runs < len(cases):
-        cases = [("tracker", signal.SIGKILL), ("mapper", signal.SIGTERM), ("mvs", signal.SIGSTOP)]
-    for k in range(runs):
-        output = folder / f"killed-{k}"
-        _kill(output, *cases[k % len(cases)], moments.uniform(0.0, MOMENTS), found)
-        shutil.rmtree(output)
+    kept: list[Path] = []
+    for k, (stage, number) in enumerate(cases):
+        output = kill(faults, f"killed-{k}", stage, number, found)
+        if stage == "mapper" and number != signal.SIGSTOP and len(kept) < resumable:
+            kept.append(output)
+        else:
+            shutil.rmtree(output)
     rows = [
         _all("stage lost: maps that open", found.maps, found.runs),
         _all("stage lost: named in the report", found.reported, found.runs),
@@ -76,66 +103,54 @@ def _killed(folder: Path, moments: random.Random, runs: int) -> list[Row]:
         at_most("stage killed or ended: all over after, longest", max(found.ends), "s", LONGEST_END),
     ]
     if found.ends_stopped:
-        rows.append(
-            at_most(
-                "stage stopped: over after the watchdog's limit, longest", max(found.ends_stopped), "s", LONGEST_END
-            )
-        )
-    return rows
+        name = "stage stopped: over after the watchdog's limit, longest"
+        rows.append(at_most(name, max(found.ends_stopped), "s", LONGEST_END))
+    return rows, kept
 
 
-def _kill(output: Path, stage: str, number: signal.Signals, moment: float, found: Kills) -> None:
-    """One run whose stage gets that signal so many seconds after the first map."""
+def kill(faults: Faults, name: str, stage: str, number: signal.Signals, found: Kills) -> Path:
+    """One run whose stage gets that signal some time after the first map; its output."""
     limits = (f"supervise.silent={SILENT}", f"supervise.dead={DEAD}") if number == signal.SIGSTOP else ()
-    with Launched(output, (*SCENE, f"output={output}", *limits)) as run:
-        if not run.wait_for((output / "map.ply").exists):
-            raise RuntimeError(f"no map came: {run.said()}")
-        time.sleep(moment)
+    with faults.run(name, *limits) as run:
+        moment = faults.wait_for_a_moment(run)
         if not run.send(stage, number):
             raise RuntimeError(f"{stage} had ended {moment:.1f} s after the first map: {run.said()}")
         began = time.monotonic()
         run.wait()
         seconds = time.monotonic() - began
         found.runs += 1
-        found.maps += map_opens(output)
+        found.maps += map_opens(run.output)
         found.reported += run.report().get("failed") == stage
         found.left += run.left()
         if number == signal.SIGSTOP:
             found.ends_stopped.append(seconds - DEAD)
         else:
             found.ends.append(seconds)
+        return run.output
 
 
-def _observed(folder: Path, moments: random.Random, runs: int, whole: Path) -> list[Row]:
-    """Every other run has an observer killed, every other one observers without room on their disk."""
+def _observed(faults: Faults, runs: int, whole: Path) -> list[Row]:
+    """Runs whose observers have no room on their disk, and, every other one, that have an observer killed."""
     finished = equal = 0
     for k in range(runs):
-        output = folder / f"observed-{k}"
         full = ("recorder._target_=bench.full_disk.FullRecorder", "evaluator._target_=bench.full_disk.FullEvaluator")
-        overrides = ("recorder=mcap", *(full if k % 2 else ()))
-        with Launched(output, (*SCENE, f"output={output}", *overrides)) as run:
-            if k % 2 == 0 and run.wait_for((output / "map.ply").exists):
-                time.sleep(moments.uniform(0.0, MOMENTS))
+        with faults.run(f"observed-{k}", "recorder=mcap", *(() if k % 2 else full)) as run:
+            if k % 2:
+                faults.wait_for_a_moment(run)
                 run.send(("evaluator", "recorder")[k // 2 % 2], signal.SIGKILL)
-            finished += run.wait() == 4
-            equal += (output / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
-        shutil.rmtree(output)
+            finished += run.wait() == OBSERVER_FAILED
+            equal += (run.output / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
+        shutil.rmtree(run.output)
     return [
         _all("observer killed, or its disk full: runs that finish and say so", finished, runs),
         _all("observer killed, or its disk full: the map of an undisturbed run", equal, runs),
     ]
 
 
-def _resumed(folder: Path, moments: random.Random, runs: int, whole: Path) -> list[Row]:
-    """Runs whose mapper was killed, resumed: how far from the undisturbed run they end."""
+def _resumed(outputs: list[Path], whole: Path) -> list[Row]:
+    """Unfinished runs, resumed: how far from the undisturbed run they end."""
     differences = []
-    for k in range(runs):
-        output = folder / f"resumed-{k}"
-        with Launched(output, (*SCENE, f"output={output}")) as run:
-            run.wait_for((output / "map.ply").exists)
-            time.sleep(moments.uniform(0.0, MOMENTS))
-            run.send("mapper", signal.SIGKILL)
-            run.wait()
+    for output in outputs:
         with Launched(output, (f"resume={output}",)) as run:
             if run.wait() != 0:
                 raise RuntimeError(run.said())
