@@ -27,22 +27,19 @@ def unpack(header: memoryview, max_values: int) -> Any:
 
 def _check(data: bytes, max_values: int) -> None:
     """A false length, or a million empty lists, would take time and memory long before msgpack is through with it."""
-    at, values, awaited = 0, 0, 1
-    while awaited:
-        if awaited > len(data) - at:
+    at, read, known, end = 0, 0, 1, len(data)  # byte; values read, and those that are known to come
+    while read < known:
+        if at >= end:
             raise ValueError("it is cut off")
-        values += 1
-        awaited -= 1
-        if values + awaited > max_values:
-            raise ValueError(f"more than {max_values} values")
         code = data[at]
         at += 1
+        read += 1
         if code < 0x80 or code >= 0xE0 or code in _SINGLE:
             continue
         if code < 0x90:
-            awaited += 2 * (code & 15)
+            known += 2 * (code & 15)
         elif code < 0xA0:
-            awaited += code & 15
+            known += code & 15
         elif code < 0xC0:
             at += code & 31
         elif code in _FIXED:
@@ -51,14 +48,16 @@ def _check(data: bytes, max_values: int) -> None:
             size = _TEXTS.get(code) or _LISTS.get(code) or _MAPS.get(code)
             if size is None:
                 raise ValueError(f"byte {code:#x} begins no value of a header")
-            if size > len(data) - at:
+            if size > end - at:
                 raise ValueError("it is cut off")
             (length,) = _LENGTH[size].unpack_from(data, at)
             at += size
             if code in _TEXTS:
                 at += length
             else:
-                awaited += length if code in _LISTS else 2 * length
+                known += length if code in _LISTS else 2 * length
+        if known > max_values:
+            raise ValueError(f"more than {max_values} values")
 
 
 __all__ = ["MAX_TEXT", "unpack"]
