@@ -17,11 +17,12 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 import nodes
-from launch.compose import CONF, parse, prepare, vocabulary
+from launch.compose import CONF, graph_of, parse, prepare, vocabulary
 from launch.graph import load_node
 from launch.output import REPORT, read_report
 from launch.parameters import GraphError
 from mvsgs_core.splats.checkpoint_files import CheckpointInfo, checkpoint_info
+from nodes.parameters import make_config
 
 WORD = "resume="
 SOURCE = "dataset"  # the slot of the choice that gives a checkpoint's keyframes
@@ -49,6 +50,22 @@ def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) ->
         if "resume_after" in known:
             config[slot].resume_after = info.stereo_after()
     return config
+
+
+def leave_out_refused(config: DictConfig) -> list[str]:
+    """Turns off what only observes and cannot run again, such as a recorder whose file is there; says so."""
+    graph = graph_of(config, (), {})
+    notes = []
+    for name in graph.observers:
+        slot = graph.slots[name]
+        if slot.placement.external:
+            continue
+        try:
+            slot.node.check(make_config(slot.node, slot.config))
+        except (OSError, ValueError) as error:
+            config[name] = {"_target_": None}
+            notes.append(f"{name} is left out: {error}")
+    return notes
 
 
 def _interrupted(folder: Path) -> DictConfig:

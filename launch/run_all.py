@@ -33,7 +33,7 @@ from launch.compose import CONF, prepare
 from launch.jobs import Job, refused, run
 from launch.parameters import GraphError
 from launch.resume import WORD as RESUME
-from launch.resume import resumed_config
+from launch.resume import leave_out_refused, resumed_config
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -63,7 +63,10 @@ def resumed_job(arguments: Sequence[str]) -> Job:
     for word in overrides:
         if word.startswith("-"):
             raise GraphError(f"{word}: {RESUME}{folder} takes slot=choice, slot.parameter=value and --inline only")
-    return Job(resumed_config(folder, overrides), overrides, {}, None, resumed=True)
+    config = resumed_config(folder, overrides)
+    for note in leave_out_refused(config):
+        print(f"note: {note}", flush=True)
+    return Job(config, overrides, {}, None, resumed=True)
 
 
 def hydra_arguments(arguments: Sequence[str]) -> list[str]:

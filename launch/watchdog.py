@@ -50,7 +50,7 @@ class Watchdog:
         self._forgive_own_absence(now, running)
         for child in running:
             watched = self._watched.setdefault(child.name, _Watched(child))
-            reason = self._silent(watched, now) or self._held_up(child, running, now)
+            reason = self._silent(watched, now) or self._held_up(watched, running, now)
             if reason:
                 return child, reason
             self._slow(watched, now)
@@ -100,23 +100,38 @@ class Watchdog:
             return f"its process hangs{limit}"
         return f"its process hangs{limit}. Where its threads stand:\n{watched.dump}"
 
-    def _held_up(self, child: Child, running: list[Child], now: float) -> str | None:
-        """A reason to give up an observer that does not get on and holds back who makes the map."""
-        if child.name not in self.observers or child.status.doing != "working":
+    def _held_up(self, watched: _Watched, running: list[Child], now: float) -> str | None:
+        """Names an observer that does not get on and holds a stage back; a reason once that has lasted too long."""
+        child = watched.child
+        if child.name not in self.observers:
             return None
-        if now - child.moved < self.limits.dead:
+        held = [
+            sender
+            for sender in running
+            if sender.name not in self.observers
+            and sender.status.doing == "held back"
+            and sender.status.topic in child.status.received
+        ]
+        seconds = min(now - child.moved, max((now - sender.moved for sender in held), default=0.0))
+        if child.status.doing != "working" or seconds < self.limits.silent:
+            watched.slow = False
             return None
-        for sender in running:
-            if sender.name in self.observers or sender.status.doing != "held back" or sender.status.topic is None:
-                continue
-            if sender.status.topic in child.status.received and now - sender.moved >= self.limits.dead:
-                return f"it has held {sender.name} back for {now - sender.moved:.0f} s"
-        return None
+        what = f"has held {held[0].name} back for {seconds:.0f} s"
+        if not watched.slow:
+            watched.slow = True
+            child.send(signal.SIGUSR1)
+            self.note(
+                f"{child.name} {what}; after {self.limits.dead:g} s the run goes on without it (where it stands: "
+                f"{child.log})"
+            )
+        return f"it {what}" if seconds >= self.limits.dead else None
 
     def _slow(self, watched: _Watched, now: float) -> None:
         child = watched.child
         still = now - child.moved
-        if still < self.limits.dead or child.status.doing != "working" or child.name in self.observers:
+        if child.name in self.observers:
+            return
+        if still < self.limits.dead or child.status.doing != "working":
             watched.slow = False
         elif not watched.slow and not watched.named:
             watched.slow = True

@@ -33,6 +33,11 @@ class Recorder(Node):
 
     config: Config
 
+    @classmethod
+    def check(cls, config: Config) -> None:
+        if Path(config.path).exists():
+            raise FileExistsError(f"path={config.path}: that recording exists already; give another file")
+
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
         if self.config.compression not in COMPRESSION:

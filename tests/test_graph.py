@@ -133,6 +133,16 @@ def test_only_best_effort_may_close_a_cycle_and_is_marked() -> None:
     assert not any(e.feedback for e in fake().edges)
 
 
+def test_an_inline_run_that_fails_lets_its_nodes_save_what_they_have(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    saved: list[str] = []
+    monkeypatch.setattr(Sink, "on_abort", lambda self, reason: saved.append(reason))
+    with pytest.raises(ArithmeticError):
+        run_inline(fake(f"output={tmp_path}", "relay.fail_at=2"))
+    assert saved == ["ArithmeticError: frame 2 cannot be relayed"]
+
+
 def test_what_the_map_shows_is_fed_back_to_stereo() -> None:
     graph = compose(["mvs=skipping", "mapper.map_views=true"])
     assert [(e.sender, e.reader) for e in graph.edges if e.feedback] == [("mapper", "mvs")]

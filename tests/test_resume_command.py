@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from launch.compose import compose, graph_of
 from launch.graph import Graph
 from launch.parameters import GraphError
-from launch.resume import resumed_config
+from launch.resume import leave_out_refused, resumed_config
 from mvsgs_core.splats.checkpoint_files import state_file, write_state
 from tests.shared_data import ROOT
 
@@ -60,6 +60,15 @@ def test_a_stream_that_is_gone_leaves_the_checkpoint_to_be_refined(tmp_path: Pat
         ("View", "dataset", "evaluator"),
         ("SplatMap", "mapper", "evaluator"),
     }
+
+
+def test_a_recording_that_is_there_is_not_written_again(tmp_path: Path) -> None:
+    (interrupted(tmp_path, "recorder=mcap") / "recording.mcap").touch()
+    config = resumed_config(tmp_path, ())
+    assert leave_out_refused(config) == [
+        f"recorder is left out: path={tmp_path}/recording.mcap: that recording exists already; give another file"
+    ]
+    assert "recorder" not in graph_of(config, (), {}).slots
 
 
 def test_overrides_hold_as_on_any_command_line(tmp_path: Path) -> None:
