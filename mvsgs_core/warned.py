@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Self
 
 from mvsgs_core.printable import printable
 
@@ -29,6 +30,17 @@ class Warnings(list[str]):
         else:
             self._further += self._enter(line, 1)
 
+    def append(self, text: str, /) -> None:
+        self.add(text)
+
+    def extend(self, texts: Iterable[str], /) -> None:
+        for text in texts:
+            self.add(text)
+
+    def __iadd__(self, texts: Iterable[str], /) -> Self:  # type: ignore[override, misc]
+        self.extend(texts)
+        return self
+
     def include(self, part: Iterable[str]) -> None:
         """Those of a part as they are now. To be called as often as one likes: nothing is counted twice."""
         times, further = dict.fromkeys(map(printable, part), 1), 0
@@ -51,10 +63,10 @@ class Warnings(list[str]):
         """How many found no room."""
         if len(self._times) < MAX_WARNINGS:
             self._times[line] = n
-            self.append(line)
+            super().append(line)
             return 0
         if self[-1] != FURTHER:
-            self.append(FURTHER)
+            super().append(FURTHER)
         return n
 
 

@@ -17,6 +17,15 @@ def test_the_same_warning_is_one_line_with_a_count() -> None:
     assert stats.warnings.lines() == ["blurred (3 times)", "lost"]
 
 
+def test_a_warning_added_as_to_any_list_is_kept_and_counted() -> None:
+    stats = Stats()
+    stats.warnings.append("a\x1b[2J")
+    stats.warnings += ["b", "b"]
+    stats.warnings.extend(str(i) for i in range(1000))
+    assert stats.warnings.lines()[:2] == [r"a\x1b[2J", "b (2 times)"]
+    assert len(stats.warnings.lines()) == MAX_WARNINGS + 1
+
+
 def test_thousands_of_long_warnings_cost_neither_time_nor_memory() -> None:
     texts = [f"{i} " + "\x00" * 59_000 for i in range(1000)]
     stats = Stats()
