@@ -8,7 +8,7 @@ import numpy as np
 
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.focal import FocalConfig, focal_of_all, observability, refine_focal
+from mvsgs_core.tracking.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.rolling_shutter import estimate_readout
 
@@ -23,6 +23,7 @@ class Calibration:
     config: FocalConfig
     stats: Stats
     given: np.ndarray  # (4,) intrinsics that came with the frames, at the tracker's size
+    pixels: float  # the focal length that came with the frames, at their own size
     settled: bool  # from the start on, where the intrinsics are no guess
     readout: float | None  # seconds; None: to be estimated
     threads: int
@@ -48,7 +49,7 @@ class Calibration:
                 rise = observability(self.graph, members, self.config.probe, self.threads)
                 if rise > self.config.certain and self._sensible():
                     self.settled = True
-                    self._report()
+                    self._report(members)
             if not self.settled and len(members) >= self.config.limit:
                 self.settle(members)
 
@@ -59,19 +60,15 @@ class Calibration:
         self.settled = True
         rise = observability(self.graph, members, self.config.probe, self.threads) if len(members) > 2 else 0.0
         if rise > self.config.usable and self._sensible():
-            self._report()
-            if rise < self.config.certain:
-                self.stats.warn(
-                    f"the focal length {self.focal_factor:.3f} times the guess is uncertain: the camera hardly turned "
-                    f"({100 * self.config.probe:.0f} % more or less cost only {100 * rise:.1f} % in the matches)"
-                )
+            self._report(members)
             return
         self.graph.intrinsics = self.given.copy()
         self.graph.optimize(members, set(members[1:]), set(members), Solver(steps=15, threads=self.threads))
-        self._report()
+        self._report([])
         self.stats.warn(
             "the focal length can't be told from these images (a camera that hardly turns, or a flat scene): the guess "
-            "is kept, and the map may be stretched in depth; calibrate and set dataset.intrinsics=[fx,fy,cx,cy]"
+            f"is kept, {self.pixels:.0f} px, and the map may be stretched in depth; calibrate and set "
+            "dataset.intrinsics=[fx,fy,cx,cy]"
         )
 
     def check(self, members: list[int]) -> None:
@@ -81,12 +78,16 @@ class Calibration:
         factor = focal_of_all(self.graph, members, self.threads)
         if factor is None:
             return
-        total = factor * self.focal_factor
-        self.stats.values["focal length, whole stream"] = f"{total:.3f} x the guess"
-        if abs(np.log(factor)) > self.config.drift:
+        sigma = uncertainty(self.graph, members, self.config.probe, self.threads, factor)
+        if not np.isfinite(sigma):
+            return
+        used = self.focal_factor * self.pixels
+        self.stats.values["focal_checked_px"] = factor * used
+        self.stats.values["focal length, whole stream"] = f"{factor * used:.1f} px, give or take {100 * sigma:.1f} %"
+        if abs(np.log(factor)) > max(self.config.drift, sigma):
             self.stats.warn(
-                f"all keyframes together want a focal length {total:.3f} times the guess, {self.focal_factor:.3f} "
-                "times was used: run again with dataset.intrinsics set to it"
+                f"all keyframes together want a focal length of {factor * used:.0f} px, give or take {100 * sigma:.1f} "
+                f"%, and {used:.0f} px was used: run again with dataset.intrinsics=[fx,fy,cx,cy] set to it"
             )
 
     def estimate_readout(self, members: list[int]) -> None:
@@ -100,9 +101,23 @@ class Calibration:
     def _sensible(self) -> bool:
         return self.config.bounds[0] < self.focal_factor < self.config.bounds[1]
 
-    def _report(self) -> None:
-        self.stats.values["focal length"] = f"{self.focal_factor:.3f} x the guess"
+    def _report(self, members: list[int]) -> None:
+        """members: keyframes that the focal length was found from; none: it is the guess."""
+        used = self.focal_factor * self.pixels
+        self.stats.values["focal length"] = f"{used:.1f} px, {self.focal_factor:.3f} x the guess"
+        self.stats.values["focal_px"] = used
         self.stats.counts["focal length over its guess"] = self.focal_factor
+        if not members:
+            return
+        sigma = uncertainty(self.graph, members, self.config.probe, self.threads)
+        self.stats.values["focal length"] += f", give or take {100 * sigma:.1f} %"
+        self.stats.values["focal_sigma_percent"] = 100 * sigma
+        if sigma > self.config.doubt:
+            self.stats.warn(
+                f"the focal length of {used:.0f} px is uncertain by {100 * sigma:.1f} %: the camera hardly turned "
+                "while it was estimated, and the map may be stretched in depth by as much; calibrate and set "
+                "dataset.intrinsics=[fx,fy,cx,cy]"
+            )
 
 
 __all__ = ["READOUT_AGAIN", "Calibration"]

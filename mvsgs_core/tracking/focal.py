@@ -14,6 +14,12 @@ from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.initialization import Start, StartCriteria, start_up
 
+# Matches that count as one: points of an image share its lens, shutter and pose, and err together. So many make the
+# curvature's deviation that of what was found on hand-held sequences whose focal length is known.
+TOGETHER = 64
+PARTS = 3  # of the keyframes, in their order, each of which is asked alone ...
+LEAST = 4  # ... where it has so many
+
 
 @dataclass(frozen=True)
 class FocalConfig:
@@ -24,7 +30,8 @@ class FocalConfig:
     probe: float = 0.1  # share by which the focal length is made wrong ...
     certain: float = 0.03  # ... and that of the cost which it must then rise by to be certain,
     usable: float = 0.002  # or, at the limit, to be better than the guess
-    drift: float = 0.03  # share by which the whole stream may contradict what was used, before it is told
+    doubt: float = 0.03  # standard deviation, as a share, above which it is told
+    drift: float = 0.01  # share by which the whole stream may contradict what was used, beyond its own uncertainty
 
 
 def start_with_unknown_focal(
@@ -60,15 +67,16 @@ def refine_focal(graph: KeyframeGraph, members: list[int], threads: int) -> str:
     return graph.optimize(members, set(members[1:]), set(members), solver, free_focal=True).failure
 
 
-def observability(graph: KeyframeGraph, members: list[int], probe: float, threads: int) -> float:
+def observability(graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0) -> float:
     """Share by which the cost rises where the focal length is wrong by `probe`, the rest adjusted to it; the graph
-    stays as it is. The lesser of both directions."""
+    stays as it is. The lesser of both directions. factor: on the graph's focal length, what is taken for right."""
     problem = graph.problem(members, set(members[1:]), set(members))
+    problem.intrinsics = problem.intrinsics * [factor, factor, 1.0, 1.0]
     solver = Solver(steps=10, robust_scale=1.0, tolerance=1e-4, threads=threads)
     here = adjust(problem, solver)
     rises = []
-    for factor in (1.0 - probe, 1.0 / (1.0 - probe)):
-        wrong = replace(problem, intrinsics=problem.intrinsics * [factor, factor, 1.0, 1.0])
+    for off in (1.0 - probe, 1.0 / (1.0 - probe)):
+        wrong = replace(problem, intrinsics=problem.intrinsics * [off, off, 1.0, 1.0])
         solution = adjust(wrong, solver)
         if here.failure or solution.failure or here.cost <= 0.0:
             return 0.0
@@ -83,4 +91,33 @@ def focal_of_all(graph: KeyframeGraph, members: list[int], threads: int) -> floa
     return None if solution.failure else solution.focal_factor
 
 
-__all__ = ["FocalConfig", "focal_of_all", "observability", "refine_focal", "start_with_unknown_focal"]
+def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0) -> float:
+    """Standard deviation of the focal length that these keyframes give, as a share; infinite where they don't tell.
+
+    factor: what they give, on the graph's focal length.
+
+    From the curvature of the cost, with matches of the same images that err together, and from how far parts of the
+    keyframes, each alone, disagree.
+    """
+    rise = observability(graph, members, probe, threads, factor)
+    matches = sum(int(np.count_nonzero(graph.edges[a, b].weight)) for a, b in graph.edges if {a, b} <= set(members))
+    if rise <= 0.0 or matches == 0:
+        return float("inf")
+    curvature = TOGETHER**0.5 * probe / float(np.sqrt(matches * rise))
+    found, weights = [], []
+    for part in np.array_split(np.array(members), PARTS):
+        if len(part) < LEAST:
+            continue
+        part_rise = observability(graph, part.tolist(), probe, threads, factor)
+        own = focal_of_all(graph, part.tolist(), threads)
+        if own is not None and part_rise > 0.0:
+            found.append(float(np.log(own)))
+            weights.append(part_rise)
+    if len(found) < 2:
+        return curvature
+    mean = np.average(found, weights=weights)
+    spread = float(np.sqrt(np.average(np.square(found - mean), weights=weights) / (len(found) - 1)))
+    return float(np.hypot(curvature, spread))
+
+
+__all__ = ["FocalConfig", "focal_of_all", "observability", "refine_focal", "start_with_unknown_focal", "uncertainty"]

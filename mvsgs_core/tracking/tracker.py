@@ -160,8 +160,9 @@ class Tracker:
         self.graph = KeyframeGraph(self.intrinsics)
         self.graph.device = config.device
         self.calibration = Calibration(
-            self.graph, config.focal, self.stats, self.intrinsics, not guessed, config.readout, config.threads
-        )
+            self.graph, config.focal, self.stats, self.intrinsics, float(intrinsics[0]), not guessed, config.readout,
+            config.threads,
+        )  # fmt: skip
         self.flow = make_flow(config.flow)
         self.matcher = Matcher(self.flow)
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, config.threads)

@@ -57,8 +57,13 @@ def test_the_focal_length_is_found(focal: float) -> None:
     assert np.isfinite(path.world_from_cam).all()
     told = [index for update in updates for index in update.keyframes]
     assert told == path.index[path.keyframe].tolist()
-    assert "focal length" in tracker.stats.values
     assert tracker.stats.warnings == []
+    values = tracker.stats.values
+    assert values["focal_px"] == pytest.approx(focal * SIZE[1], rel=0.03)
+    assert 0.0 < values["focal_sigma_percent"] < 3.0
+    assert abs(values["focal_px"] / (focal * SIZE[1]) - 1.0) < 3 * values["focal_sigma_percent"] / 100
+    if path.keyframe.sum() >= tracker.config.focal.keyframes:
+        assert values["focal_checked_px"] == pytest.approx(focal * SIZE[1], rel=0.03)
 
 
 def test_keyframes_wait_until_the_focal_length_is_settled() -> None:
@@ -67,7 +72,7 @@ def test_keyframes_wait_until_the_focal_length_is_settled() -> None:
         update = tracker.add(item.index, item.timestamp, item.image, GUESS, guessed=True)
         if update.keyframes:
             break
-        assert tracker.pending >= {k.index for k in tracker._keyframes()}, "an image that is still needed"
+        assert tracker.pending >= set(tracker.graph.keyframes if tracker.graph else ()), "an image that is still needed"
     settled = tracker.focal_factor
     assert len(update.keyframes) >= 8
     for later in room(1.3)[item.index + 1 :]:
@@ -88,3 +93,31 @@ def test_a_known_focal_length_is_left_alone() -> None:
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
     assert tracker.started
     assert tracker.focal_factor == 1.0
+
+
+def test_the_check_in_the_end_says_both_focal_lengths_and_how_sure_it_is() -> None:
+    """Keyframes went out with a focal length that the whole stream contradicts."""
+    tracker = Tracker()
+    wrong = GUESS * [1.25, 1.25, 1.0, 1.0]
+    for item in room(1.3):
+        tracker.add(item.index, item.timestamp, item.image, wrong, guessed=True)
+        if tracker.graph is not None and not tracker.calibration.settled and tracker.started:
+            tracker.graph.intrinsics = wrong * 1.0  # as if nothing better had been found
+            tracker.calibration.settled = True
+    list(tracker.finish())
+    values = tracker.stats.values
+    true = 1.3 * SIZE[1]
+    assert abs(values["focal_checked_px"] / true - 1.0) < abs(wrong[0] / true - 1.0)
+    (warning,) = [w for w in tracker.stats.warnings if "all keyframes together" in w]
+    assert f"{values['focal_checked_px']:.0f} px" in warning
+    assert f"{wrong[0]:.0f} px" in warning
+    assert "%" in warning
+
+
+def test_a_focal_length_that_few_turns_tell_is_doubted() -> None:
+    items = room(1.3)[:30]
+    tracker, _, _ = track_guessing(items)
+    values = tracker.stats.values
+    off = abs(values["focal_px"] / (1.3 * SIZE[1]) - 1.0)
+    doubted = any("uncertain" in w or "guess is kept" in w for w in tracker.stats.warnings)
+    assert doubted or off < 0.03
