@@ -135,8 +135,7 @@ class Mapper(Node):
             return
         self._settle()  # the map must not depend on when they come
         self.session.revision = max(self.session.revision, poses.revision)
-        for mapper in self.session.parts.values() or [self.mapper]:
-            mapper.correct(poses.index, poses.world_from_cam, poses.scale)
+        self.session.correct(poses.index, poses.world_from_cam, poses.scale)
         if poses.segment is not None:
             self.session.segment_of.update(zip(poses.index.tolist(), poses.segment.tolist()))
             self.session.join()
@@ -156,7 +155,7 @@ class Mapper(Node):
         self._settle(realtime=False)
         self.session.stream_ended = True
         self._choose_largest()
-        self.stats.values["segments_apart"] = len(self.session.parts)
+        self.stats.values["segments_apart"] = max(0, len(self.session.parts) - 1)  # beside the map that is shown
         yield self._map(refined=False)
         while self.session.refined < self.config.refinement:
             self.mapper.refine(self.session.refined, self.config.refinement)

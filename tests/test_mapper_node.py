@@ -160,8 +160,21 @@ def test_the_maps_of_segments_that_a_loop_joins_become_one() -> None:
     assert set(after.anchors.tolist()) >= {0, 2}
     np.testing.assert_allclose(after.world_from_cam[2:5], moved)
     assert after.scale.tolist() == [1.0, 1.0, 2.0, 2.0, 2.0, 1.0]
-    assert (node.stats.counts["segments_joined"], node.stats.values["segments_apart"]) == (1, 1)
+    assert (node.stats.counts["segments_joined"], node.stats.values["segments_apart"]) == (1, 0)
     assert not any("tracking was lost" in warning for warning in node.stats.warnings)
+
+
+def test_a_pose_that_is_none_is_counted_once_whatever_the_segments() -> None:
+    node = Mapper(settings())
+    for index, segment in ((0, 0), (1, 0), (2, 1), (3, 1)):
+        list(node.on_view(view_message(index, 0.2 * index, segment=segment)))
+    assert len(node.session.parts) == 2
+    poses = np.stack([pose_on_arc(k / 5) for k in (0, 2)])
+    poses[0, 0, 3] = np.nan
+    list(node.on_poses(Poses(1, np.array([0, 2]), poses, np.ones(2), np.array([0, 1], np.int32))))
+    assert node.stats.counts["refused_poses"] == 1
+    list(node.on_end())
+    assert node.stats.values["segments_apart"] == 1, "one beside the map that is shown"
 
 
 def test_a_segment_of_which_only_poses_are_known_yet_waits_for_its_views() -> None:

@@ -24,7 +24,7 @@ from mvsgs_core.splats.schedule import Schedule
 from mvsgs_core.splats.self_check import SelfCheck, check
 from mvsgs_core.splats.snapshot import Snapshot, snapshot
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
-from mvsgs_core.splats.view_checks import LARGEST, checked_view, is_near, is_pose
+from mvsgs_core.splats.view_checks import LARGEST, NO_POSE, checked_view, is_near, is_pose
 from mvsgs_core.stats import Stats
 
 
@@ -163,7 +163,7 @@ class OnlineMapper:
         by_index = {view.index: view for view in self.views}
         for key, pose, s in zip(index.tolist(), np.asarray(world_from_cam, dtype=np.float64), scale.tolist()):
             if not is_pose(pose, s) or (self.unit is not None and not is_near(self._local(pose)[:3, 3])):
-                self.log.refuse("poses", 1, "a corrected pose that is not finite, or none at all, was refused")
+                self.log.refuse("poses", 1, NO_POSE)
                 continue
             self.corrections[key] = (pose, s)
             view = by_index.get(key)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from mvsgs_core.splats.checkpoint_state import copy_of
 from mvsgs_core.splats.mapper import OnlineMapper
+from mvsgs_core.splats.view_checks import NO_POSE, is_pose
 from mvsgs_core.stats import Stats
 
 
@@ -38,6 +41,14 @@ class Session:
             before = self.current
             self.parts[segment] = OnlineMapper(before.config, before.log, before.corrections)
         self.current = self.parts[segment]
+
+    def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> None:
+        """Corrected poses as in `OnlineMapper.correct`, for each part's keyframes; what is no pose is counted once."""
+        usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
+        if not usable.all():
+            self.current.log.refuse("poses", int((~usable).sum()), NO_POSE)
+        for part in self.parts.values() or [self.current]:
+            part.correct(index[usable], world_from_cam[usable], scale[usable])
 
     def join(self) -> None:
         """Joins the maps of segments whose keyframes now belong to another one; the tracker joins whole segments."""

@@ -17,6 +17,7 @@ LEAST_SIDE = 8  # pixels of an image
 FOCAL = (0.05, 100.0)  # focal lengths over the image's larger side: 170 degrees to half a degree
 OFF_CENTER = 1.0  # image sizes that the principal point may lie outside of the image
 FAR = 1e6  # median depths from the origin, and between scales: float32 has no detail left there
+NO_POSE = "a corrected pose that is not finite, or none at all, was refused"
 LARGEST = 1e18  # of depths, in the world's unit: their squares are finite in float32
 
 

@@ -115,8 +115,8 @@ def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads:
             weights.append(part_rise)
     if len(found) < 2:
         return curvature
-    mean = np.average(found, weights=weights)
-    spread = float(np.sqrt(np.average(np.square(found - mean), weights=weights) / (len(found) - 1)))
+    logs, shares = np.array(found), np.array(weights) / sum(weights)
+    spread = float(np.sqrt(shares @ np.square(logs - shares @ logs) / (len(logs) - 1)))
     return float(np.hypot(curvature, spread))
 
 
