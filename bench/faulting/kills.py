@@ -20,12 +20,14 @@ from launch.outcome import OBSERVER_FAILED
 STAGES = ("dataset", "tracker", "mvs", "depth_fusion", "mapper")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP)
 SCENE = (
-    "device=cpu", "screen=plain", "dataset.size=[96,128]", "dataset.options.frames=100", "dataset.realtime=true",
+    "device=cpu", "screen=plain", "dataset.size=[96,128]", "dataset.options.frames=120", "dataset.realtime=true",
     "mapper.iterations=8", "mapper.refinement=40", "mapper.checkpoint=0.5", "evaluator.lpips=off",
     "evaluator.max_frames=30", *(f"{stage}.threads=1" for stage in STAGES[1:]),
 )  # fmt: skip
 SILENT, DEAD = 2.0, 5.0  # seconds: the watchdog's limits where a process is stopped
 MOMENTS = 3.0  # seconds after the first map within which the faults come
+RECORD = "recorder=mcap"
+ATTEMPTS = 5  # to meet a process while it runs
 QUICK = ("dataset.options.frames=50", "mapper.refinement=10", "evaluator.max_frames=10")
 QUICK_MOMENTS = 0.5
 LONGEST_END = 5.0  # seconds
@@ -45,13 +47,18 @@ class Faults:
         output = self.folder / name
         return Launched(output, (*self.scene, f"output={output}", *overrides))
 
-    def wait_for_a_moment(self, run: Launched) -> float:
-        """Some time after the first map; seconds. Raises RuntimeError where none comes."""
-        if not run.wait_for((run.output / "map.ply").exists):
-            raise RuntimeError(f"no map came: {run.said()}")
-        moment = self.random.uniform(0.0, self.moments)
-        time.sleep(moment)
-        return moment
+    def struck(self, name: str, victim: str, number: signal.Signals, *overrides: str) -> Launched:
+        """A run whose victim has just got that signal, at a moment at which it still ran. Raises RuntimeError."""
+        for attempt in range(ATTEMPTS):
+            run = self.run(f"{name}-{attempt}" if attempt else name, *overrides)
+            if not run.wait_for((run.output / "map.ply").exists):
+                run.close()
+                raise RuntimeError(f"no map came: {run.said()}")
+            time.sleep(self.random.uniform(0.0, self.moments) / (attempt + 1))
+            if run.send(victim, number):
+                return run
+            run.close()
+        raise RuntimeError(f"{victim} had always ended soon after the first map: {run.said()}")
 
 
 @dataclass
@@ -111,10 +118,7 @@ def _killed(faults: Faults, cases: list[tuple[str, signal.Signals]], resumable: 
 def kill(faults: Faults, name: str, stage: str, number: signal.Signals, found: Kills) -> Path:
     """One run whose stage gets that signal some time after the first map; its output."""
     limits = (f"supervise.silent={SILENT}", f"supervise.dead={DEAD}") if number == signal.SIGSTOP else ()
-    with faults.run(name, *limits) as run:
-        moment = faults.wait_for_a_moment(run)
-        if not run.send(stage, number):
-            raise RuntimeError(f"{stage} had ended {moment:.1f} s after the first map: {run.said()}")
+    with faults.struck(name, stage, number, *limits) as run:
         began = time.monotonic()
         run.wait()
         seconds = time.monotonic() - began
@@ -134,10 +138,9 @@ def _observed(faults: Faults, runs: int, whole: Path) -> list[Row]:
     finished = equal = 0
     for k in range(runs):
         full = ("recorder._target_=bench.full_disk.FullRecorder", "evaluator._target_=bench.full_disk.FullEvaluator")
-        with faults.run(f"observed-{k}", "recorder=mcap", *(() if k % 2 else full)) as run:
-            if k % 2:
-                faults.wait_for_a_moment(run)
-                run.send(("evaluator", "recorder")[k // 2 % 2], signal.SIGKILL)
+        name, victim = f"observed-{k}", ("evaluator", "recorder")[k // 2 % 2]
+        kill = k % 2 == 1
+        with faults.struck(name, victim, signal.SIGKILL, RECORD) if kill else faults.run(name, RECORD, *full) as run:
             finished += run.wait() == OBSERVER_FAILED
             equal += (run.output / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
         shutil.rmtree(run.output)
