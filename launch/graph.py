@@ -243,7 +243,7 @@ def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edg
                     f"{slots[sender].target} yields {_names(sends[sender])}" if sender in slots else "that slot is off"
                 )
                 origins = [other for other, types in sends.items() if message in types and message not in takes[other]]
-                if message not in OPTIONAL_MESSAGES or origins:
+                if not _spared(slot, message) and (message not in OPTIONAL_MESSAGES or origins):
                     raise GraphError(f"{refusal}: it reads it from {sender}, but {why} ({hint})")
                 warnings.append(f"{name} gets no {message.__name__}: {sender}: {why}")
                 continue
@@ -251,6 +251,12 @@ def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edg
             best_effort |= message.__name__ in slots[sender].placement.best_effort
             edges.append(Edge(message, sender, name, best_effort))
     return edges, warnings
+
+
+def _spared(slot: Slot, message: type) -> bool:
+    """Whether a slot works without a message: it would read the newest only, beside others that must all come."""
+    must = [sender for sender in slot.reads.values() if not sender.endswith("?")]
+    return bool(must) and slot.reads[message].endswith("?")
 
 
 def order(slots: Collection[str], edges: Collection[Edge]) -> tuple[list[str], list[Edge]]:

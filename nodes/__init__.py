@@ -57,6 +57,7 @@ class Node:
         self.config = self.Config() if config is None else config
         self.stats = Stats()
         self.upstream: dict[str, Any] = {}  # what each node upstream counted, by name: complete when on_end runs
+        self.unread: frozenset[type] = frozenset()  # messages that nobody reads here: work for them alone can be spared
         self.rest: Callable[[], object] = _go_on  # to be called in long work where nothing is half changed, see above
 
     @classmethod

@@ -1,4 +1,4 @@
-"""View, Poses -> SplatMap, Preview: builds the map, optimizes it between keyframes, refines it at the end."""
+"""View, Poses, Keyframe -> SplatMap, Preview: builds the map, optimizes it between keyframes, refines it at the end."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs import MapView, Poses, Preview, SplatMap, View
+from msgs import Keyframe, MapView, Poses, Preview, SplatMap, View
 from mvsgs_core.splats import checkpoint, keyframe_images
 from mvsgs_core.splats.checkpoint_files import checkpoint_info
 from mvsgs_core.splats.checkpointing import Checkpointing
@@ -21,6 +21,7 @@ from mvsgs_core.splats.losses import LossConfig
 from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.splats.optimizer import LearningRates
 from mvsgs_core.splats.preview import preview_arrays
+from mvsgs_core.splats.provisional import CoarseView, Provisional
 from mvsgs_core.splats.replay import Replay
 from mvsgs_core.splats.session import Session
 from mvsgs_core.splats.training import SkipConfig, TrainingConfig
@@ -38,6 +39,8 @@ class Mapper(Node):
     Parts of the stream between which tracking was lost share no frame of reference: each gets a map of its own. Where
     Poses say that a loop joined two, so are their maps; of those that stay apart, the one with the most keyframes is
     refined and sent.
+
+    Keyframes are read for the previews alone: until a keyframe's View comes, its coarse depth stands in for it there.
     """
 
     @dataclass
@@ -92,6 +95,7 @@ class Mapper(Node):
         if self.config.output is not None:
             self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.session, resumed)
         self._last_preview = 0.0
+        self._provisional = Provisional(self.config.preview_splats)
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -103,6 +107,7 @@ class Mapper(Node):
         return self.session.current
 
     def on_view(self, view: View) -> Iterator[Preview | MapView]:
+        self._provisional.came(view.index)
         if not self._is_new_view(view):
             return
         # sent on its way before its segment was joined: by keyframe and not by number, as the pose is corrected so, too
@@ -129,7 +134,20 @@ class Mapper(Node):
             self._checkpoints.keep(self.session)
         yield from self._preview()
 
+    def on_keyframe(self, keyframe: Keyframe) -> Iterator[Preview]:
+        if not self._previewing:
+            return
+        self._provisional.see(
+            CoarseView(
+                index=keyframe.index, image=keyframe.image, intrinsics=keyframe.intrinsics, scale=keyframe.scale,
+                world_from_cam=keyframe.world_from_cam, inverse_depth=keyframe.inverse_depth,
+                weight=keyframe.inverse_depth_weight, segment=keyframe.segment,
+            )
+        )  # fmt: skip
+        yield from self._preview()
+
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
+        self._provisional.correct(poses.index, poses.world_from_cam, poses.scale, poses.segment)
         if self._replay and not self._replay.poses(poses.revision, poses.index, poses.world_from_cam, poses.scale):
             self._say_what_does_not_fit()
             return
@@ -275,15 +293,21 @@ class Mapper(Node):
                 depth=np.where(shown.opacity.cpu().numpy() > 0.5, depth, np.float32(0)),
             )  # fmt: skip
 
+    @property
+    def _previewing(self) -> bool:
+        return self.config.preview_period > 0 and Preview not in self.unread
+
     def _preview(self, due: bool = False) -> Iterator[Preview]:
         now = time.monotonic()
-        period = self.config.preview_period
-        due |= now - self._last_preview >= period
-        if period <= 0 or not due or not self.mapper.views or not len(self.mapper.state):
+        due |= now - self._last_preview >= self.config.preview_period
+        if not self._previewing or not due or not self.mapper.views or not len(self.mapper.state):
             return
         self._last_preview = now
         view = self.mapper.views[-1]
-        arrays = preview_arrays(self.mapper, self.config.preview_splats)
+        with self.stats.time("provisional"):
+            segments = {segment for segment, part in self.session.parts.items() if part is self.mapper}
+            provisional = self._provisional.splats(self.mapper, segments)
+        arrays = preview_arrays(self.mapper, self.config.preview_splats, provisional)
         origin = np.zeros(3) if self.mapper.origin is None else self.mapper.origin
         poses = np.stack([view.world_from_cam for view in self.mapper.views])
         poses[:, :3, 3] -= origin

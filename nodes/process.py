@@ -27,7 +27,7 @@ import numpy as np
 import msgs
 from msgs import Message
 from mvsgs_core.named_modules import import_named
-from nodes import Node, is_source
+from nodes import Node, is_source, outputs
 from nodes.addresses import PeerLost, load_keys
 from nodes.freed_memory import FreedMemory
 from nodes.inbox import Inbox, Reader
@@ -104,6 +104,8 @@ class _Process:
         self._seed()
         runner = self._runner = Runner(self._spec.name, node_type(make_config(node_type, self._spec.config)))
         runner.node.rest = self._rest
+        read = {given.type for given in self._spec.outputs}
+        runner.node.unread = frozenset(sent for sent in outputs(node_type) if sent.__name__ not in read)
         inbox = self._open()
         self.status.set("waiting")
         for given in self._spec.outputs:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nodes
-from msgs import MapView, Poses, Preview, SplatMap, View
+from msgs import Keyframe, MapView, Poses, Preview, SplatMap, View
 from mvsgs_core.evaluation.image_metrics import psnr
 from mvsgs_core.splats.cameras import read_cameras
 from mvsgs_core.splats.export_ply import read_ply
@@ -38,7 +38,7 @@ def settings(**changes: object) -> Mapper.Config:
 
 
 def test_inputs_and_outputs_are_declared() -> None:
-    assert nodes.handlers(Mapper) == {View: "on_view", Poses: "on_poses"}
+    assert nodes.handlers(Mapper) == {View: "on_view", Poses: "on_poses", Keyframe: "on_keyframe"}
     assert set(nodes.outputs(Mapper)) == {SplatMap, Preview, MapView}
 
 
@@ -266,3 +266,44 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
         )  # fmt: skip
     assert psnr(render.color.clamp(0, 1).numpy(), message.image / np.float32(255)) > 25.0
     assert not node.stats.warnings
+
+
+def keyframe_message(index: int, t: float) -> Keyframe:
+    view = view_message(index, t)
+    inverse = 1.0 / view.depth[1::2, 1::2]
+    return Keyframe(
+        index=index, timestamp=view.timestamp, image=view.image, intrinsics=view.intrinsics, segment=view.segment,
+        world_from_cam=view.world_from_cam, scale=view.scale, inverse_depth=inverse.astype(np.float32),
+        inverse_depth_weight=np.ones_like(inverse, dtype=np.float32),
+    )  # fmt: skip
+
+
+def test_a_keyframe_without_depth_yet_is_in_the_preview_and_not_in_the_map() -> None:
+    node, plain = Mapper(replace(settings(), preview_period=1e-9)), Mapper(settings())
+    list(node.on_view(view_message(0, 0.0)))
+    (preview,) = node.on_keyframe(keyframe_message(7, 1.0))
+    assert isinstance(preview, Preview)
+    assert len(preview.means) > len(node.mapper.state)
+    (moved,) = [*node.on_poses(poses_of(7, 1.0)), *node.on_keyframe(keyframe_message(7, 1.0))][-1:]
+    assert isinstance(moved, Preview)
+    (after,) = node.on_view(view_message(7, 1.0))
+    assert isinstance(after, Preview)
+    assert len(after.means) == len(node.mapper.state)
+    list(plain.on_view(view_message(0, 0.0)))
+    list(plain.on_poses(poses_of(7, 1.0)))
+    list(plain.on_view(view_message(7, 1.0)))
+    for name in PARAMETERS:  # keyframes that came for the preview leave the map as it is
+        torch.testing.assert_close(getattr(node.mapper.state.splats, name), getattr(plain.mapper.state.splats, name))
+
+
+def poses_of(index: int, t: float) -> Poses:
+    pose = view_message(index, t).world_from_cam
+    return Poses(revision=1, index=np.array([index]), world_from_cam=pose[None], scale=np.array([1.0]))
+
+
+def test_previews_that_nobody_reads_are_not_made() -> None:
+    node = Mapper(replace(settings(), preview_period=1e-9))
+    node.unread = frozenset({Preview})
+    assert not list(node.on_view(view_message(0, 0.0)))
+    assert not list(node.on_keyframe(keyframe_message(7, 1.0)))
+    assert "provisional" not in node.stats.seconds

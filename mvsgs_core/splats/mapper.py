@@ -98,7 +98,7 @@ class OnlineMapper:
         median = _median(depth)
         if median == 0 and view.unfiltered is not None:  # the filters kept nothing: doubtful depth gives the scale
             median = _median(view.unfiltered) * scale / view.scale
-        if median >= LARGEST or (self.unit is not None and not is_near(self._local(pose)[:3, 3], median / self.unit)):
+        if median >= LARGEST or (self.unit is not None and not is_near(self.local(pose)[:3, 3], median / self.unit)):
             self.log.refuse("views", 1, "a keyframe far away from all others, or with depth so large, was refused")
             return 0
         if self.origin is None:
@@ -106,9 +106,9 @@ class OnlineMapper:
         if self.unit is None and median > 0:
             self.unit = median
             for earlier in self.views:
-                earlier.local_from_cam = self._local(earlier.world_from_cam)
+                earlier.local_from_cam = self.local(earlier.world_from_cam)
         added = training_view(
-            view, self._local(pose), self.config.max_pixels, self.config.skipping.levels, self.state.device
+            view, self.local(pose), self.config.max_pixels, self.config.skipping.levels, self.state.device
         )
         added.world_from_cam, added.scale, added.median_depth = pose, scale, median / (self.unit or 1.0)
         added.fixed = not self.views
@@ -162,15 +162,15 @@ class OnlineMapper:
         moved: dict[int, Similarity] = {}
         by_index = {view.index: view for view in self.views}
         for key, pose, s in zip(index.tolist(), np.asarray(world_from_cam, dtype=np.float64), scale.tolist()):
-            if not is_pose(pose, s) or (self.unit is not None and not is_near(self._local(pose)[:3, 3])):
+            if not is_pose(pose, s) or (self.unit is not None and not is_near(self.local(pose)[:3, 3])):
                 self.log.refuse("poses", 1, NO_POSE)
                 continue
             self.corrections[key] = (pose, s)
             view = by_index.get(key)
             if view is None:
                 continue
-            similarity = Similarity.between(view.local_from_cam, self._local(pose), s / view.scale)
-            view.world_from_cam, view.local_from_cam = pose, self._local(pose)
+            similarity = Similarity.between(view.local_from_cam, self.local(pose), s / view.scale)
+            view.world_from_cam, view.local_from_cam = pose, self.local(pose)
             view.rescale(s / view.scale)
             view.scale = s
             if similarity.moves(max(view.median_depth, 1e-6)):
@@ -196,14 +196,14 @@ class OnlineMapper:
         if self.unit is None and other.unit is not None:
             self.unit = other.unit
             for view in self.views:
-                view.local_from_cam = self._local(view.world_from_cam)
+                view.local_from_cam = self.local(view.world_from_cam)
         unit, other_unit = self.unit or 1.0, other.unit or 1.0
         change = Similarity(other_unit / unit, np.eye(3), (other.origin - self.origin) / unit)
         with self.log.time("joining"):
             move_with_anchors(other.state, dict.fromkeys(other.state.anchors.unique().tolist(), change))
             self.state.take_over(other.state)
         for view in other.views:
-            view.local_from_cam = self._local(view.world_from_cam)
+            view.local_from_cam = self.local(view.world_from_cam)
             view.rescale(change.scale)
             view.fixed = view.fixed and not self.views  # one holds the frame of reference
         self.views = sorted(self.views + other.views, key=lambda view: view.index)
@@ -281,7 +281,7 @@ class OnlineMapper:
             self.unit, self.median_depth, self.log,
         )  # fmt: skip
 
-    def _local(self, world_from_cam: np.ndarray) -> np.ndarray:
+    def local(self, world_from_cam: np.ndarray) -> np.ndarray:
         local = world_from_cam.copy()
         local[:3, 3] = (local[:3, 3] - self.origin) / (self.unit or 1.0)
         return local

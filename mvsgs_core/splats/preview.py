@@ -6,26 +6,34 @@ import numpy as np
 import torch
 
 from mvsgs_core.splats.mapper import OnlineMapper
+from mvsgs_core.splats.model import Splats
 from mvsgs_core.splats.reference import rotation_matrices
 from mvsgs_core.splats.spherical_harmonics import C0
 
 CHUNK = 16384  # splats whose covariances are made at once: on the way they take several times their size
 
 
-def preview_arrays(mapper: OnlineMapper, limit: int) -> dict[str, np.ndarray]:
+def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None = None) -> dict[str, np.ndarray]:
     """`render` (H, W, 3) uint8 and, for at most `limit` splats spread over the map, relative to its origin in world
-    units: `means` (N, 3), `covariances` (N, 3, 3), `colors` (N, 3) uint8, `opacities` (N,)."""
+    units: `means` (N, 3), `covariances` (N, 3, 3), `colors` (N, 3) uint8, `opacities` (N,).
+
+    provisional: fewer than `limit`, in the mapper's frame and unit, all of which are shown beside the map's.
+    """
     render = mapper.render(mapper.views[-1]).color
     final = mapper.state.detached()
-    stride = max(1, -(-len(final) // limit))
+    more = 0 if provisional is None else len(provisional)
+    stride = max(1, -(-len(final) // max(1, limit - more)))
+    shown = {name: value[::stride] for name, value in final.tensors().items()}
+    if provisional is not None:
+        shown = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in shown.items()}
     unit = mapper.unit or 1.0
-    shapes = zip(final.quaternions[::stride].split(CHUNK), final.log_scales[::stride].split(CHUNK))
+    shapes = zip(shown["quaternions"].split(CHUNK), shown["log_scales"].split(CHUNK))
     return {
         "render": _bytes(render),
-        "means": (final.means[::stride] * unit).cpu().numpy(),
+        "means": (shown["means"] * unit).cpu().numpy(),
         "covariances": torch.cat([_covariances(q, s, unit) for q, s in shapes]).cpu().numpy(),
-        "colors": _bytes(0.5 + C0 * final.sh[::stride, 0]),
-        "opacities": torch.sigmoid(final.opacity_logits[::stride]).cpu().numpy(),
+        "colors": _bytes(0.5 + C0 * shown["sh"][:, 0]),
+        "opacities": torch.sigmoid(shown["opacity_logits"]).cpu().numpy(),
     }
 
 
