@@ -96,7 +96,7 @@ class Densifier:
         if len(self.state):
             render = self.render(added, _level_of(added, size))
             opacity = render.opacity.cpu().numpy()
-            empty = empty & _resized(opacity < config.unexplored_opacity, size)
+            empty = empty & _resized(opacity < config.fill_below, size)
             solid = np.where(opacity > SOLID, render.depth.cpu().numpy(), 0.0).astype(np.float32)
             shown = np.asarray(cv2.resize(solid, size[::-1], interpolation=cv2.INTER_NEAREST))
         confidence = np.ones(size, dtype=np.float32) if view.confidence is None else view.confidence

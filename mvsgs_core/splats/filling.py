@@ -43,7 +43,7 @@ def fill_points(
     empty: np.ndarray,
     side: int,
 ) -> Points:
-    """Camera-frame points, one for each cell of `side` x `side` pixels that is empty by half or more.
+    """Camera-frame points, one for each cell of `side` x `side` pixels a quarter of which or more is empty.
 
     depth: (h, w), 0 where unknown, confidence (h, w), intrinsics (4,) at that size, image (h, w, 3) in [0, 1], empty
     (h, w) bool. A point is on the ray of its cell's center, at the depth of the most confident of the empty pixels (a
@@ -63,7 +63,7 @@ def fill_points(
     known = holes & (cells(depth) > 0)
     best = np.argmax(np.where(known, cells(confidence), -np.inf), axis=-1)
     pixels = cells(np.ones(depth.shape, dtype=bool)).sum(axis=-1)
-    chosen = known.any(axis=-1) & (2 * holes.sum(axis=-1) >= pixels)
+    chosen = known.any(axis=-1) & (4 * holes.sum(axis=-1) >= pixels)
     z = np.take_along_axis(cells(depth), best[..., None], axis=-1)[..., 0]
     colors = np.sum(cells(image) * holes[..., None], axis=2) / np.maximum(holes.sum(axis=-1), 1)[..., None]
     at_cells = camera.scale_intrinsics(intrinsics, (rows * side, columns * side), (rows, columns))

@@ -34,6 +34,7 @@ class InsertionConfig:
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
     fill: int = 4  # pixels, side of the cells that get one splat of doubtful depth where the map is empty; 0: off
+    fill_below: float = 0.7  # rendered opacity below: empty; the optimization has no reason to close half a gap
     fill_opacity: float = 0.55  # of these: doubtful ones must be outshone by what comes later, 0 to 1
     fill_scale: float = 0.7  # of these, as initial_scale: so transparent, they leave no gap only where they overlap
     min_confidence: float = 0.0  # of the depth, 0 to 1; views come filtered already

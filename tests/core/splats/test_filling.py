@@ -56,7 +56,7 @@ def test_the_most_confident_depth_of_a_cell_is_taken_and_never_one_that_is_not_e
     depth[3, 3], confidence[3, 3] = 0.0, 0.9  # unknown
     empty = np.ones((4, 8), dtype=bool)
     empty[2, 3] = False
-    empty[:, 4:] = np.arange(16).reshape(4, 4) < 7  # less than half
+    empty[:, 4:] = np.arange(16).reshape(4, 4) < 3  # less than a quarter
     intrinsics = np.array([10.0, 10.0, 3.5, 1.5])
     points = fill_points(depth, confidence, intrinsics, np.zeros((4, 8, 3)), empty, 4)
     assert points.positions[:, 2].tolist() == [3.0]
