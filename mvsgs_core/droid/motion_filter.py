@@ -9,8 +9,6 @@ from torch import Tensor
 
 from mvsgs_core.droid.networks import Networks
 
-LATE = 1.5  # of the motion that passes: a held-out frame that moved by more does not wait for the next
-
 
 @dataclass(frozen=True)
 class Encoded:
@@ -26,14 +24,10 @@ class MotionFilter:
         self.networks, self.threshold = networks, threshold
         self._last: Encoded | None = None
 
-    def passes(self, image: np.ndarray, held_out: bool = False) -> Encoded | None:
-        """An image (8h, 8w, 3) as the networks see it, None if it is too near the last that passed; the first does.
-
-        held_out: the next one is taken in its place, unless this one moved so far that the next may be lost.
-        """
+    def passes(self, image: np.ndarray) -> Encoded | None:
+        """An image (8h, 8w, 3) as the networks see it, None if it is too near the last that passed; the first does."""
         features = self.networks.features([image])[0]
-        threshold = self.threshold * (LATE if held_out else 1.0)
-        if self._last is not None and self._motion(self._last, features) <= threshold:
+        if self._last is not None and self._motion(self._last, features) <= self.threshold:
             return None
         self._last = Encoded(features, *self.networks.context(image))
         return self._last

@@ -72,7 +72,7 @@ class DroidSlam:
             self.stats.skip("frames between strides")
             return Update(self._states[-1])
         with self.stats.time("motion filter"):
-            encoded = self.motion_filter.passes(small, is_held_out(index))
+            encoded = self.motion_filter.passes(small)
         if encoded is None:
             self.stats.skip("frames that moved too little")
             return Update(self._states[-1])
@@ -195,6 +195,8 @@ class DroidSlam:
         if cam_from_world is not None:
             poses = geometry.inverse(np.stack([cam_from_world[frame.index] for frame in self.frames]))
             states[states == State.NOT_STARTED] = State.TRACKED
+            unknown = ~np.isfinite(poses).all(axis=(1, 2))
+            poses[unknown], states[unknown] = np.nan, State.LOST
         keyframes = self.video.keyframes if cam_from_world is not None else {}
         return Path(
             index=np.array([frame.index for frame in self.frames], np.int64),
@@ -202,7 +204,7 @@ class DroidSlam:
             world_from_cam=poses,
             keyframe=np.array([frame.index in keyframes for frame in self.frames], bool),
             state=states,
-            segment=np.full(count, 0 if cam_from_world is not None else -1, np.int32),
+            segment=np.where(np.isfinite(poses).all(axis=(1, 2)), 0, -1).astype(np.int32),
         )
 
 

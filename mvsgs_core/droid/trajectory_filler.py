@@ -45,7 +45,10 @@ def fill(
     threads: int,
     stats: Stats,
 ) -> np.ndarray:
-    """cam_from_world (N, 4, 4) of N frames that are no keyframes, none before the first keyframe."""
+    """cam_from_world (N, 4, 4) of N frames that are no keyframes, none before the first keyframe.
+
+    NaN where no bundle adjustment could be done: a pose that was only interpolated is none.
+    """
     poses = [np.zeros((0, 4, 4))]
     for start in range(0, len(frames), BATCH):
         poses.append(_fill(video, networks, frames[start : start + BATCH], correlation, threads, stats))
@@ -82,8 +85,11 @@ def _fill(
         solution = graph.update(count, motion_only=True)
         if solution.failure:
             stats.count("failed bundle adjustments")
-            stats.warn(f"poses between keyframes stay interpolated: {solution.failure}")
+            stats.warn(f"frames between keyframes have no pose: {solution.failure}")
+            break
     found = np.stack([frame.cam_from_world for frame in video.frames[count:]])
+    if solution.failure:
+        found[:] = np.nan
     del video.frames[count:]
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ from mvsgs_core.droid.motion_filter import MotionFilter
 from mvsgs_core.droid.networks import Networks, load, random_net
 from mvsgs_core.droid.presets import AREA, PRESETS, preset
 from mvsgs_core.droid.proximity import by_proximity, neighborhood
-from mvsgs_core.droid.trajectory_filler import StoredFrame, between
+from mvsgs_core.droid.trajectory_filler import StoredFrame, between, fill
 from mvsgs_core.droid.video import Video, VideoFrame
 from mvsgs_core.networks.droid import DroidNet, Update
+from mvsgs_core.stats import Stats
 from tests.core.networks.golden import folder, rule_weights
 
 GRID = (8, 10)
@@ -200,6 +202,21 @@ def test_the_motion_filter_keeps_the_first_frame_and_those_that_moved() -> None:
         motion_filter = MotionFilter(nets, threshold)
         assert motion_filter.passes(image) is not None
         assert (motion_filter.passes(image) is not None) == kept
+
+
+def test_a_frame_whose_adjustment_fails_has_no_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    failed = Mock(failure="the system is singular")
+    monkeypatch.setattr(FactorGraph, "update", lambda *_, **__: failed)
+    stats = Stats()
+    nets = Networks(random_net(), torch.device("cpu"))
+    made = video([0.0, 0.4, 0.8])
+    del made.frames[1]
+    frame = StoredFrame.of(1, 0.1, np.zeros((64, 80, 3), np.uint8))
+    poses = fill(made, nets, [frame], "volume", 1, stats)
+    assert poses.shape == (1, 4, 4)
+    assert np.isnan(poses).all()
+    assert any("have no pose" in warning for warning in stats.warnings)
+    assert len(made) == 2, "as it was"
 
 
 def test_scale_is_normalized_and_the_scene_stays_the_same() -> None:

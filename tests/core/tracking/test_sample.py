@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import gc
 import tracemalloc
 
 import numpy as np
 
 from mvsgs_core import geometry
+from mvsgs_core.datasets import open_dataset
 from mvsgs_core.tracking.bundle_adjustment import Solver
+from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.flow import Matches
 from mvsgs_core.tracking.frames import FrameRecord, State
+from mvsgs_core.tracking.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
+from mvsgs_core.tracking.tracker import Tracker
 from tests.core.tracking.sequences import tracked_room
 
 
@@ -42,6 +47,28 @@ def test_a_few_points_give_the_pose_of_all() -> None:
     ).cam_from_world
     off = np.linalg.norm(geometry.se3_log(again @ geometry.inverse(pose)))
     assert off < 0.1 * np.linalg.norm(geometry.se3_log(plain @ geometry.inverse(pose)))
+
+
+def test_a_camera_that_goes_to_and_fro_needs_no_memory_but_its_frames_kilobyte() -> None:
+    """10,000 frames at constant keyframes are 10 MB: a tenth of the process."""
+    items = list(open_dataset("synthetic", frames=30, threads=1, size=(96, 128)))
+    order = [*range(30), *range(28, 0, -1)]
+    tracker = Tracker(TrackerConfig(area=128 * 96, known_ground=KnownGroundConfig(keyframes=5)))
+    sizes, keyframes = [], []
+    tracemalloc.start()
+    try:
+        for n in range(12 * len(order) + 1):
+            item = items[order[n % len(order)]]
+            tracker.add(n, n / 20.0, item.image, item.intrinsics)
+            if n in (4 * len(order), 12 * len(order)):
+                assert tracker.graph is not None
+                keyframes.append(len(tracker.graph.keyframes))
+                gc.collect()
+                sizes.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert keyframes[0] == keyframes[1] >= 5
+    assert (sizes[1] - sizes[0]) / (8 * len(order)) < 1500, "bytes a frame"
 
 
 def test_a_frame_needs_a_kilobyte() -> None:
