@@ -62,7 +62,7 @@ class Mapper(Node):
         voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
         map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
         map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another
-        fill: int = 4  # pixels: cells that get one splat of unfiltered depth where the map stays empty; 0: off
+        fill: int = 4  # pixels: cells that get a splat of doubtful or continued depth where the map stays empty; 0: off
         density_control: str = "adaptive"  # adaptive, relocate or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls
