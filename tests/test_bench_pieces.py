@@ -83,6 +83,7 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
 
     switched = set().union(*(keys(name) for name in ablation.TABLE_III + ablation.SKIPS + ablation.OTHERS))
     switches = {f"mapper.{f.name}" for f in dataclasses.fields(Mapper.Config) if isinstance(f.default, bool)}
+    switches -= {"mapper.keep_checkpoint", "mapper.save_images"}  # what is written beside the map
     switches |= {f"mvs.{f.name}" for f in dataclasses.fields(Mvs.Config) if f.name.startswith("skip_")}
     assert {"mapper.skip_converged", "mvs.skip_cells", "mvs.skip_certain"} <= switches
     assert switches <= switched
