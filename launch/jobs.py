@@ -75,7 +75,7 @@ def _run(job: Job) -> int:
         said: list[Outcome] = []
 
         def over(outcome: Outcome) -> None:
-            problem = output.settle(outcome, scored=_scored(graph))
+            problem = output.settle(outcome, scored=_scored(graph), keep=_kept(graph))
             if outcome not in said:
                 if problem:
                     screen.note(problem)
@@ -86,10 +86,10 @@ def _run(job: Job) -> int:
         over(outcome)
         return outcome.code
     except GraphError as error:
-        output.settle(Outcome(REFUSED, f"refused: {error}"), scored=False)
+        output.settle(Outcome(REFUSED, f"refused: {error}"))
         return refused(error)
     except BaseException as error:
-        output.settle(Outcome(FAILED, f"{type(error).__name__}: {error}"), scored=False)
+        output.settle(Outcome(FAILED, f"{type(error).__name__}: {error}"))
         raise
     finally:
         output.release()
@@ -104,6 +104,11 @@ def refused(error: GraphError) -> int:
 def _scored(graph: Graph) -> bool:
     """Whether some node writes the report of a finished run: an observer that takes the map."""
     return any(edge.message is msgs.SplatMap and edge.reader in graph.observers for edge in graph.edges)
+
+
+def _kept(graph: Graph) -> bool:
+    """Whether the checkpoint is to stay after a complete run."""
+    return any(slot.config.get("keep_checkpoint") for slot in graph.slots.values())
 
 
 def _check_nodes(graph: Graph) -> None:
@@ -164,6 +169,8 @@ def _say(outcome: Outcome, screen: Screen, output: Output) -> None:
         screen.note(f"nothing to show: {node}: {reason}")
     for failure in outcome.observers:
         screen.note(f"the map is finished, but {failure.node} failed: {failure.error}")
+    if output.resume:
+        screen.note(f"its report is still to be made: {output.resume}")
 
 
 def unfinished(output: Output) -> str:

@@ -22,10 +22,10 @@ from omegaconf import OmegaConf
 from launch.outcome import Outcome
 from launch.parameters import GraphError
 from mvsgs_core.atomic_file import replace_text
-from mvsgs_core.splats.checkpoint_files import checkpoint_info
+from mvsgs_core.splats.checkpoint_files import FOLDER, checkpoint_info
 
 LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
-MAP = ("map.ply", "trajectory.txt", "checkpoint")  # what is worth keeping of an earlier run
+MAP = ("map.ply", "trajectory.txt", FOLDER)  # what is worth keeping of an earlier run
 BESIDE = ("report.html", REPORT, "comparison.png", "cameras.json", "keyframes", "config.yaml")  # and what belongs to it
 RUN_ALL = Path(__file__).resolve().parent / "run_all.py"
 
@@ -60,13 +60,16 @@ class Output:
         except OSError as error:
             raise GraphError(f"output={self.path}: {error.strerror or error}") from error
 
-    def settle(self, outcome: Outcome, scored: bool) -> str | None:
-        """Writes how the run ended, where no evaluator's report does. `scored`: the graph has who writes one.
+    def settle(self, outcome: Outcome, *, scored: bool = False, keep: bool = True) -> str | None:
+        """Writes how the run ended, where no evaluator's report does. `scored`: the graph has who writes one. What the
+        run could go on from goes once nothing is left to do, unless it is to be kept.
 
         What went wrong where that cannot be written, else None.
         """
         try:
             self._settle(outcome, scored)
+            if not keep and read_report(self.path).get("finished"):
+                shutil.rmtree(self.path / FOLDER, ignore_errors=True)
         except OSError as error:
             return f"{self.path / REPORT} cannot be written: {error.strerror or error}"
         return None
@@ -89,7 +92,7 @@ class Output:
             failed = ", ".join(f"{node} failed: {error}" for node, error in alone.items())
             report["reason"] = failed or ("no report came" if scored else "no slot of this graph writes a report")
             report["finished"] = not scored
-        if not outcome.whole:
+        if not report["finished"]:
             report["resume"] = self.resume = self._resume_command()
         self.write_report(report)
 

@@ -128,7 +128,8 @@ def _without_stream(config: DictConfig, folder: Path, conf: Path) -> None:
             kept.add(slot)
     for slot in classes.keys() - {SOURCE}:
         reads: dict[str, Any] = dict(config[slot].get("reads") or {})
-        wanted = [name for name, sender in reads.items() if sender.rstrip("?") not in kept - {SOURCE}]
+        gone = {name: sender for name, sender in reads.items() if sender.rstrip("?") not in kept - {SOURCE}}
+        wanted = [name for name, sender in gone.items() if name in given or not sender.endswith("?")]
         if slot in kept and given >= set(wanted):
             config[slot].reads = reads | dict.fromkeys(wanted, SOURCE)
         else:

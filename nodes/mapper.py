@@ -74,7 +74,7 @@ class Mapper(Node):
         map_views: bool = False  # send what the map shows from each keyframe, as mvs=skipping reads it
         output: str | None = None  # folder for map.ply and cameras.json; null: none is written
         checkpoint: float = 30.0  # seconds of the stream or the clock between checkpoints in the output; 0: none
-        keep_checkpoint: bool = False  # after a complete run, too
+        keep_checkpoint: bool = False  # of the finished map, after a complete run
         resume: str | None = None  # output of a run whose checkpoint is gone on with; null: a new map
         save_images: bool = False  # write each keyframe's image to output/keyframes, for a COLMAP model
         seed: int = 0

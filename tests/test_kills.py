@@ -37,12 +37,13 @@ def test_a_run_whose_mapper_was_killed_leaves_a_map_and_is_resumed(tmp_path: Pat
     assert report["rendering"]["held_out"]["count"] > 0
     assert report["trajectory"]["frames"] == 50
     assert not (output / "previous").exists()
+    assert not (output / "checkpoint").exists()
     with Launched(output, (f"resume={output}",)) as run:
         assert run.wait() == 2
         assert "has reached its end" in run.said()
 
 
-def test_observers_without_room_on_their_disk_cost_no_map(tmp_path: Path) -> None:
+def test_observers_without_room_on_their_disk_cost_no_map_and_the_report_can_still_be_made(tmp_path: Path) -> None:
     output = tmp_path / "out"
     full = ("recorder._target_=bench.full_disk.FullRecorder", "evaluator._target_=bench.full_disk.FullEvaluator")
     with Launched(output, (*SHORT, f"output={output}", "recorder=mcap", *full)) as run:
@@ -53,3 +54,9 @@ def test_observers_without_room_on_their_disk_cost_no_map(tmp_path: Path) -> Non
     report = json.loads((output / "report.json").read_text())
     assert set(report["observers"]) == {"recorder", "evaluator"}
     assert map_opens(output)
+    assert said.rstrip().endswith(f"its report is still to be made: {report['resume']}")
+    finished = (output / "map.ply").read_bytes()
+    with Launched(output, (f"resume={output}", "evaluator=standard", "recorder=off")) as run:
+        assert run.wait() == 0, run.said()
+        assert run.report()["finished"] is True
+    assert (output / "map.ply").read_bytes() == finished

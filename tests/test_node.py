@@ -248,14 +248,14 @@ def test_an_observer_that_is_killed_takes_nobody_along() -> None:
         frames = {"observers": ["watcher"], "address": g.address("source.Frame"), "type": "Frame", "readers": 1}
         g.start("left", f"{here}.Left", {"Frame": "source"}, {})
         watcher = g.start("watcher", f"{here}.Right", {"Frame": "source"}, {}, observer=True)
-        source = g.start("source", f"{here}.Source", {}, {}, {"count": 300, "delay": 0.001}, outputs=[frames])
+        source = g.start("source", f"{here}.Source", {}, {}, {"count": 2000, "delay": 0.002}, outputs=[frames])
         watcher.wait_for(lambda status: sum(status.get("in", {}).values()) > 3)
         watcher.popen.send_signal(signal.SIGSTOP)
         source.wait_for(lambda status: status.get("doing") == "held back")
         assert source.last["topic"] == "source.Frame"
         watcher.popen.kill()
         assert g.wait(20) == {"left": 0, "watcher": -signal.SIGKILL, "source": 0}
-        assert g.processes["left"].last["in"] == {"source.Frame": 300}
+        assert g.processes["left"].last["in"] == {"source.Frame": 2000}
 
 
 def test_an_observer_that_never_comes_is_waited_for_until_it_is_known_to_be_gone() -> None:
