@@ -43,7 +43,7 @@ def test_a_run_whose_mapper_was_killed_leaves_a_map_and_is_resumed(tmp_path: Pat
         assert "has reached its end" in run.said()
 
 
-def test_observers_without_room_on_their_disk_cost_no_map_and_the_report_can_still_be_made(tmp_path: Path) -> None:
+def test_observers_without_room_on_their_disk_cost_no_map(tmp_path: Path) -> None:
     output = tmp_path / "out"
     full = ("recorder._target_=bench.full_disk.FullRecorder", "evaluator._target_=bench.full_disk.FullEvaluator")
     with Launched(output, (*SHORT, f"output={output}", "recorder=mcap", *full)) as run:
@@ -54,9 +54,20 @@ def test_observers_without_room_on_their_disk_cost_no_map_and_the_report_can_sti
     report = json.loads((output / "report.json").read_text())
     assert set(report["observers"]) == {"recorder", "evaluator"}
     assert map_opens(output)
+
+
+def test_the_report_of_a_run_that_lost_its_evaluator_can_still_be_made(tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    with Launched(output, (*SHORT, f"output={output}")) as run:
+        assert run.wait_for((output / "map.ply").exists), run.said()
+        assert run.send("evaluator", signal.SIGKILL)
+        assert run.wait() == 4, run.said()
+        report, said = run.report(), run.said()
+    assert (report["finished"], report["map"]) == (False, "finished")
     assert said.rstrip().endswith(f"its report is still to be made: {report['resume']}")
     finished = (output / "map.ply").read_bytes()
-    with Launched(output, (f"resume={output}", "evaluator=standard", "recorder=off")) as run:
+    with Launched(output, (f"resume={output}",)) as run:
         assert run.wait() == 0, run.said()
         assert run.report()["finished"] is True
     assert (output / "map.ply").read_bytes() == finished
+    assert not (output / "checkpoint").exists()

@@ -37,7 +37,8 @@ class CheckpointWriter:
         self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._begun = False  # to write here
         self._changed = threading.Condition()
-        self._pending = 0  # checkpoints that are not done
+        self._pending = 0  # checkpoints that are not done,
+        self._left = 0  # and jobs of any kind
         self._thread: threading.Thread | None = None
         self.problems: queue.SimpleQueue[str] = queue.SimpleQueue()
 
@@ -58,11 +59,13 @@ class CheckpointWriter:
         self._do(lambda: self._write(session, sync))
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Whether all that was submitted is done, by then. None: however long it takes."""
+        """Whether all that was begun is done, by then. None: however long it takes."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._pending == 0, seconds)
+            return self._changed.wait_for(lambda: self._left == 0, seconds)
 
     def _do(self, job: Callable[[], object]) -> None:
+        with self._changed:
+            self._left += 1
         self._jobs.put(job)
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="checkpoints", daemon=True)
@@ -80,6 +83,10 @@ class CheckpointWriter:
             except Exception as error:  # of the checkpoint only: the map is not lost for it, and nothing is hidden
                 logging.exception("checkpoint")
                 self.problems.put(f"a checkpoint failed, the run goes on: {type(error).__name__}: {error}")
+            finally:
+                with self._changed:
+                    self._left -= 1
+                    self._changed.notify_all()
 
     def _write(self, session: Session, sync: bool) -> None:
         try:
@@ -88,7 +95,6 @@ class CheckpointWriter:
         finally:
             with self._changed:
                 self._pending -= 1
-                self._changed.notify_all()
 
     def _write_state(self, session: Session, sync: bool) -> None:
         (self._output / FOLDER / KEYFRAMES).mkdir(parents=True, exist_ok=True)

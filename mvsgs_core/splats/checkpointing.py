@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from mvsgs_core.splats.checkpoint_files import FOLDER
 from mvsgs_core.splats.checkpoint_writer import CheckpointWriter
 from mvsgs_core.splats.keyframes import TrainingView
 from mvsgs_core.splats.results import write_results
@@ -78,11 +80,14 @@ class Checkpointing:
 
     def close(self, session: Session, *, keep: bool) -> None:
         """After the map is finished. keep: its checkpoint is made too; else the last one stays, for a run whose report
-        is still to be made."""
-        if keep and self._period > 0 and len(session.largest.state):
+        is still to be made. Of a map without splats nothing stays."""
+        mapped = len(session.largest.state) > 0
+        if keep and self._period > 0 and mapped:
             self._writer.submit(session.frozen())
         self._writer.wait()
         self._pass_problems_on(session.current.log)
+        if not mapped:
+            shutil.rmtree(self._output / FOLDER, ignore_errors=True)
 
     def _due(self, session: Session) -> bool:
         if self._period <= 0 or self._writer.busy or not any(len(part.state) for part in session.parts.values()):
