@@ -391,7 +391,7 @@ class Tracker:
         waiting = list(self.starter.waiting)
         record = next(r for r in self.records if r.index == frame.index)
         if self.starter.try_start(True, self._unknown_focal()):
-            self.stats.warn("the start was forced at the end of the stream, on little motion")
+            self.stats.warn(f"the start was forced at the end of the stream: {self.starter.reason}")
             yield self._started(waiting, record)
         else:
             self.starter.abandon()
