@@ -20,7 +20,7 @@ from bench.file_mutations import mutated
 from bench.file_seeds import HOSTILE, SEEDS
 from bench.table import Row, at_least, at_most
 
-FILES, QUICK_FILES = 3000, 150
+FILES, QUICK_FILES = 3000, 90
 TIMEOUT = 20.0  # s for one file: a sound one takes a few milliseconds
 MEMORY = 400.0  # MB for one file: what an image or a message of the largest allowed size takes
 SEED = 20

@@ -42,7 +42,7 @@ class Samples:
 
 
 def measure(quick: bool) -> list[Row]:
-    frames, settled = (800, 300) if quick else (10_000, 2_000)
+    frames, settled = (500, 250) if quick else (10_000, 2_000)
     with tempfile.TemporaryDirectory() as folder:
         return _rows(*_watched(Path(folder), frames), frames, settled)
 
