@@ -29,12 +29,13 @@ from torch import Tensor
 from bench import networks
 from bench.rasterizer import intrinsics, scene, work
 from bench.table import Row, main
-from mvsgs_core.splats import optimizer, ssim
-from mvsgs_core.splats.keyframes import PosedView, training_view
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.mapping import optimizer
+from mvsgs_core.mapping.keyframes import PosedView, training_view
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.rasterizer import ssim
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 
 Action = Callable[[], object]

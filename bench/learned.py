@@ -23,12 +23,12 @@ import cv2
 import numpy as np
 import torch
 
-from bench.depth_data import SHARED, SOURCES, Scene, Source
-from bench.depth_run import Score, depth_view, score
-from bench.depth_tracked import load_tracked
+from bench.depth.data import SHARED, SOURCES, Scene, Source
+from bench.depth.run import Score, depth_view, score
+from bench.depth.tracked import load_tracked
 from bench.runs import folder as folder_of
 from bench.table import Row, main
-from bench.tracking import run as track
+from bench.tracking.__main__ import run as track
 from mvsgs_core import weights
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig

@@ -12,8 +12,8 @@ import os
 import numpy as np
 import torch
 
-from bench.depth_calibration import INLIER, fit, load, reliability
-from bench.depth_data import SHARED, SOURCES
+from bench.depth.calibration import INLIER, fit, load, reliability
+from bench.depth.data import SHARED, SOURCES
 from bench.learned import AREA, photographs
 from mvsgs_core.mvs.cascade import CascadeConfig, CascadeDepth
 from mvsgs_core.mvs.learned import NETWORKS, LearnedCascade, LearnedConfig, logit

@@ -21,12 +21,12 @@ import torch
 
 from bench.table import Row, at_least, at_most, main
 from mvsgs_core.datasets import Item, open_dataset
-from mvsgs_core.evaluation.image_metrics import psnr
 from mvsgs_core.fusion.normals import normals_of
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.training import SkipConfig
+from mvsgs_core.image_metrics import psnr
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.training import SkipConfig
+from mvsgs_core.rasterizer.rasterize import rasterize
 
 KITCHEN = Path(__file__).resolve().parent.parent.parent / "shared/data/seven_scenes_redkitchen"
 

@@ -1,4 +1,4 @@
-// The matching cost of mvsgs_core/csrc/stereo/cost_volume.cpp as plain loops over whole images: same inputs, weights,
+// The matching cost of mvsgs_core/csrc/mvs/cost_volume.cpp as plain loops over whole images: same inputs, weights,
 // samples and result, each array written once and read once; no tiles, no bands, whatever -O3 makes of it.
 #include <algorithm>
 #include <cmath>
@@ -37,7 +37,7 @@ void window_weights(const float* image, int height, int width, int radius, float
 
 }  // namespace
 
-// cost (H, D, W) of hypotheses first + k step; see mvsgs_core/csrc/stereo/stereo.hpp.
+// cost (H, D, W) of hypotheses first + k step; see mvsgs_core/csrc/mvs/stereo.hpp.
 extern "C" void plain_cost_volume(const float* reference, int height, int width, const float* neighbors,
                                   const float* warps, int views, const float* first, const float* step, int hypotheses,
                                   int radius, int best, float noise, float contrast, float* cost) {

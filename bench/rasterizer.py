@@ -34,10 +34,10 @@ import torch
 from bench.table import Row, at_most, main, timed
 from mvsgs_core import camera, native
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.splats import densities, spherical_harmonics, ssim
-from mvsgs_core.splats.densities import DENSITIES
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
+from mvsgs_core.rasterizer import densities, spherical_harmonics, ssim
+from mvsgs_core.rasterizer.densities import DENSITIES
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
 
 PASSES = 3  # of the kernel in a round
 SPEEDUP = 4.0  # over the plain loops
@@ -150,7 +150,7 @@ class Work:
 
 def work(splats: Splats, size: tuple[int, int], density: str) -> Work:
     height, width = size
-    passed = native.load("splats").forward(
+    passed = native.load("rasterizer").forward(
         *(tensor.detach() for tensor in splats.tensors().values()), pose=torch.eye(4, dtype=torch.float64),
         intrinsics=tuple(intrinsics(size).tolist()), near=1e-3, background=(0.0, 0.0, 0.0), exact=density == "exact",
         antialiased=False, degree=0, tile_mask=None, weights=True, threads=0, color=torch.empty(height, width, 3),

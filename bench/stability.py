@@ -17,15 +17,15 @@ import torch
 
 from bench.table import Row, main
 from mvsgs_core import camera
-from mvsgs_core.splats import optimizer
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.map_state import PARAMETERS, MapState
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.optimizer import LearningRates
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.ssim import image_loss
-from mvsgs_core.splats.training import TrainingConfig
+from mvsgs_core.mapping import optimizer
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.map_state import PARAMETERS, MapState
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.rasterizer.ssim import image_loss
 
 FINITE = "render and map finite"
 GOOD = 40.0  # dB of the keyframes: what bad input was refused must not cost the rest

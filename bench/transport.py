@@ -27,7 +27,7 @@ import zmq
 
 from bench.table import Row, main, timed
 from msgs import End, Frame, GroundTruth
-from nodes.transport import Publisher, ReliableReader, shut_down, wait
+from nodes.runtime.transport import Publisher, ReliableReader, shut_down, wait
 
 T = TypeVar("T")
 Sample = Frame | GroundTruth

@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from msgs import Frame, GroundTruth
 from mvsgs_core.datasets import open_dataset
-from nodes.addresses import TransportError, load_keys
 from nodes.camera import Camera
-from nodes.transport import LivePublisher
+from nodes.runtime.addresses import TransportError, load_keys
+from nodes.runtime.transport import LivePublisher
 
 GUESSED = "the intrinsics are a guess, and the frames say so: the tracker estimates the focal length (--intrinsics)"
 

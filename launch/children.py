@@ -13,7 +13,7 @@ import psutil
 
 from launch.outcome import Failure
 from launch.status import NodeStatus, printable_lines
-from nodes.signals import STARTING
+from nodes.runtime.signals import STARTING
 
 ROOT = Path(__file__).resolve().parent.parent
 

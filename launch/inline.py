@@ -13,8 +13,8 @@ import numpy as np
 import nodes
 from launch.graph import Graph
 from msgs import End, Message
-from nodes.parameters import make_config
-from nodes.runner import Runner, end_of
+from nodes.runtime.parameters import make_config
+from nodes.runtime.runner import Runner, end_of
 
 Observer = Callable[[str, nodes.Node, Any], None]
 

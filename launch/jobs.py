@@ -24,7 +24,7 @@ from launch.screen import Screen, make_screen
 from launch.status import NodeStatus
 from launch.summary import summary
 from launch.supervise import Supervisor
-from nodes.parameters import make_config
+from nodes.runtime.parameters import make_config
 
 
 class RunFailed(RuntimeError):

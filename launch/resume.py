@@ -21,8 +21,8 @@ from launch.compose import CONF, graph_of, parse, prepare, vocabulary
 from launch.graph import load_node
 from launch.output import REPORT, read_report
 from launch.parameters import GraphError
-from mvsgs_core.splats.checkpoint_files import CheckpointInfo, checkpoint_info
-from nodes.parameters import make_config
+from mvsgs_core.mapping.checkpoints.files import CheckpointInfo, checkpoint_info
+from nodes.runtime.parameters import make_config
 
 WORD = "resume="
 SOURCE = "dataset"  # the slot of the choice that gives a checkpoint's keyframes

@@ -13,7 +13,7 @@ from pathlib import Path
 from launch.graph import Graph
 from launch.parameters import GraphError
 from launch.specs import topic_of
-from nodes.spec import gone_file
+from nodes.runtime.spec import gone_file
 
 LONGEST_SOCKET_PATH = 107  # bytes that a Unix socket's address holds
 PREFIX = "mvsgs-"

@@ -10,7 +10,7 @@ from typing import Any
 
 from launch.graph import Edge, Graph
 from launch.parameters import GraphError
-from nodes.addresses import TransportError, load_keys
+from nodes.runtime.addresses import TransportError, load_keys
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 

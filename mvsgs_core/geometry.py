@@ -140,3 +140,10 @@ def umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> 
     rotation = u @ np.diag(s) @ vt
     scale = float(np.sum(d * s) / variance) if with_scale else 1.0
     return scale, rotation, mean_t - scale * rotation @ mean_s
+
+
+def left_multiplication(q: np.ndarray) -> np.ndarray:
+    """Matrices (K, 4, 4) with L(q) p = q p for quaternions (K, 4), w first."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -1,7 +1,7 @@
 """Loads the C++ kernels in the best instruction set that this CPU has.
 
-Every module is built once per instruction set (CMakeLists.txt): `_splats_v4` (AVX-512), `_splats_v3` (AVX2),
-`_splats_generic`. `MVSGS_ARCH=generic|v3|v4` forces one, for tests and benchmarks.
+Every module is built once per instruction set (CMakeLists.txt): `_rasterizer_v4` (AVX-512), `_rasterizer_v3` (AVX2),
+`_rasterizer_generic`. `MVSGS_ARCH=generic|v3|v4` forces one, for tests and benchmarks.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def instruction_sets() -> tuple[str, ...]:
 
 @functools.cache
 def load(name: str) -> ModuleType:
-    """The kernel module `name` ("splats", "tracking", "stereo"), for example `load("splats").rasterize(...)`.
+    """The kernel module `name` ("rasterizer", "tracking", "mvs"), for example `load("rasterizer").rasterize(...)`.
 
     Raises ImportError, saying what to run, if the kernels were not built.
     """

@@ -1,8 +1,8 @@
-"""`python -m nodes SPEC.json`: runs one node; nodes/spec.py has the file's form.
+"""`python -m nodes SPEC.json`: runs one node; nodes/runtime/spec.py has the file's form.
 
 What must precede the imports of torch and of the node is done here. A launcher should set the thread counts in the
 environment as well: numpy, which comes with the package, reads its own only then. It should also start this process
-with `nodes.signals.STARTING` blocked (`signal.pthread_sigmask`): what comes during the imports then waits.
+with `nodes.runtime.signals.STARTING` blocked (`signal.pthread_sigmask`): what comes during the imports then waits.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import signal
 import sys
 from pathlib import Path
 
-from nodes.signals import Signals
-from nodes.spec import Spec
+from nodes.runtime.signals import Signals
+from nodes.runtime.spec import Spec
 
 PR_SET_PDEATHSIG = 1
 
@@ -35,7 +35,7 @@ def main(arguments: list[str]) -> int:
     if spec.status_fd is not None:
         _die_with_parent()
     _place(spec)
-    from nodes.process import run
+    from nodes.runtime.process import run
 
     return run(spec, signals)
 

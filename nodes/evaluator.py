@@ -18,13 +18,14 @@ import torch
 from msgs import GroundTruth, SplatMap, Trajectory, View
 from mvsgs_core import weights
 from mvsgs_core.atomic_file import replace_text, replacing
-from mvsgs_core.evaluation import html, pictures, statistics, trajectory
+from mvsgs_core.evaluation import html, pictures, statistics
 from mvsgs_core.evaluation.evaluation import Evaluation, FinishedMap
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.track import Track
 from mvsgs_core.held_out import HELD_OUT_EVERY
-from mvsgs_core.splats.exposure import IDENTITY
-from mvsgs_core.splats.model import Splats
+from mvsgs_core.mapping.exposure import IDENTITY
+from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.trajectory_file import write_trajectory
 from nodes import Node
 
 
@@ -151,7 +152,7 @@ class Evaluator(Node):
         track = self.evaluation.track
         if track is not None:
             with replacing(folder / "trajectory.txt") as aside:
-                trajectory.write_tum(aside, track.timestamp[track.posed], track.world_from_cam[track.posed])
+                write_trajectory(aside, track.timestamp[track.posed], track.world_from_cam[track.posed])
         if comparisons:
             with replacing(folder / "comparison.png") as aside:
                 pictures.write_sheet(aside, comparisons)

@@ -10,21 +10,22 @@ from pathlib import Path
 import numpy as np
 
 from msgs import Keyframe, MapView, Poses, Preview, SplatMap, View
-from mvsgs_core.splats import checkpoint, keyframe_images
-from mvsgs_core.splats.checkpoint_files import checkpoint_info
-from mvsgs_core.splats.checkpointing import Checkpointing
-from mvsgs_core.splats.density_control import DensityConfig
-from mvsgs_core.splats.insertion import InsertionConfig
-from mvsgs_core.splats.keyframe_images import write_image
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.losses import LossConfig
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.optimizer import LearningRates
-from mvsgs_core.splats.preview import preview_arrays
-from mvsgs_core.splats.provisional import CoarseView, Provisional
-from mvsgs_core.splats.replay import Replay
-from mvsgs_core.splats.session import Session
-from mvsgs_core.splats.training import SkipConfig, TrainingConfig
+from mvsgs_core.export import keyframe_images
+from mvsgs_core.export.keyframe_images import write_image
+from mvsgs_core.mapping.checkpoints import checkpoint
+from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+from mvsgs_core.mapping.checkpoints.replay import Replay
+from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.insertion import InsertionConfig
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.losses import LossConfig
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.preview import preview_arrays
+from mvsgs_core.mapping.provisional import CoarseView, Provisional
+from mvsgs_core.mapping.session import Session
+from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from nodes import Node
 
 _SLICE = 0.05  # seconds of optimization in one on_idle

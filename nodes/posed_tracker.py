@@ -9,11 +9,11 @@ import numpy as np
 
 from msgs import Frame, GroundTruth, Keyframe, TrackingState, Trajectory
 from mvsgs_core.tracking.coarse_depth import coarse_map
+from mvsgs_core.tracking.estimation.rolling_shutter import checked_readout, unrolled
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.posed import PosedConfig
 from mvsgs_core.tracking.posed import PosedTracker as Core
-from mvsgs_core.tracking.rolling_shutter import checked_readout, unrolled
 from nodes import Node
 
 

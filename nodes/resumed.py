@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from msgs import GroundTruth, Poses, TrackingState, Trajectory, View
-from mvsgs_core.splats.checkpoint_files import checkpoint_info
-from mvsgs_core.splats.checkpoint_keyframes import kept_keyframes
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+from mvsgs_core.mapping.checkpoints.keyframes import kept_keyframes
 from nodes import Node
 
 

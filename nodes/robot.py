@@ -16,9 +16,9 @@ from mvsgs_core.camera import resize_image, scale_intrinsics
 from mvsgs_core.datasets.framing import target_size
 from mvsgs_core.datasets.sequence import selection
 from nodes import Node
-from nodes.addresses import TransportError, check_address, load_keys
+from nodes.runtime.addresses import TransportError, check_address, load_keys
+from nodes.runtime.transport import LiveReader
 from nodes.stream_times import LATEST, StreamTimes
-from nodes.transport import LiveReader
 
 POLL = 0.5  # s at most between two looks at the clock
 FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye and a telescope nothing can be tracked

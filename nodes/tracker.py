@@ -12,10 +12,10 @@ from mvsgs_core import geometry
 from mvsgs_core.tracking import tracker as core
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.coarse_depth import coarse_map
+from mvsgs_core.tracking.estimation.rolling_shutter import checked_readout, unrolled
 from mvsgs_core.tracking.front_end import FrontEndConfig
-from mvsgs_core.tracking.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
-from mvsgs_core.tracking.rolling_shutter import checked_readout, unrolled
+from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.starting import StartingConfig
 from nodes.tracking import TrackerNode
 

@@ -11,8 +11,8 @@ import pytest
 from msgs import End
 from msgs.codec import decode, encode
 from nodes import Node, Stats
-from nodes.plain import SHORTENED
-from nodes.runner import STATS_KEYS, end_of
+from nodes.runtime.plain import SHORTENED
+from nodes.runtime.runner import STATS_KEYS, end_of
 
 
 class Counting(Node):

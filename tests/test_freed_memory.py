@@ -3,8 +3,8 @@ import ctypes
 import numpy as np
 import pytest
 
-from nodes.freed_memory import PERIOD, SHARE, FreedMemory
-from nodes.status import rss
+from nodes.runtime.freed_memory import PERIOD, SHARE, FreedMemory
+from nodes.runtime.status import rss
 
 HAS_TRIM = hasattr(ctypes.CDLL(None), "malloc_trim")
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import msgs
-from bench.frame_mutations import ESCAPES, frame, good, mutated, parts
+from bench.faults.frame_mutations import ESCAPES, frame, good, mutated, parts
 from msgs import End, Frame, SplatMap
 from msgs.codec import MAX_END_HEADER_BYTES, CodecError, decode, encode
 from nodes import Stats

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from nodes.addresses import KEY_FILE, TransportError, load_keys
-from nodes.transport import create_keys
+from nodes.runtime.addresses import KEY_FILE, TransportError, load_keys
+from nodes.runtime.transport import create_keys
 
 
 def linked(folder: Path) -> None:

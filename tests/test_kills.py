@@ -7,8 +7,8 @@ import re
 import signal
 from pathlib import Path
 
-from bench.faulting.kills import SCENE
-from bench.launched import Launched, map_opens
+from bench.faults.kills import SCENE
+from bench.faults.launched import Launched, map_opens
 from tests.launches import DOWN
 
 SHORT = (*SCENE, "dataset.options.frames=50", "mapper.refinement=10", "evaluator.max_frames=10")
@@ -45,7 +45,10 @@ def test_a_run_whose_mapper_was_killed_leaves_a_map_and_is_resumed(tmp_path: Pat
 
 def test_observers_without_room_on_their_disk_cost_no_map(tmp_path: Path) -> None:
     output = tmp_path / "out"
-    full = ("recorder._target_=bench.full_disk.FullRecorder", "evaluator._target_=bench.full_disk.FullEvaluator")
+    full = (
+        "recorder._target_=bench.faults.full_disk.FullRecorder",
+        "evaluator._target_=bench.faults.full_disk.FullEvaluator",
+    )
     with Launched(output, (*SHORT, f"output={output}", "recorder=mcap", *full)) as run:
         assert run.wait() == 4, run.said()
         said = run.said()

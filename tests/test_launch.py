@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
-from nodes.transport import create_keys
+from nodes.runtime.transport import create_keys
 from tests.launches import DOWN, ROOT, Launch, launch
 
 __all__ = ["launch"]  # the fixture

@@ -13,14 +13,14 @@ import torch
 
 import nodes
 from msgs import Keyframe, MapView, Poses, Preview, SplatMap, View
-from mvsgs_core.evaluation.image_metrics import psnr
-from mvsgs_core.splats.cameras import read_cameras
-from mvsgs_core.splats.export_ply import read_ply
-from mvsgs_core.splats.map_state import PARAMETERS
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
+from mvsgs_core.export.cameras import read_cameras
+from mvsgs_core.export.ply import read_ply
+from mvsgs_core.image_metrics import psnr
+from mvsgs_core.mapping.map_state import PARAMETERS
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
 from nodes.mapper import Mapper, mapper_config
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 
 def view_message(index: int, t: float, scale: float = 1.0, segment: int = 0) -> View:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from nodes.spec import gone_file
-from nodes.transport import create_keys
+from nodes.runtime.spec import gone_file
+from nodes.runtime.transport import create_keys
 from tests.processes import ENVIRONMENT, graph
 from tests.shared_data import ROOT
 
@@ -336,8 +336,8 @@ def test_no_node_outlives_a_killed_launcher() -> None:
 
 _LAUNCHER = """
 import sys, time
-from nodes.spec import gone_file
-from nodes.transport import create_keys
+from nodes.runtime.spec import gone_file
+from nodes.runtime.transport import create_keys
 from tests.processes import Graph
 g = Graph()
 p = g.start("left", "tests.sample_nodes.Left", {"Frame": "source"}, {})

@@ -11,22 +11,22 @@ import torch
 
 from bench import networks
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
+from mvsgs_core.mapping.checkpoints.checkpoint import load, save
+from mvsgs_core.mapping.checkpoints.files import FOLDER, KEYFRAMES, state_file
+from mvsgs_core.mapping.checkpoints.images import image_names, write_images
+from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.losses import LossConfig
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.preview import preview_arrays
+from mvsgs_core.mapping.session import Session
+from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.mvs.interface import CostOptions, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
-from mvsgs_core.splats.checkpoint import load, save
-from mvsgs_core.splats.checkpoint_files import FOLDER, KEYFRAMES, state_file
-from mvsgs_core.splats.checkpoint_images import image_names, write_images
-from mvsgs_core.splats.density_control import DensityConfig
-from mvsgs_core.splats.losses import LossConfig
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.preview import preview_arrays
-from mvsgs_core.splats.session import Session
-from mvsgs_core.splats.training import SkipConfig, TrainingConfig
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from tests.core.fusion.test_consistency import view
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 from tests.core.mvs.test_backends import SIZE, problem
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
 from tests.core.tracking.test_torch_adjustment import noisy
 from tests.pretend_device import DEVICE, PretendDevice
 

@@ -14,9 +14,9 @@ import pytest
 from msgs import End, Frame, Keyframe
 from msgs.codec import decode, encode
 from nodes import Node
-from nodes.parameters import make_config
-from nodes.plain import plain
-from nodes.runner import Runner, merge_stats, own_stats
+from nodes.runtime.parameters import make_config
+from nodes.runtime.plain import plain
+from nodes.runtime.runner import Runner, merge_stats, own_stats
 from tests.sample_nodes import Left, Wrong
 
 

@@ -19,9 +19,9 @@ from msgs.codec import decode, encode
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets.mcap_file import MAGIC
 from nodes import handlers, is_source, outputs
-from nodes.parameters import make_config
 from nodes.player import Player
 from nodes.recorder import GraphRecorder, Recorder
+from nodes.runtime.parameters import make_config
 from tests.test_codec import MESSAGES, assert_equal, example
 
 

@@ -15,8 +15,8 @@ import nodes
 from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Poses, Preview, SplatMap, View
-from mvsgs_core.splats.checkpoint_files import checkpoint_info
-from mvsgs_core.splats.export_ply import read_ply
+from mvsgs_core.export.ply import read_ply
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from nodes.mapper import Mapper
 from nodes.resumed import Resumed
 from tests.test_mapper_node import pose_on_arc, settings, view_message

@@ -15,7 +15,7 @@ from launch.compose import compose, graph_of
 from launch.graph import Graph
 from launch.parameters import GraphError
 from launch.resume import leave_out_refused, resumed_config
-from mvsgs_core.splats.checkpoint_files import state_file, write_state
+from mvsgs_core.mapping.checkpoints.files import state_file, write_state
 from tests.shared_data import ROOT
 
 META = {

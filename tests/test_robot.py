@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 import zmq
 
-from bench.frame_mutations import frame as false_frame
+from bench.faults.frame_mutations import frame as false_frame
 from msgs import End, Frame
 from msgs.codec import NEWEST, encode
-from nodes.addresses import TransportError
 from nodes.robot import Robot
+from nodes.runtime.addresses import TransportError
+from nodes.runtime.transport import create_keys
 from nodes.stream_times import StreamTimes
-from nodes.transport import create_keys
 from tests.shared_data import ROOT
 
 INTERVAL = 0.03  # s between two frames

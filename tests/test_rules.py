@@ -53,7 +53,7 @@ def name(path: Path) -> str:
 
 def test_only_the_transport_imports_zmq() -> None:
     users = [path for path in python_files(*PACKAGES) if "zmq" in imports(path)]
-    assert {name(path.parent) for path in users} == {"nodes/transport"}
+    assert {name(path.parent) for path in users} == {"nodes/runtime/transport"}
 
 
 def test_the_core_knows_no_node_and_no_message() -> None:
@@ -68,9 +68,8 @@ def test_messages_know_neither_torch_nor_nodes() -> None:
 
 
 def test_importing_messages_and_the_transport_loads_no_torch() -> None:
-    code = (
-        "import sys, nodes.process, msgs.codec; print(sorted({'torch', 'cv2', 'open3d', 'hydra'} & set(sys.modules)))"
-    )
+    heavy = {"torch", "cv2", "open3d", "hydra"}
+    code = f"import sys, nodes.runtime.process, msgs.codec; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 

@@ -23,7 +23,7 @@ from msgs import Depth, Frame, GroundTruth
 from nodes.camera import Camera, CameraError
 from nodes.reader import Reader
 from nodes.robot import Robot
-from nodes.transport import Publisher
+from nodes.runtime.transport import Publisher
 from tests.core.datasets.folders import truncate, write_photos, write_tum
 from tests.shared_data import ROOT
 

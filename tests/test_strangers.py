@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 from msgs import End, Frame
-from nodes.transport import NewestReader, Publisher, ReliableReader
+from nodes.runtime.transport import NewestReader, Publisher, ReliableReader
 from tests.launches import Launch
 
 TOKEN = "0123456789abcdef"

@@ -11,7 +11,7 @@ import pytest
 import msgs
 from msgs import Frame, GroundTruth, Keyframe, Poses, TrackingState, Trajectory
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
-from mvsgs_core.evaluation.image_metrics import psnr
+from mvsgs_core.image_metrics import psnr
 from mvsgs_core.tracking.frames import State
 from nodes import Node, handlers, outputs
 from nodes.posed_tracker import PosedTracker

@@ -17,9 +17,9 @@ import zmq
 
 from msgs import End, Frame, Keyframe, Poses
 from msgs.codec import NEWEST, CodecError, encode
-from nodes.addresses import IPC_PATH_BYTES, PeerLost, TransportError, check_address, load_keys
-from nodes.inbox import Inbox
-from nodes.transport import NewestReader, Publisher, ReliableReader, create_keys
+from nodes.runtime.addresses import IPC_PATH_BYTES, PeerLost, TransportError, check_address, load_keys
+from nodes.runtime.inbox import Inbox
+from nodes.runtime.transport import NewestReader, Publisher, ReliableReader, create_keys
 
 
 def frame(index: int, width: int = 64) -> Frame:

@@ -65,7 +65,7 @@ def test_a_target_there_works_and_takes_no_other_modules_place(folder: Path, how
 
 
 def test_a_nodes_interpreter_does_not_look_where_it_is_started(folder: Path) -> None:
-    code = "import json, nodes.process, sys; print(json.dumps(sys.path))"
+    code = "import json, nodes.runtime.process, sys; print(json.dumps(sys.path))"
     environment = {**os.environ, **python_environment()}
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -20,17 +20,18 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from bench import pieces
-from bench.colmap_poses import Model
+from bench.baselines.colmap_poses import Model
+from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.runs import Matrix, figure, folder, stage_seconds
-from bench.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.table import Row, main
-from bench.tracking_peers import Peer, solve
+from bench.tracking.baselines import Peer, solve
 from launch.placement import available_cores
 from msgs import GroundTruth
+from mvsgs_core import image_metrics
 from mvsgs_core.datasets import Item
-from mvsgs_core.evaluation import image_metrics, trajectory
+from mvsgs_core.evaluation import trajectory
 from mvsgs_core.held_out import is_held_out
-from mvsgs_core.splats.training import TrainingConfig
+from mvsgs_core.mapping.training import TrainingConfig
 from nodes.reader import Reader
 
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end

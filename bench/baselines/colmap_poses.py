@@ -1,6 +1,6 @@
 """Poses and sparse points by COLMAP (Schoenberger and Frahm 2016): SIFT, sequential matching, incremental mapping.
 
-    python -m bench.colmap_poses FOLDER [--threads N]
+    python -m bench.baselines.colmap_poses FOLDER [--threads N]
 
 A process of its own: pycolmap brings libraries of its own, and a failed check inside it ends the process. FOLDER holds
 images/NUMBER.png and camera.json (`size`, `intrinsics`); poses and points go to model.npz, times to seconds.json.
@@ -48,7 +48,7 @@ def reconstruct(
         size = image.shape[0], image.shape[1]
         cv2.imwrite(str(images / f"{index:06d}.png"), image[..., ::-1])
     (folder / "camera.json").write_text(json.dumps({"size": size, "intrinsics": intrinsics.tolist()}))
-    command = [sys.executable, "-m", "bench.colmap_poses", str(folder), "--threads", str(threads)]
+    command = [sys.executable, "-m", "bench.baselines.colmap_poses", str(folder), "--threads", str(threads)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     (folder / "colmap.log").write_text(done.stdout + done.stderr)
     file = folder / "model.npz"

@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from mvsgs_core.splats import density_control, optimizer
-from mvsgs_core.splats.density_control import DensityConfig
-from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.optimizer import LearningRates
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.spherical_harmonics import C0
-from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.mapping import density_control, optimizer
+from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.keyframes import PosedView, TrainingView, training_view
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 
 

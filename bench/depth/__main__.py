@@ -16,20 +16,20 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from bench.depth_calibration import calibration_rows
-from bench.depth_ceiling import ceiling_rows
-from bench.depth_curves import curve_rows
-from bench.depth_data import SHARED, SOURCES, Scene, load_scene
-from bench.depth_failures import failure_rows
-from bench.depth_kernel import kernel_rows
-from bench.depth_parts import Variant, part_variants, skip_variants, variant_rows
-from bench.depth_peers import peer_rows
-from bench.depth_photos import PHOTOS, photo_rows
-from bench.depth_pictures import write_pictures
-from bench.depth_polish import polished
-from bench.depth_run import Run, run, score, surest
-from bench.depth_sensor import sensor_offset, without_offset
-from bench.depth_tracked import load_tracked
+from bench.depth.baselines import peer_rows
+from bench.depth.calibration import calibration_rows
+from bench.depth.curves import curve_rows
+from bench.depth.data import SHARED, SOURCES, Scene, load_scene
+from bench.depth.failures import failure_rows
+from bench.depth.kernel import kernel_rows
+from bench.depth.oracle import ceiling_rows
+from bench.depth.parts import Variant, part_variants, skip_variants, variant_rows
+from bench.depth.photos import PHOTOS, photo_rows
+from bench.depth.pictures import write_pictures
+from bench.depth.pose_refinement import polished
+from bench.depth.run import Run, run, score, surest
+from bench.depth.sensor import sensor_offset, without_offset
+from bench.depth.tracked import load_tracked
 from bench.runs import Matrix, figure, folder
 from bench.table import Row, at_least, at_most, main
 from mvsgs_core.fusion.fusion import FusionConfig

@@ -5,13 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from bench.depth_data import Scene
-from bench.depth_run import Run, score
+from bench.depth.data import Scene
+from bench.depth.run import Run, score
 from bench.table import Row, at_least
 from mvsgs_core import camera, geometry
 from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.views import StereoView
-from mvsgs_core.mvs.warp import relative_warp
+from mvsgs_core.warp import relative_warp
 
 
 def peer_rows(scene: Scene, found: Run, align: bool) -> list[Row]:

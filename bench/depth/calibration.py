@@ -1,4 +1,4 @@
-"""Fits and checks the confidences: `python -m bench.depth_calibration`.
+"""Fits and checks the confidences: `python -m bench.depth.calibration`.
 
 Prints the constants of mvsgs_core/mvs/confidence.py and mvsgs_core/fusion/confidence.py, by logistic regression of
 "within 5 % of the truth" on synthetic scenes, and how well they hold on scenes that took no part.
@@ -10,9 +10,9 @@ import argparse
 
 import numpy as np
 
-from bench.depth_data import Scene, load_scene
-from bench.depth_run import Run, run, scaled_to
-from bench.depth_tracked import load_tracked
+from bench.depth.data import Scene, load_scene
+from bench.depth.run import Run, run, scaled_to
+from bench.depth.tracked import load_tracked
 from bench.table import Row
 from mvsgs_core.fusion import confidence as fused_confidence
 from mvsgs_core.fusion.fusion import FusionConfig

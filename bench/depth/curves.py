@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bench import plots
-from bench.depth_data import Scene
-from bench.depth_run import run, score
+from bench.depth.data import Scene
+from bench.depth.run import run, score
 from bench.table import Row
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.depth_data import Scene, load_scene
-from bench.depth_run import Run, run, score
+from bench.depth.data import Scene, load_scene
+from bench.depth.run import Run, run, score
 from bench.table import Row, at_most
 from mvsgs_core import geometry
 from mvsgs_core.fusion.fusion import FusionConfig

@@ -16,7 +16,7 @@ import numpy as np
 from bench.table import Row, at_most
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.interface import CostOptions
-from mvsgs_core.mvs.warp import relative_warp
+from mvsgs_core.warp import relative_warp
 
 SOURCE = Path(__file__).with_name("plain_cost_volume.cpp")
 VIEWS = 4

@@ -17,16 +17,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bench.depth_data import Scene
+from bench.depth.data import Scene
 from bench.table import Row
 from mvsgs_core.fusion.backend import NativeFusionBackend
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.stereo import StereoDepth, empty_depth
 from mvsgs_core.mvs.views import StereoView
-from mvsgs_core.mvs.warp import apply_warp, relative_warp
-from mvsgs_core.tracking.flow import LucasKanade
 from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matching.flow import LucasKanade
+from mvsgs_core.warp import apply_warp, relative_warp
 
 INLIER = 0.05  # relative error, as in the goals of real scenes
 CORNERS = 600  # a keyframe

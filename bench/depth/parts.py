@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.depth_data import Scene
-from bench.depth_run import Run, run, score
+from bench.depth.data import Scene
+from bench.depth.run import Run, run, score
 from bench.table import Row
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig

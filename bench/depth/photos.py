@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.depth_data import SHARED
-from bench.depth_run import Run, run
+from bench.depth.data import SHARED
+from bench.depth.run import Run, run
 from bench.table import Row
 from msgs import Frame, GroundTruth, Keyframe, Poses
 from mvsgs_core.datasets import open_dataset
@@ -24,7 +24,7 @@ from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.cascade import CascadeConfig
 from mvsgs_core.mvs.interface import CostOptions
 from mvsgs_core.mvs.views import StereoView, prepare_view
-from mvsgs_core.mvs.warp import apply_warp, relative_warp
+from mvsgs_core.warp import apply_warp, relative_warp
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker
 

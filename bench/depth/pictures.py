@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bench.depth_data import Scene
-from bench.depth_run import Run, scaled_to
+from bench.depth.data import Scene
+from bench.depth.run import Run, scaled_to
 
 _UNKNOWN = (40, 40, 40)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from bench.depth_data import Scene
+from bench.depth.data import Scene
 from mvsgs_core import geometry
 from mvsgs_core.mvs.hypotheses import RangeChoice, search_range
 from mvsgs_core.mvs.views import StereoView

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.depth_data import Scene
+from bench.depth.data import Scene
 from mvsgs_core.fusion.fusion import DepthFusion, FusedDepth, FusionConfig
 from mvsgs_core.fusion.views import DepthView
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth

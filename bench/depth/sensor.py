@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.depth_data import Scene
+from bench.depth.data import Scene
 from mvsgs_core import geometry
 
 POINTS = 400  # of each map

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.depth_data import SHARED, SOURCES, Scene
+from bench.depth.data import SHARED, SOURCES, Scene
 from msgs import Frame, Keyframe, Poses
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.mvs.views import prepare_view

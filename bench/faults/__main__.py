@@ -9,7 +9,7 @@ import argparse
 import importlib
 import pkgutil
 
-from bench import faulting
+from bench import faults as faulting
 from bench.table import Row, main
 
 
@@ -29,7 +29,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     rows: list[Row] = []
     for name in wanted:
         print(f"{name} ...", flush=True)
-        rows += importlib.import_module(f"bench.faulting.{name}").measure(options.quick)
+        rows += importlib.import_module(f"bench.faults.{name}").measure(options.quick)
     return rows
 
 

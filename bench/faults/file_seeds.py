@@ -27,11 +27,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from msgs import Frame, GroundTruth
 from msgs.codec import encode
-from mvsgs_core.splats.cameras import Cameras, write_cameras
-from mvsgs_core.splats.checkpoint_files import state_file, write_state
-from mvsgs_core.splats.export_ply import write_ply
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.snapshot import Snapshot
+from mvsgs_core.export.cameras import Cameras, write_cameras
+from mvsgs_core.export.ply import write_ply
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.mapping.checkpoints.files import state_file, write_state
+from mvsgs_core.rasterizer.splats import Splats
 from nodes.recorder import COMPRESSION, ENCODING
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 4
@@ -305,7 +305,7 @@ def message_bomb(folder: Path) -> None:
         database.execute("UPDATE messages SET data = ? WHERE id = 3", (zstd_bomb(),))
 
 
-# kind -> how it is opened ("DATASET", or what bench.file_worker calls it), what is opened in its folder, how it is made
+# kind -> how it is opened ("DATASET", or what `file_worker` calls it), what is opened in its folder, how it is made
 SEEDS: dict[str, tuple[str, str, Callable[[Path], None]]] = {
     "images": ("images", ".", images),
     "transforms.json": ("images", ".", transforms),

@@ -17,10 +17,10 @@ from typing import Any
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import open_dataset
+from mvsgs_core.export.cameras import read_cameras
+from mvsgs_core.export.ply import read_ply
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.networks.checkpoints import read
-from mvsgs_core.splats.cameras import read_cameras
-from mvsgs_core.splats.checkpoint_files import checkpoint_info
-from mvsgs_core.splats.export_ply import read_ply
 from nodes.player import Player
 
 ADDRESS_SPACE = 4 * 2**30  # bytes beyond those of a fresh worker

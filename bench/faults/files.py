@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.file_mutations import mutated
-from bench.file_seeds import HOSTILE, SEEDS
+from bench.faults.file_mutations import mutated
+from bench.faults.file_seeds import HOSTILE, SEEDS
 from bench.table import Row, at_least, at_most
 
 FILES, QUICK_FILES = 3000, 90
@@ -27,7 +27,7 @@ SEED = 20
 
 
 class _Worker:
-    """`bench.file_worker` as a process, started again where a file ended it."""
+    """`bench.faults.file_worker` as a process, started again where a file ended it."""
 
     def __init__(self, log: Path) -> None:
         self._log = log
@@ -42,7 +42,7 @@ class _Worker:
     def read(self, way: str, path: Path) -> dict[str, Any]:
         """What came of the file; {"ended": how} where the worker did not outlive it."""
         if self._process is None:
-            command = [sys.executable, "-m", "bench.file_worker"]
+            command = [sys.executable, "-m", "bench.faults.file_worker"]
             quiet = {**os.environ, "OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
             with self._log.open("ab") as log:
                 self._process = subprocess.Popen(

@@ -20,7 +20,7 @@ import numpy as np
 import zmq
 
 import msgs
-from bench.frame_mutations import good, mutated
+from bench.faults.frame_mutations import good, mutated
 from bench.table import Row, at_least, at_most
 from msgs import End, Frame, Message
 from msgs.codec import NEWEST, CodecError, decode, encode

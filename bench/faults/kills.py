@@ -13,7 +13,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.launched import Launched, map_opens
+from bench.faults.launched import Launched, map_opens
 from bench.table import Row, at_most
 from launch.outcome import OBSERVER_FAILED
 
@@ -137,7 +137,10 @@ def _observed(faults: Faults, runs: int, whole: Path) -> list[Row]:
     """Runs whose observers have no room on their disk, and, every other one, that have an observer killed."""
     finished = equal = 0
     for k in range(runs):
-        full = ("recorder._target_=bench.full_disk.FullRecorder", "evaluator._target_=bench.full_disk.FullEvaluator")
+        full = (
+            "recorder._target_=bench.faults.full_disk.FullRecorder",
+            "evaluator._target_=bench.faults.full_disk.FullEvaluator",
+        )
         name, victim = f"observed-{k}", ("evaluator", "recorder")[k // 2 % 2]
         kill = k % 2 == 1
         with faults.struck(name, victim, signal.SIGKILL, RECORD) if kill else faults.run(name, RECORD, *full) as run:

@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 
 from bench.runs import ROOT
-from mvsgs_core.splats.export_ply import read_ply
+from mvsgs_core.export.ply import read_ply
 
 
 class Launched:

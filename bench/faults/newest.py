@@ -13,10 +13,10 @@ from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Keyframe, Poses, Preview, View
 from mvsgs_core.geometry import quaternion_from_rotation
-from mvsgs_core.splats.densities import neutral_beta
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.spherical_harmonics import C0
+from mvsgs_core.rasterizer.densities import neutral_beta
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.splats import Splats
 from nodes import Node
 from nodes.mapper import Mapper
 

@@ -19,12 +19,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench import tracking_curve, tracking_loop, tracking_memory, tracking_peers
+from bench import tracking_curve
 from bench.runs import folder
 from bench.table import Row, at_most, main
-from bench.tracking_cases import CASES, Case
-from bench.tracking_parts import global_adjustment_seconds
-from bench.tracking_peers import Peer, aligned_error
+from bench.tracking import baselines, loop, memory
+from bench.tracking.baselines import Peer, aligned_error
+from bench.tracking.cases import CASES, Case
+from bench.tracking.parts import global_adjustment_seconds
 from mvsgs_core.datasets import Item
 from mvsgs_core.tracking.frames import Path, State
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
@@ -156,9 +157,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
         peers: dict[str, Future[Peer]] = {}
         for name in chosen if options.colmap and whole else []:
             if CASES[name].peer_stride and not CASES[name].hard and CASES[name].there:
-                peers[name] = beside.submit(tracking_peers.solve_case, name, place / "colmap")
+                peers[name] = beside.submit(baselines.solve_case, name, place / "colmap")
         long = whole and (not options.only or "memory" in options.only)
-        memory = beside.submit(tracking_memory.follow, options.frames) if long else None
+        long_run = beside.submit(memory.follow, options.frames) if long else None
         for name in chosen:
             rows += rows_of_case(name, CASES[name], options)
         if options.curve and whole:
@@ -170,9 +171,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
         for name, peer in peers.items():
             items = CASES[name].items()[:: CASES[name].peer_stride]
             ours = run(items)
-            rows += tracking_peers.rows(name, peer.result(), ours.path, items, ours.total + ours.end)
-        if memory is not None:
-            rows += tracking_memory.rows(memory.result())
+            rows += baselines.rows(name, peer.result(), ours.path, items, ours.total + ours.end)
+        if long_run is not None:
+            rows += memory.rows(long_run.result())
     return rows
 
 
@@ -188,7 +189,7 @@ def parts(options: argparse.Namespace) -> list[Row]:
     keyframes = 40 if options.quick else 100
     seconds = global_adjustment_seconds(keyframes)
     rows = [at_most(f"global bundle adjustment, {keyframes} keyframes", seconds, "s CPU", 3.0)]
-    return rows if options.quick else rows + tracking_loop.rows(CASES["room, loop"].items())
+    return rows if options.quick else rows + loop.rows(CASES["room, loop"].items())
 
 
 def arguments(parser: argparse.ArgumentParser) -> Any:

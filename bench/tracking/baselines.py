@@ -9,9 +9,9 @@ from pathlib import Path as File
 
 import numpy as np
 
-from bench.colmap_poses import Model, load, reconstruct
+from bench.baselines.colmap_poses import Model, load, reconstruct
 from bench.table import Row, at_most
-from bench.tracking_cases import CASES
+from bench.tracking.cases import CASES
 from mvsgs_core import geometry
 from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
 from mvsgs_core.datasets import Item

@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.table import Row, at_least, at_most
-from bench.tracking_peers import aligned_error
-from mvsgs_core import geometry
+from bench.tracking.baselines import aligned_error
+from mvsgs_core import geometry, image_metrics
 from mvsgs_core.datasets import Item
-from mvsgs_core.evaluation import image_metrics
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.training import TrainingConfig
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.publish import Correction
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig

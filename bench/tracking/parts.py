@@ -9,7 +9,7 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.tracking.back_end import BackEndConfig
-from mvsgs_core.tracking.bundle_adjustment import Graph, Solver, adjust, reproject
+from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solver, adjust, reproject
 
 
 def global_adjustment_seconds(keyframes: int, cells: int = 1200, edges: int = 12, seed: int = 0) -> float:

@@ -12,7 +12,7 @@ from mvsgs_core.datasets.files import Layout, images_in
 from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
-from mvsgs_core.datasets.tum import pose_from_row, read_trajectory
+from mvsgs_core.trajectory_file import read_trajectory
 
 LAYOUT = Layout(
     "ICL-NUIM (TUM RGB-D compatible PNGs)",
@@ -74,7 +74,7 @@ def _poses(folder: Path) -> tuple[dict[int, np.ndarray], list[str]]:
     files = [p for p in (folder / "groundtruth.txt", *sorted(folder.glob("*.gt.freiburg"))) if p.is_file()]
     if not files:
         return {}, ["groundtruth.txt is missing: the trajectory is not scored"]
-    table = read_trajectory(files[0])
-    if len(table) == 0:
+    numbers, poses = read_trajectory(files[0])
+    if len(numbers) == 0:
         return {}, [f"{files[0].name} is empty: the trajectory is not scored"]
-    return {int(row[0]): _mirror(pose_from_row(row)) for row in table}, []
+    return {int(number): _mirror(pose) for number, pose in zip(numbers, poses)}, []

@@ -14,7 +14,8 @@ from mvsgs_core.datasets.files import Layout, inside
 from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
-from mvsgs_core.geometry import interpolate, rotation_from_quaternion
+from mvsgs_core.geometry import interpolate
+from mvsgs_core.trajectory_file import LATEST, read_trajectory
 
 LAYOUT = Layout(
     "TUM RGB-D",
@@ -31,7 +32,6 @@ CAMERAS = {
 }
 CALIBRATION_FILE = "camera.txt"  # our own addition: `fx fy cx cy [distortion]` in one line, in pixels of the images
 _DEPTH = DepthFormat(per_unit=5000.0)
-_LATEST = 1e12  # seconds, or units from the origin: more is damage
 
 
 class Tum(ImageSequence):
@@ -96,7 +96,7 @@ def _read_list(folder: Path, path: Path) -> list[tuple[float, Path]]:
         if len(parts) >= 2 and not line.startswith("#"):
             with reading(path, f"has a line that is not `timestamp file`, {line[:200]!r}"):
                 time = float(parts[0])
-                if not abs(time) < _LATEST:
+                if not abs(time) < LATEST:
                     raise ValueError(f"{time} s is no time")
             entries.append((time, inside(folder, parts[1], path)))
     return sorted(entries)
@@ -147,11 +147,11 @@ def _poses(folder: Path, times: np.ndarray, max_difference: float) -> tuple[dict
     path = folder / "groundtruth.txt"
     if not path.is_file():
         return {}, [f"{path.name} is missing: the trajectory is not scored"]
-    table = read_trajectory(path)
-    if len(table) == 0:
+    known, true = read_trajectory(path)
+    if len(known) == 0:
         return {}, [f"{path.name} is empty: the trajectory is not scored"]
     poses = {
-        i: _pose_at(times[i], table, j, max_difference) for i, j in nearest(times, table[:, 0], max_difference).items()
+        i: _pose_at(times[i], known, true, j, max_difference) for i, j in nearest(times, known, max_difference).items()
     }
     notes = []
     if len(poses) < len(times):
@@ -159,41 +159,12 @@ def _poses(folder: Path, times: np.ndarray, max_difference: float) -> tuple[dict
     return poses, notes
 
 
-def _pose_at(time: float, table: np.ndarray, closest: int, max_difference: float) -> np.ndarray:
+def _pose_at(time: float, known: np.ndarray, poses: np.ndarray, closest: int, max_difference: float) -> np.ndarray:
     """Half the time between two poses of motion capture is a millimeter, or a pixel, at the speed of a hand."""
-    other = closest + (1 if time > table[closest, 0] else -1)
-    if not 0 <= other < len(table) or not 0.0 < abs(table[other, 0] - time) <= max_difference:
-        return pose_from_row(table[closest])
-    span = table[other, 0] - table[closest, 0]
+    other = closest + (1 if time > known[closest] else -1)
+    if not 0 <= other < len(known) or not 0.0 < abs(known[other] - time) <= max_difference:
+        return np.asarray(poses[closest])
+    span = known[other] - known[closest]
     if span == 0.0:
-        return pose_from_row(table[closest])
-    share = (time - table[closest, 0]) / span
-    return interpolate(pose_from_row(table[closest]), pose_from_row(table[other]), share)
-
-
-def read_trajectory(path: Path) -> np.ndarray:
-    """(N, 8) float64 rows `timestamp tx ty tz qx qy qz qw`, sorted by time. Raises BadFileError for a malformed line.
-
-    Rows that are no pose are left out: motion capture writes zeros where it lost its markers.
-    """
-    rows = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        text = line.split("#")[0].replace(",", " ").split()
-        if not text:
-            continue
-        with reading(path, f"has a line that is not `timestamp tx ty tz qx qy qz qw`, {line[:200]!r}"):
-            row = [float(v) for v in text]
-            if len(row) != 8:
-                raise ValueError(f"{len(row)} numbers")
-        if np.all(np.abs(row) < _LATEST) and np.linalg.norm(row[4:]) > 0.5:
-            rows.append(row)
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    return table[np.argsort(table[:, 0], kind="stable")]
-
-
-def pose_from_row(row: np.ndarray) -> np.ndarray:
-    """world_from_cam (4, 4) float64 of `timestamp tx ty tz qx qy qz qw`."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_from_quaternion(row[[7, 4, 5, 6]])
-    pose[:3, 3] = row[1:4]
-    return pose
+        return np.asarray(poses[closest])
+    return interpolate(poses[closest], poses[other], (time - known[closest]) / span)

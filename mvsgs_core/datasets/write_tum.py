@@ -1,6 +1,6 @@
 """Writes a synthetic sequence in TUM RGB-D layout.
 
-    python -m mvsgs_core.scene.write_tum OUTDIR --scene room --frames 100
+    python -m mvsgs_core.datasets.write_tum OUTDIR --scene room --frames 100
 
 Further options are those of the synthetic dataset, as name=value: noise=4 loop=true scale=10.
 """

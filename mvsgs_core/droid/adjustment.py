@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from mvsgs_core.droid.video import Video
-from mvsgs_core.tracking.bundle_adjustment import DROID_GLOBAL, DROID_LOCAL, Graph, Solution, Solver, adjust
+from mvsgs_core.tracking.estimation.bundle_adjustment import DROID_GLOBAL, DROID_LOCAL, Graph, Solution, Solver, adjust
 
 LOCAL, GLOBAL = DROID_LOCAL, DROID_GLOBAL
 _WEIGHT = 1e-3  # information per cell² at full confidence

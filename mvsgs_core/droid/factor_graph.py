@@ -12,7 +12,7 @@ from mvsgs_core.droid.adjustment import GLOBAL, LOCAL, solve
 from mvsgs_core.droid.networks import Correlation, Networks
 from mvsgs_core.droid.proximity import Pair
 from mvsgs_core.droid.video import Video
-from mvsgs_core.tracking.bundle_adjustment import Solution
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solution
 
 _MOTION_LIMIT = 64.0  # cells, of what the update operator is told
 _FAR = 1e4  # cells: coordinates beyond are all the same to a lookup, and no risk to single precision

@@ -17,7 +17,7 @@ from mvsgs_core.evaluation.frames import Frames
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
 from mvsgs_core.evaluation.track import Track
-from mvsgs_core.splats.model import Splats
+from mvsgs_core.rasterizer.splats import Splats
 
 NEAR = 0.01  # of the typical depth: splats nearer to a camera are not drawn
 ENOUGH = 3  # held-out frames whose mean and worst say something

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvsgs_core.splats.exposure import IDENTITY
+from mvsgs_core.mapping.exposure import IDENTITY
 
 
 def between_keyframes(timestamps: np.ndarray, keyframes: np.ndarray, affines: np.ndarray) -> np.ndarray | None:

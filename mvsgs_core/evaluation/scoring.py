@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import torch
 
+from mvsgs_core import image_metrics
 from mvsgs_core.camera import resize_image
-from mvsgs_core.evaluation import image_metrics
 from mvsgs_core.evaluation.frames import ENDING
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, rolled
 from mvsgs_core.held_out import is_held_out
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
-"""Trajectory metrics after similarity alignment (Sturm et al. 2012; Umeyama 1991), and TUM trajectory files."""
+"""Trajectory metrics after similarity alignment (Sturm et al. 2012; Umeyama 1991)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -57,34 +56,3 @@ def relative_errors(estimate: np.ndarray, truth: np.ndarray, scale: float, step:
 def path_length(world_from_cam: np.ndarray) -> float:
     """Length of the way through camera positions (N, 4, 4)."""
     return float(np.linalg.norm(np.diff(world_from_cam[:, :3, 3], axis=0), axis=1).sum())
-
-
-def write_tum(file: Path, timestamps: np.ndarray, world_from_cam: np.ndarray) -> None:
-    """Writes `timestamp tx ty tz qx qy qz qw` lines, seconds and camera to world."""
-    quaternions = geometry.quaternion_from_rotation(world_from_cam[:, :3, :3])
-    with file.open("w") as out:
-        out.write("# timestamp tx ty tz qx qy qz qw (camera to world)\n")
-        for t, pose, (w, x, y, z) in zip(timestamps, world_from_cam, quaternions):
-            values = (*pose[:3, 3], x, y, z, w)
-            out.write(f"{t:.6f} " + " ".join(f"{v:.9g}" for v in values) + "\n")
-
-
-def read_tum(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Timestamps (N,) and world_from_cam (N, 4, 4) of a TUM trajectory file. Raises ValueError for a bad line."""
-    rows = []
-    for number, line in enumerate(file.read_text().splitlines(), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        try:
-            row = [float(v) for v in line.replace(",", " ").split()]
-        except ValueError as error:
-            raise ValueError(f"{file}:{number}: not a number in {line!r}") from error
-        if len(row) != 8:
-            raise ValueError(f"{file}:{number}: expected `timestamp tx ty tz qx qy qz qw`, got {len(row)} values")
-        rows.append(row)
-    data = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    poses = np.tile(np.eye(4), (len(data), 1, 1))
-    if len(data):
-        poses[:, :3, :3] = geometry.rotation_from_quaternion(data[:, [7, 4, 5, 6]])
-        poses[:, :3, 3] = data[:, 1:4]
-    return data[:, 0], poses

@@ -1,4 +1,4 @@
-"""Turns a map.ply into other formats: `python -m mvsgs_core.splats.export MAP.ply OUT`.
+"""Turns a map.ply into other formats: `python -m mvsgs_core.export MAP.ply OUT`.
 
 OUT decides: gaussians.ply (--fold, for viewers without shapes), .splat, .spz, a mesh (.glb, .obj, or --mesh with .ply),
 or a folder for a COLMAP model, with --images and --observations where they are wanted. Mesh and COLMAP model are made
@@ -13,14 +13,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from mvsgs_core.splats import keyframe_images
-from mvsgs_core.splats.export_colmap import write_colmap
-from mvsgs_core.splats.export_input import cameras_of_map, input_arguments, read_map
-from mvsgs_core.splats.export_mesh import write_mesh
-from mvsgs_core.splats.export_ply import write_ply
-from mvsgs_core.splats.export_splat import write_splat, write_spz
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.snapshot import Snapshot
+from mvsgs_core.export import keyframe_images
+from mvsgs_core.export.colmap import write_colmap
+from mvsgs_core.export.input import cameras_of_map, input_arguments, read_map
+from mvsgs_core.export.mesh import write_mesh
+from mvsgs_core.export.ply import write_ply
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.export.splat import write_splat, write_spz
+from mvsgs_core.rasterizer.splats import Splats
 
 MESHES = (".glb", ".obj", ".stl", ".off")
 
@@ -64,7 +64,7 @@ def export(options: argparse.Namespace) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m mvsgs_core.splats.export", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m mvsgs_core.export", description=__doc__)
     input_arguments(parser)
     parser.add_argument("out", type=Path, help="file.ply, .splat, .spz, .glb, .obj, or a folder for a COLMAP model")
     parser.add_argument("--fold", action="store_true", help="fold the shape into the scales (.ply)")

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core.atomic_file import replace_text
-from mvsgs_core.splats.keyframes import TrainingView
-from mvsgs_core.splats.snapshot import Snapshot
 
 FORMAT, VERSION = "mvsgs cameras", 1
 
@@ -29,19 +27,6 @@ class Cameras:
 
     def __len__(self) -> int:
         return len(self.keyframes)
-
-
-def cameras_of(final: Snapshot, views: list[TrainingView]) -> Cameras:
-    """The cameras of a map's keyframes, at the size of their images as they came; `views` as in the snapshot."""
-    count = len(views)
-    return Cameras(
-        keyframes=final.keyframes,
-        timestamps=np.array([view.timestamp for view in views], dtype=np.float64),
-        world_from_cam=final.world_from_cam,
-        intrinsics=np.array([view.image_intrinsics for view in views], dtype=np.float64).reshape(count, 4),
-        sizes=np.array([view.image_size for view in views], dtype=np.int64).reshape(count, 2),
-        exposures=final.exposures.astype(np.float64),
-    )
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:

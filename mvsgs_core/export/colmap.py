@@ -12,11 +12,11 @@ import torch
 from PIL import Image, UnidentifiedImageError
 
 from mvsgs_core import camera, geometry
-from mvsgs_core.splats.cameras import Cameras
-from mvsgs_core.splats.keyframe_images import image_name
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.snapshot import Snapshot
-from mvsgs_core.splats.spherical_harmonics import C0
+from mvsgs_core.export.cameras import Cameras
+from mvsgs_core.export.keyframe_images import image_name
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.spherical_harmonics import C0
 
 BEHIND = 0.03  # of the rendered depth: a point farther behind the surface is hidden by it
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mvsgs_core.splats.turning import RUB_FROM_RDF
+from mvsgs_core.export.turning import RUB_FROM_RDF
 
 _FLOAT, _UINT = 5126, 5125  # component types of glTF
 _VERTICES, _INDICES = 34962, 34963  # targets of its buffer views

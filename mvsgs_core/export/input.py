@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from mvsgs_core import camera
-from mvsgs_core.evaluation.trajectory import read_tum
-from mvsgs_core.splats.cameras import Cameras, read_cameras
-from mvsgs_core.splats.export_ply import read_ply
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.snapshot import Snapshot
+from mvsgs_core.export.cameras import Cameras, read_cameras
+from mvsgs_core.export.ply import read_ply
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.trajectory_file import read_trajectory
 
 
 def input_arguments(parser: argparse.ArgumentParser) -> None:
@@ -95,7 +95,7 @@ def cameras_of_map(options: argparse.Namespace) -> Cameras:
         raise ValueError("--every must be at least 1")
     known = known_cameras(options)
     if options.trajectory is not None:
-        stamps, poses = read_tum(options.trajectory)
+        stamps, poses = read_trajectory(options.trajectory)
         found = Cameras(
             keyframes=np.arange(len(stamps)), timestamps=stamps, world_from_cam=poses, intrinsics=np.zeros((0, 4)),
             sizes=np.zeros((0, 2)), exposures=np.tile(np.eye(3, 4), (len(stamps), 1, 1)),

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from mvsgs_core import camera
+from mvsgs_core.export.cameras import Cameras
+from mvsgs_core.export.glb import write_glb
+from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.open3d_loader import open3d
-from mvsgs_core.splats.cameras import Cameras
-from mvsgs_core.splats.export_glb import write_glb
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.snapshot import Snapshot
+from mvsgs_core.rasterizer.rasterize import rasterize
 
 
 def write_mesh(

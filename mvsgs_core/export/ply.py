@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from mvsgs_core.bad_file import reading
-from mvsgs_core.splats.densities import DENSITIES, gaussian_std_ratio, log_scale_shift, neutral_beta
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.snapshot import Snapshot
-from mvsgs_core.splats.spherical_harmonics import degree_of
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.rasterizer.densities import DENSITIES, gaussian_std_ratio, log_scale_shift, neutral_beta
+from mvsgs_core.rasterizer.spherical_harmonics import degree_of
+from mvsgs_core.rasterizer.splats import Splats
 
 _LONGEST_HEADER = 2**16  # bytes
 FAR = 1e3  # origins farther than this many scene extents stay a comment: float32 positions would lose the detail

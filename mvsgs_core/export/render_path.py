@@ -1,4 +1,4 @@
-"""A saved map along a path as a video: `python -m mvsgs_core.splats.render_path MAP.ply TRAJECTORY.txt OUT.mp4`.
+"""A saved map along a path as a video: `python -m mvsgs_core.export.render_path MAP.ply TRAJECTORY.txt OUT.mp4`.
 
 The camera is that of the newest keyframe in the cameras.json beside the map.
 """
@@ -14,10 +14,10 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.evaluation.trajectory import read_tum
-from mvsgs_core.splats.export_input import input_arguments, lens, read_map
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.snapshot import Snapshot
+from mvsgs_core.export.input import input_arguments, lens, read_map
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.trajectory_file import read_trajectory
 from mvsgs_core.video_file import write_video
 
 
@@ -45,7 +45,7 @@ def frames_along(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m mvsgs_core.splats.render_path", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m mvsgs_core.export.render_path", description=__doc__)
     input_arguments(parser)
     parser.add_argument("trajectory", type=Path, help="poses, TUM format: time tx ty tz qx qy qz qw")
     parser.add_argument("out", type=Path, help="video.mp4")
@@ -54,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         final, left_out = read_map(options)
-        _, poses = read_tum(options.trajectory)
+        _, poses = read_trajectory(options.trajectory)
         if not len(poses):
             raise ValueError(f"{options.trajectory} has no poses")
         path = resampled(poses, options.frames or len(poses))

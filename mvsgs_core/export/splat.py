@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mvsgs_core.export.ply import folded, relative_origin
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.export.turning import RUB_FROM_RDF, turned
 from mvsgs_core.open3d_loader import open3d
-from mvsgs_core.splats.export_ply import folded, relative_origin
-from mvsgs_core.splats.snapshot import Snapshot
-from mvsgs_core.splats.spherical_harmonics import C0
-from mvsgs_core.splats.turning import RUB_FROM_RDF, turned
+from mvsgs_core.rasterizer.spherical_harmonics import C0
 
 SPZ_STEP = 1.0 / 4096.0  # .spz keeps positions as multiples of this
 SPZ_REACH = 2048.0  # in 24 bits

@@ -8,9 +8,8 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.splats.deformation import left_multiplication
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.sh_rotation import sh_rotation
+from mvsgs_core.rasterizer.sh_rotation import sh_rotation
+from mvsgs_core.rasterizer.splats import Splats
 
 # (3, 3): from our axes (x right, y down, z forward; "RDF") to those of OpenGL and glTF (x right, y up, z back; "RUB")
 RUB_FROM_RDF = np.diag([1.0, -1.0, -1.0])
@@ -19,7 +18,7 @@ RUB_FROM_RDF = np.diag([1.0, -1.0, -1.0])
 def turned(splats: Splats, rotation: np.ndarray) -> Splats:
     """The same splats after the world was turned by `rotation` (3, 3): positions, orientations and view-dependent
     colors."""
-    turn = left_multiplication(geometry.quaternion_from_rotation(rotation[None]))[0]
+    turn = geometry.left_multiplication(geometry.quaternion_from_rotation(rotation[None]))[0]
     harmonics = sh_rotation(rotation, splats.sh.shape[1])
     return replace(
         splats,

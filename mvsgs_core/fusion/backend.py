@@ -12,7 +12,7 @@ class NativeFusionBackend:
     """The C++ kernels; `threads` None: all that OpenMP has."""
 
     def __init__(self, threads: int | None = None) -> None:
-        self._kernels = native.load("stereo")
+        self._kernels = native.load("mvs")
         self._threads = threads or 0
 
     def consistent_views(

@@ -7,7 +7,7 @@ import numpy as np
 
 from mvsgs_core.fusion.interface import Fused
 
-# Logistic regression on `features_of`, by `python -m bench.depth_calibration`.
+# Logistic regression on `features_of`, by `python -m bench.depth.calibration`.
 WEIGHTS = np.array([-1.802, 0.956, 1.655, -0.617, -0.337, -0.346, 1.449, 0.637, -0.609, -0.504, 1.107, 0.834])
 
 

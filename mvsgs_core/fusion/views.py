@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvsgs_core.mvs.warp import relative_warp
+from mvsgs_core.warp import relative_warp
 
 
 @dataclass(frozen=True)

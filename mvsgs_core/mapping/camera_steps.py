@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.splats.keyframes import TrainingView
-from mvsgs_core.splats.optimizer import BETA_1, BETA_2
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.optimizer import BETA_1, BETA_2
 
 
 @torch.no_grad()

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from mvsgs_core import geometry
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.sh_rotation import sh_rotation
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.rasterizer.sh_rotation import sh_rotation
 
 CHUNK = 16384  # splats that are moved at once: matrices in float64 for each take three times what the map keeps of it
 
@@ -62,7 +62,7 @@ def _move(state: MapState, chosen: Tensor, which: Tensor, ordered: list[Similari
     scale = _rows([s.scale for s in ordered], which)
     rotation = _rows(rotations, which)
     translation = _rows([s.translation for s in ordered], which)
-    turn = _rows(left_multiplication(geometry.quaternion_from_rotation(rotations)), which)
+    turn = _rows(geometry.left_multiplication(geometry.quaternion_from_rotation(rotations)), which)
 
     splats = state.detached()
     means = splats.means[chosen].to(torch.float64)
@@ -79,13 +79,6 @@ def _move(state: MapState, chosen: Tensor, which: Tensor, ordered: list[Similari
         first, second = state.first["sh"], state.second["sh"]
         first[chosen] = (harmonics @ first[chosen].to(torch.float64)).to(torch.float32)
         second[chosen] = (harmonics.square() @ second[chosen].to(torch.float64)).to(torch.float32)
-
-
-def left_multiplication(q: np.ndarray) -> np.ndarray:
-    """Matrices (K, 4, 4) with L(q) p = q p for quaternions (K, 4), w first."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _move_moments(state: MapState, name: str, chosen: Tensor, jacobian: Tensor) -> None:

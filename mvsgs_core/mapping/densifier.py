@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from mvsgs_core import camera
-from mvsgs_core.splats.exposure import colors_of_map, fitted_exposure
-from mvsgs_core.splats.filling import continued_depth, fill_points
-from mvsgs_core.splats.insertion import (
+from mvsgs_core.mapping.exposure import colors_of_map, fitted_exposure
+from mvsgs_core.mapping.filling import continued_depth, fill_points
+from mvsgs_core.mapping.insertion import (
     InsertionConfig,
     Points,
     depth_colors,
@@ -24,10 +24,10 @@ from mvsgs_core.splats.insertion import (
     unoccupied,
     voxel_filter,
 )  # fmt: skip
-from mvsgs_core.splats.keyframes import PosedView, TrainingView
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.rasterizer import Render
-from mvsgs_core.splats.training import TrainingConfig
+from mvsgs_core.mapping.keyframes import PosedView, TrainingView
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.stats import Stats
 
 SOLID = 0.9  # opacity from which the map's depth at a pixel is its surface's

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats.map_state import PARAMETERS, MapState, replace_values
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.reference import rotation_matrices
+from mvsgs_core.mapping.map_state import PARAMETERS, MapState, replace_values
+from mvsgs_core.rasterizer.reference import rotation_matrices
+from mvsgs_core.rasterizer.splats import Splats
 
 
 @dataclass(frozen=True)

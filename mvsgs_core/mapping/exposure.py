@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.spherical_harmonics import C0
+from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.splats import Splats
 
 IDENTITY = np.eye(3, 4, dtype=np.float32)
 LEAST_KNOWN = 0.05  # share of the image that the map must show

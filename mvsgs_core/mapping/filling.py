@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core import camera
+from mvsgs_core.mapping.insertion import Points
 from mvsgs_core.membrane import membrane
-from mvsgs_core.splats.insertion import Points
 
 LEAST_CONFIDENCE = 0.15  # a depth below is worse than what surrounds it, continued
 STIFFNESS, EDGE = 200.0, 5.0  # of what is continued, see membrane: in gray levels

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from mvsgs_core import camera
-from mvsgs_core.splats.densities import neutral_beta
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.spherical_harmonics import C0
+from mvsgs_core.rasterizer.densities import neutral_beta
+from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.splats import Splats
 
 VOXELS = 1 << 21  # along an axis: what three of them in 63 bits can number
 CHUNK = 65536  # of the map's splats that are sorted into voxels at once, in float64

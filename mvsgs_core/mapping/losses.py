@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mvsgs_core.splats import ssim
+from mvsgs_core.rasterizer import ssim
 
 LOWERED = 0.2  # scale at which the mask is made
 TINY = 1e-20

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats.model import Splats
+from mvsgs_core.rasterizer.splats import Splats
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh", "betas")
 SINGLE = ("steps", "anchors", "screen_gradient", "screen_views")  # one value a splat beside the parameters

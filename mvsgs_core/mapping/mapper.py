@@ -11,20 +11,21 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from mvsgs_core.splats import density_control, optimizer
-from mvsgs_core.splats.deformation import Similarity, move_with_anchors
-from mvsgs_core.splats.densifier import Densifier, checked_depth
-from mvsgs_core.splats.density_control import DensityConfig
-from mvsgs_core.splats.insertion import InsertionConfig
-from mvsgs_core.splats.keyframes import PosedView, TrainingView, training_view
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.optimizer import LearningRates
-from mvsgs_core.splats.rasterizer import Render, rasterize
-from mvsgs_core.splats.schedule import Schedule
-from mvsgs_core.splats.self_check import SelfCheck, check
-from mvsgs_core.splats.snapshot import Snapshot, snapshot
-from mvsgs_core.splats.training import SkipConfig, TrainingConfig, train_once
-from mvsgs_core.splats.view_checks import LARGEST, NO_POSE, checked_view, is_near, is_pose
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.mapping import density_control, optimizer
+from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
+from mvsgs_core.mapping.densifier import Densifier, checked_depth
+from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.insertion import InsertionConfig
+from mvsgs_core.mapping.keyframes import PosedView, TrainingView, training_view
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.schedule import Schedule
+from mvsgs_core.mapping.self_check import SelfCheck, check
+from mvsgs_core.mapping.snapshot import snapshot
+from mvsgs_core.mapping.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.mapping.view_checks import LARGEST, NO_POSE, checked_view, is_near, is_pose
+from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.stats import Stats
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mvsgs_core import native
-from mvsgs_core.splats.map_state import PARAMETERS, MapState
+from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -82,7 +82,7 @@ def step(state: MapState, visible: Tensor, steps: list[Group], decay_steps: int,
     values, gradients, firsts, seconds = ([tensor.numpy() for tensor in group] for group in rows)
     if not settings:
         return 0
-    refused: int = native.load("mapper").adam(
+    refused: int = native.load("mapping").adam(
         values, gradients, firsts, seconds, settings, visible.numpy(), state.steps.numpy(),
         BETA_1, BETA_2, EPSILON, decay_steps, threads or torch.get_num_threads(),
     )  # fmt: skip

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from mvsgs_core.splats.mapper import OnlineMapper
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.reference import rotation_matrices
-from mvsgs_core.splats.spherical_harmonics import C0
+from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.rasterizer.reference import rotation_matrices
+from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.splats import Splats
 
 CHUNK = 16384  # splats whose covariances are made at once: on the way they take several times their size
 

@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from mvsgs_core import camera
+from mvsgs_core.mapping.densifier import SOLID
+from mvsgs_core.mapping.filling import continued_depth, fill_points
+from mvsgs_core.mapping.insertion import Points, depth_colors, splats_from_points
+from mvsgs_core.mapping.keyframes import PosedView, training_view
+from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.view_checks import is_near
 from mvsgs_core.mvs.coarse import enlarge_inverse_depth
-from mvsgs_core.splats.densifier import SOLID
-from mvsgs_core.splats.filling import continued_depth, fill_points
-from mvsgs_core.splats.insertion import Points, depth_colors, splats_from_points
-from mvsgs_core.splats.keyframes import PosedView, training_view
-from mvsgs_core.splats.mapper import OnlineMapper
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.view_checks import is_near
+from mvsgs_core.rasterizer.splats import Splats
 
 KEPT = 8  # keyframes that wait for their depth: the newest
 SIDE = 4  # pixels of the image, side of the square that a splat stands for, or more where that is too many

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mvsgs_core.evaluation.image_metrics import psnr
+from mvsgs_core.image_metrics import psnr
 
 LEAST_PSNR = 25.0  # dB; a static map of sharp, steady images is above this
 MOST_EXPOSURE_GAIN = 1.5  # dB that one gain and offset an image and channel may bring before exposure is to blame

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mvsgs_core.splats.checkpoint_state import copy_of
-from mvsgs_core.splats.mapper import OnlineMapper
-from mvsgs_core.splats.view_checks import NO_POSE, is_pose
+from mvsgs_core.mapping.checkpoints.state import copy_of
+from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.view_checks import NO_POSE, is_pose
 from mvsgs_core.stats import Stats
 
 

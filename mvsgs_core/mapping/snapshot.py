@@ -1,32 +1,17 @@
-"""The map as it leaves the mapper: world units, positions relative to an origin in float64."""
+"""The mapper's state as a map at rest, in world units."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from mvsgs_core.splats.exposure import IDENTITY, relative_to_mean
-from mvsgs_core.splats.keyframes import TrainingView
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.model import Splats
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """Splats relative to `origin`, in world units, with the keyframes they were made from."""
-
-    splats: Splats  # detached copies, on the CPU
-    anchors: np.ndarray  # (N,) int64 keyframe of each splat
-    origin: np.ndarray  # (3,) float64, world position that `splats.means` are relative to
-    density: str
-    iterations: int
-    keyframes: np.ndarray  # (K,) int64
-    world_from_cam: np.ndarray  # (K, 4, 4) float64, as refined, world frame (not relative to the origin)
-    scale: np.ndarray  # (K,) float64
-    exposures: np.ndarray  # (K, 3, 4) float32
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.mapping.exposure import IDENTITY, relative_to_mean
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.rasterizer.splats import Splats
 
 
 def snapshot(

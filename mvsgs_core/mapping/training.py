@@ -8,12 +8,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats import optimizer
-from mvsgs_core.splats.camera_steps import step_exposure, step_pose
-from mvsgs_core.splats.keyframes import TrainingView
-from mvsgs_core.splats.losses import LossConfig, frequency_of, ges_loss
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.rasterizer import TILE, rasterize
+from mvsgs_core.mapping import optimizer
+from mvsgs_core.mapping.camera_steps import step_exposure, step_pose
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.losses import LossConfig, frequency_of, ges_loss
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.rasterizer.rasterize import TILE, rasterize
 
 
 @dataclass(frozen=True)

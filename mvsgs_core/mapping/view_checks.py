@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import PosedView
 from mvsgs_core.stats import Stats
 
 LEAST_SIDE = 8  # pixels of an image

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-# Logistic regression on `Evidence.features`, by `python -m bench.depth_calibration`.
+# Logistic regression on `Evidence.features`, by `python -m bench.depth.calibration`.
 WEIGHTS = np.array([-0.949, 0.995, 0.339, 1.583, 0.681, -0.496, -0.08, 1.558, -1.006, 2.387, 0.919])
 
 BLACK = 128.0 + 10.0  # gray levels: views have 128 taken out; ten more keep the logarithm of black tame

@@ -9,7 +9,7 @@ import numpy as np
 
 from mvsgs_core import camera
 from mvsgs_core.mvs.views import StereoView
-from mvsgs_core.mvs.warp import apply_warp, relative_warp
+from mvsgs_core.warp import apply_warp, relative_warp
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from mvsgs_core import camera
 from mvsgs_core.membrane import membrane
 from mvsgs_core.mvs.interface import Choice
 from mvsgs_core.mvs.views import StereoView
-from mvsgs_core.mvs.warp import apply_warp, relative_warp
+from mvsgs_core.warp import apply_warp, relative_warp
 
 
 @dataclass(frozen=True)

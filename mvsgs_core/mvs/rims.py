@@ -14,7 +14,7 @@ import numpy as np
 from mvsgs_core import camera
 from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, CostOptions
 from mvsgs_core.mvs.skipping import tile_counts
-from mvsgs_core.mvs.warp import apply_warp
+from mvsgs_core.warp import apply_warp
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from mvsgs_core.mvs.interface import Backend, Choice, CostOptions, SmoothOptions
 from mvsgs_core.mvs.rims import RimChoice, settle_rims
 from mvsgs_core.mvs.skipping import SkipChoice, keep_settled, settled_tiles, tiles_in_cells
 from mvsgs_core.mvs.views import StereoView
-from mvsgs_core.mvs.warp import parallax, relative_warp
+from mvsgs_core.warp import parallax, relative_warp
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The stereo kernels in PyTorch, for a GPU: the same mathematics as mvsgs_core/csrc/stereo, compared by tests."""
+"""The stereo kernels in PyTorch, for a GPU: the same mathematics as mvsgs_core/csrc/mvs, compared by tests."""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mvsgs_core import native
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.view import Backward, Render, View, screen_points
+from mvsgs_core.rasterizer.interface import Backward, Render, View, screen_points
+from mvsgs_core.rasterizer.splats import Splats
 
 
 class _Rasterize(torch.autograd.Function):
@@ -30,7 +30,7 @@ class _Rasterize(torch.autograd.Function):
         color = torch.empty(height, width, 3)
         depth, opacity = torch.empty(height, width), torch.empty(height, width)
         radii = torch.empty(len(means))
-        passed = native.load("splats").forward(
+        passed = native.load("rasterizer").forward(
             *(parameter.numpy() for parameter in parameters),
             pose=pose.detach().contiguous().numpy(),
             intrinsics=view.intrinsics,
@@ -62,7 +62,7 @@ class _Rasterize(torch.autograd.Function):
         on_screen = torch.empty(len(parameters[0]), 2)
         on_pose = torch.zeros(4, 4, dtype=torch.float64)
         on_means, on_log_scales, on_quaternions, on_opacity_logits, on_sh, on_betas = (r.numpy() for r in results)
-        ctx.report.refused = native.load("splats").backward(
+        ctx.report.refused = native.load("rasterizer").backward(
             ctx.passed,
             *(parameter.numpy() for parameter in parameters),
             color=color.numpy(),
@@ -99,7 +99,7 @@ def render(splats: Splats, view: View) -> Render:
     weight_sum = weight_max = None
     if view.weights:
         weight_sum, weight_max = torch.empty(count), torch.empty(count)
-        native.load("splats").weights(extra["passed"], weight_sum.numpy(), weight_max.numpy())
+        native.load("rasterizer").weights(extra["passed"], weight_sum.numpy(), weight_max.numpy())
     return Render(
         color=color,
         depth=depth,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats.model import Splats
+from mvsgs_core.rasterizer.splats import Splats
 
 BLUR = 0.3  # px^2, low-pass on the diagonal of the image covariance
 MAX_ALPHA = 0.99

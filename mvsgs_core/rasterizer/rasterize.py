@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats import cpu, densities, reference, spherical_harmonics
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.view import TILE, Render, View, tile_grid
+from mvsgs_core.rasterizer import cpu, densities, reference, spherical_harmonics
+from mvsgs_core.rasterizer.interface import TILE, Render, View, tile_grid
+from mvsgs_core.rasterizer.splats import Splats
 
 __all__ = ["BACKENDS", "TILE", "Render", "View", "rasterize", "se3_exp", "tile_grid"]
 
@@ -121,7 +121,7 @@ def _backend(name: str, device: torch.device) -> Callable[[Splats, View], Render
     if name == "cpu":
         return cpu.render
     if name == "triton":
-        from mvsgs_core.splats import triton_backend  # an optional package
+        from mvsgs_core.rasterizer.triton import backend as triton_backend
 
         return triton_backend.render
     raise ValueError(f"backend {name!r}: choose one of {', '.join(BACKENDS)}")

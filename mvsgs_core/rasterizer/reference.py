@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats import densities, spherical_harmonics
-from mvsgs_core.splats import view as interface
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.view import Backward, Render, View
+from mvsgs_core.rasterizer import densities, interface, spherical_harmonics
+from mvsgs_core.rasterizer.interface import Backward, Render, View
+from mvsgs_core.rasterizer.splats import Splats
 
 PAIRS_AT_ONCE = 1 << 22  # splat-pixel pairs held in memory at a time
 

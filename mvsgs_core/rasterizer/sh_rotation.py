@@ -7,7 +7,7 @@ import functools
 import numpy as np
 import torch
 
-from mvsgs_core.splats.spherical_harmonics import basis, degree_of
+from mvsgs_core.rasterizer.spherical_harmonics import basis, degree_of
 
 
 def sh_rotation(rotation: np.ndarray, bases: int) -> np.ndarray:

@@ -45,7 +45,7 @@ class _ImageLoss(torch.autograd.Function):
         threads: int,
     ) -> Tensor:  # fmt: skip
         gradient = torch.empty(image.shape)
-        l1, similarity = native.load("splats").image_loss(
+        l1, similarity = native.load("rasterizer").image_loss(
             image.detach().contiguous().numpy(), target.detach().contiguous().numpy(),
             None if pixel_weight is None else pixel_weight.numpy(), l1_weight, ssim_weight, gradient.numpy(), threads,
         )  # fmt: skip
@@ -108,7 +108,7 @@ def _triton_image_loss(
     image: Tensor, target: Tensor, weight: Tensor | None, l1_weight: float, ssim_weight: float
 ) -> Tensor:
     try:
-        from mvsgs_core.splats.triton_ssim import ImageLoss
+        from mvsgs_core.rasterizer.triton.ssim import ImageLoss
     except ModuleNotFoundError as error:
         raise ImportError(
             "the loss on a GPU needs the package triton, which comes with torch's CUDA builds: take "

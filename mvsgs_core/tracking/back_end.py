@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.bundle_adjustment import Solution, Solver
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
 

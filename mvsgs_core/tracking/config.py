@@ -5,19 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from mvsgs_core.tracking.back_end import BackEndConfig
-from mvsgs_core.tracking.focal import FocalConfig
+from mvsgs_core.tracking.estimation.focal import FocalConfig
 from mvsgs_core.tracking.front_end import FrontEndConfig
-from mvsgs_core.tracking.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
-from mvsgs_core.tracking.loop_closure import LoopConfig
-from mvsgs_core.tracking.recovery import RecoveryConfig
+from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
+from mvsgs_core.tracking.places.loop_closure import LoopConfig
+from mvsgs_core.tracking.places.recovery import RecoveryConfig
 from mvsgs_core.tracking.starting import StartingConfig
 
 
 @dataclass(frozen=True)
 class TrackerConfig:
     area: int = 320 * 240  # pixels of the tracker's image, same aspect as the input
-    flow: str = "lucas_kanade"  # mvsgs_core.tracking.flow.FLOWS, or module:Class
+    flow: str = "lucas_kanade"  # mvsgs_core.tracking.matching.flow.FLOWS, or module:Class
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
     loops: bool = True  # look for old keyframes by appearance
     readout: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated

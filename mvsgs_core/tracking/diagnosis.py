@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mvsgs_core.tracking.features import match_features
 from mvsgs_core.tracking.front_end import FrontEndConfig, Step
 from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matching.features import match_features
 
 KEPT = 1000  # measurements of each kind: more say nothing new
 

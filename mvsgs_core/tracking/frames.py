@@ -8,10 +8,10 @@ from enum import IntEnum
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.localization import localize
+from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.places.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
 
 AGREEMENT = 0.7  # of a frame's points, all of which agreed once: fewer after the map's corrections, and it is lost

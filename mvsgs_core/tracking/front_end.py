@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.flow import DenseInverseSearch, Matches, sample_field, spread
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import CELL, TrackingImage
-from mvsgs_core.tracking.localization import Localization, localize
-from mvsgs_core.tracking.matcher import Matcher
+from mvsgs_core.tracking.matching.flow import DenseInverseSearch, Matches, sample_field, spread
+from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.places.localization import Localization, localize
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.tracking.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
 from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matching.flow import Matches
 
 # What resists a change of an inverse depth d in each step, as a share of 1 / d². It is no prior: drawn to the depths
 # that keyframes were given, whole maps bend (rotation against depth), by 5 % on the synthetic room.

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvsgs_core import native
-from mvsgs_core.tracking.bundle_adjustment import Solution, Solver
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.matcher import Matcher
+from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.matching.matcher import Matcher
 
 
 @dataclass(frozen=True)

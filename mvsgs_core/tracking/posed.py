@@ -10,14 +10,14 @@ from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.bundle_adjustment import Solver, reproject
-from mvsgs_core.tracking.flow import Matches, make_flow
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
-from mvsgs_core.tracking.matcher import Matcher
+from mvsgs_core.tracking.matching.flow import Matches, make_flow
+from mvsgs_core.tracking.matching.matcher import Matcher
 
 FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to be apart where no match tells
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.localization import localize, located
+from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.places.localization import localize, located
 
 GRID = (6, 8)  # rows and columns of the image: one point each
 

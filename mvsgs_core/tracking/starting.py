@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core.tracking.diagnosis import Diagnosis
-from mvsgs_core.tracking.flow import Matches, spread
-from mvsgs_core.tracking.focal import FocalConfig, start_with_unknown_focal
+from mvsgs_core.tracking.estimation.focal import FocalConfig, start_with_unknown_focal
+from mvsgs_core.tracking.estimation.initialization import StartCriteria, start_up
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.initialization import StartCriteria, start_up
-from mvsgs_core.tracking.matcher import Matcher
+from mvsgs_core.tracking.matching.flow import Matches, spread
+from mvsgs_core.tracking.matching.matcher import Matcher
 
 
 @dataclass(frozen=True)

@@ -18,24 +18,24 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.back_end import BackEnd
-from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.calibration import READOUT_AGAIN, Calibration
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.diagnosis import Diagnosis
-from mvsgs_core.tracking.flow import make_flow
-from mvsgs_core.tracking.focal import FocalConfig
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
+from mvsgs_core.tracking.estimation.calibration import READOUT_AGAIN, Calibration
+from mvsgs_core.tracking.estimation.focal import FocalConfig
 from mvsgs_core.tracking.frames import FrameRecord, Path, State, solve_path
 from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
-from mvsgs_core.tracking.known_ground import KnownGround
 from mvsgs_core.tracking.local_map import LocalMap
-from mvsgs_core.tracking.loop_closure import LoopCloser
-from mvsgs_core.tracking.matcher import Matcher
+from mvsgs_core.tracking.matching.flow import make_flow
+from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.places.known_ground import KnownGround
+from mvsgs_core.tracking.places.loop_closure import LoopCloser
+from mvsgs_core.tracking.places.recovery import Recovery
+from mvsgs_core.tracking.places.sighting import Sighting
 from mvsgs_core.tracking.publish import Publisher, Update
-from mvsgs_core.tracking.recovery import Recovery
-from mvsgs_core.tracking.sighting import Sighting
 from mvsgs_core.tracking.starting import Starter
 
 
@@ -44,7 +44,7 @@ class Tracker:
         """clock: what the stages are timed with, in seconds. Raises ValueError where there is no such device."""
         self.config = config or TrackerConfig()
         if self.config.device != "cpu":
-            from mvsgs_core.tracking.torch_adjustment import find_device  # torch takes a second to load
+            from mvsgs_core.tracking.estimation.torch_adjustment import find_device  # torch takes a second to load
 
             find_device(self.config.device)
         self.records: list[FrameRecord] = []

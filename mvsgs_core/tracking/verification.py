@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mvsgs_core.tracking.flow import Matches
 from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.localization import Localization, located
+from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.places.localization import Localization, located
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class Keys(NamedTuple):
 
 
 def load_keys(folder: Path) -> Keys:
-    """The keys that `nodes.transport.create_keys` wrote.
+    """The keys that `nodes.runtime.transport.create_keys` wrote.
 
     Raises TransportError if there are none, if the file holds no key pair, or where somebody else could have made,
     changed or read them, as ssh does: another user's file, a link, a mode or a folder that lets others in.
@@ -40,7 +40,7 @@ def load_keys(folder: Path) -> Keys:
     except FileNotFoundError:
         raise TransportError(
             f"no keys at {path}: make them with "
-            f'python -c "from nodes.transport import create_keys; create_keys({str(folder)!r})"'
+            f'python -c "from nodes.runtime.transport import create_keys; create_keys({str(folder)!r})"'
         ) from None
     except OSError as error:
         what = "is a link: put the file itself there" if path.is_symlink() else f"cannot be read: {error.strerror}"

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from nodes.transport import NewestReader, Publisher, ReliableReader, wait
+from nodes.runtime.transport import NewestReader, Publisher, ReliableReader, wait
 
 Reader = ReliableReader | NewestReader
 

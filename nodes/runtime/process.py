@@ -28,15 +28,15 @@ import msgs
 from msgs import Message
 from mvsgs_core.named_modules import import_named
 from nodes import Node, is_source, outputs
-from nodes.addresses import PeerLost, load_keys
-from nodes.freed_memory import FreedMemory
-from nodes.inbox import Inbox, Reader
-from nodes.parameters import make_config
-from nodes.runner import Runner, end_of, stats_of
-from nodes.signals import ABORT_SECONDS, Signals, Stopped, end_within
-from nodes.spec import Spec
-from nodes.status import Status, peak_bytes
-from nodes.transport import NewestReader, Publisher, ReliableReader, shut_down
+from nodes.runtime.addresses import PeerLost, load_keys
+from nodes.runtime.freed_memory import FreedMemory
+from nodes.runtime.inbox import Inbox, Reader
+from nodes.runtime.parameters import make_config
+from nodes.runtime.runner import Runner, end_of, stats_of
+from nodes.runtime.signals import ABORT_SECONDS, Signals, Stopped, end_within
+from nodes.runtime.spec import Spec
+from nodes.runtime.status import Status, peak_bytes
+from nodes.runtime.transport import NewestReader, Publisher, ReliableReader, shut_down
 
 POLL = 0.25  # s between looks at signals and lost peers while nothing arrives
 STOP_GRACE = 2.0  # s that a source's current item may take after SIGINT

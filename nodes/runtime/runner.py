@@ -12,7 +12,7 @@ from msgs.codec import MAX_END_HEADER_BYTES, MAX_HEADER_BYTES
 from mvsgs_core.stats import Stats
 from mvsgs_core.warned import Warnings
 from nodes import Node, handlers, outputs
-from nodes.plain import fitted, plain, plain_section
+from nodes.runtime.plain import fitted, plain, plain_section
 
 STATS_KEYS = ("counts", "seconds", "skipped", "values", "warnings")
 END_BYTES = MAX_END_HEADER_BYTES - MAX_HEADER_BYTES  # the rest is for what a header holds beside the statistics

@@ -8,7 +8,7 @@
      "status_fd": null}
 
 `readers` counts those of both kinds without observers, which are named; `buffer` is in messages; `keys` is a folder,
-see `nodes.addresses.load_keys`; `token` is a secret of the run, without which a publisher takes nobody for a reader. A
+see `addresses.load_keys`; `token` is a secret of the run, without which a publisher takes nobody for a reader. A
 file NAME.gone beside this one says that the observer NAME is gone.
 """
 

@@ -13,15 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench import ablation, curves, memory, peers, plots, record, scenes, stress
+from bench import ablation, curves, memory, plots, record, scenes, stress
+from bench.baselines import __main__ as peers
+from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.runs import CONF, Matrix, Run, Setting, choices, figure, said
-from bench.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.table import Row, at_least, at_most
 from launch.compose import compose
 from launch.parameters import GraphError
 from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.splats.training import TrainingConfig
+from mvsgs_core.mapping.training import TrainingConfig
 from tests.shared_data import ROOT
 
 SEARCH = f"hydra.searchpath=[file://{CONF}]"
@@ -103,7 +104,7 @@ def test_a_slow_node_and_the_track_recorder_stand_in_the_graph() -> None:
     assert graph.slots["depth_fusion"].config["factor"] == 10.0
     with pytest.raises(GraphError, match="recorder has no choice"):
         compose(["recorder=track"])
-    graph = compose([SEARCH, "+scene=room", "++recorder._target_=bench.track_recorder.TrackRecorder",
+    graph = compose([SEARCH, "+scene=room", "++recorder._target_=bench.tracking.recorder.TrackRecorder",
                      "++recorder.reads.Trajectory=tracker"])  # fmt: skip
     assert any(edge.reader == "recorder" for edge in graph.edges)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.depth import SECTIONS, SMALL, map_section
-from bench.depth_calibration import reliability
-from bench.depth_curves import Point, settings
-from bench.depth_data import Scene, coarse_grid, without_ragged_edges
-from bench.depth_parts import part_variants, skip_variants
-from bench.depth_run import Run, scaled_to, score, surest
+from bench.depth.__main__ import SECTIONS, SMALL, map_section
+from bench.depth.calibration import reliability
+from bench.depth.curves import Point, settings
+from bench.depth.data import Scene, coarse_grid, without_ragged_edges
+from bench.depth.parts import part_variants, skip_variants
+from bench.depth.run import Run, scaled_to, score, surest
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
 

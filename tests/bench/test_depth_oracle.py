@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.depth_ceiling import ceiling, ceiling_rows, within
-from bench.depth_data import Scene, load_scene
+from bench.depth.data import Scene, load_scene
+from bench.depth.oracle import ceiling, ceiling_rows, within
 from mvsgs_core import geometry
 
 AREA = 320 * 240

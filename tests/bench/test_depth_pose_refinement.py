@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.depth_data import load_scene
-from bench.depth_polish import polished
+from bench.depth.data import load_scene
+from bench.depth.pose_refinement import polished
 from mvsgs_core import geometry
 
 

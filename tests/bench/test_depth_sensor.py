@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.depth_data import load_scene
-from bench.depth_sensor import sensor_offset, without_offset
+from bench.depth.data import load_scene
+from bench.depth.sensor import sensor_offset, without_offset
 
 
 def test_an_offset_of_inverse_depth_is_found_and_taken_out_and_none_is_believed_where_there_is_none() -> None:

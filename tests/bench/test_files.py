@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import file_worker
-from bench.faulting import files
-from bench.file_mutations import mutated
-from bench.file_seeds import SEEDS
+from bench.faults import file_worker, files
+from bench.faults.file_mutations import mutated
+from bench.faults.file_seeds import SEEDS
 from mvsgs_core.bad_file import BadFileError
 
 

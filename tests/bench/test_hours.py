@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.faulting.hours import MAX_BYTES, Samples, _rows
+from bench.faults.hours import MAX_BYTES, Samples, _rows
 from bench.table import Row
 from bench.to_and_fro import ToAndFro
 from msgs import Frame, GroundTruth

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from bench.stability import box_view, mapped
-from mvsgs_core.splats.mapper import MapperConfig
-from mvsgs_core.splats.training import TrainingConfig
+from mvsgs_core.mapping.mapper import MapperConfig
+from mvsgs_core.mapping.training import TrainingConfig
 
 
 def test_a_pass_says_whether_quality_was_judged() -> None:

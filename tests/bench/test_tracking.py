@@ -7,11 +7,12 @@ from pathlib import Path as File
 import numpy as np
 import pytest
 
-from bench import tracking_curve, tracking_memory, tracking_peers
-from bench.colmap_poses import Model, load
+from bench import tracking_curve
+from bench.baselines.colmap_poses import Model, load
+from bench.tracking import baselines, memory
+from bench.tracking.baselines import Peer
+from bench.tracking.memory import Sample
 from bench.tracking_curve import Point
-from bench.tracking_memory import Sample
-from bench.tracking_peers import Peer
 from mvsgs_core.datasets import Item
 from mvsgs_core.tracking.frames import Path
 
@@ -40,14 +41,14 @@ def test_settings_of_the_curve_differ_from_the_default_and_from_each_other() -> 
 
 def test_memory_of_a_keyframe_that_grows_misses_the_goal() -> None:
     def met(end: float) -> bool | None:
-        return tracking_memory.rows([Sample(500, 50, 100.0), Sample(2000, 100, end)])[-1].met
+        return memory.rows([Sample(500, 50, 100.0), Sample(2000, 100, end)])[-1].met
 
     assert met(200.0)
     assert not met(300.0)
 
 
 def test_a_short_stream_is_followed_and_measured() -> None:
-    samples = tracking_memory.follow(40, every=20)
+    samples = memory.follow(40, every=20)
     assert [s.frames for s in samples] == [20, 40]
     assert samples[-1].keyframes > 0
 
@@ -69,12 +70,12 @@ def test_colmap_is_a_mark_only_where_it_registers_most_frames(registered: int, g
     ours[3] = np.nan
     model = Model(np.arange(registered), 2.0 * theirs, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), {}, 30.0)
     path = Path(np.arange(20), np.zeros(20), ours, np.ones(20, bool), np.zeros(20, np.uint8), np.zeros(20, np.int32))
-    rows = tracking_peers.rows("room", Peer(model, "", (240, 320)), path, items, 3.0)
+    rows = baselines.rows("room", Peer(model, "", (240, 320)), path, items, 3.0)
     assert f"{registered} of 20 frames" in rows[0].unit
     assert rows[1].goal == goal
     assert rows[1].value == pytest.approx(0.5, rel=0.1)
     assert rows[2].value == 10.0
-    none = tracking_peers.rows("room", Peer(None, "no model", (240, 320)), path, items, 3.0)
+    none = baselines.rows("room", Peer(None, "no model", (240, 320)), path, items, 3.0)
     assert [r.value for r in none] == ["no model"]
 
 
@@ -87,10 +88,10 @@ def test_colmaps_model_is_kept_for_the_same_images_only(tmp_path: File, monkeypa
         (folder / "seconds.json").write_text('{"wall": {"matching": 1.0}, "processor": 2.0}')
         return load(folder), ""
 
-    monkeypatch.setattr(tracking_peers, "reconstruct", fake)
+    monkeypatch.setattr(baselines, "reconstruct", fake)
     items, _ = moving(5)
     for used in (items, items, items[:4]):
-        peer = tracking_peers.solve(used, tmp_path, 1)
+        peer = baselines.solve(used, tmp_path, 1)
         assert peer.model is not None
         assert peer.model.processor_seconds == 2.0
     assert calls == [5, 4]

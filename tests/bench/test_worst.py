@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.faulting.worst import rows
+from bench.faults.worst import rows
 from mvsgs_core.evaluation.scoring import Score, summarize
 
 

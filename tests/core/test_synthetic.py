@@ -13,6 +13,7 @@ import pytest
 from mvsgs_core import camera, geometry
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
+from mvsgs_core.datasets.write_tum import main as write_tum
 from mvsgs_core.scene import materials
 from mvsgs_core.scene.difficulties import Difficulties
 from mvsgs_core.scene.furniture import table, vase
@@ -20,7 +21,6 @@ from mvsgs_core.scene.lighting import Lighting, RectLight
 from mvsgs_core.scene.patches import Patch, quad
 from mvsgs_core.scene.renderer import SceneRenderer
 from mvsgs_core.scene.room import HEIGHT, LENGTH, WIDTH
-from mvsgs_core.scene.write_tum import main as write_tum
 
 LIGHT = Lighting(texel=0.1, rects=(RectLight((0, 0, 3), (0, 1, 0), (1, 0, 0), (5, 5, 5)),), zenith=(0.4, 0.5, 0.6))
 

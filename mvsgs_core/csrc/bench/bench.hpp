@@ -1,7 +1,7 @@
 // The benchmark's plain-loop rasterizer and the machine's peaks that it is measured against.
 #pragma once
 
-#include "splats/frame.hpp"
+#include "rasterizer/frame.hpp"
 
 namespace splats {
 

@@ -1,6 +1,6 @@
 // Python bindings of what the benchmark of the rasterizer measures against. Not part of an installed package.
 #include "bench/bench.hpp"
-#include "splats/arguments.hpp"
+#include "rasterizer/arguments.hpp"
 
 using namespace splats;
 

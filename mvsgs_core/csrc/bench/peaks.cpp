@@ -4,7 +4,7 @@
 #include <chrono>
 
 #include "bench/bench.hpp"
-#include "splats/tile.hpp"
+#include "rasterizer/tile.hpp"
 
 namespace splats {
 namespace {

@@ -6,7 +6,7 @@
 #include <nanobind/stl/tuple.h>
 #include <omp.h>
 
-#include "splats/frame.hpp"
+#include "rasterizer/frame.hpp"
 
 namespace splats {
 

@@ -5,8 +5,8 @@
 
 #include <cstring>
 
-#include "splats/shading.hpp"
-#include "splats/tile_walk.hpp"
+#include "rasterizer/shading.hpp"
+#include "rasterizer/tile_walk.hpp"
 
 namespace splats {
 namespace {

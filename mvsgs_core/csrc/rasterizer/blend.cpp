@@ -2,8 +2,8 @@
 // splats whose ellipse touches it pass by, a group of them at a time, until the block is full.
 #include <omp.h>
 
-#include "splats/pixels.hpp"
-#include "splats/tile.hpp"
+#include "rasterizer/pixels.hpp"
+#include "rasterizer/tile.hpp"
 
 namespace splats {
 namespace {

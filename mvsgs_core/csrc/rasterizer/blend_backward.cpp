@@ -3,8 +3,8 @@
 // sum, known from the image itself, so the transmittance is the forward pass's own product and no division undoes it.
 #include <omp.h>
 
-#include "splats/pixels.hpp"
-#include "splats/tile.hpp"
+#include "rasterizer/pixels.hpp"
+#include "rasterizer/tile.hpp"
 
 namespace splats {
 namespace {

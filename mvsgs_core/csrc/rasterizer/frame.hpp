@@ -13,7 +13,7 @@
 #include <utility>
 #include <vector>
 
-#include "splats/lanes.hpp"
+#include "rasterizer/lanes.hpp"
 
 namespace splats {
 

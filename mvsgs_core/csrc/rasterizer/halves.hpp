@@ -4,7 +4,7 @@
 
 #include <type_traits>
 
-#include "splats/inlining.hpp"
+#include "rasterizer/inlining.hpp"
 
 namespace splats {
 

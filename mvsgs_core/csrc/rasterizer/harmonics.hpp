@@ -2,7 +2,7 @@
 // directions, one in each lane.
 #pragma once
 
-#include "splats/lanes.hpp"
+#include "rasterizer/lanes.hpp"
 
 namespace splats {
 

@@ -7,9 +7,9 @@
 #pragma GCC diagnostic ignored "-Wpsabi"  // every function here is inlined: no ABI is crossed
 
 #if defined(__AVX512F__)
-#include "splats/lanes_whole.hpp"
+#include "rasterizer/lanes_whole.hpp"
 #else
-#include "splats/lanes_halves.hpp"
+#include "rasterizer/lanes_halves.hpp"
 #endif
 
 namespace splats {

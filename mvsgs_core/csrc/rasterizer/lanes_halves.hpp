@@ -5,9 +5,9 @@
 
 #include <algorithm>
 
-#include "splats/register_part.hpp"
+#include "rasterizer/register_part.hpp"
 
-#include "splats/halves.hpp"
+#include "rasterizer/halves.hpp"
 
 namespace splats {
 

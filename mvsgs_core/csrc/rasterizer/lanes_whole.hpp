@@ -6,7 +6,7 @@
 #include <algorithm>
 #include <cstdint>
 
-#include "splats/inlining.hpp"
+#include "rasterizer/inlining.hpp"
 
 namespace splats {
 
@@ -46,7 +46,7 @@ SPLATS_INLINE Lanes times_power(Lanes x, Lanes power) {  // of two
 
 }  // namespace splats
 
-#include "splats/halves.hpp"
+#include "rasterizer/halves.hpp"
 
 namespace splats {
 

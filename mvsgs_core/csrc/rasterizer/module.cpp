@@ -3,8 +3,8 @@
 
 #include <mutex>
 
-#include "splats/arguments.hpp"
-#include "splats/photometric.hpp"
+#include "rasterizer/arguments.hpp"
+#include "rasterizer/photometric.hpp"
 
 using namespace splats;
 

@@ -4,14 +4,14 @@
 // with channels innermost, so a row is one run of 3 W floats, a horizontal tap is a shift by 3 and every loop below
 // vectorizes. With a = G x, b = G y, p = G x^2, q = G y^2, r = G x y the gradient of the mean is
 // G(dS/da) + 2 x G(dS/dp) + y G(dS/dr), the window being symmetric.
-#include "splats/photometric.hpp"
+#include "rasterizer/photometric.hpp"
 
 #include <omp.h>
 
 #include <cmath>
 #include <vector>
 
-#include "splats/frame.hpp"
+#include "rasterizer/frame.hpp"
 
 namespace splats {
 namespace {

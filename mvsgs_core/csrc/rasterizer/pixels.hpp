@@ -1,7 +1,7 @@
 // Blocks of pixels from and to images in memory.
 #pragma once
 
-#include "splats/tile.hpp"
+#include "rasterizer/tile.hpp"
 
 namespace splats {
 

@@ -4,7 +4,7 @@
 
 #include <cstring>
 
-#include "splats/shading.hpp"
+#include "rasterizer/shading.hpp"
 
 namespace splats {
 namespace {

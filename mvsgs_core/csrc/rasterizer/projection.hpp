@@ -5,7 +5,7 @@
 #include <bit>
 #include <limits>
 
-#include "splats/frame.hpp"
+#include "rasterizer/frame.hpp"
 
 namespace splats {
 

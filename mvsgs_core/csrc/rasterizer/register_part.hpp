@@ -9,7 +9,7 @@
 
 #include <cstdint>
 
-#include "splats/inlining.hpp"
+#include "rasterizer/inlining.hpp"
 
 namespace splats {
 

@@ -1,8 +1,8 @@
 // The colors of sixteen splats, one in each lane, as seen from the camera.
 #pragma once
 
-#include "splats/harmonics.hpp"
-#include "splats/projection.hpp"
+#include "rasterizer/harmonics.hpp"
+#include "rasterizer/projection.hpp"
 
 namespace splats {
 

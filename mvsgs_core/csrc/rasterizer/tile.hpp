@@ -1,7 +1,7 @@
 // What the forward and the backward pass share inside a tile: 4x4 blocks of pixels, and a splat's density on a block.
 #pragma once
 
-#include "splats/frame.hpp"
+#include "rasterizer/frame.hpp"
 
 namespace splats {
 

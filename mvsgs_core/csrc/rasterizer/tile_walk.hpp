@@ -4,7 +4,7 @@
 
 #include <climits>
 
-#include "splats/tile.hpp"
+#include "rasterizer/tile.hpp"
 
 namespace splats {
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core.atomic_file import replacing
-from mvsgs_core.splats.checkpoint_files import KEYFRAMES, nothing_there, read_state, state_files, write_state
-from mvsgs_core.splats.checkpoint_state import Arrays, Corrections, pack, unpack, whole
-from mvsgs_core.splats.mapper import MapperConfig
-from mvsgs_core.splats.session import Session
+from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, nothing_there, read_state, state_files, write_state
+from mvsgs_core.mapping.checkpoints.state import Arrays, Corrections, pack, unpack, whole
+from mvsgs_core.mapping.mapper import MapperConfig
+from mvsgs_core.mapping.session import Session
 from mvsgs_core.stats import Stats
 
 # What the state's arrays depend on; everything else may be another one when a run goes on, and then is said.

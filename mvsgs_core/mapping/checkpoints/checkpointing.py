@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from mvsgs_core.splats.checkpoint_files import FOLDER
-from mvsgs_core.splats.checkpoint_writer import CheckpointWriter
-from mvsgs_core.splats.keyframes import TrainingView
-from mvsgs_core.splats.results import write_results
-from mvsgs_core.splats.session import Session
+from mvsgs_core.mapping.checkpoints.files import FOLDER
+from mvsgs_core.mapping.checkpoints.results import write_results
+from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.session import Session
 from mvsgs_core.stats import Stats
 
 SHARE = 0.02  # of the mapper's time, at most, that copying the map for checkpoints holds it up

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from mvsgs_core.atomic_file import replacing
-from mvsgs_core.splats.keyframes import TrainingView
+from mvsgs_core.mapping.keyframes import TrainingView
 
 NAME = re.compile(r"-?\d{1,19}-\d{1,2}-[0-9a-f]{8}\.png", re.ASCII)  # frame index, pyramid level, checksum
 

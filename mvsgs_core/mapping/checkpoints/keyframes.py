@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mvsgs_core.splats.checkpoint_files import KEYFRAMES, checkpoint_info, read_state
-from mvsgs_core.splats.checkpoint_images import read_images
-from mvsgs_core.splats.checkpoint_state import VIEWS, Arrays
+from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info, read_state
+from mvsgs_core.mapping.checkpoints.images import read_images
+from mvsgs_core.mapping.checkpoints.state import VIEWS, Arrays
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvsgs_core.splats.session import Session
+from mvsgs_core.mapping.session import Session
 
 TOLERANCE = 0.02  # of the median depth, radians and of scale, by which replayed poses may differ from the map's
 

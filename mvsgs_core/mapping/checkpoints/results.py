@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core.atomic_file import replacing
-from mvsgs_core.evaluation.trajectory import write_tum
-from mvsgs_core.splats.cameras import cameras_of, write_cameras
-from mvsgs_core.splats.export_ply import write_ply
-from mvsgs_core.splats.mapper import OnlineMapper
+from mvsgs_core.export.cameras import Cameras, write_cameras
+from mvsgs_core.export.ply import write_ply
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.trajectory_file import write_trajectory
 
 
 def write_results(output: Path, mapper: OnlineMapper, *, sync: bool = True) -> int:
@@ -24,8 +26,21 @@ def write_results(output: Path, mapper: OnlineMapper, *, sync: bool = True) -> i
     seconds = np.array([view.timestamp for view in mapper.views], dtype=np.float64)
     known = np.isfinite(seconds)
     with replacing(output / "trajectory.txt", sync=sync) as aside:
-        write_tum(aside, seconds[known], final.world_from_cam[known])
+        write_trajectory(aside, seconds[known], final.world_from_cam[known])
     write_cameras(output / "cameras.json", cameras_of(final, mapper.views))
     with replacing(output / "map.ply", sync=sync) as aside:
         write_ply(aside, final)
         return aside.stat().st_size
+
+
+def cameras_of(final: Snapshot, views: list[TrainingView]) -> Cameras:
+    """The cameras of a map's keyframes, at the size of their images as they came; `views` as in the snapshot."""
+    count = len(views)
+    return Cameras(
+        keyframes=final.keyframes,
+        timestamps=np.array([view.timestamp for view in views], dtype=np.float64),
+        world_from_cam=final.world_from_cam,
+        intrinsics=np.array([view.image_intrinsics for view in views], dtype=np.float64).reshape(count, 4),
+        sizes=np.array([view.image_size for view in views], dtype=np.int64).reshape(count, 2),
+        exposures=final.exposures.astype(np.float64),
+    )

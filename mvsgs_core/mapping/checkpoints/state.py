@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvsgs_core.splats.checkpoint_images import read_images
-from mvsgs_core.splats.keyframes import TrainingView
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.checkpoints.images import read_images
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.stats import Stats
 
 Corrections = dict[int, tuple[np.ndarray, float]]

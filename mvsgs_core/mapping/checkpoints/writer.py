@@ -9,13 +9,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from mvsgs_core.splats.checkpoint import images_of, save
-from mvsgs_core.splats.checkpoint_files import FOLDER, KEYFRAMES, number_of, state_file, state_files
-from mvsgs_core.splats.checkpoint_images import image_names, write_images
-from mvsgs_core.splats.keyframes import TrainingView
-from mvsgs_core.splats.mapper import MapperConfig
-from mvsgs_core.splats.results import write_results
-from mvsgs_core.splats.session import Session
+from mvsgs_core.mapping.checkpoints.checkpoint import images_of, save
+from mvsgs_core.mapping.checkpoints.files import FOLDER, KEYFRAMES, number_of, state_file, state_files
+from mvsgs_core.mapping.checkpoints.images import image_names, write_images
+from mvsgs_core.mapping.checkpoints.results import write_results
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.mapper import MapperConfig
+from mvsgs_core.mapping.session import Session
 
 AHEAD = 8  # keyframes whose images may wait to be written before their checkpoint is
 ASIDE = (".map.*.ply", ".trajectory.*.txt")  # what a killed process left half written, see `atomic_file`

@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.view import Backward, Render, View, screen_points, tile_grid
+from mvsgs_core.rasterizer.interface import Backward, Render, View, screen_points, tile_grid
+from mvsgs_core.rasterizer.splats import Splats
 
 try:
     import triton
 
-    from mvsgs_core.splats.triton_blend import SUMS, blend, blend_backward
-    from mvsgs_core.splats.triton_lists import Lists, emit, sort_by_tile
-    from mvsgs_core.splats.triton_projection import FOOTPRINT, ROW, project
-    from mvsgs_core.splats.triton_projection_backward import project_backward
+    from mvsgs_core.rasterizer.triton.blend import SUMS, blend, blend_backward
+    from mvsgs_core.rasterizer.triton.lists import Lists, emit, sort_by_tile
+    from mvsgs_core.rasterizer.triton.projection import FOOTPRINT, ROW, project
+    from mvsgs_core.rasterizer.triton.projection_backward import project_backward
 except ModuleNotFoundError as error:
     raise ImportError(
         "the triton back end needs the package triton, which comes with torch's CUDA builds: take backend='cpu'"

@@ -1,6 +1,6 @@
 """Blending on a GPU: one program a tile, all 256 pixels of it side by side, splats front to back.
 
-The same sums as in csrc/splats/blend*.cpp: forward keeps the transmittance; backward walks front to back again with
+The same sums as in csrc/rasterizer/blend*.cpp: forward keeps the transmittance; backward walks front to back again with
 what lies behind each splat known from the image, and leaves one row of sums per pair in the pair's own slot: no
 additions race. One warp a program, so that a sum over pixels needs no barrier; the next pair's splat is known early.
 TRITON_INTERPRET=1 runs this on the CPU, for tests.

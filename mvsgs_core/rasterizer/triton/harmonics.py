@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from mvsgs_core.splats import spherical_harmonics
+from mvsgs_core.rasterizer import spherical_harmonics
 
 C0 = tl.constexpr(spherical_harmonics.C0)
 C1 = tl.constexpr(spherical_harmonics.C1)

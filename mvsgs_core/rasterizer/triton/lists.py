@@ -1,7 +1,7 @@
 """Lists of splats by tile on a GPU: the exact columns that each ellipse covers on each row of 4x4 blocks.
 
-As in csrc/splats/binning.cpp, so that both kernels blend the same pairs. Depth order first, then a stable sort by tile;
-the only number that the host waits for is that of the pairs.
+As in csrc/rasterizer/binning.cpp, so that both kernels blend the same pairs. Depth order first, then a stable sort by
+tile; the only number that the host waits for is that of the pairs.
 """
 
 from __future__ import annotations

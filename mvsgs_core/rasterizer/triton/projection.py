@@ -1,4 +1,4 @@
-"""From the map to the image on a GPU: one program a block of splats; the same steps as csrc/splats/projection.hpp.
+"""From the map to the image on a GPU: one program a block of splats; the same steps as csrc/rasterizer/projection.hpp.
 
 Positions in float64 relative to the camera, the rest in float32. `project` also counts the tiles that each splat's
 ellipse touches, row by row of tiles (triton_lists).
@@ -9,8 +9,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from mvsgs_core.splats.triton_harmonics import basis
-from mvsgs_core.splats.triton_lists import row_span, tile_rows
+from mvsgs_core.rasterizer.triton.harmonics import basis
+from mvsgs_core.rasterizer.triton.lists import row_span, tile_rows
 
 # A splat on the image. With d = pixel - mean: u = pitch_u (dx - shear dy), v = pitch_v dy, m = u^2 + v^2. The mean is
 # whole + part, so that dx keeps its precision far from the corner.

@@ -1,12 +1,12 @@
-"""From the sums over a splat's pairs to its parameters and the pose on a GPU: csrc/splats/project_backward.cpp."""
+"""From the sums over a splat's pairs to its parameters and the pose on a GPU: csrc/rasterizer/project_backward.cpp."""
 
 from __future__ import annotations
 
 import triton
 import triton.language as tl
 
-from mvsgs_core.splats.triton_harmonics import basis, basis_gradient
-from mvsgs_core.splats.triton_projection import (
+from mvsgs_core.rasterizer.triton.harmonics import basis, basis_gradient
+from mvsgs_core.rasterizer.triton.projection import (
     BLUR,
     MAX_BETA,
     MIN_BETA,

@@ -1,4 +1,4 @@
-"""L1 + SSIM and their gradient on a GPU, in two kernels; the same sums as in the C++ kernel (csrc/splats/photometric).
+"""L1 + SSIM and their gradient on a GPU, in two kernels; the same sums as in C++ (csrc/rasterizer/photometric).
 
 An image (H, W, 3) is read as (H, 3 W): a horizontal tap is a shift by 3. A program owns a block of the result; source
 rows stream through it, each is filtered along itself and added to the rows of the block that it lies within 5 of, so

@@ -88,7 +88,7 @@ def adjust(graph: Graph, solver: Solver) -> Solution:
     edges = len(graph.source)
     _check(graph, k, m, edges)
     if solver.device != "cpu":
-        from mvsgs_core.tracking.torch_adjustment import adjust_with_torch  # torch takes a second to load
+        from mvsgs_core.tracking.estimation.torch_adjustment import adjust_with_torch  # torch takes a second to load
 
         return adjust_with_torch(graph, solver, solver.device)
     damping = np.full((k, m), 1e-6) if graph.damping is None else graph.damping

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
+from mvsgs_core.tracking.estimation.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
+from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout
 from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.rolling_shutter import estimate_readout
 
 READOUT_AGAIN = (10, 20, 40)  # keyframes of the map at which the readout is estimated again: the first say little
 

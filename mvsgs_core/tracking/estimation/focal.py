@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
+from mvsgs_core.tracking.estimation.initialization import Start, StartCriteria, start_up
 from mvsgs_core.tracking.graph import KeyframeGraph
-from mvsgs_core.tracking.initialization import Start, StartCriteria, start_up
 
 # Matches that count as one: points of an image share its lens, shutter and pose, and err together. So many make the
 # curvature's deviation that of what was found on hand-held sequences whose focal length is known.

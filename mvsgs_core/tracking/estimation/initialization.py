@@ -13,7 +13,7 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.camera import matrix
-from mvsgs_core.tracking.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
+from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
 from mvsgs_core.tracking.graph import KeyframeGraph
 
 

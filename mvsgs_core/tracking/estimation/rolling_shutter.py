@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from mvsgs_core.tracking.bundle_adjustment import Solver, adjust
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 

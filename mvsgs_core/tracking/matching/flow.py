@@ -17,8 +17,8 @@ import numpy as np
 
 from mvsgs_core import native
 from mvsgs_core.named_modules import import_named
-from mvsgs_core.tracking.features import match_features
 from mvsgs_core.tracking.image import BORDER, TrackingImage
+from mvsgs_core.tracking.matching.features import match_features
 
 
 @dataclass(frozen=True)
@@ -170,10 +170,10 @@ def sample_field(field: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 FLOWS = {
-    "lucas_kanade": "mvsgs_core.tracking.flow:LucasKanade",
-    "dis": "mvsgs_core.tracking.flow:refined_inverse_search",
-    "features": "mvsgs_core.tracking.flow:refined_features",
-    "raft_small": "mvsgs_core.networks.raft_flow:RefinedRaftFlow",
+    "lucas_kanade": "mvsgs_core.tracking.matching.flow:LucasKanade",
+    "dis": "mvsgs_core.tracking.matching.flow:refined_inverse_search",
+    "features": "mvsgs_core.tracking.matching.flow:refined_features",
+    "raft_small": "mvsgs_core.tracking.matching.raft_flow:RefinedRaftFlow",
 }
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvsgs_core.tracking.flow import FeatureFlow, Flow, Matches
 from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matching.flow import FeatureFlow, Flow, Matches
 
 
 class Matcher:

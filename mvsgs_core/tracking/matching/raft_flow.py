@@ -1,7 +1,7 @@
-"""RAFT-small as a flow of the tracker (mvsgs_core.tracking.flow), by itself or refined to subpixels.
+"""RAFT-small as a flow of the tracker (mvsgs_core.tracking.matching.flow), by itself or refined to subpixels.
 
-`flow: mvsgs_core.networks.raft_flow:RefinedRaftFlow`. RAFT alone solves at 1/8 and interpolates: its matches are some
-tenths of a pixel off, which costs accuracy; it is there for motion and blur that Lucas-Kanade does not follow.
+`flow: mvsgs_core.tracking.matching.raft_flow:RefinedRaftFlow`. RAFT alone solves at 1/8 and interpolates: its matches
+are some tenths of a pixel off, which costs accuracy; it is there for motion and blur that Lucas-Kanade does not follow.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import torch
 from mvsgs_core import weights
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.raft_small import STRIDE, RaftSmall
-from mvsgs_core.tracking.flow import LucasKanade, Matches
 from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matching.flow import LucasKanade, Matches
 
 
 @dataclass

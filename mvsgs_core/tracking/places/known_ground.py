@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.local_map import LocalMap
-from mvsgs_core.tracking.localization import Localization, localize
+from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.places.localization import Localization, localize
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvsgs_core.tracking.bundle_adjustment import Graph, Solver, adjust, reproject
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solver, adjust, reproject
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.matching.flow import Matches
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 
 from mvsgs_core import geometry
+from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of, solve_pose_graph
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
-from mvsgs_core.tracking.pose_graph import SimilarityEdges, scale_of, solve_pose_graph
-from mvsgs_core.tracking.retrieval import Retrieval
-from mvsgs_core.tracking.sighting import Sighting, relative_scale, sight
+from mvsgs_core.tracking.places.retrieval import Retrieval
+from mvsgs_core.tracking.places.sighting import Sighting, relative_scale, sight
 from mvsgs_core.tracking.verification import Criteria
 
 

@@ -9,9 +9,9 @@ from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.matcher import Matcher
-from mvsgs_core.tracking.retrieval import Retrieval
-from mvsgs_core.tracking.sighting import Sighting, sight
+from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.places.retrieval import Retrieval
+from mvsgs_core.tracking.places.sighting import Sighting, sight
 from mvsgs_core.tracking.verification import Criteria, verified
 
 

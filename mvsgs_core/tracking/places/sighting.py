@@ -9,13 +9,13 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.camera import matrix
-from mvsgs_core.tracking.bundle_adjustment import Solver
-from mvsgs_core.tracking.features import match_features
-from mvsgs_core.tracking.flow import Matches, spread
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.localization import Localization, localize
-from mvsgs_core.tracking.matcher import Matcher
+from mvsgs_core.tracking.matching.features import match_features
+from mvsgs_core.tracking.matching.flow import Matches, spread
+from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.places.localization import Localization, localize
 from mvsgs_core.tracking.verification import Criteria, verified
 
 

@@ -14,10 +14,10 @@ A topic has one publisher, one message type and one address. What ZeroMQ does no
   reader that only observes says so in a second subscription (`OBSERVER`), which no frame matches: it may leave.
 """
 
-from nodes.transport.live import LivePublisher, LiveReader
-from nodes.transport.publisher import Publisher
-from nodes.transport.readers import NewestReader, ReliableReader
-from nodes.transport.sockets import create_keys, shut_down, wait
+from nodes.runtime.transport.live import LivePublisher, LiveReader
+from nodes.runtime.transport.publisher import Publisher
+from nodes.runtime.transport.readers import NewestReader, ReliableReader
+from nodes.runtime.transport.sockets import create_keys, shut_down, wait
 
 __all__ = [
     "LivePublisher",

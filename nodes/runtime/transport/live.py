@@ -14,10 +14,10 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from msgs.codec import CodecError, decode
-from nodes.addresses import TransportError
-from nodes.transport.publisher import Publisher
-from nodes.transport.readers import LOST, REFUSED, NewestReader
-from nodes.transport.sockets import readable
+from nodes.runtime.addresses import TransportError
+from nodes.runtime.transport.publisher import Publisher
+from nodes.runtime.transport.readers import LOST, REFUSED, NewestReader
+from nodes.runtime.transport.sockets import readable
 
 RETRY = 0.3  # s without ZeroMQ's own attempt after which a lost connection is made anew
 FASTEST = 1000  # frames a second: a larger jump of the sequence numbers is no loss, but a sender that counts anew

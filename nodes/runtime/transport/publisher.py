@@ -12,9 +12,9 @@ import zmq
 
 from msgs import End, Message
 from msgs.codec import NEWEST, RELIABLE, encode
-from nodes.addresses import Keys, PeerLost, TransportError, check_address
-from nodes.frame_pool import FramePool
-from nodes.transport.sockets import OBSERVER, guard, open_socket, readable
+from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
+from nodes.runtime.frame_pool import FramePool
+from nodes.runtime.transport.sockets import OBSERVER, guard, open_socket, readable
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
 NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End

@@ -11,8 +11,8 @@ from zmq.utils.monitor import recv_monitor_message
 
 from msgs import End, Message
 from msgs.codec import NEWEST, RELIABLE, CodecError, Decoded, decode, max_message_bytes, type_name
-from nodes.addresses import Keys, PeerLost, TransportError, check_address
-from nodes.transport.sockets import OBSERVER, open_socket, readable
+from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
+from nodes.runtime.transport.sockets import OBSERVER, open_socket, readable
 
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 LOST = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED

@@ -9,7 +9,7 @@ from pathlib import Path
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
-from nodes.addresses import Keys, save_keys
+from nodes.runtime.addresses import Keys, save_keys
 
 OBSERVER = b"O"  # begins the subscription by which a reader says its delivery and its name: no frame begins so
 

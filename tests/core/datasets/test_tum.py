@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.datasets.tum import CAMERAS, nearest, read_trajectory
+from mvsgs_core.datasets.tum import CAMERAS, nearest
+from mvsgs_core.trajectory_file import read_trajectory
 from tests.core.datasets.folders import pose, truncate, write_image, write_tum
 
 

@@ -14,7 +14,7 @@ import pytest
 from mvsgs_core import geometry
 from mvsgs_core.droid.adjustment import GLOBAL, LOCAL, solve
 from mvsgs_core.droid.video import Video, VideoFrame
-from mvsgs_core.tracking.bundle_adjustment import Solver
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from tests.core.networks.golden import error, folder
 
 EXACT, SINGLE = 1e-8, 1e-5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core.evaluation.exposure import between_keyframes
-from mvsgs_core.splats.exposure import IDENTITY
+from mvsgs_core.mapping.exposure import IDENTITY
 
 
 def test_exposure_is_linear_between_keyframes_and_holds_beyond_them() -> None:

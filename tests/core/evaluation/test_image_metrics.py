@@ -7,8 +7,8 @@ import pytest
 import torch
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+from mvsgs_core import image_metrics
 from mvsgs_core.bad_file import BadFileError
-from mvsgs_core.evaluation import image_metrics
 from mvsgs_core.evaluation.lpips import Lpips
 from tests.shared_data import shared
 

@@ -8,8 +8,8 @@ import pytest
 from mvsgs_core import geometry
 from mvsgs_core.camera import project, unproject
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
-from mvsgs_core.evaluation.image_metrics import psnr
 from mvsgs_core.evaluation.rolling_shutter import Shutter, pixel_velocity, rolled, velocities
+from mvsgs_core.image_metrics import psnr
 
 VELOCITY = np.array([0.3, -0.2, 0.4, 0.2, -0.1, 0.3])
 

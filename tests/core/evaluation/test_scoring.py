@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mvsgs_core.evaluation.scoring import Score, View, choose, score_view, summarize
-from mvsgs_core.splats.model import Splats
+from mvsgs_core.rasterizer.splats import Splats
 
 INTRINSICS = np.array([30.0, 30.0, 15.5, 11.5])
 

@@ -8,7 +8,7 @@ from evo.core import metrics
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 
-from mvsgs_core import geometry
+from mvsgs_core import geometry, trajectory_file
 from mvsgs_core.evaluation import trajectory
 
 
@@ -79,12 +79,12 @@ def test_no_alignment_is_an_error() -> None:
 def test_tum_files_round_trip_and_evo_reads_them(tmp_path: Path) -> None:
     estimate, _ = _trajectories()
     times = np.arange(len(estimate)) / 30 + 1305031102.0
-    trajectory.write_tum(tmp_path / "t.txt", times, estimate)
-    read_times, read = trajectory.read_tum(tmp_path / "t.txt")
+    trajectory_file.write_trajectory(tmp_path / "t.txt", times, estimate)
+    read_times, read = trajectory_file.read_trajectory(tmp_path / "t.txt")
     np.testing.assert_allclose(read_times, times, atol=1e-6)
     np.testing.assert_allclose(read, estimate, atol=1e-7)
     theirs = file_interface.read_tum_trajectory_file(str(tmp_path / "t.txt"))
     np.testing.assert_allclose(np.array(theirs.poses_se3), estimate, atol=1e-7)
     (tmp_path / "bad.txt").write_text("1 2 3\n")
     with pytest.raises(ValueError, match=r"bad\.txt:1: expected"):
-        trajectory.read_tum(tmp_path / "bad.txt")
+        trajectory_file.read_trajectory(tmp_path / "bad.txt")

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mvsgs_core.splats.cameras import Cameras, cameras_of, read_cameras, write_cameras
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.export.cameras import Cameras, read_cameras, write_cameras
+from mvsgs_core.mapping.checkpoints.results import cameras_of
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 
 def cameras(count: int = 3) -> Cameras:

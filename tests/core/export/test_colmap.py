@@ -16,12 +16,12 @@ import pytest
 import torch
 
 from mvsgs_core.datasets.colmap import read_colmap
-from mvsgs_core.splats import export
-from mvsgs_core.splats.cameras import write_cameras
-from mvsgs_core.splats.export_ply import read_ply, write_ply
-from mvsgs_core.splats.keyframe_images import write_image
-from mvsgs_core.splats.model import Splats
-from tests.core.splats.tiny_map import (
+from mvsgs_core.export import __main__ as export
+from mvsgs_core.export.cameras import write_cameras
+from mvsgs_core.export.keyframe_images import write_image
+from mvsgs_core.export.ply import read_ply, write_ply
+from mvsgs_core.rasterizer.splats import Splats
+from tests.core.mapping.tiny_map import (
     INTRINSICS,
     SIZE,
     cameras_around,
@@ -30,7 +30,7 @@ from tests.core.splats.tiny_map import (
     save_cameras,
     write_poses,
 )
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 TIMES = [0.4, 0.5, 0.6]
 

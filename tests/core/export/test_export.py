@@ -11,13 +11,13 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from mvsgs_core.splats import export
-from mvsgs_core.splats.densities import log_scale_shift
-from mvsgs_core.splats.export_input import input_arguments, lens
-from mvsgs_core.splats.export_ply import folded, read_ply, write_ply
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
-from tests.core.splats.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map, save_cameras, write_poses
+from mvsgs_core.export import __main__ as export
+from mvsgs_core.export.input import input_arguments, lens
+from mvsgs_core.export.ply import folded, read_ply, write_ply
+from mvsgs_core.rasterizer.densities import log_scale_shift
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from tests.core.mapping.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map, save_cameras, write_poses
 
 
 @pytest.mark.parametrize("bases", [1, 4, 16])

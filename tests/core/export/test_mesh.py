@@ -11,12 +11,12 @@ import pytest
 import trimesh
 
 from mvsgs_core import camera
+from mvsgs_core.export import __main__ as export
+from mvsgs_core.export.glb import linear, write_glb
+from mvsgs_core.export.ply import write_ply
 from mvsgs_core.open3d_loader import open3d
-from mvsgs_core.splats import export
-from mvsgs_core.splats.export_glb import linear, write_glb
-from mvsgs_core.splats.export_ply import write_ply
-from mvsgs_core.splats.rasterizer import rasterize
-from tests.core.splats.tiny_map import ORIGIN, final_map, save_cameras, write_poses
+from mvsgs_core.rasterizer.rasterize import rasterize
+from tests.core.mapping.tiny_map import ORIGIN, final_map, save_cameras, write_poses
 
 SIZE, INTRINSICS = (48, 64), np.array([51.2, 51.2, 31.5, 23.5])
 

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 from mvsgs_core import camera
-from mvsgs_core.splats import render_path
-from mvsgs_core.splats.export_ply import write_ply
-from mvsgs_core.splats.rasterizer import rasterize
+from mvsgs_core.export import render_path
+from mvsgs_core.export.ply import write_ply
+from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.video_file import write_video
-from tests.core.splats.tiny_map import INTRINSICS, SIZE, final_map, save_cameras, write_poses
-from tests.core.splats.tiny_scene import pose_on_arc
+from tests.core.mapping.tiny_map import INTRINSICS, SIZE, final_map, save_cameras, write_poses
+from tests.core.mapping.tiny_scene import pose_on_arc
 
 VIDEO_SIZE = (96, 128)
 

@@ -13,17 +13,17 @@ import pytest
 import torch
 from plyfile import PlyData
 
+from mvsgs_core.export import __main__ as export
+from mvsgs_core.export.ply import read_ply, write_ply
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.export.splat import write_splat, write_spz
+from mvsgs_core.export.turning import RUB_FROM_RDF
 from mvsgs_core.geometry import rotation_from_quaternion
 from mvsgs_core.open3d_loader import open3d
-from mvsgs_core.splats import export
-from mvsgs_core.splats.export_ply import read_ply, write_ply
-from mvsgs_core.splats.export_splat import write_splat, write_spz
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.snapshot import Snapshot
-from mvsgs_core.splats.turning import RUB_FROM_RDF
-from tests.core.splats.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map
-from tests.core.splats.tiny_scene import pose_on_arc
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from tests.core.mapping.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map
+from tests.core.mapping.tiny_scene import pose_on_arc
 
 
 def few_splats() -> Snapshot:

@@ -12,17 +12,24 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats.checkpoint import load
-from mvsgs_core.splats.checkpoint_files import FOLDER, KEYFRAMES, checkpoint_info, read_state, state_files, write_state
-from mvsgs_core.splats.checkpoint_keyframes import kept_keyframes
-from mvsgs_core.splats.checkpoint_writer import CheckpointWriter
-from mvsgs_core.splats.density_control import DensityConfig
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.session import Session
-from mvsgs_core.splats.training import SkipConfig, TrainingConfig
+from mvsgs_core.mapping.checkpoints.checkpoint import load
+from mvsgs_core.mapping.checkpoints.files import (
+    FOLDER,
+    KEYFRAMES,
+    checkpoint_info,
+    read_state,
+    state_files,
+    write_state,
+)
+from mvsgs_core.mapping.checkpoints.keyframes import kept_keyframes
+from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
+from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.session import Session
+from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.stats import Stats
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 SIZE = (24, 32)
 PLAIN = MapperConfig(iterations=10, refinement=6, window=2, training=TrainingConfig(threads=1))
@@ -305,7 +312,7 @@ def test_no_mutated_value_raises_anything_but_a_value_error(tmp_path: Path) -> N
 
 
 def test_another_version_is_refused_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvsgs_core.splats.checkpoint_files.VERSION", 2)
+    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.VERSION", 2)
     written(begun(PLAIN), tmp_path)
     monkeypatch.undo()
     with pytest.raises(ValueError, match="version 2 of the format: this program reads 1"):

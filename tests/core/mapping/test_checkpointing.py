@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mvsgs_core.evaluation.trajectory import read_tum
-from mvsgs_core.splats.checkpoint_files import FOLDER, checkpoint_info, state_files
-from mvsgs_core.splats.checkpointing import SHARE, Checkpointing
-from mvsgs_core.splats.export_ply import read_ply
-from mvsgs_core.splats.mapper import OnlineMapper
-from mvsgs_core.splats.session import Session
-from tests.core.splats.test_checkpoint import PLAIN, begun, view
+from mvsgs_core.export.ply import read_ply
+from mvsgs_core.mapping.checkpoints.checkpointing import SHARE, Checkpointing
+from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_files
+from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.session import Session
+from mvsgs_core.trajectory_file import read_trajectory
+from tests.core.mapping.test_checkpoint import PLAIN, begun, view
 
 
 class Clock:
@@ -105,7 +105,7 @@ def test_every_checkpoint_leaves_a_map_and_the_keyframes_poses(tmp_path: Path) -
     assert times(Checkpointing(tmp_path, 30.0, session), session) == 1
     found, final = read_ply(tmp_path / "map.ply"), session.largest.snapshot()
     np.testing.assert_allclose(found.splats.means.numpy(), final.splats.means.numpy() + final.origin, atol=1e-5)
-    seconds, poses = read_tum(tmp_path / "trajectory.txt")
+    seconds, poses = read_trajectory(tmp_path / "trajectory.txt")
     np.testing.assert_allclose(seconds, [0.0, 0.1, 0.2, 0.4, 0.5])  # of the largest part
     np.testing.assert_allclose(poses, final.world_from_cam, atol=1e-6)
 

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from mvsgs_core.splats.density_control import DensityConfig, control, relocation
-from mvsgs_core.splats.map_state import PARAMETERS, MapState
-from mvsgs_core.splats.model import Splats
+from mvsgs_core.mapping.density_control import DensityConfig, control, relocation
+from mvsgs_core.mapping.map_state import PARAMETERS, MapState
+from mvsgs_core.rasterizer.splats import Splats
 
 
 def state_of(count: int) -> MapState:

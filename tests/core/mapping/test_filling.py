@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from mvsgs_core import camera
-from mvsgs_core.splats.filling import continued_depth, fill_points
-from mvsgs_core.splats.insertion import InsertionConfig
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.training import TrainingConfig
-from tests.core.splats.test_mapper import CONFIG, mapped, score
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.mapping.filling import continued_depth, fill_points
+from mvsgs_core.mapping.insertion import InsertionConfig
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.training import TrainingConfig
+from tests.core.mapping.test_mapper import CONFIG, mapped, score
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 HOLE = slice(20, 44)  # columns of the 64 in which a filter left nothing
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats.insertion import (
+from mvsgs_core.mapping.insertion import (
     InsertionConfig,
     Points,
     outliers,
@@ -17,9 +17,9 @@ from mvsgs_core.splats.insertion import (
     unoccupied,
     voxel_filter,
 )
-from mvsgs_core.splats.reference import rotation_matrices
-from mvsgs_core.splats.spherical_harmonics import C0
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.rasterizer.reference import rotation_matrices
+from mvsgs_core.rasterizer.spherical_harmonics import C0
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 
 def random_points(count: int, seed: int = 0) -> Points:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.evaluation.image_metrics import psnr
-from mvsgs_core.splats import densities, losses
-from mvsgs_core.splats.losses import LossConfig
+from mvsgs_core.image_metrics import psnr
+from mvsgs_core.mapping import losses
+from mvsgs_core.mapping.losses import LossConfig
+from mvsgs_core.rasterizer import densities
 from tests.shared_data import shared
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats import densities, losses
+from mvsgs_core.mapping import losses
+from mvsgs_core.rasterizer import densities
 from tests.shared_data import shared
 
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats.deformation import Similarity, move_with_anchors
-from mvsgs_core.splats.insertion import unoccupied
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.model import Splats
+from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
+from mvsgs_core.mapping.insertion import unoccupied
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.rasterizer.splats import Splats
 
 COUNT = 200_000
 SIZE = COUNT * (3 * 15 * 4 + 4 + 8 + 4 + 4)  # bytes: values and moments, age, anchor, gradient, views

@@ -9,17 +9,17 @@ import pytest
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.evaluation.image_metrics import psnr
-from mvsgs_core.splats import training
-from mvsgs_core.splats.density_control import DensityConfig
-from mvsgs_core.splats.insertion import InsertionConfig
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.map_state import PARAMETERS
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.optimizer import LearningRates
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.training import SkipConfig, TrainingConfig
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.image_metrics import psnr
+from mvsgs_core.mapping import training
+from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.insertion import InsertionConfig
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.map_state import PARAMETERS
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
+from mvsgs_core.rasterizer.rasterize import rasterize
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 TIMES = (0.0, 0.33, 0.66, 1.0)
 CONFIG = MapperConfig(iterations=16, refinement=20, training=TrainingConfig(threads=1))

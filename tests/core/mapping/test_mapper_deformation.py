@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.splats.deformation import Similarity, left_multiplication, move_with_anchors
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.sh_rotation import sh_rotation
-from mvsgs_core.splats.spherical_harmonics import basis
+from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.sh_rotation import sh_rotation
+from mvsgs_core.rasterizer.spherical_harmonics import basis
+from mvsgs_core.rasterizer.splats import Splats
 
 OLD = geometry.se3_exp(np.array([0.3, -0.1, 0.2, 0.1, 0.4, -0.2]))
 NEW = geometry.se3_exp(np.array([-0.5, 0.4, 0.1, -0.6, 0.2, 0.9]))
@@ -72,7 +72,7 @@ def test_moments_follow_the_change_of_variables() -> None:
 
 def test_left_multiplication_is_the_product_of_rotations() -> None:
     a, b = geometry.quaternion_from_rotation(np.stack([OLD[:3, :3], NEW[:3, :3]]))
-    product = left_multiplication(a[None])[0] @ b
+    product = geometry.left_multiplication(a[None])[0] @ b
     np.testing.assert_allclose(geometry.rotation_from_quaternion(product), OLD[:3, :3] @ NEW[:3, :3], atol=1e-12)
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.splats.map_state import PARAMETERS
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.training import TrainingConfig
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.mapping.map_state import PARAMETERS
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.training import TrainingConfig
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 SIZE = (24, 32)
 CONFIG = MapperConfig(

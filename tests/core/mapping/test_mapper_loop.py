@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.training import TrainingConfig
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.training import TrainingConfig
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 DRIFT = 0.25  # share by which lengths have shrunk at the end
 REFINEMENT = 60

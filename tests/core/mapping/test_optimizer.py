@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
-from mvsgs_core.splats import optimizer
-from mvsgs_core.splats.map_state import PARAMETERS, MapState
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.optimizer import LearningRates, groups, normalize_quaternions, step, step_reference
+from mvsgs_core.mapping import optimizer
+from mvsgs_core.mapping.map_state import PARAMETERS, MapState
+from mvsgs_core.mapping.optimizer import LearningRates, groups, normalize_quaternions, step, step_reference
+from mvsgs_core.rasterizer.splats import Splats
 
 RATES = LearningRates()
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.preview import preview_arrays
-from mvsgs_core.splats.provisional import CoarseView, Provisional
-from mvsgs_core.splats.rasterizer import rasterize
-from mvsgs_core.splats.training import TrainingConfig
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.preview import preview_arrays
+from mvsgs_core.mapping.provisional import CoarseView, Provisional
+from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 LIMIT = 4000
 

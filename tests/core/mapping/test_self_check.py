@@ -8,7 +8,7 @@ import pytest
 
 from mvsgs_core import camera
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.splats.self_check import MOST_NOISE, SelfCheck, check, noise_of
+from mvsgs_core.mapping.self_check import MOST_NOISE, SelfCheck, check, noise_of
 from tests.shared_data import shared
 
 

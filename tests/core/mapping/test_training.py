@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats import optimizer, training
-from mvsgs_core.splats.keyframes import PosedView, training_view
-from mvsgs_core.splats.map_state import MapState
-from mvsgs_core.splats.view import Backward, Render
-from tests.core.splats.rasterizer_scenes import intrinsics, random_splats
+from mvsgs_core.mapping import optimizer, training
+from mvsgs_core.mapping.keyframes import PosedView, training_view
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.rasterizer.interface import Backward, Render
+from tests.core.rasterizer.scenes import intrinsics, random_splats
 
 SIZE = (40, 56)
 

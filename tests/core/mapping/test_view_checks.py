@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats.insertion import InsertionConfig, unoccupied
-from mvsgs_core.splats.keyframes import PosedView
-from mvsgs_core.splats.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.splats.training import TrainingConfig
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.mapping.insertion import InsertionConfig, unoccupied
+from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.training import TrainingConfig
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 CONFIG = MapperConfig(iterations=2, training=TrainingConfig(threads=1))
 VIEWS = [

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mvsgs_core.evaluation.trajectory import write_tum
-from mvsgs_core.splats.cameras import Cameras, write_cameras
-from mvsgs_core.splats.insertion import InsertionConfig, points_from_depth, splats_from_points
-from mvsgs_core.splats.snapshot import Snapshot
-from tests.core.splats.tiny_scene import pose_on_arc, posed_view
+from mvsgs_core.export.cameras import Cameras, write_cameras
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.mapping.insertion import InsertionConfig, points_from_depth, splats_from_points
+from mvsgs_core.trajectory_file import write_trajectory
+from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 
 ORIGIN = np.array([10.0, -3.0, 0.5])
 SIZE = (24, 32)
@@ -62,5 +62,5 @@ def save_cameras(folder: Path, times: list[float], size: tuple[int, int] = SIZE,
 
 def write_poses(path: Path, times: list[float]) -> np.ndarray:
     poses = poses_around(times)
-    write_tum(path, np.arange(len(times), dtype=np.float64), poses)
+    write_trajectory(path, np.arange(len(times), dtype=np.float64), poses)
     return poses

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core import camera
-from mvsgs_core.splats.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import PosedView
 
 HALF = np.array([1.6, 1.2, 1.4])  # half edges of the box
 BOX = np.array([0.0, 0.0, 1.0])  # its center

@@ -10,8 +10,8 @@ import pytest
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.interface import TILE, ChooseOptions, CostOptions, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
-from mvsgs_core.mvs.warp import relative_warp
 from mvsgs_core.native import load
+from mvsgs_core.warp import relative_warp
 from tests.core.mvs.plane_scene import look, render
 
 SIZE = (36, 52)
@@ -82,7 +82,7 @@ def test_tiles_that_are_not_needed_cost_one_and_the_others_stay() -> None:
 
 
 def test_the_tile_is_the_kernels() -> None:
-    assert load("stereo").TILE == TILE
+    assert load("mvs").TILE == TILE
 
 
 def test_correlations_agree_and_mark_what_is_not_seen() -> None:

@@ -13,7 +13,7 @@ from mvsgs_core.mvs.hypotheses import RangeChoice, SearchRange, fill_uncertain, 
 from mvsgs_core.mvs.neighbors import NeighborChoice, select_neighbors
 from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
 from mvsgs_core.mvs.views import StereoView, prepare_view
-from mvsgs_core.mvs.warp import apply_warp, parallax, relative_warp
+from mvsgs_core.warp import apply_warp, parallax, relative_warp
 from tests.core.mvs.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)

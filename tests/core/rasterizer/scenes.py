@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from mvsgs_core import geometry
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import Render, rasterize
+from mvsgs_core.rasterizer.rasterize import Render, rasterize
+from mvsgs_core.rasterizer.splats import Splats
 
 POSE = geometry.se3_exp(np.array([0.1, -0.05, 0.2, 0.05, -0.1, 0.03]))
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats.densities import DENSITIES
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import Render, rasterize
-from tests.core.splats.rasterizer_scenes import copy, gradients, intrinsics, random_splats
+from mvsgs_core.rasterizer.densities import DENSITIES
+from mvsgs_core.rasterizer.rasterize import Render, rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from tests.core.rasterizer.scenes import copy, gradients, intrinsics, random_splats
 
 SIZE = (40, 56)
 BACKENDS = ("cpu", "reference")

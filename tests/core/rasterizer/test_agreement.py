@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.splats import rasterizer
-from mvsgs_core.splats.densities import DENSITIES
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
-from tests.core.splats.rasterizer_scenes import POSE, assert_agree, copy, gradients, intrinsics, random_splats
+from mvsgs_core.rasterizer import rasterize as rasterizer
+from mvsgs_core.rasterizer.densities import DENSITIES
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from tests.core.rasterizer.scenes import POSE, assert_agree, copy, gradients, intrinsics, random_splats
 
 BACKEND = "cpu"
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from mvsgs_core.splats.densities import DENSITIES
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import rasterize
-from tests.core.splats.rasterizer_scenes import POSE, copy, gradients, intrinsics, random_splats
+from mvsgs_core.rasterizer.densities import DENSITIES
+from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from tests.core.rasterizer.scenes import POSE, copy, gradients, intrinsics, random_splats
 
 SIZE = (5, 6)
 

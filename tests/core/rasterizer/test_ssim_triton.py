@@ -7,7 +7,7 @@ import os
 import pytest
 import torch
 
-from mvsgs_core.splats.ssim import chosen_backend, image_loss
+from mvsgs_core.rasterizer.ssim import chosen_backend, image_loss
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 if DEVICE == "cpu":

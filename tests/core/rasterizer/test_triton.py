@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from mvsgs_core import native
-from mvsgs_core.splats import rasterizer
-from mvsgs_core.splats.model import Splats
-from mvsgs_core.splats.rasterizer import Render, rasterize
-from tests.core.splats.rasterizer_scenes import (
+from mvsgs_core.rasterizer import rasterize as rasterizer
+from mvsgs_core.rasterizer.rasterize import Render, rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from tests.core.rasterizer.scenes import (
     POSE,
     assert_agree,
     copy,
@@ -23,7 +23,7 @@ from tests.core.splats.rasterizer_scenes import (
     random_splats,
     relative_error,
 )
-from tests.core.splats.test_rasterizer_adversarial import assert_finite, extremes
+from tests.core.rasterizer.test_adversarial import assert_finite, extremes
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # read when triton is first imported
@@ -60,13 +60,13 @@ def needles(count: int) -> Splats:
 
 def pairs_of(splats: Splats, size: tuple[int, int], density: str, mask: torch.Tensor | None) -> tuple[int, list[int]]:
     """(pairs that the C++ kernel blends, pairs of each tile in the Triton lists)."""
-    from mvsgs_core.splats import triton_backend
+    from mvsgs_core.rasterizer.triton import backend as triton_backend
 
     view = rasterizer.View(
         pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, density=density,
         background=(0.0, 0.0, 0.0), tile_mask=mask, near=1e-3, antialiased=False, degree=0, weights=False, threads=1,
     )  # fmt: skip
-    passed = native.load("splats").forward(
+    passed = native.load("rasterizer").forward(
         *splats.tensors().values(), pose=view.pose, intrinsics=view.intrinsics, near=view.near,
         background=view.background, exact=density == "exact", antialiased=False, degree=0, tile_mask=mask,
         weights=False, threads=1, color=torch.empty(*size, 3), depth=torch.empty(size), opacity=torch.empty(size),

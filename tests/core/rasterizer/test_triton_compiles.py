@@ -16,7 +16,7 @@ import sys
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from mvsgs_core.splats import triton_blend, triton_lists, triton_projection, triton_projection_backward, triton_ssim
+from mvsgs_core.rasterizer.triton import blend, lists, projection, projection_backward, ssim
 
 INTEGERS = {"count", "width", "height", "length", "tiles_x", "tiles"}
 FLOATS = {
@@ -37,21 +37,21 @@ def compile_for(capability, function, warps, **constants):
     print(capability, function.__name__, len(compiled.asm["cubin"]))
 
 for capability in (80, 90):
-    tiles = {"EXACT": capability == 80, "ROW": triton_projection.ROW}
+    tiles = {"EXACT": capability == 80, "ROW": projection.ROW}
     splats = {**tiles, "BASES": 4, "USED": 4, "ANTIALIASED": capability == 80, "BLOCK": 64}
-    sums = triton_blend.SUMS
-    compile_for(capability, triton_blend.blend, 1, WEIGHTS=capability == 80, **tiles)
-    compile_for(capability, triton_blend.blend_backward, 1, DEPTH=capability == 80, SUMS=sums, **tiles)
-    compile_for(capability, triton_ssim.similarity, 4, ROWS=16, COLUMNS=128)
-    compile_for(capability, triton_ssim.loss_gradient, 4, WEIGHTED=True, ROWS=16, COLUMNS=128)
-    footprint = triton_projection.FOOTPRINT
-    compile_for(capability, triton_lists.emit, 1, MASKED=True, BLOCK=32, ROW=16, FOOTPRINT=footprint)
+    sums = blend.SUMS
+    compile_for(capability, blend.blend, 1, WEIGHTS=capability == 80, **tiles)
+    compile_for(capability, blend.blend_backward, 1, DEPTH=capability == 80, SUMS=sums, **tiles)
+    compile_for(capability, ssim.similarity, 4, ROWS=16, COLUMNS=128)
+    compile_for(capability, ssim.loss_gradient, 4, WEIGHTED=True, ROWS=16, COLUMNS=128)
+    footprint = projection.FOOTPRINT
+    compile_for(capability, lists.emit, 1, MASKED=True, BLOCK=32, ROW=16, FOOTPRINT=footprint)
     compile_for(
-        capability, triton_lists.per_splat, 1, COLUMNS=sums, WIDTH=16, LARGEST=False, SPLATS=8, AT_ONCE=4
+        capability, lists.per_splat, 1, COLUMNS=sums, WIDTH=16, LARGEST=False, SPLATS=8, AT_ONCE=4
     )
     if capability == 80:  # the longest ones, with their whole range of switches on, once
-        compile_for(capability, triton_projection.project, 2, FOOTPRINT=footprint, **splats)
-        compile_for(capability, triton_projection_backward.project_backward, 2, POSE=True, SUMS=sums, **splats)
+        compile_for(capability, projection.project, 2, FOOTPRINT=footprint, **splats)
+        compile_for(capability, projection_backward.project_backward, 2, POSE=True, SUMS=sums, **splats)
 """
 
 

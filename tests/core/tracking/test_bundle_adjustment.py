@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core import geometry
-from mvsgs_core.tracking.bundle_adjustment import DROID_GLOBAL, DROID_LOCAL, Graph, Solver, adjust, reproject
+from mvsgs_core.tracking.estimation.bundle_adjustment import DROID_GLOBAL, DROID_LOCAL, Graph, Solver, adjust, reproject
 from tests.shared_data import shared
 
 CASES = {

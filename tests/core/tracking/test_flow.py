@@ -6,8 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mvsgs_core.tracking.flow import DenseInverseSearch, FeatureFlow, LucasKanade, make_flow, sample_field, spread
 from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matching.flow import (
+    DenseInverseSearch,
+    FeatureFlow,
+    LucasKanade,
+    make_flow,
+    sample_field,
+    spread,
+)
 
 SIZE = (240, 320)
 

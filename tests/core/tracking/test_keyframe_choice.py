@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from mvsgs_core.held_out import is_held_out
-from mvsgs_core.tracking.flow import Matches
 from mvsgs_core.tracking.front_end import FrontEndConfig, Step
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
+from mvsgs_core.tracking.matching.flow import Matches
 from tests.core.tracking.sequences import synthetic, track, tracked_room
 
 WIDTH, LIMIT = 320, 0.05  # a keyframe after 16 pixels

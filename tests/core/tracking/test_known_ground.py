@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mvsgs_core.tracking.frames import State
-from mvsgs_core.tracking.known_ground import KnownGroundConfig
+from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.tracker import TrackerConfig
 from tests.core.tracking.sequences import ate, synthetic, track
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.tracking.pose_graph import (
+from mvsgs_core.tracking.estimation.pose_graph import (
     SimilarityEdges,
     inverse_similarity,
     jacobians,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mvsgs_core.networks.raft_flow import RaftFlow, RefinedRaftFlow
-from mvsgs_core.tracking.flow import make_flow
 from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matching.flow import make_flow
+from mvsgs_core.tracking.matching.raft_flow import RaftFlow, RefinedRaftFlow
 from tests.shared_data import shared
 
 SHIFT = np.array([21.0, -13.0])
@@ -47,7 +47,7 @@ def test_a_point_that_leaves_the_image_is_lost() -> None:
 
 def test_missing_weights_and_missing_color_say_what_to_do() -> None:
     with pytest.raises(FileNotFoundError, match="RAFT"):
-        make_flow("mvsgs_core.networks.raft_flow:RaftFlow", weights="nowhere.pth")
+        make_flow("mvsgs_core.tracking.matching.raft_flow:RaftFlow", weights="nowhere.pth")
     flow = RaftFlow(weights=str(shared("weights/raft-small.pth")))
     gray = [TrackingImage.of(n, 0.0, np.zeros((64, 64, 3), np.uint8), (64, 64), False) for n in range(2)]
     points = np.full((1, 2), 30.0)

@@ -11,7 +11,7 @@ from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.frames import FrameRecord, State
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.recovery import RecoveryConfig
+from mvsgs_core.tracking.places.recovery import RecoveryConfig
 from mvsgs_core.tracking.tracker import Tracker
 from tests.core.tracking.sequences import synthetic, track
 from tests.shared_data import shared

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mvsgs_core import geometry
-from mvsgs_core.tracking.bundle_adjustment import Solver, reproject
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
+from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.rolling_shutter import estimate_readout
+from mvsgs_core.tracking.matching.flow import Matches
 from tests.core.tracking.sequences import tracked_room
 
 SIZE = (120, 160)

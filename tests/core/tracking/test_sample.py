@@ -9,12 +9,12 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.tracking.bundle_adjustment import Solver
 from mvsgs_core.tracking.config import TrackerConfig
-from mvsgs_core.tracking.flow import Matches
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.frames import FrameRecord, State
-from mvsgs_core.tracking.known_ground import KnownGroundConfig
-from mvsgs_core.tracking.localization import localize
+from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
+from mvsgs_core.tracking.places.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.tracking.tracker import Tracker
 from tests.core.tracking.sequences import tracked_room

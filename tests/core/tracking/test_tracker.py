@@ -7,8 +7,8 @@ import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.tracking.flow import FLOWS
 from mvsgs_core.tracking.frames import State
+from mvsgs_core.tracking.matching.flow import FLOWS
 from mvsgs_core.tracking.tracker import TrackerConfig
 from tests.core.tracking.sequences import ate, synthetic, track, tracked_room
 from tests.shared_data import shared
