@@ -16,8 +16,8 @@ from typing import Any
 import psutil
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
-FAKE = ROOT / "tests" / "fake_graph" / "conf"
+ROOT = Path(__file__).resolve().parents[2]
+FAKE = ROOT / "tests" / "support" / "fake_graph" / "conf"
 DOWN = 5.0  # seconds in which a graph must be gone
 
 

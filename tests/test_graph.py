@@ -16,7 +16,7 @@ from launch.placement import thread_plan
 from msgs import Frame, GroundTruth, Keyframe, Poses
 from tests.fake_graph.stages import Relay, Sink
 
-FAKE = Path(__file__).parent / "fake_graph" / "conf"
+FAKE = Path(__file__).parent / "support" / "fake_graph" / "conf"
 STAGES = "tests.fake_graph.stages"
 
 

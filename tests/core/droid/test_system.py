@@ -13,7 +13,7 @@ from mvsgs_core.droid.presets import Preset
 from mvsgs_core.droid.system import DroidConfig, DroidSlam
 from mvsgs_core.tracking.frames import Path, State
 from mvsgs_core.tracking.tracker import Update
-from tests.core.droid import oracle
+from tests.support import droid_oracle as oracle
 
 HEIGHT, WIDTH, COUNT = 96, 128, 44
 INTRINSICS = np.array([115.0, 115.0, 63.5, 47.5])
