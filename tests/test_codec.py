@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import msgs
 from msgs import End, Frame, GroundTruth, Keyframe, Message, Poses, SplatMap, Trajectory
 from msgs.codec import NEWEST, ArraySpec, CodecError, array_specs, decode, encode, type_name
-from tests.shared_data import ROOT
+from tests.support.shared_data import ROOT
 
 LIMIT = 4 * 2**20  # bytes of a message in the memory tests
 MESSAGES = list(msgs.TYPES.values())

@@ -20,8 +20,8 @@ from mvsgs_core.datasets.tum import Tum
 from mvsgs_core.datasets.video import Video
 from mvsgs_core.scene.difficulties import Difficulties
 from nodes.reader import Reader
-from tests.core.datasets.folders import write_photos
-from tests.shared_data import ROOT
+from tests.support.dataset_folders import write_photos
+from tests.support.shared_data import ROOT
 
 
 @pytest.mark.parametrize(

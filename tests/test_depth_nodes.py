@@ -12,7 +12,7 @@ from nodes import handlers, outputs
 from nodes.coarse_depth import CoarseDepth
 from nodes.depth_fusion import DepthFusion
 from nodes.mvs import Mvs
-from tests.core.mvs.plane_scene import FAR, NEAR, look, render, true_depth
+from tests.support.plane_scene import FAR, NEAR, look, render, true_depth
 
 SIZE = (120, 160)
 

@@ -11,7 +11,7 @@ import msgs
 from msgs import Frame, Keyframe, Poses, TrackingState, Trajectory
 from nodes import handlers, outputs
 from nodes.droid_tracker import DroidTracker
-from tests.core.tracking.sequences import synthetic
+from tests.support.sequences import synthetic
 
 COUNT = 9
 # the least size that the networks take, so that noise costs little

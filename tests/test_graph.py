@@ -14,10 +14,10 @@ from launch.inline import run_inline
 from launch.parameters import GraphError, convert
 from launch.placement import thread_plan
 from msgs import Frame, GroundTruth, Keyframe, Poses
-from tests.fake_graph.stages import Relay, Sink
+from tests.support.fake_graph.stages import Relay, Sink
 
 FAKE = Path(__file__).parent / "support" / "fake_graph" / "conf"
-STAGES = "tests.fake_graph.stages"
+STAGES = "tests.support.fake_graph.stages"
 
 
 def fake(*overrides: str) -> Graph:
@@ -90,7 +90,7 @@ REFUSED = [
     ([f"relay._target_={STAGES}.Bare"], "neither run() nor", ""),
     ([f"relay._target_={STAGES}.Untyped"], "must take one message", ""),
     ([f"relay._target_={STAGES}.Source"], "nobody sends", "yields Frame, GroundTruth"),
-    (["relay._target_=null"], "nobody sends tests.fake_graph.stages.Sink a Keyframe", "that slot is off"),
+    (["relay._target_=null"], "nobody sends tests.support.fake_graph.stages.Sink a Keyframe", "that slot is off"),
     (["~relay.reads"], f"relay: nobody sends {STAGES}.Relay a Frame", "set relay.reads.Frame to"),
     (["relay.reads.Frame=sink"], f"relay: nobody sends {STAGES}.Relay a Frame", "that does: source"),
     (["relay.reads.Frame=camera"], "no such slot", "there are: source, relay, sink"),

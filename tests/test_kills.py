@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bench.faults.kills import SCENE
 from bench.faults.launched import Launched, map_opens
-from tests.launches import DOWN
+from tests.support.launches import DOWN
 
 SHORT = (*SCENE, "dataset.options.frames=50", "mapper.refinement=10", "evaluator.max_frames=10")
 

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from nodes.runtime.transport import create_keys
-from tests.launches import DOWN, ROOT, Launch, launch
+from tests.support.launches import DOWN, ROOT, Launch, launch
 
 __all__ = ["launch"]  # the fixture
 

@@ -11,7 +11,7 @@ from msgs import Depth, Keyframe
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.mvs.learned import calibrated
 from nodes.learned_mvs import LearnedMvs
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 
 def _keyframe(item: Item) -> Keyframe:

@@ -20,7 +20,7 @@ from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from nodes.mapper import Mapper, mapper_config
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 
 def view_message(index: int, t: float, scale: float = 1.0, segment: int = 0) -> View:

@@ -15,8 +15,8 @@ import pytest
 
 from nodes.runtime.spec import gone_file
 from nodes.runtime.transport import create_keys
-from tests.processes import ENVIRONMENT, graph
-from tests.shared_data import ROOT
+from tests.support.processes import ENVIRONMENT, graph
+from tests.support.shared_data import ROOT
 
 DOWN = 5.0  # s in which a graph must be down after a failure
 
@@ -42,7 +42,7 @@ def test_a_node_with_other_keys_is_not_let_in(tmp_path: Path) -> None:
     create_keys(tmp_path / "ours")
     create_keys(tmp_path / "other")
     with graph(ports=free_ports(1), keys=tmp_path / "ours") as g:
-        here = "tests.sample_nodes"
+        here = "tests.support.sample_nodes"
         g.start("source", f"{here}.Source", {}, {"Frame": 1})
         stranger = g.start("left", f"{here}.Left", {"Frame": "source"}, {}, keys=str(tmp_path / "other"))
         assert stranger.popen.wait(20) == 1
@@ -172,7 +172,7 @@ def test_sigterm_stops_a_node_that_waits_for_others(busy: dict[str, dict[str, fl
 
 def test_sigterm_stops_a_node_whose_readers_never_come() -> None:
     with graph() as g:
-        left = g.start("left", "tests.sample_nodes.Left", {}, {"Keyframe": 1})
+        left = g.start("left", "tests.support.sample_nodes.Left", {}, {"Keyframe": 1})
         left.wait_for(lambda status: status.get("state") == "waiting")
         left.popen.send_signal(signal.SIGTERM)
         assert left.popen.wait(2.0) == 128 + signal.SIGTERM
@@ -218,7 +218,7 @@ def test_where_its_threads_stand_is_asked_for_by_a_signal() -> None:
 
 def test_a_slow_best_effort_reader_never_holds_its_sender_back() -> None:
     with graph() as g:
-        here = "tests.sample_nodes"
+        here = "tests.support.sample_nodes"
         g.start("viewer", f"{here}.Left", {"Frame": "source?"}, {}, {"delay": 0.3})
         g.start("source", f"{here}.Source", {}, {"Frame": 1}, {"count": 200, "delay": 0.002})
         assert set(g.wait(20).values()) == {0}
@@ -231,7 +231,7 @@ def test_a_slow_best_effort_reader_never_holds_its_sender_back() -> None:
 
 def test_a_frozen_best_effort_reader_never_holds_its_sender_back() -> None:
     with graph() as g:
-        here = "tests.sample_nodes"
+        here = "tests.support.sample_nodes"
         viewer = g.start("viewer", f"{here}.Left", {"Frame": "source?"}, {}, {})
         source = g.start("source", f"{here}.Source", {}, {"Frame": 1}, {"count": 1000, "delay": 0.001})
         viewer.wait_for(lambda status: sum(status.get("in", {}).values()) > 3)
@@ -244,7 +244,7 @@ def test_a_frozen_best_effort_reader_never_holds_its_sender_back() -> None:
 def test_an_observer_that_is_killed_takes_nobody_along() -> None:
     """While its sender is held back by it, at that."""
     with graph() as g:
-        here = "tests.sample_nodes"
+        here = "tests.support.sample_nodes"
         frames = {"observers": ["watcher"], "address": g.address("source.Frame"), "type": "Frame", "readers": 1}
         g.start("left", f"{here}.Left", {"Frame": "source"}, {})
         watcher = g.start("watcher", f"{here}.Right", {"Frame": "source"}, {}, observer=True)
@@ -260,7 +260,7 @@ def test_an_observer_that_is_killed_takes_nobody_along() -> None:
 
 def test_an_observer_that_never_comes_is_waited_for_until_it_is_known_to_be_gone() -> None:
     with graph() as g:
-        here = "tests.sample_nodes"
+        here = "tests.support.sample_nodes"
         frames = {"observers": ["watcher"], "address": g.address("source.Frame"), "type": "Frame", "readers": 1}
         left = g.start("left", f"{here}.Left", {"Frame": "source"}, {})
         source = g.start("source", f"{here}.Source", {}, {}, {"count": 3}, outputs=[frames])
@@ -274,8 +274,8 @@ def test_an_observer_that_never_comes_is_waited_for_until_it_is_known_to_be_gone
 
 def test_a_node_that_yields_what_it_does_not_declare_fails() -> None:
     with graph() as g:
-        g.start("left", "tests.sample_nodes.Wrong", {"Frame": "source"}, {})
-        g.start("source", "tests.sample_nodes.Source", {}, {"Frame": 1}, {"count": 10**6})
+        g.start("left", "tests.support.sample_nodes.Wrong", {"Frame": "source"}, {})
+        g.start("source", "tests.support.sample_nodes.Source", {}, {"Frame": 1}, {"count": 10**6})
         assert set(g.wait(20).values()) == {1}
         assert "yields a Frame, but its annotations say Keyframe" in g.processes["left"].last["error"]
 
@@ -283,10 +283,10 @@ def test_a_node_that_yields_what_it_does_not_declare_fails() -> None:
 @pytest.mark.parametrize(
     ("target", "config", "error"),
     [
-        ("tests.sample_nodes.Nothing", {}, "is no node"),
+        ("tests.support.sample_nodes.Nothing", {}, "is no node"),
         ("tests.no_such_module.Left", {}, "ModuleNotFoundError"),
-        ("tests.sample_nodes.Left", {"dely": 1}, "has no parameter dely; its parameters are: delay"),
-        ("tests.sample_nodes.Left", {"delay": "long"}, "Left.delay='long': must be float"),
+        ("tests.support.sample_nodes.Left", {"dely": 1}, "has no parameter dely; its parameters are: delay"),
+        ("tests.support.sample_nodes.Left", {"delay": "long"}, "Left.delay='long': must be float"),
     ],
 )
 def test_a_wrong_specification_is_refused(target: str, config: dict[str, object], error: str) -> None:
@@ -308,7 +308,7 @@ def test_a_file_that_is_no_specification_is_refused(tmp_path: Path) -> None:
 def test_cores_and_threads_are_set() -> None:
     core = max(os.sched_getaffinity(0))
     with graph() as g:
-        g.start("left", "tests.sample_nodes.Left", {"Frame": "source"}, {}, cpu=[core], threads=1)
+        g.start("left", "tests.support.sample_nodes.Left", {"Frame": "source"}, {}, cpu=[core], threads=1)
         left = g.processes["left"]
         left.wait_for(lambda status: status.get("state") == "running")
         for task in Path(f"/proc/{left.popen.pid}/task").iterdir():
@@ -338,9 +338,9 @@ _LAUNCHER = """
 import sys, time
 from nodes.runtime.spec import gone_file
 from nodes.runtime.transport import create_keys
-from tests.processes import Graph
+from tests.support.processes import Graph
 g = Graph()
-p = g.start("left", "tests.sample_nodes.Left", {"Frame": "source"}, {})
+p = g.start("left", "tests.support.sample_nodes.Left", {"Frame": "source"}, {})
 p.wait_for(lambda status: status.get("state") == "running")
 print(p.popen.pid, flush=True)
 time.sleep(100)

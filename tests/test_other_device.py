@@ -25,10 +25,10 @@ from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from tests.core.fusion.test_consistency import view
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
 from tests.core.mvs.test_backends import SIZE, problem
 from tests.core.tracking.test_torch_adjustment import noisy
-from tests.pretend_device import DEVICE, PretendDevice
+from tests.support.pretend_device import DEVICE, PretendDevice
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 
 def test_the_pretended_device_mixes_with_no_other() -> None:

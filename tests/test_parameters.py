@@ -17,7 +17,7 @@ from nodes import Node
 from nodes.runtime.parameters import make_config
 from nodes.runtime.plain import plain
 from nodes.runtime.runner import Runner, merge_stats, own_stats
-from tests.sample_nodes import Left, Wrong
+from tests.support.sample_nodes import Left, Wrong
 
 
 class Color(Enum):

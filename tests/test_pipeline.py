@@ -16,7 +16,7 @@ import pytest
 from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Trajectory
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 ROOT = Path(__file__).resolve().parent.parent
 # Small, so that starting the processes takes longer than the mapping.

@@ -16,7 +16,7 @@ from launch.graph import Graph
 from launch.parameters import GraphError
 from launch.resume import leave_out_refused, resumed_config
 from mvsgs_core.mapping.checkpoints.files import state_file, write_state
-from tests.shared_data import ROOT
+from tests.support.shared_data import ROOT
 
 META = {
     "newest_view": 95, "stream_seconds": 4.75, "splats": 10, "stream_ended": False, "revision": 1, "refined": 0,

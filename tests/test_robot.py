@@ -26,7 +26,7 @@ from nodes.robot import Robot
 from nodes.runtime.addresses import TransportError
 from nodes.runtime.transport import create_keys
 from nodes.stream_times import StreamTimes
-from tests.shared_data import ROOT
+from tests.support.shared_data import ROOT
 
 INTERVAL = 0.03  # s between two frames
 

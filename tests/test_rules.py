@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.shared_data import ROOT
+from tests.support.shared_data import ROOT
 
 PACKAGES = ("msgs", "nodes", "launch", "mvsgs_core", "examples")  # the product; benchmarks and tests may use more
 SOURCES = {".py", ".cpp", ".h", ".hpp", ".cu", ".yaml", ".txt", ".toml", ".js", ".html"}

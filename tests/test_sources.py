@@ -24,8 +24,8 @@ from nodes.camera import Camera, CameraError
 from nodes.reader import Reader
 from nodes.robot import Robot
 from nodes.runtime.transport import Publisher
-from tests.core.datasets.folders import truncate, write_photos, write_tum
-from tests.shared_data import ROOT
+from tests.support.dataset_folders import truncate, write_photos, write_tum
+from tests.support.shared_data import ROOT
 
 # ---------------------------------------------------------------- recorded
 

@@ -13,7 +13,7 @@ import pytest
 
 from launch.status import NodeStatus
 from launch.summary import summary
-from tests.launches import DOWN, Launch, launch
+from tests.support.launches import DOWN, Launch, launch
 
 __all__ = ["launch"]  # the fixture
 

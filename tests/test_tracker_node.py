@@ -16,7 +16,7 @@ from mvsgs_core.tracking.frames import State
 from nodes import Node, handlers, outputs
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker, spread
-from tests.core.tracking.sequences import synthetic
+from tests.support.sequences import synthetic
 
 
 def messages(count: int = 45) -> tuple[list[Frame], list[GroundTruth]]:

@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 
 from launch.children import python_environment
-from tests.core.datasets.folders import write_photos
-from tests.launches import FAKE
-from tests.shared_data import ROOT
+from tests.support.dataset_folders import write_photos
+from tests.support.launches import FAKE
+from tests.support.shared_data import ROOT
 
 STRANGERS = ("hydra", "psutil", "difflib", "json", "numpy", "cv2", "torch", "omegaconf", "msgpack", "queue", "signal")
 STRANGER = "import pathlib; pathlib.Path(__file__).with_suffix('.ran').touch()\n"
 OWN_NODE = '''
 """A user's own node, with a module of theirs beside it."""
-from tests.fake_graph.stages import Relay
+from tests.support.fake_graph.stages import Relay
 import beside_it
 
 class Mine(Relay):

@@ -26,7 +26,7 @@ from websockets.typing import Subprotocol
 from msgs import Preview
 from nodes import handlers, outputs
 from nodes.viewer import Viewer
-from tests.shared_data import ROOT
+from tests.support.shared_data import ROOT
 
 
 def free_port() -> int:

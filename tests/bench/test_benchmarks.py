@@ -23,7 +23,7 @@ from launch.parameters import GraphError
 from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.shared_data import ROOT
+from tests.support.shared_data import ROOT
 
 SEARCH = f"hydra.searchpath=[file://{CONF}]"
 MAINS = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if re.search(r"^ +main\(measure", p.read_text(), re.M))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.shared_data import ROOT
+from tests.support.shared_data import ROOT
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # read when triton is first imported

@@ -14,7 +14,7 @@ from torch import nn
 
 from mvsgs_core import weights
 from mvsgs_core.networks import checkpoints
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 CONTENT = bytes(range(256)) * 9000
 

@@ -24,8 +24,8 @@ from mvsgs_core.datasets.calibration import image_size
 from mvsgs_core.datasets.compression import decompress
 from mvsgs_core.datasets.exif import read_exif_lens
 from mvsgs_core.datasets.files import UnreadableImageError, natural_order, read_image
-from tests.core.datasets.folders import write_image, write_photos, write_replica, write_tum
 from tests.core.datasets.test_images import colmap_text
+from tests.support.dataset_folders import write_image, write_photos, write_replica, write_tum
 
 
 def huge_png(path: Path, width: int = 30_000, height: int = 30_000) -> None:

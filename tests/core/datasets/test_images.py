@@ -14,7 +14,7 @@ from PIL import Image
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.colmap import lens_of, read_colmap
 from mvsgs_core.geometry import inverse, quaternion_from_rotation, so3_exp
-from tests.core.datasets.folders import truncate, write_image, write_photos
+from tests.support.dataset_folders import truncate, write_image, write_photos
 
 POSES = []
 for i in range(4):

@@ -10,7 +10,7 @@ import pytest
 from mvsgs_core.datasets import READERS, open_dataset
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.seven_scenes import register
-from tests.core.datasets.folders import (
+from tests.support.dataset_folders import (
     pose,
     write_depth,
     write_icl_nuim,

@@ -11,8 +11,8 @@ import pytest
 
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.geometry import inverse
-from tests.core.datasets.warping import epipolar_error, photometric_error
-from tests.shared_data import shared
+from tests.support.shared_data import shared
+from tests.support.warping import epipolar_error, photometric_error
 
 Y_UP = np.diag([1.0, -1.0, 1.0, 1.0])
 

@@ -10,7 +10,7 @@ import pytest
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.tum import CAMERAS, nearest
 from mvsgs_core.trajectory_file import read_trajectory
-from tests.core.datasets.folders import pose, truncate, write_image, write_tum
+from tests.support.dataset_folders import pose, truncate, write_image, write_tum
 
 
 def test_frames_poses_and_depth_are_associated(tmp_path: Path) -> None:

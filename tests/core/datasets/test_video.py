@@ -10,7 +10,7 @@ import pytest
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import check, open_dataset
-from tests.core.datasets.folders import truncate
+from tests.support.dataset_folders import truncate
 
 FRAMES, RATE = 30, 20.0
 

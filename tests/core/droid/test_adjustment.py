@@ -15,7 +15,7 @@ from mvsgs_core import geometry
 from mvsgs_core.droid.adjustment import GLOBAL, LOCAL, solve
 from mvsgs_core.droid.video import Video, VideoFrame
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
-from tests.core.networks.golden import error, folder
+from tests.support.golden import error, folder
 
 EXACT, SINGLE = 1e-8, 1e-5
 AMPLIFIED = 1e-7  # what 1e-8 in the poses' step makes of the depths'

@@ -8,7 +8,7 @@ import torch
 
 from mvsgs_core import geometry
 from mvsgs_core.droid.geometry import agreeing_neighbors, frame_distance, reproject, world_points
-from tests.core.networks.golden import error, folder
+from tests.support.golden import error, folder
 
 TOLERANCE = 1e-5
 

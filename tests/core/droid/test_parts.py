@@ -20,7 +20,7 @@ from mvsgs_core.droid.trajectory_filler import StoredFrame, between, fill
 from mvsgs_core.droid.video import Video, VideoFrame
 from mvsgs_core.networks.droid import DroidNet, Update
 from mvsgs_core.stats import Stats
-from tests.core.networks.golden import folder, rule_weights
+from tests.support.golden import folder, rule_weights
 
 GRID = (8, 10)
 INTRINSICS = np.array([8.0, 8.0, 4.5, 3.5])

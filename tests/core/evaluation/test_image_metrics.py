@@ -10,7 +10,7 @@ from torchmetrics.functional.image import peak_signal_noise_ratio, structural_si
 from mvsgs_core import image_metrics
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.evaluation.lpips import Lpips
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 
 def _pair(seed: int, shape: tuple[int, int] = (64, 97)) -> tuple[np.ndarray, np.ndarray]:

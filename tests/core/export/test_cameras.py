@@ -12,7 +12,7 @@ import pytest
 from mvsgs_core.export.cameras import Cameras, read_cameras, write_cameras
 from mvsgs_core.mapping.checkpoints.results import cameras_of
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 
 def cameras(count: int = 3) -> Cameras:

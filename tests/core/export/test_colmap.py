@@ -21,7 +21,7 @@ from mvsgs_core.export.cameras import write_cameras
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.export.ply import read_ply, write_ply
 from mvsgs_core.rasterizer.splats import Splats
-from tests.core.mapping.tiny_map import (
+from tests.support.tiny_map import (
     INTRINSICS,
     SIZE,
     cameras_around,
@@ -30,7 +30,7 @@ from tests.core.mapping.tiny_map import (
     save_cameras,
     write_poses,
 )
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 TIMES = [0.4, 0.5, 0.6]
 

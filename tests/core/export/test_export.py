@@ -17,7 +17,7 @@ from mvsgs_core.export.ply import folded, read_ply, write_ply
 from mvsgs_core.rasterizer.densities import log_scale_shift
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.core.mapping.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map, save_cameras, write_poses
+from tests.support.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map, save_cameras, write_poses
 
 
 @pytest.mark.parametrize("bases", [1, 4, 16])

@@ -16,7 +16,7 @@ from mvsgs_core.export.glb import linear, write_glb
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.open3d_loader import open3d
 from mvsgs_core.rasterizer.rasterize import rasterize
-from tests.core.mapping.tiny_map import ORIGIN, final_map, save_cameras, write_poses
+from tests.support.tiny_map import ORIGIN, final_map, save_cameras, write_poses
 
 SIZE, INTRINSICS = (48, 64), np.array([51.2, 51.2, 31.5, 23.5])
 

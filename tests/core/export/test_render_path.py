@@ -21,8 +21,8 @@ from mvsgs_core.export import render_path
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.video_file import write_video
-from tests.core.mapping.tiny_map import INTRINSICS, SIZE, final_map, save_cameras, write_poses
-from tests.core.mapping.tiny_scene import pose_on_arc
+from tests.support.tiny_map import INTRINSICS, SIZE, final_map, save_cameras, write_poses
+from tests.support.tiny_scene import pose_on_arc
 
 VIDEO_SIZE = (96, 128)
 

@@ -22,8 +22,8 @@ from mvsgs_core.geometry import rotation_from_quaternion
 from mvsgs_core.open3d_loader import open3d
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.core.mapping.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map
-from tests.core.mapping.tiny_scene import pose_on_arc
+from tests.support.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map
+from tests.support.tiny_scene import pose_on_arc
 
 
 def few_splats() -> Snapshot:

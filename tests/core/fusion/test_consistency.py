@@ -11,7 +11,7 @@ from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig, fuse
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.torch_backend import TorchFusionBackend
 from mvsgs_core.fusion.views import DepthView, warps_between
-from tests.core.mvs.plane_scene import intrinsics_of, look, true_depth
+from tests.support.plane_scene import intrinsics_of, look, true_depth
 
 SIZE = (40, 56)
 CONFIG = FusionConfig(device="cpu", threads=1, relative=0.01)

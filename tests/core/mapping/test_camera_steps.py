@@ -12,7 +12,7 @@ from mvsgs_core.mapping.camera_steps import step_pose
 from mvsgs_core.mapping.keyframes import PosedView
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 TIMES = (0.0, 0.33, 0.66, 1.0)
 OFF = 2.0 * np.array([0.01, -0.008, 0.006, 0.006, -0.008, 0.01])  # (translation, rotation) that one pose is wrong by

@@ -29,7 +29,7 @@ from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.session import Session
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.stats import Stats
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 SIZE = (24, 32)
 PLAIN = MapperConfig(iterations=10, refinement=6, window=2, training=TrainingConfig(threads=1))

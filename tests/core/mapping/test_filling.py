@@ -16,7 +16,7 @@ from mvsgs_core.mapping.keyframes import PosedView
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
 from tests.core.mapping.test_mapper import CONFIG, mapped, score
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 HOLE = slice(20, 44)  # columns of the 64 in which a filter left nothing
 

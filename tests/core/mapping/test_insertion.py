@@ -19,7 +19,7 @@ from mvsgs_core.mapping.insertion import (
 )
 from mvsgs_core.rasterizer.reference import rotation_matrices
 from mvsgs_core.rasterizer.spherical_harmonics import C0
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 
 def random_points(count: int, seed: int = 0) -> Points:

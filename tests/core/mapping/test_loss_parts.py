@@ -10,7 +10,7 @@ from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping import losses
 from mvsgs_core.mapping.losses import LossConfig
 from mvsgs_core.rasterizer import densities
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import torch
 
 from mvsgs_core.mapping import losses
 from mvsgs_core.rasterizer import densities
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 
 @pytest.fixture(scope="module")

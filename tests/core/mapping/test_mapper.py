@@ -19,7 +19,7 @@ from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.optimizer import LearningRates
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.rasterizer.rasterize import rasterize
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 TIMES = (0.0, 0.33, 0.66, 1.0)
 CONFIG = MapperConfig(iterations=16, refinement=20, training=TrainingConfig(threads=1))

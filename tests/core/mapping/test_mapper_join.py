@@ -11,7 +11,7 @@ from mvsgs_core import geometry
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 SIZE = (24, 32)
 CONFIG = MapperConfig(

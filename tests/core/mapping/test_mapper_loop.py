@@ -9,7 +9,7 @@ import numpy as np
 from mvsgs_core.mapping.keyframes import PosedView
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 DRIFT = 0.25  # share by which lengths have shrunk at the end
 REFINEMENT = 60

@@ -9,7 +9,7 @@ import pytest
 from mvsgs_core import camera
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.mapping.self_check import MOST_NOISE, SelfCheck, check, noise_of
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 
 def picture(seed: int = 0) -> np.ndarray:

@@ -12,7 +12,7 @@ from mvsgs_core.mapping import optimizer, training
 from mvsgs_core.mapping.keyframes import PosedView, training_view
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.interface import Backward, Render
-from tests.core.rasterizer.scenes import intrinsics, random_splats
+from tests.support.rasterizer_scenes import intrinsics, random_splats
 
 SIZE = (40, 56)
 

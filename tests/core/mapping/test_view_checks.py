@@ -13,7 +13,7 @@ from mvsgs_core.mapping.insertion import InsertionConfig, unoccupied
 from mvsgs_core.mapping.keyframes import PosedView
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 CONFIG = MapperConfig(iterations=2, training=TrainingConfig(threads=1))
 VIEWS = [

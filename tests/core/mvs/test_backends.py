@@ -12,7 +12,7 @@ from mvsgs_core.mvs.interface import TILE, ChooseOptions, CostOptions, SmoothOpt
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.native import load
 from mvsgs_core.warp import relative_warp
-from tests.core.mvs.plane_scene import look, render
+from tests.support.plane_scene import look, render
 
 SIZE = (36, 52)
 COST = CostOptions(radius=2, best=2)

@@ -14,7 +14,7 @@ from mvsgs_core.mvs.neighbors import NeighborChoice, select_neighbors
 from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
 from mvsgs_core.mvs.views import StereoView, prepare_view
 from mvsgs_core.warp import apply_warp, parallax, relative_warp
-from tests.core.mvs.plane_scene import look, render, true_depth
+from tests.support.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)
 TYPICAL = np.array([0.2, 0.3, 0.45])

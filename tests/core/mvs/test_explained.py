@@ -12,7 +12,7 @@ from mvsgs_core import camera
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.explained import ExplainChoice, Explained, MapSight
 from mvsgs_core.mvs.views import StereoView, prepare_view
-from tests.core.mvs.plane_scene import look, render, true_depth
+from tests.support.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)
 

@@ -13,7 +13,7 @@ from mvsgs_core.mvs.interface import TILE, CostOptions
 from mvsgs_core.mvs.rims import RimChoice, at_level_of, continued_surfaces, differing_tiles, settle_rims
 from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
 from mvsgs_core.mvs.views import prepare_view
-from tests.core.mvs.plane_scene import look, render, true_depth
+from tests.support.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)
 

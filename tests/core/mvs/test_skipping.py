@@ -13,7 +13,7 @@ from mvsgs_core.mvs.interface import TILE, Choice
 from mvsgs_core.mvs.skipping import SkipChoice, cell_bounds, keep_settled, settled_tiles, tiles_in_cells
 from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, estimate_depth
 from mvsgs_core.mvs.views import StereoView, prepare_view
-from tests.core.mvs.plane_scene import look, render, true_depth
+from tests.support.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)
 CHOICE = SkipChoice(cell_radius=1, cell_percentile=10.0, cell_margin=1.5, least_cells=3)

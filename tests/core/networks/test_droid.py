@@ -6,7 +6,7 @@ import torch
 
 from mvsgs_core.networks.correlation import CorrelationVolume, OnTheFlyCorrelation
 from mvsgs_core.networks.droid import DroidNet, upsample
-from tests.core.networks.golden import error, folder, rule_weights
+from tests.support.golden import error, folder, rule_weights
 
 TOLERANCE = 2e-5
 

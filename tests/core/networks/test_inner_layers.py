@@ -10,7 +10,7 @@ from mvsgs_core.networks.correlation import CorrelationVolume
 from mvsgs_core.networks.droid import DroidNet, normalize_images
 from mvsgs_core.networks.mvsformer import MvsFormer
 from mvsgs_core.networks.vfuse import FusionInput, VFuse
-from tests.core.networks.golden import check_error, checks, error, folder, recorded, rule_weights
+from tests.support.golden import check_error, checks, error, folder, recorded, rule_weights
 
 LAYERS, VOLUMES, WEIGHTS = 2e-5, 1e-4, 2e-4  # of backbones and features, of cost volumes, of view weights
 

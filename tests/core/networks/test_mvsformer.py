@@ -6,7 +6,7 @@ import torch
 
 from mvsgs_core.networks.mvsformer import MvsFormer, MvsOutput
 from mvsgs_core.networks.twins import TwinsSmall
-from tests.core.networks.golden import error, folder, rule_weights
+from tests.support.golden import error, folder, rule_weights
 
 
 def _network(backbone: str) -> MvsFormer:

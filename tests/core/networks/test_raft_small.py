@@ -8,7 +8,7 @@ from mvsgs_core import camera, geometry
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.raft_small import RaftSmall
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 
 @pytest.fixture(scope="module")

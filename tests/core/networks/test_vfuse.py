@@ -6,7 +6,7 @@ import torch
 
 from mvsgs_core.networks.vfuse import Fused, FusionInput, VFuse, splat_views
 from mvsgs_core.networks.vfuse_confidence import MODES, confidence_of
-from tests.core.networks.golden import error, folder, rule_weights
+from tests.support.golden import error, folder, rule_weights
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import torch
 from mvsgs_core.rasterizer.densities import DENSITIES
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.core.rasterizer.scenes import copy, gradients, intrinsics, random_splats
+from tests.support.rasterizer_scenes import copy, gradients, intrinsics, random_splats
 
 SIZE = (40, 56)
 BACKENDS = ("cpu", "reference")

@@ -10,7 +10,7 @@ from mvsgs_core.rasterizer import rasterize as rasterizer
 from mvsgs_core.rasterizer.densities import DENSITIES
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.core.rasterizer.scenes import POSE, assert_agree, copy, gradients, intrinsics, random_splats
+from tests.support.rasterizer_scenes import POSE, assert_agree, copy, gradients, intrinsics, random_splats
 
 BACKEND = "cpu"
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from mvsgs_core.rasterizer.densities import DENSITIES
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.core.rasterizer.scenes import POSE, copy, gradients, intrinsics, random_splats
+from tests.support.rasterizer_scenes import POSE, copy, gradients, intrinsics, random_splats
 
 SIZE = (5, 6)
 

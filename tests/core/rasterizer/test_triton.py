@@ -13,7 +13,8 @@ from mvsgs_core import native
 from mvsgs_core.rasterizer import rasterize as rasterizer
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.core.rasterizer.scenes import (
+from tests.core.rasterizer.test_adversarial import assert_finite, extremes
+from tests.support.rasterizer_scenes import (
     POSE,
     assert_agree,
     copy,
@@ -23,7 +24,6 @@ from tests.core.rasterizer.scenes import (
     random_splats,
     relative_error,
 )
-from tests.core.rasterizer.test_adversarial import assert_finite, extremes
 
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # read when triton is first imported

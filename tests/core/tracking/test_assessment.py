@@ -8,7 +8,7 @@ import pytest
 from mvsgs_core import geometry
 from mvsgs_core.tracking.image import tracking_size
 from mvsgs_core.tracking.tracker import TrackerConfig
-from tests.core.tracking.sequences import ate, synthetic, track, tracked_room
+from tests.support.sequences import ate, synthetic, track, tracked_room
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.tracking.estimation.bundle_adjustment import DROID_GLOBAL, DROID_LOCAL, Graph, Solver, adjust, reproject
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 CASES = {
     # first free pose, solver, poses only, depth prior

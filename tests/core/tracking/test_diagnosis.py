@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core.datasets import Item, open_dataset
-from tests.core.tracking.sequences import synthetic, track
+from tests.support.sequences import synthetic, track
 
 
 def blank() -> list[Item]:

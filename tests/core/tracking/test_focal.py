@@ -12,7 +12,7 @@ from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.tracking.frames import Path
 from mvsgs_core.tracking.tracker import Tracker, Update
-from tests.core.tracking.sequences import ate
+from tests.support.sequences import ate
 
 SIZE = (240, 320)
 GUESS = np.array(guess_lens(SIZE).intrinsics)

@@ -10,7 +10,7 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.front_end import FrontEndConfig, Step
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
 from mvsgs_core.tracking.matching.flow import Matches
-from tests.core.tracking.sequences import synthetic, track, tracked_room
+from tests.support.sequences import synthetic, track, tracked_room
 
 WIDTH, LIMIT = 320, 0.05  # a keyframe after 16 pixels
 

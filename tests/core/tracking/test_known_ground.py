@@ -9,7 +9,7 @@ import numpy as np
 from mvsgs_core.tracking.frames import State
 from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.tracker import TrackerConfig
-from tests.core.tracking.sequences import ate, synthetic, track
+from tests.support.sequences import ate, synthetic, track
 
 ROUND = 80  # frames of a round: every third of 240 of the room's loop
 

@@ -7,7 +7,7 @@ import pytest
 
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.posed import PosedTracker
-from tests.core.tracking.sequences import synthetic
+from tests.support.sequences import synthetic
 
 
 def depths(factor: float, count: int = 40) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -8,7 +8,7 @@ import pytest
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import make_flow
 from mvsgs_core.tracking.matching.raft_flow import RaftFlow, RefinedRaftFlow
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 SHIFT = np.array([21.0, -13.0])
 

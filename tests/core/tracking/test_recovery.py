@@ -13,8 +13,8 @@ from mvsgs_core.tracking.frames import FrameRecord, State
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.places.recovery import RecoveryConfig
 from mvsgs_core.tracking.tracker import Tracker
-from tests.core.tracking.sequences import synthetic, track
-from tests.shared_data import shared
+from tests.support.sequences import synthetic, track
+from tests.support.shared_data import shared
 
 
 def covered(items: list[Item], noisy: range, black: range) -> list[Item]:

@@ -11,7 +11,7 @@ from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
-from tests.core.tracking.sequences import tracked_room
+from tests.support.sequences import tracked_room
 
 SIZE = (120, 160)
 

@@ -17,7 +17,7 @@ from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
 from mvsgs_core.tracking.places.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.tracking.tracker import Tracker
-from tests.core.tracking.sequences import tracked_room
+from tests.support.sequences import tracked_room
 
 
 def matches_of(reference: int, frame: int) -> tuple[Matches, np.ndarray]:

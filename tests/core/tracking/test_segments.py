@@ -10,7 +10,7 @@ from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.tracking.frames import State
 from mvsgs_core.tracking.tracker import Tracker
-from tests.core.tracking.sequences import ate
+from tests.support.sequences import ate
 
 BEFORE, COVERED = 30, 3
 

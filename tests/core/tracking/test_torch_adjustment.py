@@ -11,8 +11,8 @@ import torch
 from mvsgs_core.tracking.estimation import torch_adjustment
 from mvsgs_core.tracking.estimation.bundle_adjustment import DROID_LOCAL, Graph, Solution, Solver, adjust
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
-from tests.core.tracking.sequences import synthetic
 from tests.core.tracking.test_bundle_adjustment import moved, scene
+from tests.support.sequences import synthetic
 
 
 def both(graph: Graph, solver: Solver) -> tuple[Solution, Solution]:

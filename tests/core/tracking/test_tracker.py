@@ -10,8 +10,8 @@ from mvsgs_core.datasets import open_dataset
 from mvsgs_core.tracking.frames import State
 from mvsgs_core.tracking.matching.flow import FLOWS
 from mvsgs_core.tracking.tracker import TrackerConfig
-from tests.core.tracking.sequences import ate, synthetic, track, tracked_room
-from tests.shared_data import shared
+from tests.support.sequences import ate, synthetic, track, tracked_room
+from tests.support.shared_data import shared
 
 
 def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:

@@ -11,7 +11,7 @@ from mvsgs_core.export.cameras import Cameras, write_cameras
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.insertion import InsertionConfig, points_from_depth, splats_from_points
 from mvsgs_core.trajectory_file import write_trajectory
-from tests.core.mapping.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, posed_view
 
 ORIGIN = np.array([10.0, -3.0, 0.5])
 SIZE = (24, 32)

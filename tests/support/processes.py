@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from nodes.runtime.signals import STARTING
-from tests.shared_data import ROOT
+from tests.support.shared_data import ROOT
 
 ENVIRONMENT = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
@@ -121,7 +121,7 @@ class Graph:
     def diamond(self, **configs: Mapping[str, Any]) -> None:
         """source -> left, right -> join; the join writes `joined`."""
         join = {"path": str(self.directory / "joined.json"), **configs.get("join", {})}
-        here = "tests.sample_nodes"
+        here = "tests.support.sample_nodes"
         self.start("join", f"{here}.Join", {"Keyframe": "left", "GroundTruth": "right"}, {}, join)
         self.start("left", f"{here}.Left", {"Frame": "source"}, {"Keyframe": 1}, configs.get("left"))
         self.start("right", f"{here}.Right", {"Frame": "source"}, {"GroundTruth": 1}, configs.get("right"))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 
 def folder(name: str) -> Path:
