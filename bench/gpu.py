@@ -30,7 +30,7 @@ from bench import networks
 from bench.rasterizer import intrinsics, scene, work
 from bench.table import Row, main
 from mvsgs_core.mapping import optimizer
-from mvsgs_core.mapping.keyframes import PosedView, training_view
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig, train_once
 from mvsgs_core.rasterizer import ssim
@@ -168,10 +168,10 @@ def iteration_rows(size: tuple[int, int], count: int, device: torch.device, roun
     state.append(scene(count, size[1], "gaussian"), torch.zeros(count, dtype=torch.int64))
     g = np.random.default_rng(0)
     image = g.integers(0, 255, (*size, 3), dtype=np.uint8)
-    posed = PosedView(0, image, intrinsics(size), np.eye(4), np.zeros(size, np.float32))
+    posed = RGBDKeyframe(0, image, intrinsics(size), np.eye(4), np.zeros(size, np.float32))
     view = training_view(posed, np.eye(4), None, 1, device)
     training = TrainingConfig(backend="triton")
-    groups = optimizer.groups(optimizer.LearningRates(), 1.0, 1.0, False, training.density)
+    groups = optimizer.groups(optimizer.OptimizerConfig(), 1.0, 1.0, False, training.density)
     log = Stats()
     rendered = torch.rand(*size, 3, device=device, requires_grad=True)
     target = view.target(0)

@@ -23,7 +23,7 @@ from bench.table import Row, at_least, at_most, main
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.image_metrics import psnr
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import SkipConfig
 from mvsgs_core.rasterizer.rasterize import rasterize
@@ -36,8 +36,8 @@ class Scene:
     """Keyframes to map and frames to score."""
 
     name: str
-    views: list[PosedView]
-    held_out: list[PosedView]
+    views: list[RGBDKeyframe]
+    held_out: list[RGBDKeyframe]
 
     @property
     def label(self) -> str:
@@ -71,8 +71,8 @@ class Run:
 def room(keyframes: int, size: tuple[int, int]) -> Scene:
     """Every 3rd frame is a keyframe; frame 1 of every other gap is held out."""
     frames = open_dataset("synthetic", scene="room", frames=3 * keyframes, size=size)
-    views: list[PosedView] = []
-    held_out: list[PosedView] = []
+    views: list[RGBDKeyframe] = []
+    held_out: list[RGBDKeyframe] = []
     for item in frames:
         if item.index % 3 == 0 or item.index % 6 == 1:
             (views if item.index % 3 == 0 else held_out).append(_posed(item))
@@ -81,8 +81,8 @@ def room(keyframes: int, size: tuple[int, int]) -> Scene:
 
 def kitchen(path: Path, frames: int, size: tuple[int, int]) -> Scene:
     """7-Scenes: frames with depth are the even ones; every 6th is a keyframe, the 3rd after it held out."""
-    views: list[PosedView] = []
-    held_out: list[PosedView] = []
+    views: list[RGBDKeyframe] = []
+    held_out: list[RGBDKeyframe] = []
     for item in open_dataset("seven_scenes", path=str(path), size=size, stop=frames):
         if item.world_from_cam is None:
             continue
@@ -93,10 +93,10 @@ def kitchen(path: Path, frames: int, size: tuple[int, int]) -> Scene:
     return Scene("kitchen", views, held_out)
 
 
-def _posed(item: Item) -> PosedView:
+def _posed(item: Item) -> RGBDKeyframe:
     assert item.world_from_cam is not None
     depth = np.zeros(item.image.shape[:2], dtype=np.float32) if item.depth is None else item.depth
-    return PosedView(
+    return RGBDKeyframe(
         item.index, item.image, item.intrinsics, item.world_from_cam, depth, normals=normals_of(depth, item.intrinsics)
     )
 
@@ -126,7 +126,7 @@ def run(scene: Scene, config: MapperConfig, checkpoints: int = 10, period: float
     start = time.perf_counter()
     for view in scene.views:
         came = time.perf_counter()
-        mapper.add_view(view)
+        mapper.add_keyframe(view)
         while period is not None and time.perf_counter() - came < period and mapper.step():
             pass
     while period is None and mapper.step():

@@ -18,10 +18,10 @@ import torch
 from bench.table import Row, main
 from mvsgs_core import camera
 from mvsgs_core.mapping import optimizer
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.optimizer import OptimizerConfig
 from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
@@ -119,7 +119,7 @@ def once(
     refused_steps = 0
     if len(splats):
         (loss + render.depth.mean() + render.opacity.mean()).backward()
-        groups = optimizer.groups(LearningRates(), 2.0, 1.0, True, density)
+        groups = optimizer.groups(OptimizerConfig(), 2.0, 1.0, True, density)
         refused_steps = optimizer.step(state, render.visible, groups, 100)
     finite = all(bool(torch.isfinite(value).all()) for value in (render.color, render.depth, render.opacity))
     spread_no_further = all(
@@ -133,7 +133,7 @@ def once(
     return Row(name, text, "", FINITE, finite and spread_no_further)
 
 
-def box_view(index: int, x: float, size: tuple[int, int] = SIZE, origin: float = 0.0) -> PosedView:
+def box_view(index: int, x: float, size: tuple[int, int] = SIZE, origin: float = 0.0) -> RGBDKeyframe:
     """A textured plane two units ahead, seen from x."""
     height, width = size
     intrinsics = camera.scale_intrinsics(INTRINSICS, SIZE, size)
@@ -145,14 +145,14 @@ def box_view(index: int, x: float, size: tuple[int, int] = SIZE, origin: float =
     pose[0, 3] = x + origin
     image = np.round(255.0 * np.clip(waves, 0.0, 1.0)).astype(np.uint8)
     normals = np.broadcast_to(np.array([0.0, 0.0, -1.0], dtype=np.float32), (height, width, 3)).copy()
-    return PosedView(index, image, intrinsics, pose, np.full(size, 2.0, dtype=np.float32), normals=normals)
+    return RGBDKeyframe(index, image, intrinsics, pose, np.full(size, 2.0, dtype=np.float32), normals=normals)
 
 
-def mapped(name: str, views: list[PosedView], config: MapperConfig, least: float | None = None) -> Row:
+def mapped(name: str, views: list[RGBDKeyframe], config: MapperConfig, least: float | None = None) -> Row:
     """The whole mapper on these views; least: dB that its keyframes must reach, None: only finiteness is looked at."""
     mapper = OnlineMapper(config)
     for posed in views:
-        mapper.add_view(posed)
+        mapper.add_keyframe(posed)
     while mapper.step():
         pass
     state_finite = all(bool(torch.isfinite(getattr(mapper.state.splats, key)).all()) for key in PARAMETERS)
@@ -174,13 +174,13 @@ def mapped(name: str, views: list[PosedView], config: MapperConfig, least: float
     return Row(name, f"{text}; {len(mapper.log.warnings)} warnings", "", goal, met)
 
 
-def with_bad_pixels(view: PosedView) -> PosedView:
+def with_bad_pixels(view: RGBDKeyframe) -> RGBDKeyframe:
     image = view.image.astype(np.float32) / 255.0
     image[4:9, 5:20] = np.nan
     return replace(view, image=image)
 
 
-def with_bad_depths(view: PosedView) -> PosedView:
+def with_bad_depths(view: RGBDKeyframe) -> RGBDKeyframe:
     depth = view.depth.copy()
     depth[:9] = np.nan
     depth[9:12] = np.inf
@@ -219,7 +219,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     rows.append(mapped("mapper, NaN pose", lost, config, GOOD))
     rows.append(mapped("mapper, images of one pixel", [box_view(k, 0.2 * k, size=(1, 1)) for k in range(3)], config))
     steps = 2_000 if options.quick else 20_000
-    usual = LearningRates()
+    usual = OptimizerConfig()
     wild = replace(usual, **{key: 100.0 * value for key, value in vars(usual).items()
                              if key not in ("means_final", "decay_steps")})  # fmt: skip
     for density in ("gaussian", "exact"):

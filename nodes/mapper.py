@@ -12,19 +12,19 @@ import numpy as np
 from msgs import Keyframe, MapView, Poses, Preview, SplatMap, View
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints import checkpoint
 from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.replay import Replay
-from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.losses import LossConfig
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.optimizer import OptimizerConfig
 from mvsgs_core.mapping.preview import preview_arrays
-from mvsgs_core.mapping.provisional import CoarseView, Provisional
-from mvsgs_core.mapping.session import Session
+from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from nodes import Node
 
@@ -87,14 +87,14 @@ class Mapper(Node):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         self._core_config = mapper_config(self.config)
-        self.session, resumed = Session(OnlineMapper(self._core_config, self.stats)), None
+        self.atlas, resumed = Atlas(OnlineMapper(self._core_config, self.stats)), None
         self._replay: Replay | None = None
         if self.config.resume is not None:
-            self.session, resumed = checkpoint.load(Path(self.config.resume), self._core_config, self.stats)
-            self._replay = Replay(self.session)
+            self.atlas, resumed = checkpoint.load(Path(self.config.resume), self._core_config, self.stats)
+            self._replay = Replay(self.atlas)
         self._checkpoints: Checkpointing | None = None
         if self.config.output is not None:
-            self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.session, resumed)
+            self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.atlas, resumed)
         self._last_preview = 0.0
         self._provisional = Provisional(self.config.preview_splats)
 
@@ -105,23 +105,23 @@ class Mapper(Node):
 
     @property
     def mapper(self) -> OnlineMapper:
-        return self.session.current
+        return self.atlas.current
 
     def on_view(self, view: View) -> Iterator[Preview | MapView]:
         self._provisional.came(view.index)
         if not self._is_new_view(view):
             return
         # sent on its way before its segment was joined: by keyframe and not by number, as the pose is corrected so, too
-        segment = self.session.segment_of.get(view.index, view.segment)
+        segment = self.atlas.segment_of.get(view.index, view.segment)
         self._settle()
-        self.session.enter(segment)
+        self.atlas.enter(segment)
         if self.config.map_views:
             self._settle()
             yield from self._map_view(segment)
-        self.session.came(view.index, view.timestamp)
+        self.atlas.came(view.index, view.timestamp)
         known = len(self.mapper.views)
-        self.mapper.add_view(
-            PosedView(
+        self.mapper.add_keyframe(
+            RGBDKeyframe(
                 index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
                 depth=view.depth, scale=view.scale, confidence=view.confidence, normals=view.normals,
                 unfiltered=view.unfiltered, timestamp=view.timestamp,
@@ -132,14 +132,14 @@ class Mapper(Node):
         if self._checkpoints is not None:
             for added in self.mapper.views[known:]:
                 self._checkpoints.added(added)
-            self._checkpoints.keep(self.session)
+            self._checkpoints.keep(self.atlas)
         yield from self._preview()
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Preview]:
         if not self._previewing:
             return
         self._provisional.see(
-            CoarseView(
+            CoarseKeyframe(
                 index=keyframe.index, image=keyframe.image, intrinsics=keyframe.intrinsics, scale=keyframe.scale,
                 world_from_cam=keyframe.world_from_cam, inverse_depth=keyframe.inverse_depth,
                 weight=keyframe.inverse_depth_weight, segment=keyframe.segment,
@@ -153,11 +153,11 @@ class Mapper(Node):
             self._say_what_does_not_fit()
             return
         self._settle()  # the map must not depend on when they come
-        self.session.revision = max(self.session.revision, poses.revision)
-        self.session.correct(poses.index, poses.world_from_cam, poses.scale)
+        self.atlas.revision = max(self.atlas.revision, poses.revision)
+        self.atlas.correct(poses.index, poses.world_from_cam, poses.scale)
         if poses.segment is not None:
-            self.session.segment_of.update(zip(poses.index.tolist(), poses.segment.tolist()))
-            self.session.join()
+            self.atlas.segment_of.update(zip(poses.index.tolist(), poses.segment.tolist()))
+            self.atlas.join()
         yield from ()
 
     def on_idle(self) -> list[Preview] | None:
@@ -172,29 +172,29 @@ class Mapper(Node):
 
     def on_end(self) -> Iterator[SplatMap | Preview]:
         self._settle(realtime=False)
-        self.session.stream_ended = True
+        self.atlas.stream_ended = True
         self._choose_largest()
-        self.stats.values["segments_apart"] = max(0, len(self.session.parts) - 1)  # beside the map that is shown
+        self.stats.values["segments_apart"] = max(0, len(self.atlas.parts) - 1)  # beside the map that is shown
         yield self._map(refined=False)
-        while self.session.refined < self.config.refinement:
-            self.mapper.refine(self.session.refined, self.config.refinement)
-            self.session.refined += 1
+        while self.atlas.refined < self.config.refinement:
+            self.mapper.refine(self.atlas.refined, self.config.refinement)
+            self.atlas.refined += 1
             self._keep()
         self._report()
         self._check()
         if not len(self.mapper.state):
             self.stats.nothing(self._why_nothing())
         elif self._checkpoints is not None:
-            self.stats.values["map_bytes"] = self._checkpoints.finish(self.session)
+            self.stats.values["map_bytes"] = self._checkpoints.finish(self.atlas)
         yield from self._preview(due=True)  # who watches is left with the map as it is now
         yield self._map(refined=True)
         if self._checkpoints is not None:
-            self._checkpoints.close(self.session, keep=self.config.keep_checkpoint)
+            self._checkpoints.close(self.atlas, keep=self.config.keep_checkpoint)
             self._checkpoints = None
 
     def on_abort(self, reason: str) -> None:
         if self._checkpoints is not None:
-            self._checkpoints.last(self.session)
+            self._checkpoints.last(self.atlas)
 
     def _is_new_view(self, view: View) -> bool:
         if self._replay is None or self._replay.view(view.index, view.world_from_cam, view.scale):
@@ -218,7 +218,7 @@ class Mapper(Node):
         """Between two iterations, where nothing is half changed."""
         self.rest()
         if self._checkpoints is not None:
-            self._checkpoints.keep(self.session)
+            self._checkpoints.keep(self.atlas)
 
     def _why_nothing(self) -> str:
         counts = self.stats.counts
@@ -247,10 +247,10 @@ class Mapper(Node):
             self.stats.warn(f"images of keyframes cannot be saved: {error.strerror or error}")
 
     def _choose_largest(self) -> None:
-        parts = list(self.session.parts.values())
+        parts = list(self.atlas.parts.values())
         if len(parts) < 2:
             return
-        self.session.current = self.session.largest
+        self.atlas.current = self.atlas.largest
         total = sum(len(mapper.views) for mapper in parts)
         self.stats.warn(
             f"tracking was lost: the map shows the largest of {len(parts)} parts, "
@@ -260,7 +260,7 @@ class Mapper(Node):
     def _report(self) -> None:
         self.stats.values["splats"] = len(self.mapper.state)
         self.stats.values["iterations"] = self.mapper.iterations
-        self.stats.values["iterations_owed"] = self.mapper.schedule.owed
+        self.stats.values["iterations_pending"] = self.mapper.schedule.pending
         self.stats.values["image_bytes"] = self.mapper.image_bytes
 
     def _check(self) -> None:
@@ -306,7 +306,7 @@ class Mapper(Node):
         self._last_preview = now
         view = self.mapper.views[-1]
         with self.stats.time("provisional"):
-            segments = {segment for segment, part in self.session.parts.items() if part is self.mapper}
+            segments = {segment for segment, part in self.atlas.parts.items() if part is self.mapper}
             provisional = self._provisional.splats(self.mapper, segments)
         arrays = preview_arrays(self.mapper, self.config.preview_splats, provisional)
         origin = np.zeros(3) if self.mapper.origin is None else self.mapper.origin
@@ -352,10 +352,10 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
             converged=config.skip_converged, tiles=config.skip_tiles, coarse_to_fine=config.coarse_to_fine,
             selective=config.selective,
         ),
-        rates=LearningRates(),
+        rates=OptimizerConfig(),
         insertion=InsertionConfig(
             unexplored=config.unexplored, unexplored_psnr=config.unexplored_psnr, voxel=config.voxel,
             map_voxel=config.map_voxel, map_voxel_error=config.map_voxel_error, fill=config.fill,
         ),
-        density_control=DensityConfig(mode=config.density_control, max_splats=config.max_splats),
+        density_control=DensityControlConfig(mode=config.density_control, max_splats=config.max_splats),
     )  # fmt: skip

@@ -20,11 +20,11 @@ from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from nodes.mapper import Mapper, mapper_config
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 
 def view_message(index: int, t: float, scale: float = 1.0, segment: int = 0) -> View:
-    view = posed_view(index, pose_on_arc(t), (24, 32))
+    view = rgbd_keyframe(index, pose_on_arc(t), (24, 32))
     assert view.normals is not None
     return View(
         index=index, timestamp=0.1 * index, image=view.image, intrinsics=view.intrinsics,
@@ -147,7 +147,7 @@ def test_the_maps_of_segments_that_a_loop_joins_become_one() -> None:
     node = Mapper(settings())
     for index, segment in [(0, 0), (1, 0), (2, 1), (3, 1)]:
         list(node.on_view(view_message(index, index / 5, segment=segment)))
-    parts = [len(mapper.state) for mapper in node.session.parts.values()]
+    parts = [len(mapper.state) for mapper in node.atlas.parts.values()]
     moved = np.stack([pose_on_arc(k / 5) for k in (2, 3, 4)])
     moved[:, :3, 3] += [0.5, 0.0, 0.0]
     joined = np.zeros(3, np.int32)
@@ -168,7 +168,7 @@ def test_a_pose_that_is_none_is_counted_once_whatever_the_segments() -> None:
     node = Mapper(settings())
     for index, segment in ((0, 0), (1, 0), (2, 1), (3, 1)):
         list(node.on_view(view_message(index, 0.2 * index, segment=segment)))
-    assert len(node.session.parts) == 2
+    assert len(node.atlas.parts) == 2
     poses = np.stack([pose_on_arc(k / 5) for k in (0, 2)])
     poses[0, 0, 3] = np.nan
     list(node.on_poses(Poses(1, np.array([0, 2]), poses, np.ones(2), np.array([0, 1], np.int32))))
@@ -184,7 +184,7 @@ def test_a_segment_of_which_only_poses_are_known_yet_waits_for_its_views() -> No
     list(node.on_poses(Poses(1, np.array([2]), pose_on_arc(0.4)[None], np.ones(1), zero)))
     list(node.on_view(view_message(3, 0.6, segment=0)))
     list(node.on_view(view_message(4, 0.8, segment=2)))
-    assert [len(mapper.views) for mapper in node.session.parts.values()] == [2, 1]
+    assert [len(mapper.views) for mapper in node.atlas.parts.values()] == [2, 1]
     assert "segments_joined" not in node.stats.counts
 
 

@@ -11,14 +11,14 @@ import torch
 
 from bench import networks
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import load, save
 from mvsgs_core.mapping.checkpoints.files import FOLDER, KEYFRAMES, state_file
 from mvsgs_core.mapping.checkpoints.images import image_names, write_images
-from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.losses import LossConfig
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
-from mvsgs_core.mapping.session import Session
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.mvs.interface import CostOptions, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
@@ -28,7 +28,7 @@ from tests.core.fusion.test_consistency import view
 from tests.core.mvs.test_backends import SIZE, problem
 from tests.core.tracking.test_torch_adjustment import noisy
 from tests.support.pretend_device import DEVICE, PretendDevice
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 
 def test_the_pretended_device_mixes_with_no_other() -> None:
@@ -95,13 +95,13 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
             loss=LossConfig(),
         ),
         skipping=SkipConfig(tiles=True, tiles_every=2, coarse_to_fine=True, coarse_visits=1),
-        density_control=DensityConfig(every=3, mode=mode),
+        density_control=DensityControlConfig(every=3, mode=mode),
     )  # fmt: skip
-    views = [posed_view(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(3)]
+    views = [rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(3)]
     with PretendDevice():
         mapper = OnlineMapper(config)
         for one in views:
-            mapper.add_view(one)
+            mapper.add_keyframe(one)
         while mapper.step():
             pass
         moved = views[1].world_from_cam.copy()
@@ -120,16 +120,16 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
 def test_a_checkpoint_of_a_mapper_elsewhere_gives_it_back(tmp_path: Path) -> None:
     training = TrainingConfig(backend="reference", exposure=True, poses=True, pose_visits=0)
     config = MapperConfig(iterations=3, device=DEVICE, training=training, skipping=SkipConfig(tiles=True))
-    views = [posed_view(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(2)]
+    views = [rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(2)]
     images = tmp_path / FOLDER / KEYFRAMES
     images.mkdir(parents=True)
     with PretendDevice():
         mapper = OnlineMapper(config)
         for one in views:
-            mapper.add_view(one)
+            mapper.add_keyframe(one)
         mapper.step()
-        session = Session(mapper, {0: mapper})
-        frozen = session.frozen()
+        atlas = Atlas(mapper, {0: mapper})
+        frozen = atlas.frozen()
         names = [image_names(view) for view in frozen.current.views]
         for view, files in zip(frozen.current.views, names):
             write_images(images, view, files, sync=False)

@@ -175,7 +175,7 @@ def test_a_refinement_that_was_cut_off_goes_on_where_it_was(tmp_path: Path) -> N
 
         def rest() -> None:
             rests.append(None)
-            if cut is not None and node.session.refined == cut:
+            if cut is not None and node.atlas.refined == cut:
                 raise Cut
 
         node.config.refinement, node.rest = 9, rest

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from mvsgs_core.mapping import density_control, optimizer
-from mvsgs_core.mapping.density_control import DensityConfig
-from mvsgs_core.mapping.keyframes import PosedView, TrainingView, training_view
+from mvsgs_core.mapping.density_control import DensityControlConfig
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.mapping.map_state import MapState
-from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.optimizer import OptimizerConfig
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig, train_once
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.spherical_harmonics import C0
@@ -34,8 +34,8 @@ class SparseConfig:
     seed: int = 0
     initial_opacity: float = 0.1
     training: TrainingConfig = field(default_factory=TrainingConfig)
-    rates: LearningRates = field(default_factory=LearningRates)
-    density: DensityConfig = field(default_factory=DensityConfig)
+    rates: OptimizerConfig = field(default_factory=OptimizerConfig)
+    density: DensityControlConfig = field(default_factory=DensityControlConfig)
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class SparseMap:
 
     def _training(self, view: Posed) -> TrainingView:
         unknown = np.zeros(view.image.shape[:2], dtype=np.float32)
-        posed = PosedView(view.index, view.image, view.intrinsics, view.world_from_cam, unknown)
+        posed = RGBDKeyframe(view.index, view.image, view.intrinsics, view.world_from_cam, unknown)
         return training_view(posed, self._local(view.world_from_cam), None, 1, self.state.device)
 
     def _local(self, world_from_cam: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from bench.table import Row, at_least, at_most
 from bench.tracking.baselines import aligned_error
 from mvsgs_core import geometry, image_metrics
 from mvsgs_core.datasets import Item
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.tracking.graph import KeyframeGraph
@@ -89,8 +89,8 @@ def map_scores(items: Sequence[Item], closed: Closed) -> MapScores:
     for item in [item for item in items if item.index in closed.before][::EVERY]:
         n = item.index
         for mapper in (follows, stays):
-            mapper.add_view(_view(item, closed.before[n], closed.units[n], 1.0))
-        knows.add_view(_view(item, after[n], closed.units[n] * scale[n], scale[n]))
+            mapper.add_keyframe(_view(item, closed.before[n], closed.units[n], 1.0))
+        knows.add_keyframe(_view(item, after[n], closed.units[n] * scale[n], scale[n]))
     for mapper in (follows, stays, knows):
         while mapper.step():
             pass
@@ -130,10 +130,10 @@ def _mapper() -> OnlineMapper:
     return OnlineMapper(config)
 
 
-def _view(item: Item, pose: np.ndarray, unit: float, scale: float) -> PosedView:
+def _view(item: Item, pose: np.ndarray, unit: float, scale: float) -> RGBDKeyframe:
     assert item.depth is not None
     depth = item.depth[::2, ::2] * np.float32(unit)
-    return PosedView(item.index, item.image, item.intrinsics, pose, depth, scale)
+    return RGBDKeyframe(item.index, item.image, item.intrinsics, pose, depth, scale)
 
 
 def _score(mapper: OnlineMapper) -> float:

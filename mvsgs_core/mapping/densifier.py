@@ -24,7 +24,7 @@ from mvsgs_core.mapping.insertion import (
     unoccupied,
     voxel_filter,
 )  # fmt: skip
-from mvsgs_core.mapping.keyframes import PosedView, TrainingView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.rasterizer.rasterize import Render
@@ -46,7 +46,7 @@ class Densifier:
     median_depth: float  # of the scene, in `unit`
     log: Stats
 
-    def insert(self, view: PosedView, added: TrainingView, depth: np.ndarray) -> int:
+    def insert(self, view: RGBDKeyframe, added: TrainingView, depth: np.ndarray) -> int:
         """Adds splats where `depth` (h, w), world units, is known and the map does not explain the image."""
         config = self.config
         size = (depth.shape[0], depth.shape[1])
@@ -84,7 +84,7 @@ class Densifier:
             self.log.skip("points_voxel_filter", before - len(points))
         return self._append(points, added, config.initial_opacity, config.initial_scale)
 
-    def fill(self, view: PosedView, added: TrainingView) -> int:
+    def fill(self, view: RGBDKeyframe, added: TrainingView) -> int:
         """Adds sparse splats wherever the map shows nothing, what was just inserted included: at the depth before the
         filters, and where that says nothing continued from what surrounds it."""
         config = self.config

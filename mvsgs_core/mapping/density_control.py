@@ -18,7 +18,7 @@ from mvsgs_core.rasterizer.splats import Splats
 
 
 @dataclass(frozen=True)
-class DensityConfig:
+class DensityControlConfig:
     """When and how splats are added and removed during optimization."""
 
     mode: str = "adaptive"  # "adaptive": clone, split, prune; "relocate": as 3DGS-MCMC; "none"
@@ -41,7 +41,9 @@ class DensityChange:
 
 
 @torch.no_grad()
-def control(state: MapState, config: DensityConfig, median_depth: float, generator: torch.Generator) -> DensityChange:
+def control(
+    state: MapState, config: DensityControlConfig, median_depth: float, generator: torch.Generator
+) -> DensityChange:
     """One round on the gradients accumulated since the last; resets them. Raises ValueError for an unknown mode."""
     if config.mode not in ("adaptive", "relocate", "none"):
         raise ValueError(f"no density control {config.mode!r}; there are: adaptive, relocate, none")
@@ -51,19 +53,21 @@ def control(state: MapState, config: DensityConfig, median_depth: float, generat
         change = _relocate(state, config, median_depth, generator)
     else:
         change = _adapt(state, config, median_depth, generator)
-    state.reset_screen()
+    state.reset_means2d()
     return change
 
 
-def removable(state: MapState, config: DensityConfig, median_depth: float) -> Tensor:
+def removable(state: MapState, config: DensityControlConfig, median_depth: float) -> Tensor:
     """(N,) bool: transparent, or too large for the scene."""
     transparent = state.splats.opacity_logits < math.log(config.prune_opacity / (1.0 - config.prune_opacity))
     largest = state.splats.log_scales.max(dim=1).values
     return transparent | (largest > math.log(config.prune_scale * median_depth))
 
 
-def _adapt(state: MapState, config: DensityConfig, median_depth: float, generator: torch.Generator) -> DensityChange:
-    mean_gradient = state.screen_gradient / state.screen_views.clamp(min=1.0)
+def _adapt(
+    state: MapState, config: DensityControlConfig, median_depth: float, generator: torch.Generator
+) -> DensityChange:
+    mean_gradient = state.means2d_gradient / state.means2d_views.clamp(min=1.0)
     prune = removable(state, config, median_depth)
     dense = (mean_gradient > config.gradient) & ~prune
     room = max(0, config.max_splats - len(state))
@@ -114,7 +118,9 @@ def _halves(splats: Splats, generator: torch.Generator) -> Splats:
     return Splats(**doubled)
 
 
-def _relocate(state: MapState, config: DensityConfig, median_depth: float, generator: torch.Generator) -> DensityChange:
+def _relocate(
+    state: MapState, config: DensityControlConfig, median_depth: float, generator: torch.Generator
+) -> DensityChange:
     """Dead splats move onto live ones, drawn by opacity, such that the render changes least.
 
     Kheradmand et al. 2024 (3DGS as Markov chain Monte Carlo), equation 9: N splats at one place, each of opacity

@@ -14,8 +14,8 @@ from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
 
 IDENTITY = np.eye(3, 4, dtype=np.float32)
-LEAST_KNOWN = 0.05  # share of the image that the map must show
-LEAST_OPACITY = 0.9  # of a pixel that the map shows
+MIN_KNOWN = 0.05  # share of the image that the map must show
+MIN_OPACITY = 0.9  # of a pixel that the map shows
 SATURATED = 0.98  # a camera's color from here on, and from its complement down, is cut off
 SAMPLES = 20000  # pixels that are fitted, at most
 HOLD = 1e-3  # variance of color that counts as much as the identity does
@@ -31,9 +31,9 @@ def fitted_exposure(render: np.ndarray, opacity: np.ndarray, image: np.ndarray) 
     Robust (Cauchy): what the map does not know yet, or has at a wrong place, has little say. opacity: (H, W) of the
     render. None where the map shows too little of the image.
     """
-    known = (opacity > LEAST_OPACITY) & np.isfinite(render).all(axis=-1) & np.isfinite(image).all(axis=-1)
+    known = (opacity > MIN_OPACITY) & np.isfinite(render).all(axis=-1) & np.isfinite(image).all(axis=-1)
     known &= (image > 1.0 - SATURATED).all(axis=-1) & (image < SATURATED).all(axis=-1)
-    if known.mean() < LEAST_KNOWN:
+    if known.mean() < MIN_KNOWN:
         return None
     every = max(1, int(known.sum()) // SAMPLES)
     affine = np.zeros((3, 4), dtype=np.float32)

@@ -13,7 +13,7 @@ from mvsgs_core import camera
 from mvsgs_core.mapping.insertion import Points
 from mvsgs_core.membrane import membrane
 
-LEAST_CONFIDENCE = 0.15  # a depth below is worse than what surrounds it, continued
+MIN_CONFIDENCE = 0.15  # a depth below is worse than what surrounds it, continued
 STIFFNESS, EDGE = 200.0, 5.0  # of what is continued, see membrane: in gray levels
 
 
@@ -24,9 +24,9 @@ def continued_depth(depth: np.ndarray, confidence: np.ndarray, shown: np.ndarray
     shows nothing; image (h, w, 3) in [0, 1], at whose edges the surface may break. In inverse depth, where a plane
     stays a plane. Doubtful depth is left as it is where nothing better is in the whole image; all 0 where none is.
     """
-    sure = np.where((depth > 0) & (confidence >= LEAST_CONFIDENCE), confidence.astype(np.float32) ** 2, np.float32(0))
+    sure = np.where((depth > 0) & (confidence >= MIN_CONFIDENCE), confidence.astype(np.float32) ** 2, np.float32(0))
     known = np.where(sure > 0, depth, shown)
-    weight = np.where(sure > 0, sure, np.where(shown > 0, np.float32(LEAST_CONFIDENCE), np.float32(0)))
+    weight = np.where(sure > 0, sure, np.where(shown > 0, np.float32(MIN_CONFIDENCE), np.float32(0)))
     if not weight.any():
         known, weight = depth, (depth > 0).astype(np.float32)
     inverse = np.where(known > 0, 1.0 / np.maximum(known, 1e-30), 0.0).astype(np.float32)

@@ -12,7 +12,7 @@ from mvsgs_core import camera
 
 
 @dataclass(frozen=True)
-class PosedView:
+class RGBDKeyframe:
     """A keyframe with its depth, as it comes to the mapper."""
 
     index: int
@@ -95,7 +95,7 @@ class TrainingView:
 
 
 def training_view(
-    view: PosedView, local_from_cam: np.ndarray, max_pixels: int | None, level_count: int, device: torch.device
+    view: RGBDKeyframe, local_from_cam: np.ndarray, max_pixels: int | None, level_count: int, device: torch.device
 ) -> TrainingView:
     """The pyramid and state of a new keyframe. max_pixels: area of the training image; None: the image's own."""
     height, width = view.image.shape[:2]

@@ -86,7 +86,7 @@ def frequency_mask(image: Tensor, frequency: float) -> Tensor:
     return edge_response(image, frequency) >= 0.5
 
 
-def ges_loss(
+def photometric_loss(
     image: Tensor, target: Tensor, frequency: float, config: LossConfig | None = None, threads: int | None = None
 ) -> Tensor:
     """config.l1 L1 + config.ssim (1 - SSIM) + config.frequency mean |m image - m target|, a scalar; (H, W, 3) images.

@@ -8,7 +8,7 @@ from torch import Tensor
 from mvsgs_core.rasterizer.splats import Splats
 
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh", "betas")
-SINGLE = ("steps", "anchors", "screen_gradient", "screen_views")  # one value a splat beside the parameters
+SINGLE = ("steps", "anchors", "means2d_gradient", "means2d_views")  # one value a splat beside the parameters
 
 
 class MapState:
@@ -16,7 +16,7 @@ class MapState:
 
     `first` and `second` hold one tensor a parameter, of the parameter's shape. `steps` (N,) int32 counts the Adam steps
     of each splat: splats of an online map differ in age. `anchors` (N,) int64 is the keyframe that a splat moves with.
-    `screen_gradient` (N,) and `screen_views` (N,) accumulate what density control decides on.
+    `means2d_gradient` (N,) and `means2d_views` (N,) accumulate what density control decides on.
     """
 
     def __init__(self, sh_bases: int, device: torch.device) -> None:
@@ -28,8 +28,8 @@ class MapState:
         self.second = {name: torch.zeros_like(value) for name, value in empty.items()}
         self.steps = torch.zeros(0, dtype=torch.int32, device=device)
         self.anchors = torch.zeros(0, dtype=torch.int64, device=device)
-        self.screen_gradient = torch.zeros(0, device=device)
-        self.screen_views = torch.zeros(0, device=device)
+        self.means2d_gradient = torch.zeros(0, device=device)
+        self.means2d_views = torch.zeros(0, device=device)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -65,7 +65,7 @@ class MapState:
     def append(self, new: Splats, anchors: Tensor, steps: Tensor | None = None) -> None:
         """Adds splats with moments of zero. `steps`: their age; 0 unless they descend from older splats."""
         count = len(anchors)
-        values = self._given_up()
+        values = self._release_tensors()
         for name in PARAMETERS:
             added = getattr(new, name).detach().to(self.device)
             zeros = torch.zeros_like(added)
@@ -77,13 +77,13 @@ class MapState:
         zeros = torch.zeros(count, device=self.device)
         self.steps = torch.cat([self.steps, age])
         self.anchors = torch.cat([self.anchors, anchors.to(self.device)])
-        self.screen_gradient = torch.cat([self.screen_gradient, zeros])
-        self.screen_views = torch.cat([self.screen_views, zeros])
+        self.means2d_gradient = torch.cat([self.means2d_gradient, zeros])
+        self.means2d_views = torch.cat([self.means2d_views, zeros])
 
     @torch.no_grad()
     def take_over(self, other: MapState) -> None:
         """Adds all splats of another map with their moments, ages, anchors and gradients; `other` stays as it is."""
-        values = self._given_up()
+        values = self._release_tensors()
         for name in PARAMETERS:
             values[name] = torch.cat([values[name], getattr(other.splats, name).detach()])
             self.first[name] = torch.cat([self.first[name], other.first[name]])
@@ -91,22 +91,22 @@ class MapState:
         self.splats = _leaves(values)
         self.steps = torch.cat([self.steps, other.steps])
         self.anchors = torch.cat([self.anchors, other.anchors])
-        self.screen_gradient = torch.cat([self.screen_gradient, other.screen_gradient])
-        self.screen_views = torch.cat([self.screen_views, other.screen_views])
+        self.means2d_gradient = torch.cat([self.means2d_gradient, other.means2d_gradient])
+        self.means2d_views = torch.cat([self.means2d_views, other.means2d_views])
 
     @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
         """Drops the splats where `mask` (N,) bool is False."""
         if bool(mask.all()):
             return
-        values = self._given_up()
+        values = self._release_tensors()
         for name in PARAMETERS:
             values[name] = values[name][mask]
             self.first[name] = self.first[name][mask]
             self.second[name] = self.second[name][mask]
         self.splats = _leaves(values)
         self.steps, self.anchors = self.steps[mask], self.anchors[mask]
-        self.screen_gradient, self.screen_views = self.screen_gradient[mask], self.screen_views[mask]
+        self.means2d_gradient, self.means2d_views = self.means2d_gradient[mask], self.means2d_views[mask]
 
     @torch.no_grad()
     def grow_sh(self, bases: int) -> None:
@@ -122,16 +122,16 @@ class MapState:
         self.splats = _leaves(values)
 
     @torch.no_grad()
-    def accumulate_screen(self, gradient: Tensor, visible: Tensor) -> None:
+    def accumulate_means2d(self, gradient: Tensor, visible: Tensor) -> None:
         """Adds the norms (N,) of the screen-space gradients of one view, where it saw the splat."""
-        self.screen_gradient += torch.where(visible, gradient, 0.0)
-        self.screen_views += visible
+        self.means2d_gradient += torch.where(visible, gradient, 0.0)
+        self.means2d_views += visible
 
-    def reset_screen(self) -> None:
-        self.screen_gradient.zero_()
-        self.screen_views.zero_()
+    def reset_means2d(self) -> None:
+        self.means2d_gradient.zero_()
+        self.means2d_views.zero_()
 
-    def _given_up(self) -> dict[str, Tensor]:
+    def _release_tensors(self) -> dict[str, Tensor]:
         """The splats' tensors, held by nothing else: so that each is freed when a new one takes its place.
 
         Growing all of them at once would need the whole map's memory a second time.

@@ -15,16 +15,16 @@ from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping import density_control, optimizer
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
 from mvsgs_core.mapping.densifier import Densifier, checked_depth
-from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.keyframes import PosedView, TrainingView, training_view
+from mvsgs_core.mapping.keyframe_checks import MAX_DEPTH, NO_POSE, checked_keyframe, is_near, is_pose
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.mapping.map_state import MapState
-from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.optimizer import OptimizerConfig
 from mvsgs_core.mapping.schedule import Schedule
 from mvsgs_core.mapping.self_check import SelfCheck, check
 from mvsgs_core.mapping.snapshot import snapshot
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig, train_once
-from mvsgs_core.mapping.view_checks import LARGEST, NO_POSE, checked_view, is_near, is_pose
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.stats import Stats
 
@@ -44,13 +44,13 @@ class MapperConfig:
     device: str = "cpu"
     training: TrainingConfig = field(default_factory=TrainingConfig)
     skipping: SkipConfig = field(default_factory=SkipConfig)
-    rates: LearningRates = field(default_factory=LearningRates)
+    rates: OptimizerConfig = field(default_factory=OptimizerConfig)
     insertion: InsertionConfig = field(default_factory=InsertionConfig)
-    density_control: DensityConfig = field(default_factory=DensityConfig)
+    density_control: DensityControlConfig = field(default_factory=DensityControlConfig)
 
 
 class OnlineMapper:
-    """Builds the map: `add_view`, then `step` while there is something owed, `correct` at any time, `refine` last."""
+    """Builds the map: `add_keyframe`, then `step` while pending, `correct` at any time, `refine` last."""
 
     def __init__(
         self,
@@ -78,28 +78,28 @@ class OnlineMapper:
         known = [view.median_depth for view in self.views if view.median_depth > 0]
         return float(np.median(known)) if known else 1.0
 
-    def add_view(self, view: PosedView) -> int:
+    def add_keyframe(self, view: RGBDKeyframe) -> int:
         """Takes in a keyframe and adds splats where the map does not explain it; returns their number.
 
         Without `realtime`, what earlier keyframes are owed is done first, so that the result does not depend on how
-        fast keyframes come. A view that no camera gives is refused and counted, see `view_checks`.
+        fast keyframes come. A view that no camera gives is refused and counted, see `keyframe_checks`.
         """
         if self.config.realtime:
             self.log.skip("iterations_realtime", self.schedule.drop())
         else:
             while self.step():
                 pass
-        checked = checked_view(view, self.log)
+        checked = checked_keyframe(view, self.log)
         return 0 if checked is None else self._take_in(checked)
 
-    def _take_in(self, view: PosedView) -> int:
+    def _take_in(self, view: RGBDKeyframe) -> int:
         depth = checked_depth(view.depth, self.log)
         pose, scale = self.corrections.get(view.index, (np.asarray(view.world_from_cam, dtype=np.float64), view.scale))
         depth = depth * np.float32(scale / view.scale)
         median = _median(depth)
         if median == 0 and view.unfiltered is not None:  # the filters kept nothing: doubtful depth gives the scale
             median = _median(view.unfiltered) * scale / view.scale
-        if median >= LARGEST or (self.unit is not None and not is_near(self.local(pose)[:3, 3], median / self.unit)):
+        if median >= MAX_DEPTH or (self.unit is not None and not is_near(self.local(pose)[:3, 3], median / self.unit)):
             self.log.refuse("views", 1, "a keyframe far away from all others, or with depth so large, was refused")
             return 0
         if self.origin is None:
@@ -126,7 +126,7 @@ class OnlineMapper:
                 densifier.expose(added, self.views[-2] if len(self.views) > 1 else None)
             inserted = densifier.insert(view, added, depth) if (depth > 0).any() else 0
             inserted += densifier.fill(view, added)
-        self.schedule.owe(self.config.iterations)
+        self.schedule.add_budget(self.config.iterations)
         self.log.count("inserted", inserted)
         self.log.count("views")
         self.log.count("views_without_depth", float(not (depth > 0).any()))
@@ -134,7 +134,7 @@ class OnlineMapper:
 
     def step(self) -> bool:
         """One owed iteration; False when nothing is owed."""
-        if self.schedule.owed == 0 or not self.views or len(self.state) == 0:
+        if self.schedule.pending == 0 or not self.views or len(self.state) == 0:
             self.schedule.drop()
             return False
         with self.log.time("optimization"):
@@ -210,8 +210,8 @@ class OnlineMapper:
         self.views = sorted(self.views + other.views, key=lambda view: view.index)
         self.with_image = sorted(self.with_image + other.with_image, key=lambda view: view.index)
         self._bound_images()
-        self.schedule.forget()
-        self.schedule.owe(other.schedule.drop())
+        self.schedule.reset()
+        self.schedule.add_budget(other.schedule.drop())
         self.iterations += other.iterations
 
     def render(self, view: TrainingView, level: int = 0) -> Render:
@@ -250,7 +250,7 @@ class OnlineMapper:
             order = [view.index for view in self.with_image]
             k = min(range(1, last), key=lambda k: order[k + 1] - order[k - 1])
             self.with_image.pop(k).drop_images()
-            self.schedule.forget()
+            self.schedule.reset()
             self.log.refuse(
                 "images",
                 1,

@@ -15,7 +15,7 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 
 
 @dataclass(frozen=True)
-class LearningRates:
+class OptimizerConfig:
     """Rates of a splat's parameters. Lengths are in units of the scene's median depth."""
 
     means: float = 5.0e-4  # median depths a step, for a new splat
@@ -41,7 +41,7 @@ class Group:
     tail: float = 1.0  # the others this share of it
 
 
-def groups(rates: LearningRates, median_depth: float, factor: float, train_betas: bool, density: str) -> list[Group]:
+def groups(rates: OptimizerConfig, median_depth: float, factor: float, train_betas: bool, density: str) -> list[Group]:
     """The steps of all parameters for a scene of this median depth; `factor` scales all rates (the global decay)."""
     log_depth = math.log(median_depth)
     means = rates.means * median_depth * factor

@@ -16,19 +16,19 @@ from mvsgs_core import camera
 from mvsgs_core.mapping.densifier import SOLID
 from mvsgs_core.mapping.filling import continued_depth, fill_points
 from mvsgs_core.mapping.insertion import Points, depth_colors, splats_from_points
-from mvsgs_core.mapping.keyframes import PosedView, training_view
+from mvsgs_core.mapping.keyframe_checks import is_near
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.mapping.view_checks import is_near
 from mvsgs_core.mvs.coarse import enlarge_inverse_depth
 from mvsgs_core.rasterizer.splats import Splats
 
 KEPT = 8  # keyframes that wait for their depth: the newest
 SIDE = 4  # pixels of the image, side of the square that a splat stands for, or more where that is too many
-SHARE = 0.25  # of a preview's splats that may be provisional
+MAX_FRACTION = 0.25  # of a preview's splats that may be provisional
 
 
 @dataclass(frozen=True)
-class CoarseView:
+class CoarseKeyframe:
     """A keyframe with the tracker's depth alone."""
 
     index: int
@@ -43,7 +43,7 @@ class CoarseView:
 
 @dataclass
 class _Waiting:
-    view: CoarseView  # as it came
+    view: CoarseKeyframe  # as it came
     world_from_cam: np.ndarray
     scale: float
     segment: int
@@ -53,15 +53,15 @@ class _Waiting:
 class Provisional:
     """Feeds on keyframes as they come; `splats` makes what is missing within its budget of time."""
 
-    def __init__(self, limit: int, share_of_time: float = 0.05) -> None:
-        """limit: splats of a whole preview; share_of_time: of the time since the last preview, spent on new ones."""
+    def __init__(self, limit: int, time_fraction: float = 0.05) -> None:
+        """limit: splats of a whole preview; time_fraction: of the time since the last preview, spent on new ones."""
         self._waiting: list[_Waiting] = []
-        self._limit = int(SHARE * limit)
-        self._share = share_of_time
+        self._limit = int(MAX_FRACTION * limit)
+        self._time_fraction = time_fraction
         self._newest = -1  # keyframe that is in the map
         self._asked = time.perf_counter()
 
-    def see(self, view: CoarseView) -> None:
+    def see(self, view: CoarseKeyframe) -> None:
         """A keyframe that the map does not have yet; one that it has, or that is no camera, is passed over."""
         sound = np.isfinite(view.world_from_cam).all() and np.isfinite(view.intrinsics).all() and view.scale > 0
         if view.index > self._newest and sound:
@@ -94,7 +94,7 @@ class Provisional:
         The newest keyframe's are made at once; those of older ones only while there is time for it.
         """
         now = time.perf_counter()
-        deadline, self._asked = now + self._share * (now - self._asked), now
+        deadline, self._asked = now + self._time_fraction * (now - self._asked), now
         if mapper.unit is None or mapper.origin is None or not len(mapper.state):
             return None
         parts: list[Splats] = []
@@ -131,7 +131,7 @@ def _points(waiting: _Waiting, local_from_cam: np.ndarray, mapper: OnlineMapper)
     view = waiting.view
     size = (view.image.shape[0], view.image.shape[1])
     nothing = np.zeros((1, 1), dtype=np.float32)
-    posed = PosedView(view.index, view.image, view.intrinsics, waiting.world_from_cam, nothing)
+    posed = RGBDKeyframe(view.index, view.image, view.intrinsics, waiting.world_from_cam, nothing)
     render = mapper.render(training_view(posed, local_from_cam, None, 1, mapper.state.device))
     solid = render.opacity.cpu().numpy() > SOLID
     factor = waiting.scale / view.scale / (mapper.unit or 1.0)  # of depths as they came to the mapper's

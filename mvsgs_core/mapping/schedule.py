@@ -10,33 +10,33 @@ import numpy as np
 class Schedule:
     """Owed iterations and the order of the keyframes, drawn without replacement, seeded.
 
-    Keyframes are given by their position in the mapper's list. `owed` counts down to 0.
+    Keyframes are given by their position in the mapper's list. `pending` counts down to 0.
     """
 
     def __init__(self, window: int, seed: int) -> None:
         self.window = window
-        self.owed = 0
+        self.pending = 0
         self._random = np.random.default_rng(seed)
         self._local: list[int] = []
         self._all: list[int] = []
         self._turn = 0
 
-    def owe(self, iterations: int) -> None:
-        self.owed += iterations
+    def add_budget(self, iterations: int) -> None:
+        self.pending += iterations
         self._local = []  # the window has moved
 
     def drop(self) -> int:
         """Forgets what is owed; returns how many iterations that were."""
-        dropped, self.owed = self.owed, 0
+        dropped, self.pending = self.pending, 0
         return dropped
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The positions have changed: begins new rounds."""
         self._local, self._all = [], []
 
     def next(self, count: int) -> int:
         """Position of the next of `count` > 0 keyframes; takes one off what is owed."""
-        self.owed = max(0, self.owed - 1)
+        self.pending = max(0, self.pending - 1)
         self._turn += 1
         if self._turn % 2:
             if not self._local:
@@ -57,13 +57,13 @@ class Schedule:
     def state(self) -> dict[str, Any]:
         """All that the next draws depend on, as JSON has it."""
         return {
-            "owed": self.owed, "turn": self._turn, "local": list(self._local), "all": list(self._all),
+            "pending": self.pending, "turn": self._turn, "local": list(self._local), "all": list(self._all),
             "random": self._random.bit_generator.state,
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any], count: int) -> None:
         """Goes on where `state()` was taken, with `count` keyframes. Raises ValueError for what it never returns."""
-        self.owed, self._turn = (_at_least_zero(state.get(name)) for name in ("owed", "turn"))
+        self.pending, self._turn = (_at_least_zero(state.get(name)) for name in ("pending", "turn"))
         self._local, self._all = (_positions(state.get(name), count) for name in ("local", "all"))
         try:
             self._random.bit_generator.state = state["random"]

@@ -10,10 +10,10 @@ import numpy as np
 
 from mvsgs_core.image_metrics import psnr
 
-LEAST_PSNR = 25.0  # dB; a static map of sharp, steady images is above this
-MOST_EXPOSURE_GAIN = 1.5  # dB that one gain and offset an image and channel may bring before exposure is to blame
-LEAST_STEADY_PSNR = 22.0  # dB that they must reach: a render of something else gains by them, too
-MOST_NOISE = 6.0  # of 255; sharp and steady images without noise read 0.5 to 3.1, small and textured ones the most
+MIN_PSNR = 25.0  # dB; a static map of sharp, steady images is above this
+MAX_EXPOSURE_GAIN = 1.5  # dB that one gain and offset an image and channel may bring before exposure is to blame
+MIN_STEADY_PSNR = 22.0  # dB that they must reach: a render of something else gains by them, too
+MAX_NOISE = 6.0  # of 255; sharp and steady images without noise read 0.5 to 3.1, small and textured ones the most
 _SECOND_DERIVATIVE = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
 
 
@@ -33,23 +33,23 @@ class SelfCheck:
     @property
     def warning(self) -> str | None:
         """What to tell the user; None where the map explains its images, and the images are good."""
-        if self.psnr >= LEAST_PSNR:
+        if self.psnr >= MIN_PSNR:
             return self._noise_warning
         causes = []
-        if self.steady_psnr > max(LEAST_STEADY_PSNR, self.psnr + MOST_EXPOSURE_GAIN):
+        if self.steady_psnr > max(MIN_STEADY_PSNR, self.psnr + MAX_EXPOSURE_GAIN):
             causes.append(f"exposure changes (without: {self.steady_psnr:.1f} dB; mapper.exposure=true models it)")
-        if self.noise > MOST_NOISE:
+        if self.noise > MAX_NOISE:
             causes.append(f"noise of {self.noise:.0f} of 255")
         known = " and ".join(causes) or "motion, blur, wrong poses or too few iterations"
         return (
-            f"the map renders its own keyframes at {self.psnr:.1f} dB only ({LEAST_PSNR:g} expected): the images hold "
+            f"the map renders its own keyframes at {self.psnr:.1f} dB only ({MIN_PSNR:g} expected): the images hold "
             f"what a static map cannot explain, here {known}"
         )
 
     @property
     def _noise_warning(self) -> str | None:
         """Of a map that fits its noisy keyframes: it has learned some of their noise, and other views show that."""
-        if self.noise <= MOST_NOISE:
+        if self.noise <= MAX_NOISE:
             return None
         return (
             f"the images hold noise of {self.noise:.0f} of 255: even a perfect map would render them at "

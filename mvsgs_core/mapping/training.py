@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from mvsgs_core.mapping import optimizer
-from mvsgs_core.mapping.camera_steps import step_exposure, step_pose
+from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
 from mvsgs_core.mapping.keyframes import TrainingView
-from mvsgs_core.mapping.losses import LossConfig, frequency_of, ges_loss
+from mvsgs_core.mapping.losses import LossConfig, frequency_of, photometric_loss
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.rasterize import TILE, rasterize
 
@@ -107,7 +107,7 @@ def train_once(
         masked = torch.where(pixels_of_tiles(tiles, view.size(level))[..., None], masked, render.color.detach())
         log.skip("tiles_low_error", int((~tiles).sum()))
     frequency = frequency_of(view.visits, training.frequency_horizon)
-    loss = ges_loss(render.color, masked, frequency, training.loss, training.threads)
+    loss = photometric_loss(render.color, masked, frequency, training.loss, training.threads)
     view.visits += 1
     value = float(loss.detach())
     if not value < float("inf"):
@@ -120,7 +120,7 @@ def train_once(
         log.refuse("gradients", render.backward.refused, text)
     if render.screen.grad is not None:
         gradient = render.screen.grad.norm(dim=1)
-        state.accumulate_screen(torch.where(torch.isfinite(gradient), gradient, 0.0), render.visible)
+        state.accumulate_means2d(torch.where(torch.isfinite(gradient), gradient, 0.0), render.visible)
     visible = render.visible if skipping.selective else torch.ones_like(render.visible)
     refused = optimizer.step(state, visible, groups, decay_steps, training.threads or 0)
     if refused:

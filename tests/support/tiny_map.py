@@ -11,7 +11,7 @@ from mvsgs_core.export.cameras import Cameras, write_cameras
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.insertion import InsertionConfig, points_from_depth, splats_from_points
 from mvsgs_core.trajectory_file import write_trajectory
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 ORIGIN = np.array([10.0, -3.0, 0.5])
 SIZE = (24, 32)
@@ -21,7 +21,7 @@ INTRINSICS = np.array([25.0, 26.0, 15.5, 11.5])
 def final_map(bases: int = 4, density: str = "gaussian", origin: np.ndarray = ORIGIN, size: tuple[int, int] = SIZE,
               opacity: float = 0.9) -> Snapshot:  # fmt: skip
     """A splat for each pixel of the view from the origin."""
-    view = posed_view(0, np.eye(4), size)
+    view = rgbd_keyframe(0, np.eye(4), size)
     points = points_from_depth(view.depth, view.intrinsics, view.image / 255.0, view.normals, np.ones(size, dtype=bool))
     splats = splats_from_points(points, np.eye(4), bases, density, InsertionConfig(initial_opacity=opacity))
     generator = torch.Generator().manual_seed(0)

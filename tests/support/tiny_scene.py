@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core import camera
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 
 HALF = np.array([1.6, 1.2, 1.4])  # half edges of the box
 BOX = np.array([0.0, 0.0, 1.0])  # its center
@@ -20,9 +20,9 @@ def pose_on_arc(t: float) -> np.ndarray:
     return pose
 
 
-def posed_view(
+def rgbd_keyframe(
     index: int, world_from_cam: np.ndarray, size: tuple[int, int] = (48, 64), origin: float = 0.0, unit: float = 1.0
-) -> PosedView:
+) -> RGBDKeyframe:
     """The view from a pose; the world is scaled by `unit` and then moved by `origin` along x."""
     height, width = size
     intrinsics = np.array([0.8 * width, 0.8 * width, width / 2 - 0.5, height / 2 - 0.5])
@@ -37,7 +37,7 @@ def posed_view(
     inward = -np.sign(directions) * np.eye(3)[wall]
     pose = world_from_cam.copy()
     pose[:3, 3] = pose[:3, 3] * unit + [origin, 0.0, 0.0]
-    return PosedView(
+    return RGBDKeyframe(
         index=index,
         image=np.round(255 * _texture(points, wall)).astype(np.uint8),
         intrinsics=intrinsics,

@@ -1,4 +1,4 @@
-"""A session as a checkpoint: written to a folder and read back, every value checked. See `checkpoint_files`."""
+"""A atlas as a checkpoint: written to a folder and read back, every value checked. See `checkpoint_files`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core.atomic_file import replacing
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, nothing_there, read_state, state_files, write_state
 from mvsgs_core.mapping.checkpoints.state import Arrays, Corrections, pack, unpack, whole
 from mvsgs_core.mapping.mapper import MapperConfig
-from mvsgs_core.mapping.session import Session
 from mvsgs_core.stats import Stats
 
 # What the state's arrays depend on; everything else may be another one when a run goes on, and then is said.
@@ -22,38 +22,38 @@ OF_THE_MACHINE = ("device", "training.threads", "training.backend")
 LOGGED = ("counts", "skipped", "seconds", "warnings")
 
 
-def save(session: Session, config: MapperConfig, file: Path, names: dict[int, list[list[str]]], *, sync: bool) -> None:
-    """Writes a frozen session's state. config: of its mappers, with their device; names: image files by segment.
+def save(atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, list[list[str]]], *, sync: bool) -> None:
+    """Writes a frozen atlas's state. config: of its mappers, with their device; names: image files by segment.
 
     Raises OSError.
     """
-    log, corrections = session.current.log, session.current.corrections
+    log, corrections = atlas.current.log, atlas.current.corrections
     index = sorted(corrections)
     poses = np.array([corrections[k][0] for k in index], dtype=np.float64).reshape(-1, 4, 4)
     arrays: dict[str, np.ndarray] = {
-        "keyframes": np.array([view.index for part in session.parts.values() for view in part.views], dtype=np.int64),
-        "segment_of": np.array(sorted(session.segment_of.items()), dtype=np.int64).reshape(-1, 2),
+        "keyframes": np.array([view.index for part in atlas.parts.values() for view in part.views], dtype=np.int64),
+        "segment_of": np.array(sorted(atlas.segment_of.items()), dtype=np.int64).reshape(-1, 2),
         "corrections/index": np.array(index, dtype=np.int64),
         "corrections/world_from_cam": poses,
         "corrections/scale": np.array([corrections[k][1] for k in index], dtype=np.float64),
     }
     mappers: list[dict[str, Any]] = []
-    for segment, part in session.parts.items():
+    for segment, part in atlas.parts.items():
         head, own = pack(part, f"map{len(mappers)}", names[segment])
-        mappers.append({"segment": segment, "current": part is session.current, **head})
+        mappers.append({"segment": segment, "current": part is atlas.current, **head})
         arrays |= own
     meta = {
-        "config": described(config), "newest_view": session.newest_view, "stream_seconds": session.stream_seconds,
-        "revision": session.revision, "stream_ended": session.stream_ended, "refined": session.refined,
-        "splats": len(session.largest.state), "mappers": mappers,
+        "config": described(config), "newest_view": atlas.newest_view, "stream_seconds": atlas.stream_seconds,
+        "revision": atlas.revision, "stream_ended": atlas.stream_ended, "refined": atlas.refined,
+        "splats": len(atlas.largest.state), "mappers": mappers,
         "log": {name: getattr(log, name) for name in LOGGED},
     }  # fmt: skip
     with replacing(file, sync=sync) as aside:
         write_state(aside, meta, arrays)
 
 
-def load(output: Path, config: MapperConfig, log: Stats) -> tuple[Session, Path]:
-    """The session of the newest whole checkpoint in a run's output directory, and its file.
+def load(output: Path, config: MapperConfig, log: Stats) -> tuple[Atlas, Path]:
+    """The atlas of the newest whole checkpoint in a run's output directory, and its file.
 
     `log` gets what that run had counted, and warnings of what was wrong with newer checkpoints and of what of `config`
     is not as it was. Raises ValueError where there is none, or `config` does not fit.
@@ -61,13 +61,13 @@ def load(output: Path, config: MapperConfig, log: Stats) -> tuple[Session, Path]
     problems: list[str] = []
     for file in state_files(output):
         try:
-            session = _load(file, config, log)
+            atlas = _load(file, config, log)
         except ValueError as error:
             problems.append(f"{file}: {error}")
             continue
         for problem in problems:
             log.warn(f"an older checkpoint was taken: {problem}")
-        return session, file
+        return atlas, file
     raise ValueError("; ".join(problems) or nothing_there(output))
 
 
@@ -90,7 +90,7 @@ def described(config: Any, prefix: str = "") -> dict[str, str]:
     return found
 
 
-def _load(file: Path, config: MapperConfig, log: Stats) -> Session:
+def _load(file: Path, config: MapperConfig, log: Stats) -> Atlas:
     meta, raw = read_state(file)
     arrays, parts = Arrays(raw), meta.get("mappers")
     differing = list(_differences(meta.get("config"), config))
@@ -109,14 +109,14 @@ def _load(file: Path, config: MapperConfig, log: Stats) -> Session:
     images = file.parent / KEYFRAMES
     mappers = [unpack(part, arrays.of(f"map{k}"), config, log, corrections, images) for k, part in enumerate(parts)]
     pairs = arrays.take("segment_of", np.int64, (None, 2))
-    session = Session(
+    atlas = Atlas(
         mappers[chosen[0]], dict(zip(segments, mappers)), dict(pairs.tolist()), meta["newest_view"],
         meta["stream_seconds"], meta["revision"], meta["stream_ended"], whole(meta["refined"], "refined"),
     )  # fmt: skip
     log.include(logged)
     if differing:
         log.warn(f"the run goes on with other parameters than it had: {', '.join(differing)}")
-    return session
+    return atlas
 
 
 def _differences(saved: Any, config: MapperConfig) -> Iterator[str]:

@@ -7,47 +7,47 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.files import FOLDER
 from mvsgs_core.mapping.checkpoints.results import write_results
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.keyframes import TrainingView
-from mvsgs_core.mapping.session import Session
 from mvsgs_core.stats import Stats
 
-SHARE = 0.02  # of the mapper's time, at most, that copying the map for checkpoints holds it up
+MAX_FRACTION = 0.02  # of the mapper's time, at most, that copying the map for checkpoints holds it up
 LAST = 2.5  # seconds for the last checkpoint of a run that ends early
 
 
 class Checkpointing:
-    """Saves a session every `period` seconds of the stream or of the clock, and as soon as there is a map.
+    """Saves a atlas every `period` seconds of the stream or of the clock, and as soon as there is a map.
 
-    Less often where that would take more than `SHARE` of the time, or the disk is still writing the last one.
+    Less often where that would take more than `MAX_FRACTION` of the time, or the disk is still writing the last one.
     """
 
     def __init__(
-        self, output: Path, period: float, session: Session, resumed: Path | None = None,
+        self, output: Path, period: float, atlas: Atlas, resumed: Path | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:  # fmt: skip
         """output: the run's directory. period: 0: no checkpoints. resumed: the state that the run goes on from."""
         self._output, self._period, self._clock = output, period, clock
         own = resumed if resumed is not None and resumed.parent.parent == output else None
-        self._writer = CheckpointWriter(output, session.current.config, own)
+        self._writer = CheckpointWriter(output, atlas.current.config, own)
         self._began = self._saved_at = clock()
-        self._saved_stream = session.stream_seconds
+        self._saved_stream = atlas.stream_seconds
         self._never = resumed is None  # saved
         self._held = self._last = 0.0  # seconds that copying took: all, the last one
 
-    def keep(self, session: Session) -> None:
+    def keep(self, atlas: Atlas) -> None:
         """Saves if it is time to. Cheap where it is not: to be called after every view, slice and iteration."""
-        log = session.current.log
+        log = atlas.current.log
         self._pass_problems_on(log)
-        if not self._due(session):
+        if not self._due(atlas):
             return
         start = self._clock()
         with log.time("checkpoint"):
             log.count("checkpoints")
-            self._writer.submit(session.frozen())
-        self._saved_at, self._saved_stream, self._never = self._clock(), session.stream_seconds, False
+            self._writer.submit(atlas.frozen())
+        self._saved_at, self._saved_stream, self._never = self._clock(), atlas.stream_seconds, False
         self._last = self._saved_at - start
         self._held += self._last
 
@@ -56,48 +56,48 @@ class Checkpointing:
         if self._period > 0:
             self._writer.prepare(view)
 
-    def last(self, session: Session) -> None:
+    def last(self, atlas: Atlas) -> None:
         """What there is, for a run that ends early: within `LAST` seconds, or the checkpoint before stays."""
-        log = session.current.log
-        if not len(session.largest.state):
+        log = atlas.current.log
+        if not len(atlas.largest.state):
             return
         try:
             if self._period > 0:
-                self._writer.submit(session.frozen(), sync=False)
+                self._writer.submit(atlas.frozen(), sync=False)
                 if not self._writer.wait(LAST):
                     log.refuse("checkpoints", 1, "there was no time for a last checkpoint: the one before stays")
             else:
-                write_results(self._output, session.largest, sync=False)
+                write_results(self._output, atlas.largest, sync=False)
         except (OSError, ValueError) as error:
             log.refuse("checkpoints", 1, f"no last checkpoint: {error}")
         self._pass_problems_on(log)
 
-    def finish(self, session: Session) -> int:
+    def finish(self, atlas: Atlas) -> int:
         """The finished map: its files are whole and on the disk then; the bytes of map.ply. Raises OSError."""
         self._writer.wait()
-        self._pass_problems_on(session.current.log)
-        return write_results(self._output, session.current)
+        self._pass_problems_on(atlas.current.log)
+        return write_results(self._output, atlas.current)
 
-    def close(self, session: Session, *, keep: bool) -> None:
+    def close(self, atlas: Atlas, *, keep: bool) -> None:
         """After the map is finished. keep: its checkpoint is made too; else the last one stays, for a run whose report
         is still to be made. Of a map without splats nothing stays."""
-        mapped = len(session.largest.state) > 0
+        mapped = len(atlas.largest.state) > 0
         if keep and self._period > 0 and mapped:
-            self._writer.submit(session.frozen())
+            self._writer.submit(atlas.frozen())
         self._writer.wait()
-        self._pass_problems_on(session.current.log)
+        self._pass_problems_on(atlas.current.log)
         if not mapped:
             shutil.rmtree(self._output / FOLDER, ignore_errors=True)
 
-    def _due(self, session: Session) -> bool:
-        if self._period <= 0 or self._writer.busy or not any(len(part.state) for part in session.parts.values()):
+    def _due(self, atlas: Atlas) -> bool:
+        if self._period <= 0 or self._writer.busy or not any(len(part.state) for part in atlas.parts.values()):
             return False
         now = self._clock()
         if self._never:
             return True
-        if self._held + self._last > SHARE * (now - self._began):
+        if self._held + self._last > MAX_FRACTION * (now - self._began):
             return False
-        return max(now - self._saved_at, abs(session.stream_seconds - self._saved_stream)) >= self._period
+        return max(now - self._saved_at, abs(atlas.stream_seconds - self._saved_stream)) >= self._period
 
     def _pass_problems_on(self, log: Stats) -> None:
         while not self._writer.problems.empty():

@@ -23,7 +23,7 @@ import numpy as np
 
 FOLDER, KEYFRAMES = "checkpoint", "keyframes"
 FORMAT, VERSION = "mvsgs checkpoint", 1
-MOST_META = 64 << 20  # bytes of JSON
+MAX_META = 64 << 20  # bytes of JSON
 NEIGHBORS = 16  # keyframes before the newest one that stereo and fusion of the next ones may look at, at most
 
 
@@ -106,7 +106,7 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     except (ValueError, RuntimeError, EOFError, LookupError, struct.error, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     text = arrays.pop("meta", np.zeros(0, np.uint8)).tobytes()
-    if not 0 < len(text) <= MOST_META:
+    if not 0 < len(text) <= MAX_META:
         raise ValueError(f"{path} is no checkpoint of a mapper")
     try:
         meta = json.loads(text, parse_constant=_refuse)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvsgs_core.mapping.session import Session
+from mvsgs_core.mapping.atlas import Atlas
 
 TOLERANCE = 0.02  # of the median depth, radians and of scale, by which replayed poses may differ from the map's
 
@@ -16,10 +16,10 @@ class Replay:
     reference: what comes then does not fit the map, and nothing of it is taken.
     """
 
-    def __init__(self, session: Session) -> None:
-        """session: as it was loaded."""
-        self._session = session
-        self._newest, self._revision = session.newest_view, session.revision
+    def __init__(self, atlas: Atlas) -> None:
+        """atlas: as it was loaded."""
+        self._session = atlas
+        self._newest, self._revision = atlas.newest_view, atlas.revision
         self._found: dict[int, tuple[np.ndarray, float]] = {}  # replayed pose and scale of each keyframe
         self._decided = False
         self.problem = ""  # why nothing of the stream is taken

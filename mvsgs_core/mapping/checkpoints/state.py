@@ -22,7 +22,7 @@ Corrections = dict[int, tuple[np.ndarray, float]]
 SPLATS: dict[str, tuple[type, tuple[int, ...]]] = {  # N splats: dtype and shape of a row, without harmonics
     "means": (np.float32, (3,)), "log_scales": (np.float32, (3,)), "quaternions": (np.float32, (4,)),
     "opacity_logits": (np.float32, ()), "betas": (np.float32, ()), "steps": (np.int32, ()), "anchors": (np.int64, ()),
-    "screen_gradient": (np.float32, ()), "screen_views": (np.float32, ()),
+    "means2d_gradient": (np.float32, ()), "means2d_views": (np.float32, ()),
 }  # fmt: skip
 VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in TrainingView
     "index": (np.int64, ()), "timestamp": (np.float64, ()), "world_from_cam": (np.float64, (4, 4)),

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import images_of, save
 from mvsgs_core.mapping.checkpoints.files import FOLDER, KEYFRAMES, number_of, state_file, state_files
 from mvsgs_core.mapping.checkpoints.images import image_names, write_images
 from mvsgs_core.mapping.checkpoints.results import write_results
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.mapper import MapperConfig
-from mvsgs_core.mapping.session import Session
 
 AHEAD = 8  # keyframes whose images may wait to be written before their checkpoint is
 ASIDE = (".map.*.ply", ".trajectory.*.txt")  # what a killed process left half written, see `atomic_file`
@@ -52,11 +52,11 @@ class CheckpointWriter:
             kept = replace(view, levels=list(view.levels))  # should they be let go meanwhile
             self._do(lambda: self._write_images(kept, sync=True))
 
-    def submit(self, session: Session, *, sync: bool = True) -> None:
-        """Begins to write a frozen session, after what is being written. sync: wait for the disk."""
+    def submit(self, atlas: Atlas, *, sync: bool = True) -> None:
+        """Begins to write a frozen atlas, after what is being written. sync: wait for the disk."""
         with self._changed:
             self._pending += 1
-        self._do(lambda: self._write(session, sync))
+        self._do(lambda: self._write(atlas, sync))
 
     def wait(self, seconds: float | None = None) -> bool:
         """Whether all that was begun is done, by then. None: however long it takes."""
@@ -88,30 +88,30 @@ class CheckpointWriter:
                     self._left -= 1
                     self._changed.notify_all()
 
-    def _write(self, session: Session, sync: bool) -> None:
+    def _write(self, atlas: Atlas, sync: bool) -> None:
         try:
-            self._write_state(session, sync)
-            write_results(self._output, session.largest, sync=sync)
+            self._write_state(atlas, sync)
+            write_results(self._output, atlas.largest, sync=sync)
         finally:
             with self._changed:
                 self._pending -= 1
 
-    def _write_state(self, session: Session, sync: bool) -> None:
+    def _write_state(self, atlas: Atlas, sync: bool) -> None:
         (self._output / FOLDER / KEYFRAMES).mkdir(parents=True, exist_ok=True)
         if not self._begun:
             self._remove_parts()
             self._begun = True
         known = {
             segment: [self._write_images(view, sync=sync) for view in part.views]
-            for segment, part in session.parts.items()
+            for segment, part in atlas.parts.items()
         }
         file = state_file(self._output, self._number + 1)
-        save(session, self._config, file, known, sync=sync)
+        save(atlas, self._config, file, known, sync=sync)
         self._number += 1
         images = {name for names in known.values() for view in names for name in view}
         self._remove_others({file, self._before}, images | self._images_before)
         self._before, self._images_before = file, images
-        present = {view.index for part in session.parts.values() for view in part.views if view.levels}
+        present = {view.index for part in atlas.parts.values() for view in part.views if view.levels}
         self._names = {index: entry for index, entry in self._names.items() if index in present}
 
     def _write_images(self, view: TrainingView, sync: bool) -> list[str]:

@@ -12,7 +12,7 @@ import pytest
 from mvsgs_core.export.cameras import Cameras, read_cameras, write_cameras
 from mvsgs_core.mapping.checkpoints.results import cameras_of
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 
 def cameras(count: int = 3) -> Cameras:
@@ -40,9 +40,9 @@ def test_cameras_come_back_to_the_bit(tmp_path: Path, count: int) -> None:
 
 def test_a_map_knows_its_cameras_at_the_size_of_the_images_also_where_these_are_gone() -> None:
     mapper = OnlineMapper(MapperConfig(max_pixels=12 * 16, max_keyframes=2, window=1, iterations=2))
-    views = [posed_view(5 * k, pose_on_arc(k / 3), (24, 32), origin=100.0) for k in range(4)]
+    views = [rgbd_keyframe(5 * k, pose_on_arc(k / 3), (24, 32), origin=100.0) for k in range(4)]
     for view in views:
-        mapper.add_view(view)
+        mapper.add_keyframe(view)
     assert any(not view.levels for view in mapper.views)
     found = cameras_of(mapper.snapshot(), mapper.views)
     assert found.keyframes.tolist() == [0, 5, 10, 15]

@@ -30,7 +30,7 @@ from tests.support.tiny_map import (
     save_cameras,
     write_poses,
 )
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 TIMES = [0.4, 0.5, 0.6]
 
@@ -83,7 +83,7 @@ def test_colmap_opens_the_model_with_its_cameras_poses_and_points(tmp_path: Path
         np.testing.assert_allclose(found["images"][name]["cam_from_world"], np.linalg.inv(pose)[:3], atol=1e-9)
     points = np.array([found["points"][str(k + 1)] for k in range(24 * 32)])
     np.testing.assert_allclose(points[:, :3], read_ply(tmp_path / "map.ply").splats.means.numpy(), atol=1e-6)
-    image = posed_view(0, np.eye(4), SIZE).image
+    image = rgbd_keyframe(0, np.eye(4), SIZE).image
     np.testing.assert_allclose(points[:, 3:], image.reshape(-1, 3), atol=1.0)
     assert set(map(len, found["tracks"].values())) == {0}
 
@@ -126,7 +126,7 @@ def test_a_wall_hides_the_points_behind_it(tmp_path: Path, from_behind: bool) ->
 
 def test_images_are_those_of_the_names(tmp_path: Path) -> None:
     save_cameras(tmp_path, TIMES)
-    views = [posed_view(7 * k, pose_on_arc(t), SIZE) for k, t in enumerate(TIMES)]
+    views = [rgbd_keyframe(7 * k, pose_on_arc(t), SIZE) for k, t in enumerate(TIMES)]
     for view in views:
         write_image(tmp_path / "keyframes", view.index, view.image)
     write_image(tmp_path / "keyframes", 99, views[0].image)  # of a keyframe that the map has not

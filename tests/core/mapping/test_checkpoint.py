@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import load
 from mvsgs_core.mapping.checkpoints.files import (
     FOLDER,
@@ -23,13 +24,12 @@ from mvsgs_core.mapping.checkpoints.files import (
 )
 from mvsgs_core.mapping.checkpoints.keyframes import kept_keyframes
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
-from mvsgs_core.mapping.density_control import DensityConfig
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.density_control import DensityControlConfig
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.session import Session
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.stats import Stats
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (24, 32)
 PLAIN = MapperConfig(iterations=10, refinement=6, window=2, training=TrainingConfig(threads=1))
@@ -40,12 +40,12 @@ EVERYTHING = replace(
     max_keyframes=4,
     training=TrainingConfig(threads=1, density="exact", betas=True, exposure=True, poses=True, pose_visits=1),
     skipping=SkipConfig(tiles=True, coarse_to_fine=True, converged_visits=3),
-    density_control=DensityConfig(mode="relocate", every=7, prune_opacity=0.3),
+    density_control=DensityControlConfig(mode="relocate", every=7, prune_opacity=0.3),
 )
 
 
-def view(index: int) -> PosedView:
-    found = posed_view(index, pose_on_arc(index / 8), SIZE)
+def view(index: int) -> RGBDKeyframe:
+    found = rgbd_keyframe(index, pose_on_arc(index / 8), SIZE)
     if index != 1:
         return replace(found, timestamp=0.1 * index)
     image = found.image.astype(np.float32) / np.float32(255)
@@ -53,46 +53,46 @@ def view(index: int) -> PosedView:
     return replace(found, image=image, timestamp=0.1)
 
 
-def begun(config: MapperConfig) -> Session:
+def begun(config: MapperConfig) -> Atlas:
     """Two segments, corrections, and iterations that are still owed."""
-    session = Session(OnlineMapper(config))
+    atlas = Atlas(OnlineMapper(config))
     for index in range(6):
-        session.enter(int(index == 3))
-        session.current.add_view(view(index))
-        session.came(index, 0.1 * index)
+        atlas.enter(int(index == 3))
+        atlas.current.add_keyframe(view(index))
+        atlas.came(index, 0.1 * index)
         for _ in range(4):
-            session.current.step()
+            atlas.current.step()
     moved = pose_on_arc(0.3)
     moved[:3, 3] += 0.02
-    for part in session.parts.values():
+    for part in atlas.parts.values():
         part.correct(np.array([2, 7]), np.stack([moved, moved]), np.array([1.1, 1.2]))
-    session.segment_of.update({3: 1, 2: 0})
-    session.revision = 4
-    return session
+    atlas.segment_of.update({3: 1, 2: 0})
+    atlas.revision = 4
+    return atlas
 
 
-def ended(session: Session) -> dict[str, torch.Tensor]:
+def ended(atlas: Atlas) -> dict[str, torch.Tensor]:
     """The map that comes of it: views, a correction, a join, the rest of the iterations and the refinement."""
     for index in range(6, 9):
-        session.enter(0)
-        session.current.add_view(view(index))
-        session.came(index, 0.1 * index)
-    session.current.correct(np.array([6]), pose_on_arc(0.76)[None], np.ones(1))
-    session.segment_of[3] = 0
-    session.join()
-    while session.current.step():
+        atlas.enter(0)
+        atlas.current.add_keyframe(view(index))
+        atlas.came(index, 0.1 * index)
+    atlas.current.correct(np.array([6]), pose_on_arc(0.76)[None], np.ones(1))
+    atlas.segment_of[3] = 0
+    atlas.join()
+    while atlas.current.step():
         pass
-    for done in range(session.current.config.refinement):
-        session.current.refine(done, session.current.config.refinement)
-    final = session.current.snapshot()
+    for done in range(atlas.current.config.refinement):
+        atlas.current.refine(done, atlas.current.config.refinement)
+    final = atlas.current.snapshot()
     poses = {"poses": torch.from_numpy(final.world_from_cam), "exposures": torch.from_numpy(final.exposures)}
-    return session.current.state.tensors() | poses
+    return atlas.current.state.tensors() | poses
 
 
-def written(session: Session, output: Path) -> Path:
+def written(atlas: Atlas, output: Path) -> Path:
     """The folder with its checkpoint."""
-    writer = CheckpointWriter(output, session.current.config)
-    writer.submit(session.frozen(), sync=False)
+    writer = CheckpointWriter(output, atlas.current.config)
+    writer.submit(atlas.frozen(), sync=False)
     assert writer.wait(20.0)
     assert writer.problems.empty(), writer.problems.get()
     return output
@@ -102,9 +102,9 @@ def written(session: Session, output: Path) -> Path:
 def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_map_to_the_bit(
     config: MapperConfig, tmp_path: Path
 ) -> None:
-    session = begun(config)
-    written(session, tmp_path)
-    expected = ended(session)
+    atlas = begun(config)
+    written(atlas, tmp_path)
+    expected = ended(atlas)
     log = Stats()
     again, file = load(tmp_path, config, log)
     assert (again.newest_view, again.revision, again.segment_of) == (5, 4, {3: 1, 2: 0})
@@ -115,15 +115,15 @@ def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_map_to_the_bit(
     assert len(expected["steps"]) > 100
     for name, value in expected.items():
         assert torch.equal(found[name], value), name
-    assert log.counts == session.current.log.counts
+    assert log.counts == atlas.current.log.counts
 
 
 def test_the_stream_goes_on_while_a_frozen_session_stays_as_it_was(tmp_path: Path) -> None:
-    session = begun(PLAIN)
-    frozen = session.frozen()
+    atlas = begun(PLAIN)
+    frozen = atlas.frozen()
     before = {name: value.clone() for name, value in frozen.current.state.tensors().items()}
     views = [replace(v, pose_delta=v.pose_delta.copy()) for v in frozen.current.views]
-    ended(session)
+    ended(atlas)
     for name, value in frozen.current.state.tensors().items():
         assert torch.equal(value, before[name]), name
     for one, other in zip(frozen.current.views, views):
@@ -153,20 +153,20 @@ def test_the_keyframes_of_a_checkpoint_are_what_the_mapper_was_given(tmp_path: P
 
 
 def test_images_are_written_once_and_two_states_are_kept(tmp_path: Path) -> None:
-    session, config = begun(EVERYTHING), EVERYTHING
+    atlas, config = begun(EVERYTHING), EVERYTHING
     writer = CheckpointWriter(tmp_path, config)
     times = []
     for _ in range(3):
-        writer.submit(session.frozen())
+        writer.submit(atlas.frozen())
         assert writer.wait(20.0)
         times.append({f.name: f.stat().st_mtime_ns for f in (tmp_path / FOLDER / KEYFRAMES).iterdir()})
     assert times[0] == times[1] == times[2]
     assert len(times[0]) == 2 * (4 + 1)  # two levels of four keyframes, max_keyframes, and of the other segment's one
     assert [file.name for file in state_files(tmp_path)] == ["state-00000003.npz", "state-00000002.npz"]
     for index in range(6, 9):
-        session.current.add_view(view(index))
+        atlas.current.add_keyframe(view(index))
     for _ in range(2):  # the state before the last one still needs what was let go
-        writer.submit(session.frozen())
+        writer.submit(atlas.frozen())
         assert writer.wait(20.0)
     left = {f.name for f in (tmp_path / FOLDER / KEYFRAMES).iterdir()}
     assert len(left) == 2 * (4 + 1)
@@ -186,10 +186,10 @@ def test_another_runs_checkpoint_is_replaced_by_the_first_of_this_one(tmp_path: 
 
 
 def test_a_damaged_state_is_said_and_the_one_before_taken(tmp_path: Path) -> None:
-    session = begun(PLAIN)
+    atlas = begun(PLAIN)
     writer = CheckpointWriter(tmp_path, PLAIN)
     for _ in range(2):
-        writer.submit(session.frozen())
+        writer.submit(atlas.frozen())
         assert writer.wait(20.0)
     newest, before = state_files(tmp_path)
     data = bytearray(newest.read_bytes())
@@ -239,10 +239,10 @@ def test_a_folder_without_a_checkpoint_says_why(tmp_path: Path) -> None:
 
 
 def test_a_map_in_the_middle_of_a_change_is_not_frozen() -> None:
-    session = begun(PLAIN)
-    session.current.state.anchors = session.current.state.anchors[:-1]
+    atlas = begun(PLAIN)
+    atlas.current.state.anchors = atlas.current.state.anchors[:-1]
     with pytest.raises(ValueError, match="middle of a change"):
-        session.frozen()
+        atlas.frozen()
 
 
 def test_no_mutated_byte_raises_anything_but_a_value_error(tmp_path: Path) -> None:

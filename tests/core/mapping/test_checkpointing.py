@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from mvsgs_core.export.ply import read_ply
-from mvsgs_core.mapping.checkpoints.checkpointing import SHARE, Checkpointing
+from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.checkpoints.checkpointing import MAX_FRACTION, Checkpointing
 from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_files
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.mapping.session import Session
 from mvsgs_core.trajectory_file import read_trajectory
 from tests.core.mapping.test_checkpoint import PLAIN, begun, view
 
@@ -32,11 +32,11 @@ class Clock:
         return self.now
 
 
-def times(checkpoints: Checkpointing, session: Session) -> float:
+def times(checkpoints: Checkpointing, atlas: Atlas) -> float:
     """How often was saved so far, after a look."""
-    checkpoints.keep(session)
+    checkpoints.keep(atlas)
     assert checkpoints._writer.wait(20.0)
-    return session.current.log.counts.get("checkpoints", 0)
+    return atlas.current.log.counts.get("checkpoints", 0)
 
 
 @contextmanager
@@ -51,59 +51,59 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 
 def test_the_first_checkpoint_is_made_as_soon_as_there_is_a_map(tmp_path: Path) -> None:
-    session = Session(OnlineMapper(PLAIN))
-    checkpoints = Checkpointing(tmp_path, 30.0, session, clock=Clock())
-    assert times(checkpoints, session) == 0
-    session.enter(0)
-    session.current.add_view(replace(view(0), depth=np.zeros((24, 32), np.float32), normals=None))
-    assert times(checkpoints, session) == 0
-    session.current.add_view(view(2))
-    assert times(checkpoints, session) == 1
-    assert times(checkpoints, session) == 1
+    atlas = Atlas(OnlineMapper(PLAIN))
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas, clock=Clock())
+    assert times(checkpoints, atlas) == 0
+    atlas.enter(0)
+    atlas.current.add_keyframe(replace(view(0), depth=np.zeros((24, 32), np.float32), normals=None))
+    assert times(checkpoints, atlas) == 0
+    atlas.current.add_keyframe(view(2))
+    assert times(checkpoints, atlas) == 1
+    assert times(checkpoints, atlas) == 1
     assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 2]
 
 
 def test_the_period_is_of_the_stream_or_of_the_clock(tmp_path: Path) -> None:
-    session, clock = begun(PLAIN), Clock()
-    checkpoints = Checkpointing(tmp_path, 30.0, session, clock=clock)
-    assert times(checkpoints, session) == 1
+    atlas, clock = begun(PLAIN), Clock()
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas, clock=clock)
+    assert times(checkpoints, atlas) == 1
     clock.now += 29.0
-    assert times(checkpoints, session) == 1
+    assert times(checkpoints, atlas) == 1
     clock.now += 2.0
-    assert times(checkpoints, session) == 2
-    session.came(6, 29.0)
-    assert times(checkpoints, session) == 2
-    session.came(7, 30.6)
-    assert times(checkpoints, session) == 3
-    session.came(8, float("nan"))
-    assert times(checkpoints, session) == 3
+    assert times(checkpoints, atlas) == 2
+    atlas.came(6, 29.0)
+    assert times(checkpoints, atlas) == 2
+    atlas.came(7, 30.6)
+    assert times(checkpoints, atlas) == 3
+    atlas.came(8, float("nan"))
+    assert times(checkpoints, atlas) == 3
 
 
 def test_the_period_grows_where_checkpoints_would_take_too_much_of_the_time(tmp_path: Path) -> None:
-    session, clock = begun(PLAIN), Clock(look=1.0)  # two looks in each: a second a checkpoint
-    checkpoints = Checkpointing(tmp_path, 10.0, session, clock=clock)
+    atlas, clock = begun(PLAIN), Clock(look=1.0)  # two looks in each: a second a checkpoint
+    checkpoints = Checkpointing(tmp_path, 10.0, atlas, clock=clock)
     began, made = clock.now, []
     while clock.now < began + 1000.0:
-        if times(checkpoints, session) > len(made):
+        if times(checkpoints, atlas) > len(made):
             made.append(clock.now - began)
     assert made[0] < 5.0
-    assert np.diff(made).min() >= 1.0 / SHARE * 0.9
-    assert 15 <= len(made) <= SHARE * 1000.0
+    assert np.diff(made).min() >= 1.0 / MAX_FRACTION * 0.9
+    assert 15 <= len(made) <= MAX_FRACTION * 1000.0
 
 
 def test_no_checkpoint_is_made_without_a_period(tmp_path: Path) -> None:
-    session = begun(PLAIN)
-    checkpoints = Checkpointing(tmp_path, 0.0, session)
-    assert times(checkpoints, session) == 0
-    checkpoints.last(session)
+    atlas = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 0.0, atlas)
+    assert times(checkpoints, atlas) == 0
+    checkpoints.last(atlas)
     assert not (tmp_path / FOLDER).exists()
-    assert len(read_ply(tmp_path / "map.ply").splats) == len(session.largest.state)
+    assert len(read_ply(tmp_path / "map.ply").splats) == len(atlas.largest.state)
 
 
 def test_every_checkpoint_leaves_a_map_and_the_keyframes_poses(tmp_path: Path) -> None:
-    session = begun(PLAIN)
-    assert times(Checkpointing(tmp_path, 30.0, session), session) == 1
-    found, final = read_ply(tmp_path / "map.ply"), session.largest.snapshot()
+    atlas = begun(PLAIN)
+    assert times(Checkpointing(tmp_path, 30.0, atlas), atlas) == 1
+    found, final = read_ply(tmp_path / "map.ply"), atlas.largest.snapshot()
     np.testing.assert_allclose(found.splats.means.numpy(), final.splats.means.numpy() + final.origin, atol=1e-5)
     seconds, poses = read_trajectory(tmp_path / "trajectory.txt")
     np.testing.assert_allclose(seconds, [0.0, 0.1, 0.2, 0.4, 0.5])  # of the largest part
@@ -111,69 +111,69 @@ def test_every_checkpoint_leaves_a_map_and_the_keyframes_poses(tmp_path: Path) -
 
 
 def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> None:
-    session, clock = begun(PLAIN), Clock()
-    checkpoints = Checkpointing(tmp_path, 30.0, session, clock=clock)
-    assert times(checkpoints, session) == 1
+    atlas, clock = begun(PLAIN), Clock()
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas, clock=clock)
+    assert times(checkpoints, atlas) == 1
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     clock.now += 40.0
-    session.current.add_view(view(7))
+    atlas.current.add_keyframe(view(7))
     with files_of_at_most(20_000):
-        assert times(checkpoints, session) == 2
-        checkpoints.keep(session)
-    assert any("make room" in text and "File too large" in text for text in session.current.log.warnings)
+        assert times(checkpoints, atlas) == 2
+        checkpoints.keep(atlas)
+    assert any("make room" in text and "File too large" in text for text in atlas.current.log.warnings)
     after = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     assert {file: after[file] for file in before} == before
     assert not any(file.name.startswith(".") for file in after)
     clock.now += 40.0
-    assert times(checkpoints, session) == 3
+    assert times(checkpoints, atlas) == 3
     assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 1, 2, 3, 4, 5, 7]
 
 
 def test_a_final_map_that_cannot_be_written_is_an_error_and_leaves_the_one_before(tmp_path: Path) -> None:
-    session = begun(PLAIN)
-    checkpoints = Checkpointing(tmp_path, 30.0, session)
-    assert times(checkpoints, session) == 1
+    atlas = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas)
+    assert times(checkpoints, atlas) == 1
     before = (tmp_path / "map.ply").read_bytes()
     with files_of_at_most(20_000), pytest.raises(OSError, match="File too large"):
-        checkpoints.finish(session)
+        checkpoints.finish(atlas)
     assert (tmp_path / "map.ply").read_bytes() == before
-    assert checkpoint_info(tmp_path).splats == len(session.largest.state)
+    assert checkpoint_info(tmp_path).splats == len(atlas.largest.state)
 
 
 def test_the_last_checkpoint_of_a_run_that_ends_early_is_there_at_once(tmp_path: Path) -> None:
-    session = begun(PLAIN)
-    checkpoints = Checkpointing(tmp_path, 30.0, session)
-    checkpoints.keep(session)  # is being written, perhaps
-    session.current.add_view(view(8))
-    session.came(8, 0.8)
-    for added in session.current.views:
+    atlas = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas)
+    checkpoints.keep(atlas)  # is being written, perhaps
+    atlas.current.add_keyframe(view(8))
+    atlas.came(8, 0.8)
+    for added in atlas.current.views:
         checkpoints.added(added)
     start = time.perf_counter()
-    checkpoints.last(session)
+    checkpoints.last(atlas)
     assert time.perf_counter() - start < 3.0
     assert checkpoint_info(tmp_path).newest_keyframe_index == 8
-    assert len(read_ply(tmp_path / "map.ply").splats) == len(session.current.state)
-    assert not session.current.log.counts.get("refused_checkpoints")
+    assert len(read_ply(tmp_path / "map.ply").splats) == len(atlas.current.state)
+    assert not atlas.current.log.counts.get("refused_checkpoints")
 
 
 def test_a_map_that_was_cut_off_in_a_change_leaves_the_checkpoint_before(tmp_path: Path) -> None:
-    session = begun(PLAIN)
-    checkpoints = Checkpointing(tmp_path, 30.0, session)
-    assert times(checkpoints, session) == 1
-    session.current.state.anchors = session.current.state.anchors[:-1]
-    checkpoints.last(session)
-    assert any("middle of a change" in text for text in session.current.log.warnings)
+    atlas = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas)
+    assert times(checkpoints, atlas) == 1
+    atlas.current.state.anchors = atlas.current.state.anchors[:-1]
+    checkpoints.last(atlas)
+    assert any("middle of a change" in text for text in atlas.current.log.warnings)
     assert [file.name for file in state_files(tmp_path)] == ["state-00000001.npz"]
 
 
 def test_the_checkpoint_of_a_finished_map_is_made_where_wanted(tmp_path: Path) -> None:
-    session = begun(PLAIN)
-    checkpoints = Checkpointing(tmp_path, 30.0, session)
-    assert times(checkpoints, session) == 1
-    session.stream_ended, session.refined = True, 6
-    checkpoints.finish(session)
-    checkpoints.close(session, keep=False)
+    atlas = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas)
+    assert times(checkpoints, atlas) == 1
+    atlas.stream_ended, atlas.refined = True, 6
+    checkpoints.finish(atlas)
+    checkpoints.close(atlas, keep=False)
     assert not checkpoint_info(tmp_path).finished  # the one before: its report may still be to be made
-    checkpoints.close(session, keep=True)
+    checkpoints.close(atlas, keep=True)
     assert checkpoint_info(tmp_path).finished
     assert (tmp_path / "map.ply").exists()

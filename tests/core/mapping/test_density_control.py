@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvsgs_core.mapping.density_control import DensityConfig, control, relocation
+from mvsgs_core.mapping.density_control import DensityControlConfig, control, relocation
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -29,32 +29,32 @@ def state_of(count: int) -> MapState:
 def lengths(state: MapState) -> set[int]:
     sizes = {len(getattr(state.splats, name)) for name in PARAMETERS}
     sizes |= {len(moment) for moments in (state.first, state.second) for moment in moments.values()}
-    return sizes | {len(x) for x in (state.steps, state.anchors, state.screen_gradient, state.screen_views)}
+    return sizes | {len(x) for x in (state.steps, state.anchors, state.means2d_gradient, state.means2d_views)}
 
 
 def test_small_splats_with_a_large_gradient_are_cloned_large_ones_split() -> None:
     state = state_of(10)
-    config = DensityConfig(gradient=1.0, split_scale=0.01, prune_opacity=0.05)
+    config = DensityControlConfig(gradient=1.0, split_scale=0.01, prune_opacity=0.05)
     with torch.no_grad():
         state.splats.log_scales[4] = math.log(0.1)
         state.splats.opacity_logits[9] = -6.0
         state.splats.log_scales[8, 1] = math.log(2.0)
-    state.screen_views += 2.0
-    state.screen_gradient[[3, 4, 9]] = 3.0
+    state.means2d_views += 2.0
+    state.means2d_gradient[[3, 4, 9]] = 3.0
     change = control(state, config, 1.0, torch.Generator().manual_seed(0))
     assert (change.cloned, change.split, change.pruned) == (1, 1, 2)
     assert lengths(state) == {10 - 2 + 1 + 1}
     assert sorted(state.anchors.tolist()) == [0, 1, 2, 3, 3, 4, 4, 5, 6, 7]
     halves = state.splats.log_scales[state.anchors == 4]
     torch.testing.assert_close(halves, torch.full((2, 3), math.log(0.1 / 1.6)))
-    assert not state.screen_gradient.any()
+    assert not state.means2d_gradient.any()
 
 
 def test_growth_stops_at_the_limit_with_the_worst_first() -> None:
     state = state_of(10)
-    state.screen_views += 1.0
-    state.screen_gradient += torch.arange(10) + 1.0
-    change = control(state, DensityConfig(gradient=0.5, max_splats=13), 1.0, torch.Generator())
+    state.means2d_views += 1.0
+    state.means2d_gradient += torch.arange(10) + 1.0
+    change = control(state, DensityControlConfig(gradient=0.5, max_splats=13), 1.0, torch.Generator())
     assert change.cloned == 3
     assert sorted(state.anchors.tolist())[-6:] == [7, 7, 8, 8, 9, 9]
 
@@ -62,12 +62,12 @@ def test_growth_stops_at_the_limit_with_the_worst_first() -> None:
 def test_none_leaves_everything_alone_and_an_unknown_mode_is_refused() -> None:
     state = state_of(5)
     before = state.splats.opacity_logits.clone()
-    state.screen_views += 1.0
-    state.screen_gradient += 1.0
-    control(state, DensityConfig(mode="none"), 1.0, torch.Generator())
+    state.means2d_views += 1.0
+    state.means2d_gradient += 1.0
+    control(state, DensityControlConfig(mode="none"), 1.0, torch.Generator())
     assert torch.equal(before, state.splats.opacity_logits)
     with pytest.raises(ValueError, match="adaptive, relocate, none"):
-        control(state, DensityConfig(mode="sometimes"), 1.0, torch.Generator())
+        control(state, DensityControlConfig(mode="sometimes"), 1.0, torch.Generator())
 
 
 def test_relocation_keeps_the_number_and_moves_the_dead_onto_the_living() -> None:
@@ -75,7 +75,7 @@ def test_relocation_keeps_the_number_and_moves_the_dead_onto_the_living() -> Non
     with torch.no_grad():
         state.splats.opacity_logits[5:15] = -8.0
     living = torch.cat([state.splats.means[:5], state.splats.means[15:]]).detach().clone()
-    change = control(state, DensityConfig(mode="relocate"), 1.0, torch.Generator().manual_seed(1))
+    change = control(state, DensityControlConfig(mode="relocate"), 1.0, torch.Generator().manual_seed(1))
     assert change.relocated == 10
     assert lengths(state) == {20}
     distances = torch.cdist(state.splats.means.detach()[5:15], living).min(dim=1).values

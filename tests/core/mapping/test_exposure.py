@@ -11,7 +11,7 @@ from mvsgs_core.mapping.exposure import IDENTITY, KEPT, colors_of_map, fitted_ex
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.rasterizer.rasterize import rasterize
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (60, 80)
 AFFINE = np.array([[1.3, 0, 0, -0.05], [0, 1.2, 0, 0.02], [0, 0, 0.8, 0.03]], np.float32)
@@ -43,8 +43,8 @@ def test_a_map_that_shows_too_little_and_a_flat_image_say_nothing_wild() -> None
 
 def test_the_mean_exposure_becomes_the_maps_and_renders_stay() -> None:
     mapper = OnlineMapper(MapperConfig(iterations=5, refinement=0, sh_degree=1, training=TrainingConfig(threads=1)))
-    view = posed_view(0, pose_on_arc(0.0))
-    mapper.add_view(view)
+    view = rgbd_keyframe(0, pose_on_arc(0.0))
+    mapper.add_keyframe(view)
     splats = mapper.snapshot().splats
     splats.sh = 0.3 * splats.sh  # no color at its limits, 0 and 1
     splats.opacity_logits, splats.log_scales = splats.opacity_logits + 4.0, splats.log_scales + 0.7
@@ -67,10 +67,10 @@ def test_a_keyframe_of_another_exposure_starts_with_it_and_lays_no_second_skin()
         mapper = OnlineMapper(
             MapperConfig(iterations=40, refinement=0, training=TrainingConfig(threads=1, exposure=exposure))
         )
-        mapper.add_view(posed_view(0, pose_on_arc(0.0)))
-        second = posed_view(5, pose_on_arc(0.1))
+        mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.0)))
+        second = rgbd_keyframe(5, pose_on_arc(0.1))
         bright = np.clip(np.round(0.7 * second.image), 0, 255).astype(np.uint8)
-        counts[exposure] = mapper.add_view(replace(second, image=bright))
+        counts[exposure] = mapper.add_keyframe(replace(second, image=bright))
         if exposure:
             gains = mapper.views[1].exposure.detach().numpy()[:, :3].diagonal()
             np.testing.assert_allclose(gains, 0.7, atol=0.12)
@@ -82,8 +82,8 @@ def test_a_camera_of_constant_exposure_hardly_drifts() -> None:
     rng = np.random.default_rng(1)
     mapper = OnlineMapper(MapperConfig(iterations=10, refinement=0, training=TrainingConfig(threads=1, exposure=True)))
     for k, time in enumerate(np.linspace(0.0, 1.0, 12)):
-        view = posed_view(k, pose_on_arc(float(time)))
+        view = rgbd_keyframe(k, pose_on_arc(float(time)))
         noisy = np.clip(view.image + rng.normal(0.0, 8.0, view.image.shape), 0, 255).astype(np.uint8)
-        mapper.add_view(replace(view, image=noisy))
+        mapper.add_keyframe(replace(view, image=noisy))
     gains = np.array([v.exposure.detach().numpy()[:, :3].diagonal() for v in mapper.views])
     assert np.abs(gains - 1.0).max() < 0.15

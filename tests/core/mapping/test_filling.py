@@ -12,17 +12,17 @@ import torch
 from mvsgs_core import camera
 from mvsgs_core.mapping.filling import continued_depth, fill_points
 from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
 from tests.core.mapping.test_mapper import CONFIG, mapped, score
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 HOLE = slice(20, 44)  # columns of the 64 in which a filter left nothing
 
 
-def with_hole(index: int, t: float) -> PosedView:
-    view = posed_view(index, pose_on_arc(t))
+def with_hole(index: int, t: float) -> RGBDKeyframe:
+    view = rgbd_keyframe(index, pose_on_arc(t))
     depth, normals = view.depth.copy(), np.array(view.normals)
     depth[:, HOLE], normals[:, HOLE] = 0.0, 0.0
     confidence = np.where(depth > 0, 0.9, 0.2).astype(np.float32)
@@ -35,7 +35,7 @@ def mapper_with(fill: int) -> OnlineMapper:
 
 
 def test_a_point_stands_for_its_cell() -> None:
-    view = posed_view(0, pose_on_arc(0.4), (30, 41))  # neither side is a multiple of 4
+    view = rgbd_keyframe(0, pose_on_arc(0.4), (30, 41))  # neither side is a multiple of 4
     colors = view.image / 255.0
     empty = np.zeros((30, 41), dtype=bool)
     empty[4:12, 8:16] = True
@@ -67,7 +67,7 @@ def test_a_hole_of_the_filters_is_covered_sparsely() -> None:
     opacity = {}
     for fill in (0, 4):
         mapper = mapper_with(fill)
-        mapper.add_view(with_hole(0, 0.5))
+        mapper.add_keyframe(with_hole(0, 0.5))
         opacity[fill] = mapper.render(mapper.views[0]).opacity.numpy()[:, HOLE]
         assert mapper.log.counts.get("filled", 0) == (12 * 6 if fill else 0)
     opacities = mapper.state.splats.opacity_logits[-72:].sigmoid().detach().numpy()
@@ -78,14 +78,14 @@ def test_a_hole_of_the_filters_is_covered_sparsely() -> None:
 
 def test_what_the_map_shows_is_not_filled() -> None:
     mapper = mapper_with(4)
-    mapper.add_view(posed_view(0, pose_on_arc(0.5)))
-    mapper.add_view(with_hole(5, 0.5))
+    mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.5)))
+    mapper.add_keyframe(with_hole(5, 0.5))
     assert mapper.log.counts["filled"] == 0
 
 
 def test_a_view_between_keyframes_with_holes_is_rendered_better() -> None:
     views = [with_hole(5 * k, t) for k, t in enumerate((0.4, 0.5, 0.6))]
-    between = posed_view(99, pose_on_arc(0.45))
+    between = rgbd_keyframe(99, pose_on_arc(0.45))
     without = mapped(views, replace(CONFIG, insertion=InsertionConfig(fill=0)))
     assert score(mapped(views), between) > score(without, between) + 2.0
 
@@ -96,9 +96,9 @@ def test_a_corrected_scale_holds_for_the_filling_too() -> None:
     pose = view.world_from_cam.copy()
     pose[:3, 3] *= 2.0
     mapper.correct(np.array([0]), pose[None], np.array([2.0]))
-    mapper.add_view(view)
+    mapper.add_keyframe(view)
     plain = mapper_with(4)
-    plain.add_view(view)
+    plain.add_keyframe(view)
     ratio = mapper.snapshot().splats.means.norm(dim=1) / plain.snapshot().splats.means.norm(dim=1)
     np.testing.assert_allclose(ratio.numpy(), 2.0, rtol=1e-4)
 
@@ -109,7 +109,7 @@ def test_depth_that_is_not_finite_is_refused_and_what_surrounds_it_goes_on() -> 
     broken = view.unfiltered.copy()
     broken[:, HOLE] = np.nan
     mapper = mapper_with(4)
-    mapper.add_view(replace(view, unfiltered=broken))
+    mapper.add_keyframe(replace(view, unfiltered=broken))
     assert mapper.log.counts["refused_depths"] == 48 * 24
     assert mapper.log.counts["filled"] == 12 * 6
     assert torch.isfinite(mapper.state.splats.means).all()
@@ -117,7 +117,7 @@ def test_depth_that_is_not_finite_is_refused_and_what_surrounds_it_goes_on() -> 
 
 def test_where_matching_says_nothing_what_surrounds_it_goes_on() -> None:
     """A strip that no other view sees: its depth is noise, and its confidence says so."""
-    view = posed_view(0, pose_on_arc(0.5))
+    view = rgbd_keyframe(0, pose_on_arc(0.5))
     strip = np.zeros(view.depth.shape, dtype=bool)
     strip[:, 52:] = True
     random = np.random.default_rng(0)
@@ -130,7 +130,7 @@ def test_where_matching_says_nothing_what_surrounds_it_goes_on() -> None:
     assert np.median(error) < 0.1 < 0.5 < np.median(np.abs(depth / view.depth - 1.0)[strip])
     filtered = np.where(strip, 0.0, view.depth).astype(np.float32)
     mapper = mapper_with(4)
-    mapper.add_view(replace(view, depth=filtered, normals=None, confidence=confidence, unfiltered=depth))
+    mapper.add_keyframe(replace(view, depth=filtered, normals=None, confidence=confidence, unfiltered=depth))
     opacity = mapper.render(mapper.views[0]).opacity.numpy()
     assert (opacity > 0.5).mean() > 0.99
     assert mapper.log.counts["filled"] >= 12 * 3
@@ -138,32 +138,35 @@ def test_where_matching_says_nothing_what_surrounds_it_goes_on() -> None:
 
 def test_what_the_map_shows_goes_on_where_a_view_has_no_depth_at_all() -> None:
     """A camera that only turned: no neighbor has a baseline, but a part of its view is mapped."""
-    first = posed_view(0, pose_on_arc(0.5))
+    first = rgbd_keyframe(0, pose_on_arc(0.5))
     mapper = mapper_with(4)
-    mapper.add_view(first)
+    mapper.add_keyframe(first)
     turn = np.eye(4)
     turn[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.25, 0.0]))[0]
-    turned = posed_view(5, first.world_from_cam @ turn)
+    turned = rgbd_keyframe(5, first.world_from_cam @ turn)
     nothing = np.zeros_like(turned.depth)
-    shown = mapper.add_view(replace(turned, depth=nothing, normals=None, confidence=nothing, unfiltered=nothing))
+    shown = mapper.add_keyframe(replace(turned, depth=nothing, normals=None, confidence=nothing, unfiltered=nothing))
     assert shown > 0
     assert (mapper.render(mapper.views[1]).opacity.numpy() > 0.5).mean() > 0.99
 
 
 def test_doubtful_depth_is_mapped_where_the_filters_kept_nothing() -> None:
-    view = posed_view(0, pose_on_arc(0.5))
+    view = rgbd_keyframe(0, pose_on_arc(0.5))
     low, nothing = np.full(view.depth.shape, 0.1, np.float32), np.zeros_like(view.depth)
     mapper = mapper_with(4)
-    assert mapper.add_view(replace(view, depth=nothing, normals=None, confidence=low, unfiltered=view.depth)) == 12 * 16
+    assert (
+        mapper.add_keyframe(replace(view, depth=nothing, normals=None, confidence=low, unfiltered=view.depth))
+        == 12 * 16
+    )
     assert mapper.unit == pytest.approx(float(np.median(view.depth)))
     assert (mapper.render(mapper.views[0]).opacity.numpy() > 0.5).mean() > 0.99
 
 
 def test_a_view_without_any_depth_adds_nothing_to_an_empty_map() -> None:
-    view = posed_view(0, pose_on_arc(0.5))
+    view = rgbd_keyframe(0, pose_on_arc(0.5))
     nothing = np.zeros_like(view.depth)
     mapper = mapper_with(4)
-    assert mapper.add_view(replace(view, depth=nothing, confidence=nothing, unfiltered=nothing)) == 0
+    assert mapper.add_keyframe(replace(view, depth=nothing, confidence=nothing, unfiltered=nothing)) == 0
     assert not continued_depth(nothing, nothing, nothing, view.image / 255.0).any()
 
 

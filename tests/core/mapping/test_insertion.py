@@ -19,7 +19,7 @@ from mvsgs_core.mapping.insertion import (
 )
 from mvsgs_core.rasterizer.reference import rotation_matrices
 from mvsgs_core.rasterizer.spherical_harmonics import C0
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 
 def random_points(count: int, seed: int = 0) -> Points:
@@ -73,7 +73,7 @@ def test_voxels_too_small_for_the_extent_are_refused() -> None:
 
 
 def test_empty_points_make_no_splats() -> None:
-    view = posed_view(0, np.eye(4))
+    view = rgbd_keyframe(0, np.eye(4))
     nothing = np.zeros(view.depth.shape, dtype=bool)
     points = points_from_depth(view.depth, view.intrinsics, view.image / 255.0, view.normals, nothing)
     assert len(voxel_filter(points, 0.1)) == 0
@@ -81,7 +81,7 @@ def test_empty_points_make_no_splats() -> None:
 
 
 def test_splats_lie_on_the_surface_and_are_flat_along_its_normal() -> None:
-    view = posed_view(0, pose_on_arc(0.3))
+    view = rgbd_keyframe(0, pose_on_arc(0.3))
     points = points_from_depth(
         view.depth, view.intrinsics, view.image / 255.0, view.normals, np.ones(view.depth.shape, dtype=bool)
     )

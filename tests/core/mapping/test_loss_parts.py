@@ -47,7 +47,7 @@ def test_terms_and_psnr(golden: dict[str, np.ndarray]) -> None:
     terms = (LossConfig(1.0, 0.0, 0.0), LossConfig(0.0, 1.0, 0.0), LossConfig(0.0, 0.0, 1.0))
     last = len(golden["freq"]) - 1
     for i, frequency in enumerate(golden["freq"]):
-        l1, one_minus_ssim, masked = (losses.ges_loss(image, target, float(frequency), t).item() for t in terms)
+        l1, one_minus_ssim, masked = (losses.photometric_loss(image, target, float(frequency), t).item() for t in terms)
         wanted = golden["l1_ssim_maskl1"][i]
         assert l1 == pytest.approx(wanted[0], abs=1e-5)
         assert 1 - one_minus_ssim == pytest.approx(wanted[1], abs=1e-5)

@@ -32,7 +32,7 @@ def test_mask_and_loss_have_the_released_codes_values(golden: dict[str, np.ndarr
         sure = np.abs(wanted - 0.5) > (0.03 if ends else 1e-4)
         mask = losses.frequency_mask(image, float(frequency)).numpy()
         assert (mask[sure] == golden["mask"][i].astype(bool)[sure]).all()
-        loss = losses.ges_loss(image, target, float(frequency)).item()
+        loss = losses.photometric_loss(image, target, float(frequency)).item()
         assert loss == pytest.approx(golden["loss"][i], abs=1e-3 if ends else 1e-5)
 
 
@@ -42,7 +42,7 @@ def test_gradient_has_the_released_codes_values(
     golden: dict[str, np.ndarray], frequency: int, dtype: torch.dtype
 ) -> None:
     image = as_image(golden["image"]).to(dtype).requires_grad_()
-    losses.ges_loss(image, as_image(golden["gt"]), float(frequency)).backward()  # type: ignore[no-untyped-call]
+    losses.photometric_loss(image, as_image(golden["gt"]), float(frequency)).backward()  # type: ignore[no-untyped-call]
     assert image.grad is not None
     wanted = golden[f"dloss_dimage_f{frequency}"].transpose(1, 2, 0)
     assert np.abs(image.grad.numpy() - wanted).max() <= 1e-4 * np.abs(wanted).max()
@@ -63,7 +63,7 @@ def test_scale_factor_has_the_released_codes_values() -> None:
 @pytest.mark.parametrize("frequency", [0.0, 30.0, 50.0, 100.0])
 def test_image_without_edges_stays_finite(frequency: float) -> None:
     flat = torch.full((20, 30, 3), 0.4).requires_grad_()
-    loss = losses.ges_loss(flat, torch.zeros(20, 30, 3), frequency)
+    loss = losses.photometric_loss(flat, torch.zeros(20, 30, 3), frequency)
     loss.backward()  # type: ignore[no-untyped-call]
     assert bool(torch.isfinite(loss))
     assert flat.grad is not None
@@ -92,7 +92,7 @@ def test_frequency_of_an_online_view() -> None:
 
 def test_without_the_mask_it_is_l1_and_ssim() -> None:
     image, target = torch.rand(24, 32, 3), torch.rand(24, 32, 3)
-    plain = losses.ges_loss(image, target, 10.0, losses.LossConfig(l1=0.8, ssim=0.0, frequency=0.0))
+    plain = losses.photometric_loss(image, target, 10.0, losses.LossConfig(l1=0.8, ssim=0.0, frequency=0.0))
     assert plain.item() == pytest.approx(0.8 * (image - target).abs().mean().item(), rel=1e-5)
 
 

@@ -11,28 +11,28 @@ import torch
 from mvsgs_core import geometry
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping import training
-from mvsgs_core.mapping.density_control import DensityConfig
+from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.optimizer import LearningRates
+from mvsgs_core.mapping.optimizer import OptimizerConfig
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.rasterizer.rasterize import rasterize
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 TIMES = (0.0, 0.33, 0.66, 1.0)
 CONFIG = MapperConfig(iterations=16, refinement=20, training=TrainingConfig(threads=1))
 
 
-def tiny_views(origin: float = 0.0, unit: float = 1.0) -> list[PosedView]:
-    return [posed_view(5 * k, pose_on_arc(t), origin=origin, unit=unit) for k, t in enumerate(TIMES)]
+def tiny_views(origin: float = 0.0, unit: float = 1.0) -> list[RGBDKeyframe]:
+    return [rgbd_keyframe(5 * k, pose_on_arc(t), origin=origin, unit=unit) for k, t in enumerate(TIMES)]
 
 
-def mapped(views: list[PosedView], config: MapperConfig = CONFIG) -> OnlineMapper:
+def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:
     mapper = OnlineMapper(config)
     for view in views:
-        mapper.add_view(view)
+        mapper.add_keyframe(view)
     while mapper.step():
         pass
     for done in range(config.refinement):
@@ -40,7 +40,7 @@ def mapped(views: list[PosedView], config: MapperConfig = CONFIG) -> OnlineMappe
     return mapper
 
 
-def score(mapper: OnlineMapper, view: PosedView) -> float:
+def score(mapper: OnlineMapper, view: RGBDKeyframe) -> float:
     final = mapper.snapshot()
     pose = view.world_from_cam.copy()
     pose[:3, 3] -= final.origin
@@ -54,7 +54,7 @@ def score(mapper: OnlineMapper, view: PosedView) -> float:
 
 def test_a_view_between_the_keyframes_is_rendered_well() -> None:
     mapper = mapped(tiny_views())
-    assert score(mapper, posed_view(99, pose_on_arc(0.5))) > 30.0
+    assert score(mapper, rgbd_keyframe(99, pose_on_arc(0.5))) > 30.0
     assert mapper.iterations <= 4 * 16 + 20
     assert mapper.log.skipped["points_explored"] > 2000
     assert mapper.log.seconds["refinement"] > 0
@@ -63,8 +63,8 @@ def test_a_view_between_the_keyframes_is_rendered_well() -> None:
 
 @pytest.mark.parametrize(("origin", "unit"), [(1e6, 1.0), (-1e5, 1e-3), (0.0, 1e4)])
 def test_the_worlds_origin_and_unit_do_not_matter(origin: float, unit: float) -> None:
-    here = score(mapped(tiny_views()), posed_view(99, pose_on_arc(0.5)))
-    there = score(mapped(tiny_views(origin, unit)), posed_view(99, pose_on_arc(0.5), origin=origin, unit=unit))
+    here = score(mapped(tiny_views()), rgbd_keyframe(99, pose_on_arc(0.5)))
+    there = score(mapped(tiny_views(origin, unit)), rgbd_keyframe(99, pose_on_arc(0.5), origin=origin, unit=unit))
     assert there > here - 1.0
 
 
@@ -77,10 +77,10 @@ def test_the_same_seed_gives_the_same_map() -> None:
 def test_it_does_not_matter_when_the_owed_iterations_are_done() -> None:
     early, late = OnlineMapper(CONFIG), OnlineMapper(CONFIG)
     for view in tiny_views():
-        early.add_view(view)
+        early.add_keyframe(view)
         while early.step():
             pass
-        late.add_view(view)
+        late.add_keyframe(view)
     while late.step():
         pass
     assert torch.equal(early.state.splats.means, late.state.splats.means)
@@ -89,11 +89,11 @@ def test_it_does_not_matter_when_the_owed_iterations_are_done() -> None:
 def test_realtime_drops_what_older_keyframes_are_owed() -> None:
     mapper = OnlineMapper(replace(CONFIG, realtime=True))
     for view in tiny_views():
-        mapper.add_view(view)
+        mapper.add_keyframe(view)
         mapper.step()
     assert mapper.iterations == 4
     assert mapper.log.skipped["iterations_realtime"] == 3 * 15
-    assert mapper.schedule.owed == 15
+    assert mapper.schedule.pending == 15
 
 
 def test_corrections_move_the_map_rigidly_with_scale() -> None:
@@ -117,12 +117,12 @@ def test_a_late_view_of_an_older_scale_is_converted() -> None:
     doubled = [replace(v, world_from_cam=_stretched(v.world_from_cam, 2.0)) for v in views]
     plain, corrected = OnlineMapper(CONFIG), OnlineMapper(CONFIG)
     for mapper in (plain, corrected):
-        mapper.add_view(views[0])
+        mapper.add_keyframe(views[0])
     index = np.array([v.index for v in views])
     corrected.correct(index, np.stack([v.world_from_cam for v in doubled]), np.full(4, 2.0))
     for view in views[1:]:
-        plain.add_view(view)
-        corrected.add_view(view)  # still of scale 1
+        plain.add_keyframe(view)
+        corrected.add_keyframe(view)  # still of scale 1
     here = score(plain, views[2])
     there = score(corrected, doubled[2])
     assert there == pytest.approx(here, abs=1.0)
@@ -170,9 +170,9 @@ def test_a_view_without_depth_adds_nothing_but_is_trained_on() -> None:
     views = tiny_views()
     mapper = OnlineMapper(CONFIG)
     empty = replace(views[0], depth=np.zeros((24, 32), np.float32), normals=None)
-    assert mapper.add_view(empty) == 0
+    assert mapper.add_keyframe(empty) == 0
     assert not mapper.step()
-    assert mapper.add_view(views[1]) > 0
+    assert mapper.add_keyframe(views[1]) > 0
     while mapper.step():
         pass
     assert mapper.views[0].visits > 0
@@ -182,11 +182,11 @@ def test_depth_smaller_than_the_image_is_used_at_its_own_size() -> None:
     view = tiny_views()[0]
     small = replace(view, depth=view.depth[::2, ::2].copy(), normals=view.normals[::2, ::2].copy())
     mapper = OnlineMapper(replace(CONFIG, insertion=InsertionConfig(voxel=0.0)))
-    assert mapper.add_view(small) == 24 * 32
+    assert mapper.add_keyframe(small) == 24 * 32
 
 
 def test_the_map_never_grows_beyond_its_limit_and_says_so() -> None:
-    config = replace(CONFIG, density_control=DensityConfig(max_splats=1000, every=10))
+    config = replace(CONFIG, density_control=DensityControlConfig(max_splats=1000, every=10))
     mapper = mapped(tiny_views(), config)
     assert len(mapper.state) <= 1000
     assert any("max_splats" in text for text in mapper.log.warnings)
@@ -219,7 +219,7 @@ def test_every_density_trains_with_harmonics_and_exposure(density: str) -> None:
 
 
 def test_wild_learning_rates_leave_the_map_finite() -> None:
-    rates = LearningRates()
+    rates = OptimizerConfig()
     wild = replace(rates, **{k: 100 * v for k, v in vars(rates).items() if k not in ("means_final", "decay_steps")})
     mapper = mapped(tiny_views(), replace(CONFIG, rates=wild, iterations=30))
     for name in PARAMETERS:
@@ -228,7 +228,7 @@ def test_wild_learning_rates_leave_the_map_finite() -> None:
 
 
 def test_images_are_kept_for_a_bounded_number_of_keyframes_spread_over_the_run() -> None:
-    views = [posed_view(k, pose_on_arc(k / 9)) for k in range(10)]
+    views = [rgbd_keyframe(k, pose_on_arc(k / 9)) for k in range(10)]
     mapper = mapped(views, replace(CONFIG, iterations=4, window=2, max_keyframes=5))
     kept = [view.index for view in mapper.views if view.levels]
     assert len(kept) == 5
@@ -248,7 +248,7 @@ def test_gradients_that_are_not_finite_are_counted_and_the_map_stays_finite(monk
         pixel = color[24, 32, 0]
         return color.mean() + (pixel - pixel.detach()).abs().sqrt()  # 0, with a derivative of NaN
 
-    monkeypatch.setattr(training, "ges_loss", with_one_bad_pixel)
+    monkeypatch.setattr(training, "photometric_loss", with_one_bad_pixel)
     mapper = mapped(tiny_views()[:2], replace(CONFIG, iterations=4, refinement=0))
     assert mapper.log.counts["refused_gradients"] > 0
     assert any("gradients" in text for text in mapper.log.warnings)

@@ -11,7 +11,7 @@ from mvsgs_core import geometry
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (24, 32)
 CONFIG = MapperConfig(
@@ -30,8 +30,8 @@ OTHER_FRAME = geometry.se3_exp(np.array([300.0, -7.0, 20.0, 0.3, 0.2, -0.4]))
 def mapped(indices: list[int], frame: np.ndarray, unit: float, corrections: dict) -> OnlineMapper:
     mapper = OnlineMapper(CONFIG, corrections=corrections)
     for index in indices:
-        view = posed_view(index, pose_on_arc(index / 8), SIZE, unit=unit)
-        mapper.add_view(replace(view, world_from_cam=frame @ view.world_from_cam))
+        view = rgbd_keyframe(index, pose_on_arc(index / 8), SIZE, unit=unit)
+        mapper.add_keyframe(replace(view, world_from_cam=frame @ view.world_from_cam))
     while mapper.step():
         pass
     return mapper
@@ -70,7 +70,7 @@ def test_every_keyframe_sees_after_the_join_what_it_saw_before() -> None:
     for name in PARAMETERS:
         assert first.state.first[name].shape == getattr(first.state.splats, name).shape
 
-    first.add_view(posed_view(7, pose_on_arc(7 / 8), SIZE))  # beyond the number of images that are kept
+    first.add_keyframe(rgbd_keyframe(7, pose_on_arc(7 / 8), SIZE))  # beyond the number of images that are kept
     while first.step():
         pass
     assert sum(bool(view.levels) for view in first.views) == 5
@@ -80,7 +80,7 @@ def test_every_keyframe_sees_after_the_join_what_it_saw_before() -> None:
 def test_maps_that_have_no_depth_or_no_keyframe_yet_are_joined() -> None:
     corrections: dict = {}
     empty, blind = OnlineMapper(CONFIG, corrections=corrections), OnlineMapper(CONFIG, corrections=corrections)
-    blind.add_view(replace(posed_view(0, pose_on_arc(0.0), SIZE), depth=np.zeros(SIZE, np.float32)))
+    blind.add_keyframe(replace(rgbd_keyframe(0, pose_on_arc(0.0), SIZE), depth=np.zeros(SIZE, np.float32)))
     full = mapped([1, 2], np.eye(4), 3.0, corrections)
     seen = [full.render(view).color for view in full.views]
     blind.join(empty)

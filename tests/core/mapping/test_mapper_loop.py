@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 DRIFT = 0.25  # share by which lengths have shrunk at the end
 REFINEMENT = 60
 
 
-def drifted(views: list[PosedView]) -> tuple[list[PosedView], np.ndarray]:
+def drifted(views: list[RGBDKeyframe]) -> tuple[list[RGBDKeyframe], np.ndarray]:
     """Every step and depth shrinks a little more: as a tracker without loops sees it; and the factors (K,)."""
     factors = np.exp(-DRIFT * np.arange(len(views)) / len(views))
     found = [views[0]]
@@ -27,10 +27,10 @@ def drifted(views: list[PosedView]) -> tuple[list[PosedView], np.ndarray]:
     return found, factors
 
 
-def mapped(views: list[PosedView]) -> OnlineMapper:
+def mapped(views: list[RGBDKeyframe]) -> OnlineMapper:
     mapper = OnlineMapper(MapperConfig(iterations=12, training=TrainingConfig(threads=1)))
     for view in views:
-        mapper.add_view(view)
+        mapper.add_keyframe(view)
     while mapper.step():
         pass
     return mapper
@@ -49,7 +49,7 @@ def psnr(mapper: OnlineMapper) -> float:
 
 
 def test_a_map_that_is_corrected_renders_as_well_as_one_that_never_drifted() -> None:
-    views = [posed_view(k, pose_on_arc(k / 7)) for k in range(8)]
+    views = [rgbd_keyframe(k, pose_on_arc(k / 7)) for k in range(8)]
     wrong, factors = drifted(views)
     follows, stays, knows = mapped(wrong), mapped(wrong), mapped(views)
     poses = np.stack([view.world_from_cam for view in views])

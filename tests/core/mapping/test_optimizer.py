@@ -9,10 +9,10 @@ import torch
 
 from mvsgs_core.mapping import optimizer
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
-from mvsgs_core.mapping.optimizer import LearningRates, groups, normalize_quaternions, step, step_reference
+from mvsgs_core.mapping.optimizer import OptimizerConfig, groups, normalize_quaternions, step, step_reference
 from mvsgs_core.rasterizer.splats import Splats
 
-RATES = LearningRates()
+RATES = OptimizerConfig()
 
 
 def random_state(count: int, seed: int = 0, bases: int = 4) -> MapState:
@@ -118,7 +118,7 @@ def test_a_bad_gradient_is_refused_for_that_splat_only(bad: float, run) -> None:
 def test_wild_rates_stay_inside_the_bounds() -> None:
     state = random_state(30)
     wild = groups(
-        LearningRates(means=1e4, log_scales=50.0, opacity_logits=1e3, sh=1e3, betas=1e3), 1.0, 1.0, True, "exact"
+        OptimizerConfig(means=1e4, log_scales=50.0, opacity_logits=1e3, sh=1e3, betas=1e3), 1.0, 1.0, True, "exact"
     )
     for iteration in range(30):
         set_gradients(state, iteration)

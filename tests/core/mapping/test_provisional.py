@@ -8,35 +8,35 @@ import torch
 
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
-from mvsgs_core.mapping.provisional import CoarseView, Provisional
+from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
 from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 LIMIT = 4000
 
 
-def coarse(index: int, t: float, known: slice = slice(None), **changes: object) -> CoarseView:
+def coarse(index: int, t: float, known: slice = slice(None), **changes: object) -> CoarseKeyframe:
     """A keyframe of the tiny scene with inverse depth on every 4th pixel, of the columns `known`."""
-    view = posed_view(index, pose_on_arc(t))
+    view = rgbd_keyframe(index, pose_on_arc(t))
     inverse, weight = 1.0 / view.depth[2::4, 2::4], np.zeros_like(view.depth[2::4, 2::4])
     weight[:, known] = 1.0
     values: dict[str, object] = {
         "index": index, "image": view.image, "intrinsics": view.intrinsics, "world_from_cam": view.world_from_cam,
         "scale": 1.0, "inverse_depth": inverse.astype(np.float32), "weight": weight,
     }  # fmt: skip
-    return CoarseView(**(values | changes))  # type: ignore[arg-type]
+    return CoarseKeyframe(**(values | changes))  # type: ignore[arg-type]
 
 
 @pytest.fixture
 def mapper() -> OnlineMapper:
     mapper = OnlineMapper(MapperConfig(training=TrainingConfig(threads=1)))
-    mapper.add_view(posed_view(0, pose_on_arc(0.0)))
+    mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.0)))
     return mapper
 
 
-def coverage(mapper: OnlineMapper, splats: Splats | None, view: CoarseView) -> float:
+def coverage(mapper: OnlineMapper, splats: Splats | None, view: CoarseKeyframe) -> float:
     """Share of the keyframe's pixels above half opacity, by the map and these splats."""
     shown = mapper.state.detached().tensors()
     if splats is not None:
@@ -100,7 +100,7 @@ def test_what_is_no_camera_or_no_map_shows_nothing(mapper: OnlineMapper) -> None
 
 
 def test_the_oldest_are_dropped_and_the_budget_holds(mapper: OnlineMapper) -> None:
-    provisional = Provisional(LIMIT, share_of_time=0.0)  # no time: the newest keyframe alone
+    provisional = Provisional(LIMIT, time_fraction=0.0)  # no time: the newest keyframe alone
     for index in range(1, 30):
         provisional.see(coarse(index, 1.0))
     assert len(provisional._waiting) == 8

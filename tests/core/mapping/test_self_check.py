@@ -8,7 +8,7 @@ import pytest
 
 from mvsgs_core import camera
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.mapping.self_check import MOST_NOISE, SelfCheck, check, noise_of
+from mvsgs_core.mapping.self_check import MAX_NOISE, SelfCheck, check, noise_of
 from tests.support.shared_data import shared
 
 
@@ -77,7 +77,7 @@ def test_clean_real_video_raises_no_alarm_at_any_size(name: str, folder: str) ->
     for size in ((480, 640), (180, 240), (120, 160)):
         small = camera.resize_image(image, size).astype(np.float32) / 255.0
         found = known(check([(small, small)]))
-        assert found.noise < 0.5 * MOST_NOISE
+        assert found.noise < 0.5 * MAX_NOISE
         assert found.warning is None
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mvsgs_core.mapping import optimizer, training
-from mvsgs_core.mapping.keyframes import PosedView, training_view
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.interface import Backward, Render
 from tests.support.rasterizer_scenes import intrinsics, random_splats
@@ -39,10 +39,10 @@ def test_refused_gradients_are_counted_once(monkeypatch: pytest.MonkeyPatch) -> 
     state.append(random_splats(50, bases=1), torch.zeros(50, dtype=torch.int64))
     image = np.full((*SIZE, 3), 128, dtype=np.uint8)
     depth = np.ones(SIZE, dtype=np.float32)
-    view = training_view(PosedView(0, image, intrinsics(SIZE), np.eye(4), depth), np.eye(4), None, 1, state.device)
+    view = training_view(RGBDKeyframe(0, image, intrinsics(SIZE), np.eye(4), depth), np.eye(4), None, 1, state.device)
     counts = Counts()
     training.train_once(
         state, view, training.TrainingConfig(threads=1), training.SkipConfig(),
-        optimizer.groups(optimizer.LearningRates(), 1.0, 1.0, False, "gaussian"), 600, 1.0, 1.0, False, counts,
+        optimizer.groups(optimizer.OptimizerConfig(), 1.0, 1.0, False, "gaussian"), 600, 1.0, 1.0, False, counts,
     )  # fmt: skip
     assert counts == {"gradients": 3}

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core.mapping.checkpoints.state import copy_of
+from mvsgs_core.mapping.keyframe_checks import NO_POSE, is_pose
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.mapping.view_checks import NO_POSE, is_pose
 from mvsgs_core.stats import Stats
 
 
 @dataclass
-class Session:
+class Atlas:
     """The mappers of a stream's segments, which share log and corrections, and how far the stream has come."""
 
     current: OnlineMapper  # the one that is gone on with
@@ -73,13 +73,13 @@ class Session:
         for part in self.parts.values():
             part.global_rate = 1.0
 
-    def frozen(self) -> Session:
+    def frozen(self) -> Atlas:
         """A copy that shares nothing that changes, on the CPU. Raises ValueError in the middle of a change."""
         log, corrections = Stats(), dict(self.current.corrections)
         log.include(self.current.log)
         parts = {segment: copy_of(part, log, corrections) for segment, part in self.parts.items()}
         current = next((parts[s] for s, part in self.parts.items() if part is self.current), None)
-        return Session(
+        return Atlas(
             current or OnlineMapper(self.current.config, log, corrections), parts, dict(self.segment_of),
             self.newest_view, self.stream_seconds, self.revision, self.stream_ended, self.refined,
         )  # fmt: skip

@@ -10,21 +10,21 @@ import pytest
 import torch
 
 from mvsgs_core.mapping.insertion import InsertionConfig, unoccupied
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 CONFIG = MapperConfig(iterations=2, training=TrainingConfig(threads=1))
 VIEWS = [
-    replace(posed_view(k, pose_on_arc(k / 4), (24, 32)), confidence=np.ones((24, 32), np.float32)) for k in range(4)
+    replace(rgbd_keyframe(k, pose_on_arc(k / 4), (24, 32)), confidence=np.ones((24, 32), np.float32)) for k in range(4)
 ]
 
 
-def mapped(views: list[PosedView], config: MapperConfig = CONFIG) -> OnlineMapper:
+def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:
     mapper = OnlineMapper(config)
     for view in views:
-        mapper.add_view(view)
+        mapper.add_keyframe(view)
     while mapper.step():
         pass
     return mapper
@@ -34,7 +34,7 @@ def is_sound(mapper: OnlineMapper) -> bool:
     return all(bool(torch.isfinite(value).all()) for value in mapper.state.tensors().values())
 
 
-def with_far_pixels(view: PosedView, factor: float) -> PosedView:
+def with_far_pixels(view: RGBDKeyframe, factor: float) -> RGBDKeyframe:
     depth = view.depth.copy()
     depth[0, 0] = depth[-1, -1] = factor * np.median(depth)
     return replace(view, depth=depth)
@@ -119,9 +119,9 @@ def test_no_mutated_keyframe_ends_the_map_or_makes_it_unsound() -> None:
     wild = np.array([0.0, -1.0, 1e-40, 1e-9, 1e9, 3e4, 1e19, 3e38, -3e38, np.nan, np.inf, -np.inf])
     training = TrainingConfig(threads=1, exposure=True, poses=True, pose_visits=1)
     mapper = OnlineMapper(replace(CONFIG, iterations=1, sh_degree=1, training=training))
-    mapper.add_view(VIEWS[0])
+    mapper.add_keyframe(VIEWS[0])
     for index in range(1, 120):
-        view = replace(posed_view(index, pose_on_arc(random.random()), (24, 32)), unfiltered=VIEWS[0].depth.copy())
+        view = replace(rgbd_keyframe(index, pose_on_arc(random.random()), (24, 32)), unfiltered=VIEWS[0].depth.copy())
         changes: dict[str, Any] = {"confidence": np.ones((24, 32), np.float32)}
         for name in random.choice(["depth", "confidence", "normals", "unfiltered", "intrinsics", "pose", "scale"], 2):
             value = random.choice(wild)
@@ -137,7 +137,7 @@ def test_no_mutated_keyframe_ends_the_map_or_makes_it_unsound() -> None:
                     array = array * array.dtype.type(value)
             changes[field] = array
         with np.errstate(all="ignore"):
-            mapper.add_view(replace(view, **changes))
+            mapper.add_keyframe(replace(view, **changes))
             mapper.step()
         if index % 20 == 0:
             assert is_sound(mapper), changes

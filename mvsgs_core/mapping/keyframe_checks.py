@@ -10,18 +10,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.stats import Stats
 
-LEAST_SIDE = 8  # pixels of an image
+MIN_SIDE = 8  # pixels of an image
 FOCAL = (0.05, 100.0)  # focal lengths over the image's larger side: 170 degrees to half a degree
 OFF_CENTER = 1.0  # image sizes that the principal point may lie outside of the image
 FAR = 1e6  # median depths from the origin, and between scales: float32 has no detail left there
 NO_POSE = "a corrected pose that is not finite, or none at all, was refused"
-LARGEST = 1e18  # of depths, in the world's unit: their squares are finite in float32
+MAX_DEPTH = 1e18  # of depths, in the world's unit: their squares are finite in float32
 
 
-def checked_view(view: PosedView, log: Stats) -> PosedView | None:
+def checked_keyframe(view: RGBDKeyframe, log: Stats) -> RGBDKeyframe | None:
     """The view without normals and confidences that are none; None, and counted, where it cannot be mapped."""
     problem = _problem(view)
     if problem:
@@ -55,12 +55,12 @@ def is_near(position: np.ndarray, depth: float = 0.0) -> bool:
     return bool(np.abs(position).max() < FAR and depth < FAR)
 
 
-def _problem(view: PosedView) -> str:
+def _problem(view: RGBDKeyframe) -> str:
     """Why it cannot be mapped; empty if it can."""
     height, width = view.image.shape[:2]
     size, fx, fy, cx, cy = max(height, width), *np.asarray(view.intrinsics, dtype=np.float64)
-    if min(height, width) < LEAST_SIDE:
-        return f"an image smaller than {LEAST_SIDE} pixels"
+    if min(height, width) < MIN_SIDE:
+        return f"an image smaller than {MIN_SIDE} pixels"
     if view.depth.ndim != 2 or view.depth.size == 0:
         return "an empty depth map"
     maps = (view.confidence, view.normals, view.unfiltered)

@@ -8,32 +8,32 @@ import numpy as np
 import pytest
 
 from mvsgs_core import camera, geometry
-from mvsgs_core.mapping.camera_steps import step_pose
-from mvsgs_core.mapping.keyframes import PosedView
+from mvsgs_core.mapping.camera_optimizer import step_pose
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.support.tiny_scene import pose_on_arc, posed_view
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 TIMES = (0.0, 0.33, 0.66, 1.0)
 OFF = 2.0 * np.array([0.01, -0.008, 0.006, 0.006, -0.008, 0.01])  # (translation, rotation) that one pose is wrong by
 TRAINING = TrainingConfig(threads=1, poses=True, pose_rate=5e-4)
 
 
-def views(unit: float = 1.0) -> list[PosedView]:
-    return [posed_view(5 * k, pose_on_arc(t), unit=unit) for k, t in enumerate(TIMES)]
+def views(unit: float = 1.0) -> list[RGBDKeyframe]:
+    return [rgbd_keyframe(5 * k, pose_on_arc(t), unit=unit) for k, t in enumerate(TIMES)]
 
 
-def mapped(given: list[PosedView], training: TrainingConfig) -> OnlineMapper:
+def mapped(given: list[RGBDKeyframe], training: TrainingConfig) -> OnlineMapper:
     mapper = OnlineMapper(MapperConfig(iterations=25, refinement=0, training=training))
     for view in given:
-        mapper.add_view(view)
+        mapper.add_keyframe(view)
     for _ in range(100):
-        mapper.schedule.owe(1)
+        mapper.schedule.add_budget(1)
         mapper.step()
     return mapper
 
 
-def shift(view: PosedView, pose: np.ndarray) -> float:
+def shift(view: RGBDKeyframe, pose: np.ndarray) -> float:
     """Mean shift in pixels of the view's points when they are seen from `pose`, in place of the view's own."""
     points = camera.unproject(view.depth, view.intrinsics).reshape(-1, 3)
     there = geometry.inverse(pose) @ view.world_from_cam
@@ -78,7 +78,7 @@ def test_a_correction_keeps_what_was_refined_in_the_new_scale() -> None:
 
 def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
     mapper = OnlineMapper(MapperConfig())
-    mapper.add_view(views()[0])
+    mapper.add_keyframe(views()[0])
     view = mapper.views[0]
     assert not step_pose(view, np.array([0, 0, np.nan, 0, 0, 0.0]), 1e-3, 1e-3)
     assert np.array_equal(view.pose_delta, np.eye(4))
