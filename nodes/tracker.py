@@ -15,7 +15,7 @@ from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.estimation.rolling_shutter import checked_readout, unrolled
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
-from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
+from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.starting import StartingConfig
 from nodes.tracking import TrackerNode
 
@@ -65,7 +65,7 @@ class Tracker(TrackerNode):
                 starting=StartingConfig(keyframes=c.start_keyframes),
                 readout=checked_readout(c.readout),
                 loops=c.loops,
-                known_ground=KnownGroundConfig(keyframes=c.known_from, flow=c.known_flow),
+                covisibility=CovisibilityConfig(min_keyframes=c.known_from, max_flow=c.known_flow),
             )
         )
 

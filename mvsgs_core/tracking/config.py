@@ -8,7 +8,7 @@ from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.estimation.focal import FocalConfig
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
-from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
+from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.places.loop_closure import LoopConfig
 from mvsgs_core.tracking.places.recovery import RecoveryConfig
 from mvsgs_core.tracking.starting import StartingConfig
@@ -32,7 +32,7 @@ class TrackerConfig:
     loop: LoopConfig = field(default_factory=LoopConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     back_end: BackEndConfig = field(default_factory=BackEndConfig)
-    known_ground: KnownGroundConfig = field(default_factory=KnownGroundConfig)
+    covisibility: CovisibilityConfig = field(default_factory=CovisibilityConfig)
 
 
 __all__ = ["TrackerConfig"]

@@ -31,10 +31,10 @@ from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import make_flow
 from mvsgs_core.tracking.matching.matcher import Matcher
-from mvsgs_core.tracking.places.known_ground import KnownGround
+from mvsgs_core.tracking.places.covisibility import CovisibleKeyframes
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
 from mvsgs_core.tracking.places.loop_closure import LoopCloser
 from mvsgs_core.tracking.places.recovery import Recovery
-from mvsgs_core.tracking.places.sighting import Sighting
 from mvsgs_core.tracking.publish import Publisher, Update
 from mvsgs_core.tracking.starting import Starter
 
@@ -172,7 +172,7 @@ class Tracker:
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, config.threads)
         self.loops = LoopCloser(self.graph, self.local_map, config.loop)
         self.recovery = Recovery(self.graph, self.matcher, self.loops.retrieval, config.recovery, config.front_end)
-        self.known_ground = KnownGround(self.graph, self.local_map, config.known_ground, config.threads)
+        self.covisible_keyframes = CovisibleKeyframes(self.graph, self.local_map, config.covisibility, config.threads)
         self.back_end = BackEnd(self.graph, self.local_map, config.back_end, config.threads)
         self.publisher = Publisher(self.graph, config.tolerance, lambda index: self.keyframe(index).segment)
 
@@ -207,12 +207,12 @@ class Tracker:
             waiting = list(self.starter.waiting)
             started = self.starter.try_start(focal=self._unknown_focal())
         if not started:
-            sighting = self.recovery.relocalize(frame) if self.segment > 0 else None
-            if sighting is None:
+            place = self.recovery.relocalize(frame) if self.segment > 0 else None
+            if place is None:
                 return Update(State.NOT_STARTED)
             self.starter.abandon()
             self.segment -= 1
-            return self._resume(frame, record, sighting)
+            return self._resume(frame, record, place)
         return self._started(waiting, record)
 
     def _started(self, waiting: list[int], record: FrameRecord) -> Update:
@@ -238,10 +238,10 @@ class Tracker:
         pose = step.localization.cam_from_world
         reference = self.front_end.reference.index
         record.follow(self.graph, reference, step.matches, pose)
-        limit = self.known_ground.limit(reference, self.config.front_end.keyframe_flow)
+        limit = self.covisible_keyframes.limit(reference, self.config.front_end.keyframe_flow)
         moved = self.front_end.wants_keyframe(step, limit)
         wanted = self.choice.wants(frame.index, reference, step, frame.size[1], limit)
-        if moved and self._known_here(frame, pose, reference):
+        if moved and self._reuse_keyframe(frame, pose, reference):
             return Update(State.TRACKED)
         if not wanted:
             self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
@@ -268,7 +268,7 @@ class Tracker:
             record.state = State.DEGENERATE
             self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
         self.stats.count("keyframes")
-        self.known_ground.made(frame.index)
+        self.covisible_keyframes.made(frame.index)
         self._since = 0
         if len(self.graph.keyframes) in READOUT_AGAIN:
             self.calibration.estimate_readout(self.local_map.members(self.segment)[-12:])
@@ -307,16 +307,16 @@ class Tracker:
     def _unknown_focal(self) -> FocalConfig | None:
         return None if self.calibration.settled else self.config.focal
 
-    def _known_here(self, frame: TrackingImage, pose: np.ndarray, reference: int) -> bool:
+    def _reuse_keyframe(self, frame: TrackingImage, pose: np.ndarray, reference: int) -> bool:
         """An old keyframe sees this: it becomes the reference, and no further one is made."""
-        with self.stats.time("known ground"):
-            known = self.known_ground.find(frame, pose, reference)
+        with self.stats.time("covisible keyframes"):
+            known = self.covisible_keyframes.find(frame, pose, reference)
         if known is None:
             return False
         self._tail = {}
         image = self.keyframe(known.index).image
         self.front_end.resume(image, frame, known.matches, known.localization.cam_from_world)
-        self.stats.skip("keyframes on known ground")
+        self.stats.skip("keyframes spared by covisible ones")
         return True
 
     def _close_loops(self, index: int) -> None:
@@ -349,12 +349,12 @@ class Tracker:
             return Update(record.state)
         self.recovery.keep(frame)
         with self.stats.time("relocalization"):
-            sighting = self.recovery.lost(frame)
-        if sighting is not None:
+            place = self.recovery.lost(frame)
+        if place is not None:
             if not self.started:
                 self.starter.abandon()
                 self.segment -= 1
-            return self._resume(frame, record, sighting)
+            return self._resume(frame, record, place)
         if not self.started:
             self.starter.abandon()
             return self._begin(frame, record)
@@ -365,17 +365,17 @@ class Tracker:
             return Update(self._begin(frame, record).state, told)
         return Update(record.state)
 
-    def _resume(self, frame: TrackingImage, record: FrameRecord, sighting: Sighting) -> Update:
+    def _resume(self, frame: TrackingImage, record: FrameRecord, place: PlaceMatch) -> Update:
         """Tracking goes on from a keyframe that was found in a frame."""
         assert self.graph is not None
-        keyframe = self.graph.keyframes[sighting.index]
+        keyframe = self.graph.keyframes[place.index]
         self.started, self._tail = True, {}
         self.segment = keyframe.segment
-        self.front_end.resume(keyframe.image, frame, sighting.matches, sighting.localization.cam_from_world)
+        self.front_end.resume(keyframe.image, frame, place.matches, place.localization.cam_from_world)
         self.recovery.found_again()
         self.stats.count("relocalized")
         record.state = State.TRACKED
-        record.follow(self.graph, sighting.index, sighting.matches, sighting.localization.cam_from_world)
+        record.follow(self.graph, place.index, place.matches, place.localization.cam_from_world)
         return Update(State.TRACKED)
 
     def _force_start(self) -> Iterator[Update]:

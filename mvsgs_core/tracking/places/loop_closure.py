@@ -11,9 +11,9 @@ from mvsgs_core import geometry
 from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of, solve_pose_graph
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, relative_scale, verify_place
 from mvsgs_core.tracking.places.retrieval import Retrieval
-from mvsgs_core.tracking.places.sighting import Sighting, relative_scale, sight
-from mvsgs_core.tracking.verification import Criteria
+from mvsgs_core.tracking.pose_criteria import PoseCriteria
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class LoopConfig:
     candidates: int = 2  # keyframes that are looked at, for each new one
     apart: int = 10  # keyframes: nearer ones are no loop
     agreement: float = 0.03  # of depth, radians, half of the scale: below, the map is right and only gains an edge
-    criteria: Criteria = field(default_factory=Criteria)
+    criteria: PoseCriteria = field(default_factory=PoseCriteria)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class LoopCloser:
         descriptors = keyframe.image.features()[1]
         usual = set(order[max(0, place - 2) : place])
         for candidate in self.retrieval.query(descriptors, self.config.candidates, near, usual):
-            found = sight(self.graph, self.local_map.matcher, candidate, keyframe.image, self.config.criteria)
+            found = verify_place(self.graph, self.local_map.matcher, candidate, keyframe.image, self.config.criteria)
             if found is None:
                 continue
             scale = relative_scale(self.graph, found, index)
@@ -65,7 +65,7 @@ class LoopCloser:
                 return self.close(found, index, scale)
         return None
 
-    def close(self, found: Sighting, index: int, scale: float) -> Closure:
+    def close(self, found: PlaceMatch, index: int, scale: float) -> Closure:
         """Moves the map so that the sighting holds. scale: unit of keyframe `index` over that of the sighted one."""
         old, new = self.graph.keyframes[found.index], self.graph.keyframes[index]
         joined = new.segment if old.segment != new.segment else None
@@ -83,20 +83,20 @@ class LoopCloser:
         self.local_map.match_edge(index, found.index)
         return closure
 
-    def _disagreement(self, found: Sighting, index: int, scale: float) -> float:
+    def _disagreement(self, found: PlaceMatch, index: int, scale: float) -> float:
         difference = found.localization.cam_from_world @ self.graph.world_from_cam(index)
         shift = float(np.linalg.norm(difference[:3, 3])) / self.graph.keyframes[index].median_depth
         turn = float(np.linalg.norm(geometry.so3_log(difference[:3, :3])))
         return max(shift, turn, 0.5 * abs(float(np.log(scale))))
 
-    def _measured(self, found: Sighting, index: int, scale: float) -> np.ndarray:
+    def _measured(self, found: PlaceMatch, index: int, scale: float) -> np.ndarray:
         """Similarity (4, 4): camera `index`, in its own unit, from the sighted camera."""
         relative = found.localization.cam_from_world @ self.graph.world_from_cam(found.index)
         result = np.eye(4)
         result[:3, :3], result[:3, 3] = scale * relative[:3, :3], scale * relative[:3, 3]
         return result
 
-    def _pull(self, found: Sighting, index: int, scale: float) -> str:
+    def _pull(self, found: PlaceMatch, index: int, scale: float) -> str:
         """Pose graph over the segment; returns why it failed, or nothing."""
         order = self.local_map.members(self.graph.keyframes[index].segment)
         number = {k: n for n, k in enumerate(order)}
@@ -120,7 +120,7 @@ class LoopCloser:
             self._apply(k, similarity)
         return ""
 
-    def _join(self, found: Sighting, index: int, scale: float) -> None:
+    def _join(self, found: PlaceMatch, index: int, scale: float) -> None:
         """Brings the segment of `index` into the frame and unit of the sighted one."""
         target = self.graph.keyframes[found.index].segment
         wanted = self._measured(found, index, scale) @ self.graph.keyframes[found.index].cam_from_world

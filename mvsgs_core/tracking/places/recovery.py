@@ -10,17 +10,17 @@ from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, verify_place
 from mvsgs_core.tracking.places.retrieval import Retrieval
-from mvsgs_core.tracking.places.sighting import Sighting, sight
-from mvsgs_core.tracking.verification import Criteria, verified
+from mvsgs_core.tracking.pose_criteria import PoseCriteria, verified
 
 
 @dataclass(frozen=True)
 class RecoveryConfig:
     candidates: int = 3  # keyframes that a lost frame is compared with
     patience: int = 6  # lost frames in a row after which a new segment begins
-    kept: int = 400  # images of frames without a pose, for another try in the end; the oldest goes first
-    criteria: Criteria = field(default_factory=Criteria)
+    max_images: int = 400  # images of frames without a pose, for another try in the end; the oldest goes first
+    criteria: PoseCriteria = field(default_factory=PoseCriteria)
 
 
 class Recovery:
@@ -51,21 +51,21 @@ class Recovery:
     def keep(self, frame: TrackingImage) -> None:
         """The image of a frame that has no pose (yet)."""
         self._kept[frame.index] = frame.bare()
-        if len(self._kept) > self.config.kept:
+        if len(self._kept) > self.config.max_images:
             del self._kept[next(iter(self._kept))]
 
-    def lost(self, frame: TrackingImage) -> Sighting | None:
+    def lost(self, frame: TrackingImage) -> PlaceMatch | None:
         """One more lost frame: where it was found, if it was."""
         self.in_a_row += 1
         return self.relocalize(frame)
 
-    def relocalize(self, frame: TrackingImage) -> Sighting | None:
+    def relocalize(self, frame: TrackingImage) -> PlaceMatch | None:
         """The keyframe that looks most alike and verifies."""
         candidates = self.retrieval.query(frame.features()[1], self.config.candidates, set())
         for index in candidates:
             if index not in self.graph.keyframes:
                 continue
-            found = sight(self.graph, self.matcher, index, frame, self.config.criteria)
+            found = verify_place(self.graph, self.matcher, index, frame, self.config.criteria)
             if found is not None:
                 return found
         return None

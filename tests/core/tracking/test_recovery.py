@@ -57,7 +57,7 @@ def test_each_lost_run_is_followed_from_its_own_keyframes() -> None:
 
 def test_only_the_newest_images_of_frames_without_a_pose_are_kept() -> None:
     items = covered(list(synthetic(frames=80)), range(40, 52), range(0))[:60]
-    tracker, _, _ = track(items, TrackerConfig(recovery=RecoveryConfig(kept=5, patience=100)))
+    tracker, _, _ = track(items, TrackerConfig(recovery=RecoveryConfig(max_images=5, patience=100)))
     assert len(tracker.recovery._kept) == 5
     assert min(tracker.recovery._kept) >= 40
 

@@ -13,7 +13,7 @@ from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.frames import FrameRecord, State
 from mvsgs_core.tracking.matching.flow import Matches
-from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
+from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.places.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.tracking.tracker import Tracker
@@ -53,7 +53,7 @@ def test_a_camera_that_goes_to_and_fro_needs_no_memory_but_its_frames_kilobyte()
     """10,000 frames at constant keyframes are 10 MB: a tenth of the process."""
     items = list(open_dataset("synthetic", frames=30, threads=1, size=(96, 128)))
     order = [*range(30), *range(28, 0, -1)]
-    tracker = Tracker(TrackerConfig(area=128 * 96, known_ground=KnownGroundConfig(keyframes=5)))
+    tracker = Tracker(TrackerConfig(area=128 * 96, covisibility=CovisibilityConfig(min_keyframes=5)))
     sizes, keyframes = [], []
     tracemalloc.start()
     try:

@@ -1,4 +1,4 @@
-"""A camera that is lost, begins anew, and sees known ground again: the two segments become one map."""
+"""A camera that is lost, begins anew, and sees the first part again: the two segments become one map."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mvsgs_core.tracking.frames import State
-from mvsgs_core.tracking.places.known_ground import KnownGroundConfig
+from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.tracker import TrackerConfig
 from tests.support.sequences import ate, synthetic, track
 
@@ -17,12 +17,12 @@ ROUND = 80  # frames of a round: every third of 240 of the room's loop
 def test_a_second_round_makes_few_keyframes_and_is_as_accurate() -> None:
     once = synthetic(frames=240, loop=True, stride=3)
     items = [replace(once[n % ROUND], index=n, timestamp=n / 7.0) for n in range(2 * ROUND)]
-    tracker, path, _ = track(items, TrackerConfig(known_ground=KnownGroundConfig(keyframes=24)))
+    tracker, path, _ = track(items, TrackerConfig(covisibility=CovisibilityConfig(min_keyframes=24)))
     first, second = (int(half.sum()) for half in np.split(path.keyframe, [ROUND]))
     assert first >= 24
     assert second <= 0.2 * first
-    assert tracker.stats.skipped["keyframes on known ground"] >= 5
-    assert np.isfinite(path.world_from_cam).all(), "frames on known ground have poses"
+    assert tracker.stats.skipped["keyframes spared by covisible ones"] >= 5
+    assert np.isfinite(path.world_from_cam).all(), "frames that see what old keyframes see have poses"
     assert (path.state == State.TRACKED).all()
     assert tracker.publisher.told == set(path.index[path.keyframe].tolist()), "no keyframe that was told is taken back"
     error, length = ate(path, items)

@@ -19,9 +19,9 @@ from mvsgs_core.tracking.places.localization import Localization, localize
 
 
 @dataclass(frozen=True)
-class KnownGroundConfig:
-    keyframes: int = 64  # of a map: smaller ones take every view, each makes them more accurate; 0: from the start
-    flow: float = 0.13  # of the width: a view nearer to an old keyframe than this is known; 0: none ever is
+class CovisibilityConfig:
+    min_keyframes: int = 64  # of a map: smaller ones take every view, each makes them more accurate; 0: from the start
+    max_flow: float = 0.13  # of the width: a view nearer to an old keyframe than this is known; 0: none ever is
     age: int = 12  # references since a keyframe was made, before it counts as old: the local window, and its baselines
     candidates: int = 2  # old keyframes that are tried, the nearest first
     share: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new
@@ -30,7 +30,7 @@ class KnownGroundConfig:
 
 
 @dataclass(frozen=True)
-class KnownView:
+class PlaceMatch:
     """An old keyframe that sees what a frame sees."""
 
     index: int
@@ -38,8 +38,8 @@ class KnownView:
     localization: Localization  # of the frame
 
 
-class KnownGround:
-    def __init__(self, graph: KeyframeGraph, local_map: LocalMap, config: KnownGroundConfig, threads: int) -> None:
+class CovisibleKeyframes:
+    def __init__(self, graph: KeyframeGraph, local_map: LocalMap, config: CovisibilityConfig, threads: int) -> None:
         self.graph = graph
         self.local_map = local_map
         self.config = config
@@ -55,18 +55,18 @@ class KnownGround:
 
     def limit(self, reference: int, usual: float) -> float:
         """Median flow, as a share of the width, at which another keyframe is needed; usual: that of a young one."""
-        return max(usual, self.config.flow) if reference == self.followed else usual
+        return max(usual, self.config.max_flow) if reference == self.followed else usual
 
-    def find(self, frame: TrackingImage, pose: np.ndarray, reference: int) -> KnownView | None:
+    def find(self, frame: TrackingImage, pose: np.ndarray, reference: int) -> PlaceMatch | None:
         """The old keyframe to follow from this frame on, whose pose (4, 4) was found against the reference.
 
         None where the view is new, or where the map contradicts itself: then a keyframe has to tie the two parts.
         """
         segment = self.graph.keyframes[reference].segment
-        if self.config.flow == 0 or len(self.local_map.members(segment)) < self.config.keyframes:
+        if self.config.max_flow == 0 or len(self.local_map.members(segment)) < self.config.min_keyframes:
             return None
         old = [index for index in sorted(self._tied_to(reference)) if self._is_old(index, segment)]
-        near = self.local_map.from_pose(pose, old, self.config.flow * frame.size[1])
+        near = self.local_map.from_pose(pose, old, self.config.max_flow * frame.size[1])
         for index in near[: self.config.candidates]:
             found = self._verify(frame, pose, index)
             if found is not None:
@@ -75,7 +75,7 @@ class KnownGround:
             self._release(index)
         return None
 
-    def _verify(self, frame: TrackingImage, pose: np.ndarray, index: int) -> KnownView | None:
+    def _verify(self, frame: TrackingImage, pose: np.ndarray, index: int) -> PlaceMatch | None:
         expected, _ = self.graph.predict_pose(index, pose)
         keyframe = self.graph.keyframes[index]
         matches, share = self.local_map.matcher.match(keyframe.image, frame, expected, 0.0)
@@ -88,7 +88,7 @@ class KnownGround:
         found = localize(self.graph, {index: matches}, pose, self.solver)
         if found.failure or found.inliers < self.config.inliers:
             return None
-        return KnownView(index, matches, found)
+        return PlaceMatch(index, matches, found)
 
     def _is_old(self, index: int, segment: int) -> bool:
         return (
@@ -115,4 +115,4 @@ class KnownGround:
             self.graph.keyframes[index].image.release()
 
 
-__all__ = ["KnownGround", "KnownGroundConfig", "KnownView"]
+__all__ = ["CovisibilityConfig", "CovisibleKeyframes", "PlaceMatch"]

@@ -18,7 +18,7 @@ from mvsgs_core.tracking.places.localization import Localization, located
 
 
 @dataclass(frozen=True)
-class Criteria:
+class PoseCriteria:
     """What makes a pose certain."""
 
     share: float = 0.12  # of the keyframe's textured points, found
@@ -27,7 +27,7 @@ class Criteria:
     spread: float = 0.1  # of the image area: hull of the inliers
 
 
-def verified(graph: KeyframeGraph, index: int, matches: Matches, found: Localization, criteria: Criteria) -> bool:
+def verified(graph: KeyframeGraph, index: int, matches: Matches, found: Localization, criteria: PoseCriteria) -> bool:
     """Whether the matches of the points of keyframe `index` verify the pose that was found from them."""
     keyframe = graph.keyframes[index]
     known = matches.alive & keyframe.triangulated
@@ -45,4 +45,4 @@ def verified(graph: KeyframeGraph, index: int, matches: Matches, found: Localiza
     return bool(cv2.contourArea(hull) >= criteria.spread * height * width)
 
 
-__all__ = ["Criteria", "verified"]
+__all__ = ["PoseCriteria", "verified"]

@@ -16,11 +16,11 @@ from mvsgs_core.tracking.matching.features import match_features
 from mvsgs_core.tracking.matching.flow import Matches, spread
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.places.localization import Localization, localize
-from mvsgs_core.tracking.verification import Criteria, verified
+from mvsgs_core.tracking.pose_criteria import PoseCriteria, verified
 
 
 @dataclass(frozen=True)
-class Sighting:
+class PlaceMatch:
     """Keyframe `index` was found in an image."""
 
     index: int
@@ -28,9 +28,9 @@ class Sighting:
     localization: Localization  # of the image, in the keyframe's map
 
 
-def sight(
-    graph: KeyframeGraph, matcher: Matcher, index: int, image: TrackingImage, criteria: Criteria
-) -> Sighting | None:
+def verify_place(
+    graph: KeyframeGraph, matcher: Matcher, index: int, image: TrackingImage, criteria: PoseCriteria
+) -> PlaceMatch | None:
     """None where the keyframe's points are not found or no pose explains them."""
     keyframe = graph.keyframes[index]
     from_keyframe, in_image = match_features(keyframe.image, image, threshold=1.5)
@@ -62,10 +62,10 @@ def sight(
     localization = localize(graph, {index: matches}, relative @ keyframe.cam_from_world, Solver(steps=10))
     if not verified(graph, index, matches, localization, criteria):
         return None
-    return Sighting(index, matches, localization)
+    return PlaceMatch(index, matches, localization)
 
 
-def relative_scale(graph: KeyframeGraph, sighting: Sighting, index: int) -> float | None:
+def relative_scale(graph: KeyframeGraph, sighting: PlaceMatch, index: int) -> float | None:
     """Unit of keyframe `index`'s own depths over the unit of the sighted keyframe's; None where too few compare."""
     here, seen = graph.keyframes[index], graph.keyframes[sighting.index]
     usable = sighting.matches.alive & seen.triangulated
@@ -87,4 +87,4 @@ def relative_scale(graph: KeyframeGraph, sighting: Sighting, index: int) -> floa
     return float(np.median(ratio))
 
 
-__all__ = ["Sighting", "relative_scale", "sight"]
+__all__ = ["PlaceMatch", "relative_scale", "verify_place"]
