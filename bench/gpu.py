@@ -41,7 +41,7 @@ from mvsgs_core.stats import Stats
 Action = Callable[[], object]
 
 CASES = (((480, 640), 50_000), ((864, 1152), 1_000_000))  # (height, width), splats; the second has 1.0 megapixel
-DENSITIES = ("gaussian", "exact")
+KERNELS = ("gaussian", "exact")
 # floating-point operations of one splat on one pixel: forward and backward, a transcendental counted as one
 OPERATIONS = {"gaussian": 24 + 56, "exact": 24 + 56 + 14}
 
@@ -92,13 +92,13 @@ def on_device(splats: Splats, device: torch.device) -> Splats:
     return Splats(*(tensor.detach().to(device).requires_grad_() for tensor in splats.tensors().values()))
 
 
-def triton_case(splats: Splats, size: tuple[int, int], density: str) -> tuple[Action, Action]:
+def triton_case(splats: Splats, size: tuple[int, int], kernel: str) -> tuple[Action, Action]:
     """(forward, backward of the last forward pass)."""
     last: list[Tensor] = []
     gradient = torch.ones(*size, 3, device=splats.means.device)
 
     def forward() -> None:
-        last[:] = [rasterize(splats, np.eye(4), intrinsics(size), size, density=density, backend="triton").color]
+        last[:] = [rasterize(splats, np.eye(4), intrinsics(size), size, kernel=kernel, backend="triton").color]
 
     return forward, lambda: last[0].backward(gradient)
 
@@ -134,19 +134,19 @@ def traffic(count: int, pairs: int, size: tuple[int, int]) -> float:
 
 def rasterizer_rows(size: tuple[int, int], count: int, device: torch.device, peaks: Peaks, rounds: int) -> list[Row]:
     rows = []
-    for density in DENSITIES:
-        host = scene(count, size[1], density)
-        done = work(host, size, density)
+    for kernel in KERNELS:
+        host = scene(count, size[1], kernel)
+        done = work(host, size, kernel)
         splats = on_device(host, device)
-        label = f"{size[1]}x{size[0]} {count / 1000:g}k {density}"
-        actions = [*triton_case(splats, size, density)]
-        beside = density == "gaussian" and importlib.util.find_spec("gsplat") is not None
+        label = f"{size[1]}x{size[0]} {count / 1000:g}k {kernel}"
+        actions = [*triton_case(splats, size, kernel)]
+        beside = kernel == "gaussian" and importlib.util.find_spec("gsplat") is not None
         if beside:
             actions += gsplat_case(splats, size)
         taken = milliseconds(actions, device, rounds)
         ours = taken[0] + taken[1]
         memory = 1e3 * traffic(count, done.pairs, size) / peaks.bytes
-        arithmetic = 1e3 * done.contributed * OPERATIONS[density] / peaks.operations
+        arithmetic = 1e3 * done.contributed * OPERATIONS[kernel] / peaks.operations
         rows += [
             Row(f"{label}: forward", taken[0], "ms"),
             Row(f"{label}: backward", taken[1], "ms"),
@@ -171,7 +171,7 @@ def iteration_rows(size: tuple[int, int], count: int, device: torch.device, roun
     posed = RGBDKeyframe(0, image, intrinsics(size), np.eye(4), np.zeros(size, np.float32))
     view = training_view(posed, np.eye(4), None, 1, device)
     training = TrainingConfig(backend="triton")
-    groups = optimizer.groups(optimizer.OptimizerConfig(), 1.0, 1.0, False, training.density)
+    groups = optimizer.groups(optimizer.OptimizerConfig(), 1.0, 1.0, False, training.kernel)
     log = Stats()
     rendered = torch.rand(*size, 3, device=device, requires_grad=True)
     target = view.target(0)

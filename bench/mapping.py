@@ -110,7 +110,7 @@ def held_out_psnr(mapper: OnlineMapper, scene: Scene) -> float:
         pose[:3, 3] -= final.origin
         with torch.no_grad():
             color = rasterize(
-                final.splats, pose, view.intrinsics, view.image.shape[:2], density=final.density,
+                final.splats, pose, view.intrinsics, view.image.shape[:2], kernel=final.kernel,
                 near=1e-3 * (mapper.unit or 1.0),
             ).color  # fmt: skip
         scores.append(psnr(color.clamp(0.0, 1.0).numpy(), view.image.astype(np.float32) / 255.0))
@@ -175,7 +175,7 @@ def variants(config: MapperConfig) -> dict[str, MapperConfig]:
         "low-error tiles left out": replace(config, skipping=replace(skipping, tiles=True)),
         "coarse-to-fine": replace(config, skipping=replace(skipping, coarse_to_fine=True)),
         "every splat stepped": replace(config, skipping=replace(skipping, selective=False)),
-        "shapes trained (exact)": replace(config, training=replace(training, density="exact", betas=True)),
+        "shapes trained (exact)": replace(config, training=replace(training, kernel="exact", betas=True)),
         "harmonics of degree 1": replace(config, sh_degree=1),
         "exposure trained": replace(config, training=replace(training, exposure=True)),
         "poses trained": replace(config, training=replace(training, poses=True)),

@@ -34,8 +34,8 @@ import torch
 from bench.table import Row, at_most, main, timed
 from mvsgs_core import camera, native
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.rasterizer import densities, spherical_harmonics, ssim
-from mvsgs_core.rasterizer.densities import DENSITIES
+from mvsgs_core.rasterizer import kernels, spherical_harmonics, ssim
+from mvsgs_core.rasterizer.kernels import KERNELS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -65,7 +65,7 @@ class Times:
         return sum(self.milliseconds())
 
 
-def scene(count: int, width: int, density: str) -> Splats:
+def scene(count: int, width: int, kernel: str) -> Splats:
     """`count` splats over the view of a camera at the origin with a focal length of 0.9 widths, aspect 4:3."""
     g = torch.Generator().manual_seed(0)
     across = torch.rand(count, 2, generator=g) - 0.5
@@ -79,7 +79,7 @@ def scene(count: int, width: int, density: str) -> Splats:
         quaternions=torch.randn(count, 4, generator=g),
         opacity_logits=torch.randn(count, generator=g),
         sh=torch.randn(count, 1, 3, generator=g) * 0.5,
-        betas=betas if density == "exact" else torch.zeros(count),
+        betas=betas if kernel == "exact" else torch.zeros(count),
     )
     return Splats(*(tensor.requires_grad_() for tensor in splats.tensors().values()))
 
@@ -90,14 +90,14 @@ def intrinsics(size: tuple[int, int]) -> np.ndarray:
 
 
 def run(
-    splats: Splats, size: tuple[int, int], density: str, backend: str, threads: int, times: Times,
+    splats: Splats, size: tuple[int, int], kernel: str, backend: str, threads: int, times: Times,
     antialiased: bool = False,
 ) -> torch.Tensor:  # fmt: skip
     """One forward and backward pass, timed."""
     gradient = torch.ones(*size, 3)
     start = time.perf_counter()
     render = rasterize(
-        splats, np.eye(4), intrinsics(size), size, density=density, backend=backend, threads=threads,
+        splats, np.eye(4), intrinsics(size), size, kernel=kernel, backend=backend, threads=threads,
         antialiased=antialiased,
     )  # fmt: skip
     middle = time.perf_counter()
@@ -106,11 +106,11 @@ def run(
     return render.color.detach()
 
 
-def run_baseline(splats: Splats, size: tuple[int, int], density: str, threads: int, times: Times) -> torch.Tensor:
+def run_baseline(splats: Splats, size: tuple[int, int], kernel: str, threads: int, times: Times) -> torch.Tensor:
     color = torch.empty(*size, 3)
     seconds = native.load("bench").baseline(
         *(tensor.detach() for tensor in splats.tensors().values()), torch.eye(4, dtype=torch.float64),
-        tuple(intrinsics(size).tolist()), density == "exact", threads, color, torch.ones(*size, 3),
+        tuple(intrinsics(size).tolist()), kernel == "exact", threads, color, torch.ones(*size, 3),
         torch.empty(len(splats), 9),
     )  # fmt: skip
     times.add(*seconds)
@@ -127,13 +127,13 @@ class Operations:
     what lies behind, seven for dL/dalpha (its reciprocal is three), eleven for the sums; the exact form adds eight.
     """
 
-    density: int
+    kernel: int
     forward: int = 9
     backward: int = 27
 
     def pair(self) -> int:
-        """Of the forward and the backward pass: both evaluate the density, for keeping it costs more bytes."""
-        return 2 * self.density + self.forward + self.backward
+        """Of the forward and the backward pass: both evaluate the kernel, for keeping it costs more bytes."""
+        return 2 * self.kernel + self.forward + self.backward
 
 
 OPERATIONS = {"gaussian": Operations(13), "exact": Operations(37, backward=35)}
@@ -148,11 +148,11 @@ class Work:
     pairs: int  # of splats and tiles
 
 
-def work(splats: Splats, size: tuple[int, int], density: str) -> Work:
+def work(splats: Splats, size: tuple[int, int], kernel: str) -> Work:
     height, width = size
     passed = native.load("rasterizer").forward(
         *(tensor.detach() for tensor in splats.tensors().values()), pose=torch.eye(4, dtype=torch.float64),
-        intrinsics=tuple(intrinsics(size).tolist()), near=1e-3, background=(0.0, 0.0, 0.0), exact=density == "exact",
+        intrinsics=tuple(intrinsics(size).tolist()), near=1e-3, background=(0.0, 0.0, 0.0), exact=kernel == "exact",
         antialiased=False, degree=0, tile_mask=None, weights=True, threads=0, color=torch.empty(height, width, 3),
         depth=torch.empty(size), opacity=torch.empty(size), radii=torch.empty(len(splats)),
     )  # fmt: skip
@@ -168,7 +168,7 @@ class Roofline:
     simple: float  # exponentials and bytes
 
 
-def roofline(done: Work, count: int, size: tuple[int, int], density: str, threads: int) -> Roofline:
+def roofline(done: Work, count: int, size: tuple[int, int], kernel: str, threads: int) -> Roofline:
     peaks = native.load("bench")
     products = peaks.peak_products(threads)
     cache = peaks.peak_tile_bytes(threads)
@@ -181,10 +181,10 @@ def roofline(done: Work, count: int, size: tuple[int, int], density: str, thread
         return 64 * (FORWARD_VECTORS + BACKWARD_VECTORS) * pairs / 16 / cache
 
     def bound(pairs: int) -> float:
-        blending = max(pairs * OPERATIONS[density].pair() / products, state(pairs))
+        blending = max(pairs * OPERATIONS[kernel].pair() / products, state(pairs))
         return 1e3 * (blending + count * PROJECTION_OPERATIONS / products + memory)
 
-    densities_only = 2 * done.evaluated / peaks.peak_densities(density == "exact", threads)
+    densities_only = 2 * done.evaluated / peaks.peak_densities(kernel == "exact", threads)
     simple = 1e3 * (max(densities_only, state(done.evaluated)) + memory)
     return Roofline(bound(done.contributed), bound(done.evaluated), simple)
 
@@ -209,34 +209,34 @@ class Round:
 
 
 def compare(size: tuple[int, int], count: int, threads: int, rounds: int) -> list[Row]:
-    """C++ kernel, plain loops and roofline at one size, and what the density forms cost."""
+    """C++ kernel, plain loops and roofline at one size, and what the kernels cost."""
     rows = []
     totals = {}
-    for density in DENSITIES:
-        splats = scene(count, size[1], density)
-        done = work(splats, size, density)
+    for kernel in KERNELS:
+        splats = scene(count, size[1], kernel)
+        done = work(splats, size, kernel)
         measured = [Round() for _ in range(rounds)]
         for each in measured:
             for i in range(PASSES):
-                image = run(splats, size, density, "cpu", threads, each.fast)
-                if density != "ges_scale" and i == 0:
-                    other = run_baseline(splats, size, density, threads, each.plain)
-                    run(splats, size, density, "cpu", 1, each.one)
-            if density != "ges_scale":
-                each.bound = roofline(done, count, size, density, threads)
-                each.alone = roofline(done, count, size, density, 1)
+                image = run(splats, size, kernel, "cpu", threads, each.fast)
+                if kernel != "ges_scale" and i == 0:
+                    other = run_baseline(splats, size, kernel, threads, each.plain)
+                    run(splats, size, kernel, "cpu", 1, each.one)
+            if kernel != "ges_scale":
+                each.bound = roofline(done, count, size, kernel, threads)
+                each.alone = roofline(done, count, size, kernel, 1)
         both = [each.fast.total() for each in measured]
-        totals[density] = statistics.median(both)
-        label = f"{size[1]}x{size[0]} {count // 1000}k {density}"
+        totals[kernel] = statistics.median(both)
+        label = f"{size[1]}x{size[0]} {count // 1000}k {kernel}"
         forward, backward = zip(*(each.fast.milliseconds() for each in measured), strict=True)
         rows += [timed(f"{label}: forward", forward, "ms"), timed(f"{label}: backward", backward, "ms")]
-        if density == "ges_scale":
+        if kernel == "ges_scale":
             continue
         plain = [each.plain.milliseconds() for each in measured]
         faster = [each.plain.total() / each.fast.total() for each in measured]
         alone = [each.one.total() / each.fast.total() for each in measured]
         rows += [
-            timed(f"{label}: both", both, "ms", most=MARKS[size[0], density]),
+            timed(f"{label}: both", both, "ms", most=MARKS[size[0], kernel]),
             timed(f"{label}: plain loops, forward", [ms for ms, _ in plain], "ms"),
             timed(f"{label}: plain loops, backward", [ms for _, ms in plain], "ms"),
             timed(f"{label}: times faster than plain loops", faster, "x", least=SPEEDUP),
@@ -250,22 +250,22 @@ def compare(size: tuple[int, int], count: int, threads: int, rounds: int) -> lis
             timed(f"{label}: share by exponentials and bytes only", [e.share("simple") for e in measured], "%"),
             timed(f"{label}: share of the roofline, 1 thread", [e.share_alone() for e in measured], "%"),
         ]
-    for density in DENSITIES[1:]:
-        price = totals[density] / totals["gaussian"]
-        rows.append(Row(f"{size[1]}x{size[0]}: price of {density} over gaussian", price, "x"))
+    for kernel in KERNELS[1:]:
+        price = totals[kernel] / totals["gaussian"]
+        rows.append(Row(f"{size[1]}x{size[0]}: price of {kernel} over gaussian", price, "x"))
     return rows
 
 
 def beside_reference(threads: int) -> list[Row]:
     """The PyTorch reference on a small scene."""
     size, rows = (48, 64), []
-    for density in ("gaussian", "exact"):
-        splats, slow, fast = scene(1000, size[1], density), Times(), Times()
+    for kernel in ("gaussian", "exact"):
+        splats, slow, fast = scene(1000, size[1], kernel), Times(), Times()
         for _ in range(3):
-            run(splats, size, density, "reference", threads, slow)
-            run(splats, size, density, "cpu", threads, fast)
-        rows.append(Row(f"64x48 1k {density}: reference, both", slow.total(), "ms"))
-        rows.append(Row(f"64x48 1k {density}: times faster than the reference", slow.total() / fast.total(), "x"))
+            run(splats, size, kernel, "reference", threads, slow)
+            run(splats, size, kernel, "cpu", threads, fast)
+        rows.append(Row(f"64x48 1k {kernel}: reference, both", slow.total(), "ms"))
+        rows.append(Row(f"64x48 1k {kernel}: times faster than the reference", slow.total() / fast.total(), "x"))
     return rows
 
 
@@ -296,7 +296,7 @@ def psnr(render: torch.Tensor, image: torch.Tensor) -> float:
 
 
 def fit(
-    image: torch.Tensor, intrinsics_of_view: np.ndarray, density: str, seconds: float, antialiased: bool = False
+    image: torch.Tensor, intrinsics_of_view: np.ndarray, kernel: str, seconds: float, antialiased: bool = False
 ) -> tuple[Splats, float, int]:
     """(splats, PSNR, iterations) of 3,000 splats fitted to one image in `seconds` of one core."""
     height, width = image.shape[:2]
@@ -313,7 +313,7 @@ def fit(
         quaternions=torch.randn(3000, 4, generator=g),
         opacity_logits=torch.full((3000,), -1.0),
         sh=spherical_harmonics.from_rgb(colors)[:, None],
-        betas=torch.full((3000,), densities.neutral_beta(density)),
+        betas=torch.full((3000,), kernels.neutral_beta(kernel)),
     )
     leaves = [tensor.requires_grad_() for tensor in splats.tensors().values()]
     rates = (2e-3, 5e-3, 1e-3, 5e-2, 1e-2, 1e-2)
@@ -321,7 +321,7 @@ def fit(
     start, iterations, render = time.process_time(), 0, None
     while time.process_time() - start < seconds or render is None:
         render = rasterize(
-            splats, np.eye(4), intrinsics_of_view, (height, width), density=density, threads=1, antialiased=antialiased
+            splats, np.eye(4), intrinsics_of_view, (height, width), kernel=kernel, threads=1, antialiased=antialiased
         )
         adam.zero_grad()
         ssim.image_loss(render.color, image, l1_weight=0.8, ssim_weight=0.2, threads=1).backward()
@@ -337,13 +337,13 @@ def room() -> tuple[torch.Tensor, np.ndarray]:
 
 
 def worth(seconds: float) -> list[Row]:
-    """What each density form reaches in the same time: one view of the synthetic room, one core."""
+    """What each kernel reaches in the same time: one view of the synthetic room, one core."""
     rows = []
     image, intrinsics_of_room = room()
-    for density in densities.DENSITIES:
-        _, reached, iterations = fit(image, intrinsics_of_room, density, seconds)
-        rows.append(Row(f"one view, {seconds:g} s of one core, {density}: PSNR", reached, "dB"))
-        rows.append(Row(f"one view, {seconds:g} s of one core, {density}: iterations", float(iterations), ""))
+    for kernel in kernels.KERNELS:
+        _, reached, iterations = fit(image, intrinsics_of_room, kernel, seconds)
+        rows.append(Row(f"one view, {seconds:g} s of one core, {kernel}: PSNR", reached, "dB"))
+        rows.append(Row(f"one view, {seconds:g} s of one core, {kernel}: iterations", float(iterations), ""))
     return rows
 
 

@@ -102,9 +102,7 @@ def not_finite() -> Splats:
     return splats
 
 
-def once(
-    name: str, splats: Splats, size: tuple[int, int] = SIZE, density: str = "gaussian", origin: float = 0.0
-) -> Row:
+def once(name: str, splats: Splats, size: tuple[int, int] = SIZE, kernel: str = "gaussian", origin: float = 0.0) -> Row:
     """One render, backward pass and step."""
     state = MapState(splats.sh.shape[1], torch.device("cpu"))
     state.append(splats, torch.zeros(len(splats), dtype=torch.int64))
@@ -113,13 +111,13 @@ def once(
     before = {key: torch.isfinite(value).flatten(1).all(1) if value.dim() > 1 else torch.isfinite(value)
               for key, value in state.detached().tensors().items()}  # fmt: skip
     intrinsics = camera.scale_intrinsics(INTRINSICS, SIZE, size)
-    render = rasterize(state.splats, pose, intrinsics, size, density=density)
+    render = rasterize(state.splats, pose, intrinsics, size, kernel=kernel)
     target = torch.full((*size, 3), 0.5)
     loss = image_loss(render.color, target, l1_weight=0.8, ssim_weight=0.2)
     refused_steps = 0
     if len(splats):
         (loss + render.depth.mean() + render.opacity.mean()).backward()
-        groups = optimizer.groups(OptimizerConfig(), 2.0, 1.0, True, density)
+        groups = optimizer.groups(OptimizerConfig(), 2.0, 1.0, True, kernel)
         refused_steps = optimizer.step(state, render.visible, groups, 100)
     finite = all(bool(torch.isfinite(value).all()) for value in (render.color, render.depth, render.opacity))
     spread_no_further = all(
@@ -201,8 +199,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
         "NaN and Inf in the splats themselves": not_finite,
     }
     rows = [once(name, make()) for name, make in cases.items()]
-    rows.append(once("beta from 0.1 to 20, exact", betas(), density="exact"))
-    rows.append(once("beta from 0.1 to 20, ges_scale", betas(), density="ges_scale"))
+    rows.append(once("beta from 0.1 to 20, exact", betas(), kernel="exact"))
+    rows.append(once("beta from 0.1 to 20, ges_scale", betas(), kernel="ges_scale"))
     rows.append(once("one pixel", cloud(200), size=(1, 1)))
     far = cloud(200)
     far.means[:, 0] += 1e6
@@ -222,11 +220,11 @@ def measure(options: argparse.Namespace) -> list[Row]:
     usual = OptimizerConfig()
     wild = replace(usual, **{key: 100.0 * value for key, value in vars(usual).items()
                              if key not in ("means_final", "decay_steps")})  # fmt: skip
-    for density in ("gaussian", "exact"):
-        training = TrainingConfig(threads=1, density=density, betas=True)
+    for kernel in ("gaussian", "exact"):
+        training = TrainingConfig(threads=1, kernel=kernel, betas=True)
         skipping = replace(config.skipping, converged=False)
         storm = replace(config, iterations=steps // 4, rates=wild, training=training, skipping=skipping)
-        rows.append(mapped(f"{steps} steps at 100 times the rates, {density}", views, storm))
+        rows.append(mapped(f"{steps} steps at 100 times the rates, {kernel}", views, storm))
     return rows
 
 

@@ -138,7 +138,7 @@ class SplatMap:
 
     refined: bool
     iterations: int
-    density: str  # "gaussian", "exact" or "ges_scale": what `betas` means
+    kernel: str  # "gaussian", "exact" or "ges_scale": what `betas` means
     origin: Annotated[np.ndarray, "float64 3"]  # world position that means are relative to: float32 needs it near
     means: Annotated[np.ndarray, "float32 N 3"]
     log_scales: Annotated[np.ndarray, "float32 N 3"]

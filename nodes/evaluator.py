@@ -164,7 +164,7 @@ def _finished(message: SplatMap) -> FinishedMap:
     splats = Splats(*(torch.from_numpy(np.array(a, dtype=np.float32)) for a in arrays))
     return FinishedMap(
         splats,
-        message.density,
+        message.kernel,
         message.origin,
         message.iterations,
         {int(i): pose for i, pose in zip(message.keyframes, message.world_from_cam)},

@@ -52,7 +52,7 @@ class Mapper(Node):
         realtime: bool = False  # a new keyframe cancels what older ones are owed
         max_pixels: int | None = None  # area of the training images; null: as they come
         max_keyframes: int = 1000  # whose images are kept and trained on; beyond, they are thinned out evenly
-        density: str = "gaussian"  # gaussian, exact or ges_scale
+        kernel: str = "gaussian"  # gaussian, exact or ges_scale
         betas: bool = False  # train the shape (exact, ges_scale)
         loss: str = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
         sh_degree: int = 0  # of the view-dependent color, 0 to 3
@@ -275,7 +275,7 @@ class Mapper(Node):
         final = self.mapper.snapshot()
         arrays = {name: value.numpy() for name, value in final.splats.tensors().items()}
         return SplatMap(
-            refined=refined, iterations=final.iterations, density=final.density, origin=final.origin, **arrays,
+            refined=refined, iterations=final.iterations, kernel=final.kernel, origin=final.origin, **arrays,
             anchors=final.anchors, keyframes=final.keyframes, world_from_cam=final.world_from_cam, scale=final.scale,
             exposures=final.exposures,
         )  # fmt: skip
@@ -345,7 +345,7 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
         seed=config.seed,
         device=device,
         training=TrainingConfig(
-            density=config.density, betas=config.betas, exposure=config.exposure, threads=config.threads,
+            kernel=config.kernel, betas=config.betas, exposure=config.exposure, threads=config.threads,
             poses=config.refine_poses, loss=_loss(config.loss),
         ),
         skipping=SkipConfig(

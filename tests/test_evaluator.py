@@ -38,7 +38,7 @@ def _splat_map(refined: bool) -> SplatMap:
     return SplatMap(
         refined=refined,
         iterations=100,
-        density="gaussian",
+        kernel="gaussian",
         origin=ORIGIN,
         means=np.stack([x.ravel(), y.ravel(), np.full(n, 2.0)], axis=1).astype(np.float32),
         log_scales=np.full((n, 3), np.log(0.1), np.float32),
@@ -161,8 +161,8 @@ def test_renders_are_rolled_with_the_shutter_that_the_tracker_took_out(evaluator
     assert view.shutter.readout == 0.02
     moved = geometry.se3_log(geometry.inverse(poses[4]) @ poses[6])
     np.testing.assert_allclose(view.shutter.velocity, moved * 15, atol=1e-7)
-    color = render_view(finished.splats, finished.density, view, (H, W)).color
-    still = render_view(finished.splats, finished.density, replace(view, shutter=None), (H, W)).color
+    color = render_view(finished.splats, finished.kernel, view, (H, W)).color
+    still = render_view(finished.splats, finished.kernel, replace(view, shutter=None), (H, W)).color
     assert np.abs(color - still).max() > 1e-3
     list(evaluator.on_end())
     assert "20.0 ms a frame" in evaluator.report["protocol"]
@@ -178,8 +178,8 @@ def test_frames_between_keyframes_are_rendered_at_an_exposure_between_theirs(eva
     finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.views()
     for frame, gain in ((0, 1.0), (2, 2 / 3), (3, 0.5), (5, 5 / 6), (6, 1.0)):
         view = views[frame]
-        color = render_view(finished.splats, finished.density, view, (H, W)).color
-        plain = render_view(finished.splats, finished.density, replace(view, exposure=None), (H, W)).color
+        color = render_view(finished.splats, finished.kernel, view, (H, W)).color
+        plain = render_view(finished.splats, finished.kernel, replace(view, exposure=None), (H, W)).color
         np.testing.assert_allclose(color, gain * plain, atol=1e-5)
     list(evaluator.on_end())
     assert "interpolated in time" in evaluator.report["protocol"]

@@ -235,11 +235,11 @@ def test_unfiltered_depth_reaches_the_map() -> None:
 
 
 def test_the_core_configuration_has_the_nodes_values() -> None:
-    config = mapper_config(settings(fill=7, voxel=0.5, unexplored_psnr=33.0, density="exact", density_control="none"))
+    config = mapper_config(settings(fill=7, voxel=0.5, unexplored_psnr=33.0, kernel="exact", density_control="none"))
     assert config.insertion.fill == 7
     assert config.insertion.voxel == 0.5
     assert config.insertion.unexplored_psnr == 33.0
-    assert config.training.density == "exact"
+    assert config.training.kernel == "exact"
     assert config.density_control.mode == "none"
 
 
@@ -254,7 +254,7 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
         list(node.on_view(view_message(7 * k, k / 2)))
     before, after = [m for m in node.on_end() if isinstance(m, SplatMap)]
     assert before.iterations == 90
-    assert after.density == chosen["density"]
+    assert after.kernel == chosen["kernel"]
     assert bool((after.betas != after.betas[0]).any()) == chosen["betas"]
     assert (tmp_path / "map.ply").exists()
     message = view_message(99, 0.25)
@@ -262,7 +262,7 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
         render = rasterize(
             Splats(**{name: torch.from_numpy(getattr(after, name)) for name in PARAMETERS}),
             message.world_from_cam - np.pad(after.origin[:, None], ((0, 1), (3, 0))), message.intrinsics,
-            (24, 32), density=after.density,
+            (24, 32), kernel=after.kernel,
         )  # fmt: skip
     assert psnr(render.color.clamp(0, 1).numpy(), message.image / np.float32(255)) > 25.0
     assert not node.stats.warnings

@@ -91,7 +91,7 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
     config = MapperConfig(
         iterations=4, refinement=1, sh_degree=1, device=DEVICE,
         training=TrainingConfig(
-            backend="reference", exposure=True, poses=True, pose_visits=0, betas=True, density="exact",
+            backend="reference", exposure=True, poses=True, pose_visits=0, betas=True, kernel="exact",
             loss=LossConfig(),
         ),
         skipping=SkipConfig(tiles=True, tiles_every=2, coarse_to_fine=True, coarse_visits=1),

@@ -83,7 +83,7 @@ class SparseMap:
         with torch.no_grad():
             color = rasterize(
                 self.state.detached(), self._local(view.world_from_cam), view.intrinsics, view.image.shape[:2],
-                density=self.config.training.density, threads=self.config.training.threads,
+                kernel=self.config.training.kernel, threads=self.config.training.threads,
             ).color  # fmt: skip
         return np.asarray(color.clamp(0, 1).numpy())
 
@@ -94,7 +94,7 @@ class SparseMap:
 
     def _step(self, view: TrainingView, done: float) -> None:
         settling = max(0.0, (done - 1.0 + self.config.settle) / self.config.settle)
-        groups = optimizer.groups(self.config.rates, 1.0, 0.1**settling, False, self.config.training.density)
+        groups = optimizer.groups(self.config.rates, 1.0, 0.1**settling, False, self.config.training.kernel)
         train_once(
             self.state,
             view,

@@ -13,7 +13,7 @@ from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Keyframe, Poses, Preview, View
 from mvsgs_core.geometry import quaternion_from_rotation
-from mvsgs_core.rasterizer.densities import neutral_beta
+from mvsgs_core.rasterizer.kernels import neutral_beta
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats

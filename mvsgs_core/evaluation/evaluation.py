@@ -28,7 +28,7 @@ class FinishedMap:
     """The map at one moment, and the keyframe poses that it was optimized with."""
 
     splats: Splats
-    density: str
+    kernel: str
     origin: np.ndarray  # (3,) world position that the splats' means are relative to
     iterations: int
     keyframe_poses: dict[int, np.ndarray]
@@ -107,7 +107,7 @@ class Evaluation:
                 "splats": len(final.splats.means) if final else 0,
                 "bytes": final.bytes if final else 0,
                 "iterations": final.iterations if final else 0,
-                "density": final.density if final else None,
+                "kernel": final.kernel if final else None,
             },
             "time": {
                 "wall": wall,
@@ -174,7 +174,7 @@ class Evaluation:
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
         views = scoring.choose(self.views(refined), self.max_frames)
-        scores = [scoring.score_view(finished.splats, finished.density, v, self.lpips) for v in views]
+        scores = [scoring.score_view(finished.splats, finished.kernel, v, self.lpips) for v in views]
         self.scores[refined] = scores
         held_out = sum(score.held_out for score in scores)
         few = f"{held_out} of the {len(scores)} frames scored are held out: their mean and their worst say little"

@@ -28,7 +28,7 @@ def comparisons(evaluation: Evaluation) -> list[Row]:
     for name, score in _picks(scores):
         figures = f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}, {100 * score.coverage:.1f} % covered"
         caption = f"{name}: {score.index} ({score.kind}), {figures}"
-        rows.append((caption, scoring.comparison(finished.splats, finished.density, views[score.index])))
+        rows.append((caption, scoring.comparison(finished.splats, finished.kernel, views[score.index])))
     return rows
 
 

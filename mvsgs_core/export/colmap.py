@@ -110,7 +110,7 @@ def _seen(final: Snapshot, means: np.ndarray, cameras: Cameras, k: int) -> tuple
     local[:3, 3] -= final.origin
     height, width = cameras.sizes[k].tolist()
     with torch.no_grad():
-        render = rasterize(final.splats, local, cameras.intrinsics[k], (height, width), density=final.density)
+        render = rasterize(final.splats, local, cameras.intrinsics[k], (height, width), kernel=final.kernel)
     surface = torch.where(render.opacity >= 0.5, render.depth, torch.inf).numpy()
     in_camera = means @ geometry.inverse(local)[:3, :3].T + geometry.inverse(local)[:3, 3]
     ahead = np.flatnonzero(in_camera[:, 2] > 0)

@@ -30,7 +30,7 @@ def write_mesh(
         local = pose.copy()
         local[:3, 3] -= final.origin
         with torch.no_grad():
-            render = rasterize(final.splats, local, intrinsics, (size[0], size[1]), density=final.density)
+            render = rasterize(final.splats, local, intrinsics, (size[0], size[1]), kernel=final.kernel)
         depth = torch.where(render.opacity >= min_opacity, render.depth, 0.0)
         views.append((local, intrinsics, depth.numpy(), render.color.clamp(0.0, 1.0).numpy()))
     seen = [depth[depth > 0] for _, _, depth, _ in views if (depth > 0).any()]

@@ -9,7 +9,7 @@ import torch
 
 from mvsgs_core.bad_file import reading
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.rasterizer.densities import DENSITIES, gaussian_std_ratio, log_scale_shift, neutral_beta
+from mvsgs_core.rasterizer.kernels import KERNELS, gaussian_std_ratio, log_scale_shift, neutral_beta
 from mvsgs_core.rasterizer.spherical_harmonics import degree_of
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -25,7 +25,7 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     fold: for viewers that know only Gaussians; the scales are those of the closest Gaussian, and there is no beta. The
     scale is a logarithm: what multiplies the standard deviation is added to it.
     """
-    splats = folded(final.splats, final.density) if fold else final.splats
+    splats = folded(final.splats, final.kernel) if fold else final.splats
     origin = relative_origin(final)
     means = splats.means.numpy().astype(np.float64) + (final.origin - origin)
     harmonics = splats.sh.numpy()
@@ -39,14 +39,14 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     columns |= {f"scale_{k}": splats.log_scales[:, k].numpy() for k in range(3)}
     unit = torch.nn.functional.normalize(splats.quaternions, dim=1).numpy()
     columns |= {f"rot_{k}": unit[:, k] for k in range(4)}
-    density = "gaussian" if fold else final.density
-    if density != "gaussian":
+    kernel = "gaussian" if fold else final.kernel
+    if kernel != "gaussian":
         columns["beta"] = splats.betas.numpy()
     rows = np.empty(len(splats), dtype=[(name, "<f4") for name in columns])
     for name, values in columns.items():
         rows[name] = values
     header = [
-        "ply", "format binary_little_endian 1.0", f"comment density {density}",
+        "ply", "format binary_little_endian 1.0", f"comment density {kernel}",
         "comment origin " + " ".join(repr(float(value)) for value in origin), f"element vertex {len(splats)}",
         *(f"property float {name}" for name in columns), "end_header\n",
     ]  # fmt: skip
@@ -62,11 +62,11 @@ def relative_origin(final: Snapshot) -> np.ndarray:
     return final.origin if far else np.zeros(3)
 
 
-def folded(splats: Splats, density: str) -> Splats:
+def folded(splats: Splats, kernel: str) -> Splats:
     """The closest plain Gaussians: the shape goes into the scales."""
-    if density == "gaussian":
+    if kernel == "gaussian":
         return splats
-    shift = log_scale_shift(splats.betas) if density == "ges_scale" else gaussian_std_ratio(splats.betas).log()
+    shift = log_scale_shift(splats.betas) if kernel == "ges_scale" else gaussian_std_ratio(splats.betas).log()
     return Splats(
         splats.means, splats.log_scales + shift[:, None], splats.quaternions, splats.opacity_logits, splats.sh,
         torch.full_like(splats.betas, 2.0),
@@ -90,7 +90,7 @@ def _parse(data: bytes) -> Snapshot:
     header = data[:end].decode("ascii", errors="replace").splitlines()
     if "format binary_little_endian 1.0" not in header:
         raise ValueError("only binary_little_endian PLY files are read")
-    count, names, origin, density = _parse_header(header)
+    count, names, origin, kernel = _parse_header(header)
     available = {name for name, _ in names}
     needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{k}" for k in range(3)),
               *(f"rot_{k}" for k in range(4))]  # fmt: skip
@@ -109,9 +109,9 @@ def _parse(data: bytes) -> Snapshot:
     sh[:, 0] = _columns(rows, ["f_dc_0", "f_dc_1", "f_dc_2"])
     if rest:
         sh[:, 1:] = _columns(rows, rest).reshape(count, 3, bases - 1).transpose(0, 2, 1)
-    if density is None:
-        density = "exact" if "beta" in available else "gaussian"
-    betas = rows["beta"] if "beta" in available else np.full(count, neutral_beta(density))
+    if kernel is None:
+        kernel = "exact" if "beta" in available else "gaussian"
+    betas = rows["beta"] if "beta" in available else np.full(count, neutral_beta(kernel))
     splats = Splats(
         means=_tensor(_columns(rows, ["x", "y", "z"])),
         log_scales=_tensor(_columns(rows, ["scale_0", "scale_1", "scale_2"])),
@@ -121,7 +121,7 @@ def _parse(data: bytes) -> Snapshot:
         betas=_tensor(betas),
     )
     return Snapshot(
-        splats=splats, anchors=np.full(count, -1, dtype=np.int64), origin=origin, density=density, iterations=0,
+        splats=splats, anchors=np.full(count, -1, dtype=np.int64), origin=origin, kernel=kernel, iterations=0,
         keyframes=np.zeros(0, dtype=np.int64), world_from_cam=np.zeros((0, 4, 4)), scale=np.zeros(0),
         exposures=np.zeros((0, 3, 4), dtype=np.float32),
     )  # fmt: skip
@@ -130,7 +130,7 @@ def _parse(data: bytes) -> Snapshot:
 def _parse_header(header: list[str]) -> tuple[int, list[tuple[str, str]], np.ndarray, str | None]:
     kinds = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1",
              "int": "<i4", "int32": "<i4"}  # fmt: skip
-    count, names, origin, density = -1, [], np.zeros(3), None
+    count, names, origin, kernel = -1, [], np.zeros(3), None
     for line in header:
         words = line.split()
         match words:
@@ -146,11 +146,11 @@ def _parse_header(header: list[str]) -> tuple[int, list[tuple[str, str]], np.nda
                 origin = np.array([float(x), float(y), float(z)])
                 if not np.all(np.isfinite(origin)):
                     raise ValueError(f"its origin is not finite, {origin}")
-            case ["comment", "density", name] if name in DENSITIES:
-                density = name
+            case ["comment", "density", name] if name in KERNELS:
+                kernel = name
     if count < 0:
         raise ValueError("it has no vertices")
-    return count, names, origin, density
+    return count, names, origin, kernel
 
 
 def _columns(rows: np.ndarray, names: list[str]) -> np.ndarray:

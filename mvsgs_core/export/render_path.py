@@ -40,7 +40,7 @@ def frames_along(
         local = pose.copy()
         local[:3, 3] -= final.origin
         with torch.no_grad():
-            color = rasterize(final.splats, local, intrinsics, size, density=final.density).color
+            color = rasterize(final.splats, local, intrinsics, size, kernel=final.kernel).color
         yield (color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
 
 

@@ -16,7 +16,7 @@ class Snapshot:
     splats: Splats  # detached copies, on the CPU
     anchors: np.ndarray  # (N,) int64 keyframe of each splat
     origin: np.ndarray  # (3,) float64, world position that `splats.means` are relative to
-    density: str
+    kernel: str
     iterations: int
     keyframes: np.ndarray  # (K,) int64
     world_from_cam: np.ndarray  # (K, 4, 4) float64, as refined, world frame (not relative to the origin)

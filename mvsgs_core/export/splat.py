@@ -23,7 +23,7 @@ def write_splat(path: Path, final: Snapshot) -> None:
     Axes as in map.ply: the format names none, and those who convert between the two change none. The largest and most
     opaque splats come first: viewers show a file while it loads.
     """
-    splats = folded(final.splats, final.density)
+    splats = folded(final.splats, final.kernel)
     means = splats.means.numpy() + (final.origin - relative_origin(final)).astype(np.float64)
     opacity = torch.sigmoid(splats.opacity_logits)
     rows = np.zeros(
@@ -46,7 +46,7 @@ def write_spz(path: Path, final: Snapshot) -> None:
     Raises ValueError where the format's fixed steps of 1/4096 unit would blur the map or its 24 bits do not reach as
     far, OSError where the file cannot be written.
     """
-    splats = turned(folded(final.splats, final.density), RUB_FROM_RDF)
+    splats = turned(folded(final.splats, final.kernel), RUB_FROM_RDF)
     means = splats.means.numpy() + RUB_FROM_RDF @ (final.origin - relative_origin(final))
     typical = float(splats.log_scales.max(dim=1).values.median().exp()) if len(splats) else 1.0
     if typical < 2.0 * SPZ_STEP:

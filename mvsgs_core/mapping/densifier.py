@@ -141,7 +141,7 @@ class Densifier:
             self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
             points = points.first(max(0, room))
         new = splats_from_points(
-            points, added.local_from_cam, self.state.splats.sh.shape[1], self.training.density, self.config,
+            points, added.local_from_cam, self.state.splats.sh.shape[1], self.training.kernel, self.config,
             opacity, scale,
         )  # fmt: skip
         self.state.append(new, torch.full((len(points),), added.index, dtype=torch.int64))

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from mvsgs_core import camera
-from mvsgs_core.rasterizer.densities import neutral_beta
+from mvsgs_core.rasterizer.kernels import neutral_beta
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -173,7 +173,7 @@ def splats_from_points(
     points: Points,
     world_from_cam: np.ndarray,
     sh_bases: int,
-    density: str,
+    kernel: str,
     config: InsertionConfig,
     opacity: float | None = None,
     scale: float | None = None,
@@ -181,7 +181,7 @@ def splats_from_points(
     """Splats in the world frame of `world_from_cam` (4, 4), float32 tensors on the CPU.
 
     opacity: of all; None: `initial_opacity`. Standard deviations are `scale` (None: `initial_scale`) spacings,
-    `flatten` of that along a known normal. The shape starts as a Gaussian: beta = 2, or b = 0 for density "ges_scale".
+    `flatten` of that along a known normal. The shape starts as a Gaussian: beta = 2, or b = 0 for kernel "ges_scale".
     """
     count = len(points)
     rotation, translation = world_from_cam[:3, :3], world_from_cam[:3, 3]
@@ -200,7 +200,7 @@ def splats_from_points(
         quaternions=_tensor(np.where(known[:, None], rotation_to(normals), [1.0, 0.0, 0.0, 0.0])),
         opacity_logits=_tensor(np.full(count, np.log(opacity / (1.0 - opacity)))),
         sh=_tensor(sh),
-        betas=_tensor(np.full(count, neutral_beta(density))),
+        betas=_tensor(np.full(count, neutral_beta(kernel))),
     )
 
 

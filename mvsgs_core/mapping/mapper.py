@@ -219,7 +219,7 @@ class OnlineMapper:
         with torch.no_grad():
             return rasterize(
                 self.state.detached(), view.refined_from_cam, view.intrinsics[level], view.size(level),
-                density=self.config.training.density, near=self.config.training.near * self.median_depth,
+                kernel=self.config.training.kernel, near=self.config.training.near * self.median_depth,
                 backend=self.config.training.backend, exposure=view.exposure if self.config.training.exposure else None,
                 antialiased=self.config.training.antialiased, threads=self.config.training.threads,
             )  # fmt: skip
@@ -231,7 +231,7 @@ class OnlineMapper:
 
     def snapshot(self) -> Snapshot:
         """The map in world units, relative to its origin."""
-        return snapshot(self.state, self.views, self.origin, self.unit, self.config.training.density, self.iterations)
+        return snapshot(self.state, self.views, self.origin, self.unit, self.config.training.kernel, self.iterations)
 
     @property
     def image_bytes(self) -> int:
@@ -261,7 +261,7 @@ class OnlineMapper:
     def _train(self, view: TrainingView, refining: bool = False) -> None:
         config = self.config
         factors = optimizer.groups(
-            config.rates, self.median_depth, self.global_rate, config.training.betas, config.training.density
+            config.rates, self.median_depth, self.global_rate, config.training.betas, config.training.kernel
         )
         train_once(
             self.state, view, config.training, config.skipping, factors, config.rates.decay_steps,

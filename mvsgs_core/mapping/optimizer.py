@@ -41,11 +41,11 @@ class Group:
     tail: float = 1.0  # the others this share of it
 
 
-def groups(rates: OptimizerConfig, median_depth: float, factor: float, train_betas: bool, density: str) -> list[Group]:
+def groups(rates: OptimizerConfig, median_depth: float, factor: float, train_betas: bool, kernel: str) -> list[Group]:
     """The steps of all parameters for a scene of this median depth; `factor` scales all rates (the global decay)."""
     log_depth = math.log(median_depth)
     means = rates.means * median_depth * factor
-    beta_range = (-60.0, 60.0) if density == "ges_scale" else (0.1, 20.0)
+    beta_range = (-60.0, 60.0) if kernel == "ges_scale" else (0.1, 20.0)
     result = [
         Group("means", means, means * rates.means_final, -1e6 * median_depth, 1e6 * median_depth),
         Group("log_scales", rates.log_scales * factor, rates.log_scales * factor, log_depth - 14.0, log_depth + 3.0),

@@ -116,7 +116,7 @@ class Provisional:
             parts.append(
                 splats_from_points(
                     replace(points, positions=points.positions * factor, spacing=points.spacing * factor),
-                    local, mapper.state.splats.sh.shape[1], mapper.config.training.density, config,
+                    local, mapper.state.splats.sh.shape[1], mapper.config.training.kernel, config,
                     config.initial_opacity, config.fill_scale,
                 )
             )  # fmt: skip

@@ -19,7 +19,7 @@ def snapshot(
     views: list[TrainingView],
     origin: np.ndarray | None,
     unit: float | None,
-    density: str,
+    kernel: str,
     iterations: int,
 ) -> Snapshot:
     """The state in world units; `unit` is the length of the mapper's unit in the world."""
@@ -36,7 +36,7 @@ def snapshot(
         splats=splats,
         anchors=state.anchors.cpu().numpy().copy(),
         origin=np.zeros(3) if origin is None else origin.copy(),
-        density=density,
+        kernel=kernel,
         iterations=iterations,
         keyframes=np.array([view.index for view in views], dtype=np.int64),
         world_from_cam=np.stack([_refined(v, length) for v in views]) if count else np.zeros((0, 4, 4)),

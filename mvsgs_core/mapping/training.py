@@ -20,8 +20,8 @@ from mvsgs_core.rasterizer.rasterize import TILE, rasterize
 class TrainingConfig:
     """What is rendered and trained."""
 
-    density: str = "gaussian"  # "gaussian", "exact" or "ges_scale"
-    betas: bool = False  # train the shape; without effect for density "gaussian"
+    kernel: str = "gaussian"  # "gaussian", "exact" or "ges_scale"
+    betas: bool = False  # train the shape; without effect for kernel "gaussian"
     exposure: bool = False  # train a color affine for each keyframe
     exposure_rate: float = 1e-3  # learning rate of it
     poses: bool = False  # train the keyframes' poses, the first one's excepted
@@ -95,7 +95,7 @@ def train_once(
     moving = training.poses and not view.fixed and view.visits >= training.pose_visits
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
     render = rasterize(
-        state.splats, view.refined_from_cam, view.intrinsics[level], view.size(level), density=training.density,
+        state.splats, view.refined_from_cam, view.intrinsics[level], view.size(level), kernel=training.kernel,
         backend=training.backend, exposure=exposure, pose_delta=twist, tile_mask=tiles,
         near=training.near * median_depth, antialiased=training.antialiased, threads=training.threads,
     )  # fmt: skip
@@ -118,8 +118,8 @@ def train_once(
     if render.backward.refused:
         text = "gradients of splats that were not finite were set to 0 in the rasterizer's backward pass"
         log.refuse("gradients", render.backward.refused, text)
-    if render.screen.grad is not None:
-        gradient = render.screen.grad.norm(dim=1)
+    if render.means2d.grad is not None:
+        gradient = render.means2d.grad.norm(dim=1)
         state.accumulate_means2d(torch.where(torch.isfinite(gradient), gradient, 0.0), render.visible)
     visible = render.visible if skipping.selective else torch.ones_like(render.visible)
     refused = optimizer.step(state, visible, groups, decay_steps, training.threads or 0)

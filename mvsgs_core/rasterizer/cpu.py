@@ -13,17 +13,17 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mvsgs_core import native
-from mvsgs_core.rasterizer.interface import Backward, Render, View, screen_points
+from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, means2d_leaf
 from mvsgs_core.rasterizer.splats import Splats
 
 
 class _Rasterize(torch.autograd.Function):
-    """(parameters, screen, pose) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
+    """(parameters, means2d, pose) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
 
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor,
-        betas: Tensor, screen: Tensor, pose: Tensor, view: View, extra: dict[str, Any],
+        betas: Tensor, means2d: Tensor, pose: Tensor, view: RenderSettings, extra: dict[str, Any],
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         height, width = view.size
         parameters = [t.detach().contiguous() for t in (means, log_scales, quaternions, opacity_logits, sh, betas)]
@@ -36,7 +36,7 @@ class _Rasterize(torch.autograd.Function):
             intrinsics=view.intrinsics,
             near=view.near,
             background=view.background,
-            exact=view.density == "exact",
+            exact=view.kernel == "exact",
             antialiased=view.antialiased,
             degree=view.degree,
             tile_mask=None if view.tile_mask is None else view.tile_mask.numpy(),
@@ -82,10 +82,10 @@ class _Rasterize(torch.autograd.Function):
             on_pose=on_pose.numpy(),
         )
         *shared, of_betas = results
-        return (*shared, of_betas if ctx.view.density == "exact" else None, on_screen, on_pose, None, None)
+        return (*shared, of_betas if ctx.view.kernel == "exact" else None, on_screen, on_pose, None, None)
 
 
-def render(splats: Splats, view: View) -> Render:
+def render(splats: Splats, view: RenderSettings) -> Render:
     """See `rasterizer.rasterize`. Raises ValueError unless the splats are float32 in main memory."""
     if splats.means.dtype != torch.float32 or splats.means.device.type != "cpu":
         raise ValueError(
@@ -93,9 +93,9 @@ def render(splats: Splats, view: View) -> Render:
             "take backend='reference' for float64"
         )
     count = len(splats)
-    screen = screen_points(splats, view)
+    means2d = means2d_leaf(splats, view)
     extra: dict[str, Any] = {"backward": Backward()}
-    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), screen, view.pose, view, extra)
+    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), means2d, view.pose, view, extra)
     weight_sum = weight_max = None
     if view.weights:
         weight_sum, weight_max = torch.empty(count), torch.empty(count)
@@ -106,7 +106,7 @@ def render(splats: Splats, view: View) -> Render:
         opacity=opacity,
         visible=extra["radii"] > 0,
         radii=extra["radii"],
-        screen=screen,
+        means2d=means2d,
         weight_sum=weight_sum,
         weight_max=weight_max,
         refused=extra["passed"].refused,

@@ -15,19 +15,19 @@ MIN_TRANSMITTANCE = 1e-4
 CLAMP_MARGIN = 0.3  # of tan(fov): how far beyond the image the Jacobian follows x/z and y/z
 MIN_COMPENSATION = 0.005  # floor of the antialiased opacity factor
 MAX_VARIANCE = 1e16  # px^2
-MAX_REACH = 1e12  # of m, where an exact density of a small exponent ends at the latest
+MAX_REACH = 1e12  # of m, where an exact kernel of a small exponent ends at the latest
 MIN_QUATERNION = 1e-8
 TILE = 16  # pixels
 
 
 @dataclass(frozen=True)
-class View:
+class RenderSettings:
     """What the back ends get besides the splats: a checked camera and the switches."""
 
     pose: Tensor  # (4, 4) float64 world_from_cam, may carry a gradient
     intrinsics: tuple[float, ...]  # fx, fy, cx, cy, px at `size`
     size: tuple[int, int]  # height, width, px
-    density: str  # "gaussian" or "exact"
+    kernel: str  # "gaussian" or "exact"
     background: tuple[float, ...]  # red, green, blue
     tile_mask: Tensor | None  # (ceil(H / 16), ceil(W / 16)) bool, False = leave the tile out
     near: float  # map units
@@ -53,7 +53,7 @@ class Render:
     opacity: Tensor  # (H, W), 0 to 1
     visible: Tensor  # (N,) bool: in front, on the image, opacity at least 1/255
     radii: Tensor  # (N,), half of the longer side of the splat's box on the image, px; 0 if not visible
-    screen: (
+    means2d: (
         Tensor  # (N, 2) zeros; after backward its .grad is dL/d(mean on the image), in units of half the image (3DGS)
     )
     weight_sum: Tensor | None  # (N,), blending weight alpha * T summed over the pixels; None unless asked for
@@ -67,8 +67,8 @@ def tile_grid(size: tuple[int, int]) -> tuple[int, int]:
     return -(-size[0] // TILE), -(-size[1] // TILE)
 
 
-def screen_points(splats: Splats, view: View) -> Tensor:
-    """Zeros (N, 2) for `Render.screen`; they take a gradient where anything else does."""
+def means2d_leaf(splats: Splats, view: RenderSettings) -> Tensor:
+    """Zeros (N, 2) for `Render.means2d`; they take a gradient where anything else does."""
     inputs = [*splats.tensors().values(), view.pose]
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
     return splats.means.new_zeros(len(splats), 2).requires_grad_(wanted)

@@ -5,7 +5,7 @@ The mathematics, the same in each: EWA splatting (Zwicker et al. 2001) as in 3D 
 - A splat's covariance goes to the image by the projection's Jacobian at its mean, there x/z and y/z clamped to the
   image widened by 0.3 tan(fov) on every side; + 0.3 px^2 on the diagonal (`antialiased` scales the opacity by
   sqrt(det / det_blurred), so that a splat smaller than a pixel does not grow brighter by it).
-- alpha = min(0.99, opacity * density(m)); below 1/255 it is skipped. Splats are blended front to back in the order of
+- alpha = min(0.99, opacity * kernel(m)); below 1/255 it is skipped. Splats are blended front to back in the order of
   float32 depth, equal depths in the order of their index; a pixel ends once its transmittance is below 1e-4 (the splat
   that brings it below is blended still).
 - Color = sum w c + T background, with c = max(0, 1/2 + SH(direction from the camera)); depth = sum w z / sum w, 0 where
@@ -24,11 +24,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.rasterizer import cpu, densities, reference, spherical_harmonics
-from mvsgs_core.rasterizer.interface import TILE, Render, View, tile_grid
+from mvsgs_core.rasterizer import cpu, kernels, reference, spherical_harmonics
+from mvsgs_core.rasterizer.interface import TILE, Render, RenderSettings, tile_grid
 from mvsgs_core.rasterizer.splats import Splats
 
-__all__ = ["BACKENDS", "TILE", "Render", "View", "rasterize", "se3_exp", "tile_grid"]
+__all__ = ["BACKENDS", "TILE", "Render", "RenderSettings", "rasterize", "se3_exp", "tile_grid"]
 
 BACKENDS = ("auto", "reference", "cpu", "triton")
 
@@ -50,7 +50,7 @@ def rasterize(
     intrinsics: Tensor | np.ndarray,
     size: tuple[int, int],
     *,
-    density: str = "gaussian",
+    kernel: str = "gaussian",
     background: Tensor | np.ndarray | None = None,
     backend: str = "auto",
     exposure: Tensor | None = None,
@@ -79,23 +79,23 @@ def rasterize(
     Raises ValueError for shapes, dtypes, sizes or names that do not fit, ImportError if the back end is not there.
     """
     splats.check()
-    densities.check_density(density)
+    kernels.check_kernel(kernel)
     most = spherical_harmonics.degree_of(splats.sh.shape[1])
     if degree is not None and not 0 <= degree <= most:
         raise ValueError(f"degree {degree}: the splats have spherical harmonics up to {most}")
     if size[0] < 1 or size[1] < 1:
         raise ValueError(f"an image of {size[0]}x{size[1]} pixels cannot be rendered")
-    if density == "ges_scale":
-        shift = densities.log_scale_shift(splats.betas)
+    if kernel == "ges_scale":
+        shift = kernels.log_scale_shift(splats.betas)
         splats = Splats(
             splats.means, splats.log_scales + shift[:, None], splats.quaternions, splats.opacity_logits, splats.sh,
             splats.betas.detach(),
         )  # fmt: skip
-    view = View(
+    view = RenderSettings(
         pose=_pose(world_from_cam, pose_delta),
         intrinsics=_floats(intrinsics, 4, "intrinsics"),
         size=(int(size[0]), int(size[1])),
-        density="exact" if density == "exact" else "gaussian",
+        kernel="exact" if kernel == "exact" else "gaussian",
         background=(0.0, 0.0, 0.0) if background is None else _floats(background, 3, "background"),
         tile_mask=_mask(tile_mask, size),
         near=float(near),
@@ -113,7 +113,7 @@ def rasterize(
     return render
 
 
-def _backend(name: str, device: torch.device) -> Callable[[Splats, View], Render]:
+def _backend(name: str, device: torch.device) -> Callable[[Splats, RenderSettings], Render]:
     if name == "auto":
         name = "cpu" if device.type == "cpu" else "triton"
     if name == "reference":

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mvsgs_core.rasterizer import densities, interface, spherical_harmonics
-from mvsgs_core.rasterizer.interface import Backward, Render, View
+from mvsgs_core.rasterizer import interface, kernels, spherical_harmonics
+from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings
 from mvsgs_core.rasterizer.splats import Splats
 
 PAIRS_AT_ONCE = 1 << 22  # splat-pixel pairs held in memory at a time
@@ -35,7 +35,7 @@ def usable(splats: Splats) -> Tensor:
     return torch.stack(finite).all(dim=0) & (splats.quaternions.norm(dim=-1) > interface.MIN_QUATERNION)
 
 
-def axes_on_image(splats: Splats, points: Tensor, view: View) -> Tensor:
+def axes_on_image(splats: Splats, points: Tensor, view: RenderSettings) -> Tensor:
     """(N, 2, 3) in px: the splats' axes, each one standard deviation long, projected by the Jacobian at `points`."""
     fx, fy, cx, cy = view.intrinsics
     height, width = view.size
@@ -67,8 +67,8 @@ class Projected:
     betas: Tensor  # (N,)
 
 
-def project(splats: Splats, screen: Tensor, view: View) -> Projected:
-    """EWA projection of usable splats in front of the camera; `screen` (N, 2) moves them, unit half the image."""
+def project(splats: Splats, means2d: Tensor, view: RenderSettings) -> Projected:
+    """EWA projection of usable splats in front of the camera; `means2d` (N, 2) moves them, unit half the image."""
     fx, fy, cx, cy = view.intrinsics
     height, width = view.size
     dtype, device = splats.means.dtype, splats.means.device
@@ -77,7 +77,7 @@ def project(splats: Splats, screen: Tensor, view: View) -> Projected:
     points = (from_camera @ pose[:3, :3]).to(dtype)
     depths = points[:, 2]
     centers = torch.stack([fx * points[:, 0] / depths + cx, fy * points[:, 1] / depths + cy], dim=-1)
-    centers = centers + screen * torch.tensor([0.5 * width, 0.5 * height], dtype=dtype, device=device)
+    centers = centers + means2d * torch.tensor([0.5 * width, 0.5 * height], dtype=dtype, device=device)
 
     row_x, row_y = axes_on_image(splats, points, view).unbind(1)
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
@@ -105,7 +105,7 @@ class Choice:
 
 
 @torch.no_grad()
-def choose(splats: Splats, view: View) -> Choice:
+def choose(splats: Splats, view: RenderSettings) -> Choice:
     """Leaves out what is not usable, behind the near plane, degenerate on the image, too faint or off the image."""
     height, width = view.size
     keep = usable(splats)
@@ -115,35 +115,35 @@ def choose(splats: Splats, view: View) -> Choice:
     chosen = Splats(*(tensor[kept] for tensor in splats.tensors().values()))
     p = project(chosen, torch.zeros_like(chosen.means[:, :2]), view)
     sane = torch.isfinite(p.determinant) & (p.xx < interface.MAX_VARIANCE) & (p.yy < interface.MAX_VARIANCE)
-    reach = densities.extent(p.opacity, p.betas, view.density).clamp(max=interface.MAX_REACH)
+    reach = kernels.extent(p.opacity, p.betas, view.kernel).clamp(max=interface.MAX_REACH)
     half_x, half_y = (reach * p.xx).sqrt(), (reach * p.yy).sqrt()
     on_image = (p.centers[:, 0] + half_x >= 0) & (p.centers[:, 0] - half_x <= width - 1)
     on_image &= (p.centers[:, 1] + half_y >= 0) & (p.centers[:, 1] - half_y <= height - 1)
-    seen = torch.nonzero(sane & on_image & (p.opacity >= densities.MIN_ALPHA))[:, 0]
+    seen = torch.nonzero(sane & on_image & (p.opacity >= kernels.MIN_ALPHA))[:, 0]
     seen = seen[torch.argsort(z[kept][seen].float(), stable=True)]
     refused = int((~keep).sum()) + int((~sane).sum())
     return Choice(kept[seen], torch.stack([half_x, half_y], dim=1)[seen], refused)
 
 
-def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, view: View) -> Tensor:
+def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, view: RenderSettings) -> Tensor:
     """(P, V) of pixels (P,) by splats (V,); 0 below 1/255 and in tiles left out."""
     dx, dy = pixel_x[:, None] - p.centers[:, 0], pixel_y[:, None] - p.centers[:, 1]
     m = p.yy / p.determinant * (dx - p.xy / p.yy * dy) ** 2 + dy * dy / p.yy
-    alpha = (p.opacity * densities.falloff(m, p.betas, view.density)).clamp(max=interface.MAX_ALPHA)
-    counted = alpha >= densities.MIN_ALPHA
+    alpha = (p.opacity * kernels.falloff(m, p.betas, view.kernel)).clamp(max=interface.MAX_ALPHA)
+    counted = alpha >= kernels.MIN_ALPHA
     if view.tile_mask is not None:
         counted = counted & view.tile_mask[pixel_y // interface.TILE, pixel_x // interface.TILE][:, None]
     return torch.where(counted, alpha, 0.0)
 
 
-def render(splats: Splats, view: View) -> Render:
+def render(splats: Splats, view: RenderSettings) -> Render:
     """See `rasterizer.rasterize`."""
     dtype, device, count = splats.means.dtype, splats.means.device, len(splats)
     height, width = view.size
-    screen = interface.screen_points(splats, view)
+    means2d = interface.means2d_leaf(splats, view)
     choice = choose(splats, view)
     shown = Splats(*(tensor.index_select(0, choice.order) for tensor in splats.tensors().values()))
-    p = project(shown, screen.index_select(0, choice.order), view)
+    p = project(shown, means2d.index_select(0, choice.order), view)
     background = torch.tensor(view.background, dtype=dtype, device=device)
     weight_sum, weight_max, radii = splats.means.new_zeros(3, count).unbind(0)
 
@@ -175,7 +175,7 @@ def render(splats: Splats, view: View) -> Render:
         opacity=torch.cat(opacity).reshape(height, width),
         visible=radii > 0,
         radii=radii,
-        screen=screen,
+        means2d=means2d,
         weight_sum=weight_sum if view.weights else None,
         weight_max=weight_max if view.weights else None,
         refused=choice.refused,

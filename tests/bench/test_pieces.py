@@ -87,7 +87,7 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
     switches |= {f"mvs.{f.name}" for f in dataclasses.fields(Mvs.Config) if f.name.startswith("skip_")}
     assert {"mapper.skip_converged", "mvs.skip_cells", "mvs.skip_certain"} <= switches
     assert switches <= switched
-    others = ("voxel", "map_voxel", "map_voxel_error", "fill", "density_control", "density", "loss", "sh_degree")
+    others = ("voxel", "map_voxel", "map_voxel_error", "fill", "density_control", "kernel", "loss", "sh_degree")
     assert {f"mapper.{name}" for name in others} <= switched
     assert {"mvs", "depth_fusion", "tracker", "tracker.still_flow", "tracker.readout"} <= switched
 

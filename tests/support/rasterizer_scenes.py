@@ -60,10 +60,10 @@ def gradients(splats: Splats, size: tuple[int, int], seed: int = 1, **options: A
     assert isinstance(loss, Tensor)
     loss.backward()
     found = {name: t.grad for name, t in splats.tensors().items() if t.grad is not None}
-    assert render.screen.grad is not None
+    assert render.means2d.grad is not None
     assert delta.grad is not None
     assert exposure.grad is not None
-    return render, {**found, "screen": render.screen.grad, "pose": delta.grad, "exposure": exposure.grad}
+    return render, {**found, "means2d": render.means2d.grad, "pose": delta.grad, "exposure": exposure.grad}
 
 
 def relative_error(value: Tensor, truth: Tensor) -> float:

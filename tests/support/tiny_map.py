@@ -18,17 +18,17 @@ SIZE = (24, 32)
 INTRINSICS = np.array([25.0, 26.0, 15.5, 11.5])
 
 
-def final_map(bases: int = 4, density: str = "gaussian", origin: np.ndarray = ORIGIN, size: tuple[int, int] = SIZE,
+def final_map(bases: int = 4, kernel: str = "gaussian", origin: np.ndarray = ORIGIN, size: tuple[int, int] = SIZE,
               opacity: float = 0.9) -> Snapshot:  # fmt: skip
     """A splat for each pixel of the view from the origin."""
     view = rgbd_keyframe(0, np.eye(4), size)
     points = points_from_depth(view.depth, view.intrinsics, view.image / 255.0, view.normals, np.ones(size, dtype=bool))
-    splats = splats_from_points(points, np.eye(4), bases, density, InsertionConfig(initial_opacity=opacity))
+    splats = splats_from_points(points, np.eye(4), bases, kernel, InsertionConfig(initial_opacity=opacity))
     generator = torch.Generator().manual_seed(0)
     splats.sh[:, 1:] = 0.1 * torch.randn(splats.sh[:, 1:].shape, generator=generator)
     splats.betas = splats.betas + torch.rand(len(splats), generator=generator)
     return Snapshot(
-        splats=splats, anchors=np.zeros(len(splats), dtype=np.int64), origin=origin, density=density, iterations=5,
+        splats=splats, anchors=np.zeros(len(splats), dtype=np.int64), origin=origin, kernel=kernel, iterations=5,
         keyframes=np.zeros(1, dtype=np.int64), world_from_cam=np.eye(4)[None], scale=np.ones(1),
         exposures=np.eye(3, 4, dtype=np.float32)[None],
     )  # fmt: skip

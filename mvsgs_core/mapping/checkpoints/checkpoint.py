@@ -17,7 +17,7 @@ from mvsgs_core.mapping.mapper import MapperConfig
 from mvsgs_core.stats import Stats
 
 # What the state's arrays depend on; everything else may be another one when a run goes on, and then is said.
-FIXED = ("sh_degree", "max_pixels", "training.density", "skipping.levels")
+FIXED = ("sh_degree", "max_pixels", "training.kernel", "skipping.levels")
 OF_THE_MACHINE = ("device", "training.threads", "training.backend")
 LOGGED = ("counts", "skipped", "seconds", "warnings")
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mvsgs_core.rasterizer.interface import Backward, Render, View, screen_points, tile_grid
+from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, means2d_leaf, tile_grid
 from mvsgs_core.rasterizer.splats import Splats
 
 try:
@@ -45,7 +45,7 @@ class Pass:
     refused: int
 
 
-def projected(parameters: list[Tensor], view: View) -> Pass:
+def projected(parameters: list[Tensor], view: RenderSettings) -> Pass:
     """Projects and lists the splats of `parameters`, the fields of `Splats`. Raises ValueError for too many pairs."""
     means, sh = parameters[0], parameters[4]
     count, device = len(means), means.device
@@ -61,7 +61,7 @@ def projected(parameters: list[Tensor], view: View) -> Pass:
     if count:
         project[(programs,)](
             *parameters, camera, rows, footprints, depths, radii, pairs, refused, count, width, height,
-            *view.intrinsics, view.near, BASES=sh.shape[1], USED=(view.degree + 1) ** 2, EXACT=view.density == "exact",
+            *view.intrinsics, view.near, BASES=sh.shape[1], USED=(view.degree + 1) ** 2, EXACT=view.kernel == "exact",
             ANTIALIASED=view.antialiased, BLOCK=BLOCK, ROW=ROW, FOOTPRINT=FOOTPRINT, **LAUNCH,
         )  # fmt: skip
     order = torch.argsort(depths, stable=True)
@@ -85,12 +85,12 @@ def projected(parameters: list[Tensor], view: View) -> Pass:
 
 
 class _Rasterize(torch.autograd.Function):
-    """(parameters, screen, pose) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
+    """(parameters, means2d, pose) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
 
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor,
-        betas: Tensor, screen: Tensor, pose: Tensor, view: View, extra: dict[str, Any],
+        betas: Tensor, means2d: Tensor, pose: Tensor, view: RenderSettings, extra: dict[str, Any],
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         parameters = [t.detach().contiguous() for t in (means, log_scales, quaternions, opacity_logits, sh, betas)]
         passed = projected(parameters, view)
@@ -102,7 +102,7 @@ class _Rasterize(torch.autograd.Function):
         weights = means.new_zeros(2, len(lists.pair_splats) if view.weights else 1)
         blend[(tiles_y * tiles_x,)](
             passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
-            weights[1], *view.background, height, width, tiles_x, EXACT=view.density == "exact", WEIGHTS=view.weights,
+            weights[1], *view.background, height, width, tiles_x, EXACT=view.kernel == "exact", WEIGHTS=view.weights,
             ROW=ROW, **LAUNCH_TILE,
         )  # fmt: skip
         extra.update(passed=passed)
@@ -128,20 +128,20 @@ class _Rasterize(torch.autograd.Function):
             for output, gradient in zip(outputs, gradients)
         )
         sums = color.new_zeros(len(lists.pair_splats), SUMS)
-        exact = view.density == "exact"
+        exact = view.kernel == "exact"
         blend_backward[(tiles_y * tiles_x,)](
             passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, *outputs, on_color, on_depth,
             on_opacity, sums, height, width, tiles_x, EXACT=exact, DEPTH=any(g is not None for g in gradients[1:]),
             SUMS=SUMS, ROW=ROW, **LAUNCH_TILE,
         )  # fmt: skip
         results = [torch.empty_like(parameter) for parameter in parameters]
-        on_screen = color.new_empty(count, 2)
+        on_means2d = color.new_empty(count, 2)
         programs = triton.cdiv(count, BLOCK)
         wants_pose = ctx.needs_input_grad[7]
         on_pose = torch.zeros(max(1, programs), 12, dtype=torch.float64, device=color.device)
         if count:
             project_backward[(programs,)](
-                *parameters, passed.camera, passed.rows, lists.sums(sums), lists.pairs, *results, on_screen, on_pose,
+                *parameters, passed.camera, passed.rows, lists.sums(sums), lists.pairs, *results, on_means2d, on_pose,
                 count, width, height, *view.intrinsics, BASES=parameters[4].shape[1], USED=(view.degree + 1) ** 2,
                 EXACT=exact, ANTIALIASED=view.antialiased, POSE=wants_pose, BLOCK=BLOCK, ROW=ROW, SUMS=SUMS, **LAUNCH,
             )  # fmt: skip
@@ -149,16 +149,16 @@ class _Rasterize(torch.autograd.Function):
         if wants_pose:
             pose = torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(view.pose.device)
         *shared, on_betas = results
-        return (*shared, on_betas if exact else None, on_screen, pose, None, None)
+        return (*shared, on_betas if exact else None, on_means2d, pose, None, None)
 
 
-def render(splats: Splats, view: View) -> Render:
+def render(splats: Splats, view: RenderSettings) -> Render:
     """See `rasterizer.rasterize`. Raises ValueError for other than float32."""
     if splats.means.dtype != torch.float32:
         raise ValueError(f"the triton back end takes float32 splats, got {splats.means.dtype}")
-    screen = screen_points(splats, view)
+    means2d = means2d_leaf(splats, view)
     extra: dict[str, Any] = {}
-    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), screen, view.pose, view, extra)
+    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), means2d, view.pose, view, extra)
     passed: Pass = extra["passed"]
     return Render(
         color=color,
@@ -166,7 +166,7 @@ def render(splats: Splats, view: View) -> Render:
         opacity=opacity,
         visible=passed.radii > 0,
         radii=passed.radii,
-        screen=screen,
+        means2d=means2d,
         weight_sum=extra.get("weight_sum"),
         weight_max=extra.get("weight_max"),
         refused=passed.refused,

@@ -55,7 +55,7 @@ def _axis_gradient(  # type: ignore[no-untyped-def]
 @triton.jit
 def project_backward(  # type: ignore[no-untyped-def]
     means, log_scales, quaternions, opacity_logits, sh, betas, camera, rows, totals, pairs,
-    on_means, on_log_scales, on_quaternions, on_logits, on_sh, on_betas, on_screen, on_pose,
+    on_means, on_log_scales, on_quaternions, on_logits, on_sh, on_betas, on_means2d, on_pose,
     count, width, height, fx, fy, cx, cy,
     BASES: tl.constexpr, USED: tl.constexpr, EXACT: tl.constexpr, ANTIALIASED: tl.constexpr, POSE: tl.constexpr,
     BLOCK: tl.constexpr, ROW: tl.constexpr, SUMS: tl.constexpr,
@@ -198,8 +198,8 @@ def project_backward(  # type: ignore[no-untyped-def]
     tl.store(on_quaternions + 4 * n + 3, tl.where(good, on_e, 0.0), mask=inside)
     tl.store(on_logits + n, tl.where(good, on_logit, 0.0), mask=inside)
     tl.store(on_betas + n, tl.where(good, on_beta, 0.0), mask=inside)
-    tl.store(on_screen + 2 * n, tl.where(good, on_u * (0.5 * width), 0.0), mask=inside)
-    tl.store(on_screen + 2 * n + 1, tl.where(good, on_v * (0.5 * height), 0.0), mask=inside)
+    tl.store(on_means2d + 2 * n, tl.where(good, on_u * (0.5 * width), 0.0), mask=inside)
+    tl.store(on_means2d + 2 * n + 1, tl.where(good, on_v * (0.5 * height), 0.0), mask=inside)
     for k in tl.static_range(BASES):
         value = tl.zeros([BLOCK], tl.float32)
         if k < USED:

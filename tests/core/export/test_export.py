@@ -14,7 +14,7 @@ from plyfile import PlyData
 from mvsgs_core.export import __main__ as export
 from mvsgs_core.export.input import input_arguments, lens
 from mvsgs_core.export.ply import folded, read_ply, write_ply
-from mvsgs_core.rasterizer.densities import log_scale_shift
+from mvsgs_core.rasterizer.kernels import log_scale_shift
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map, save_cameras, write_poses
@@ -44,16 +44,16 @@ def test_an_empty_map_is_a_file_too(tmp_path: Path) -> None:
     assert len(PlyData.read(str(tmp_path / "map.ply"))["vertex"].data) == 0
 
 
-@pytest.mark.parametrize("density", ["gaussian", "exact", "ges_scale"])
-def test_a_saved_map_is_read_back(tmp_path: Path, density: str) -> None:
-    final = final_map(4, density)
+@pytest.mark.parametrize("kernel", ["gaussian", "exact", "ges_scale"])
+def test_a_saved_map_is_read_back(tmp_path: Path, kernel: str) -> None:
+    final = final_map(4, kernel)
     write_ply(tmp_path / "map.ply", final)
     again = read_ply(tmp_path / "map.ply")
-    assert again.density == density
+    assert again.kernel == kernel
     for name, value in final.splats.tensors().items():
         if name == "means":
             value = value + torch.from_numpy(ORIGIN)
-        if name == "betas" and density == "gaussian":
+        if name == "betas" and kernel == "gaussian":
             continue
         torch.testing.assert_close(getattr(again.splats, name), value.float(), rtol=1e-5, atol=1e-6)
 
@@ -70,11 +70,11 @@ def test_folding_adds_the_logarithm_and_drops_beta(tmp_path: Path) -> None:
     final = final_map(1, "ges_scale")
     write_ply(tmp_path / "map.ply", final, fold=True)
     again = read_ply(tmp_path / "map.ply")
-    assert again.density == "gaussian"
+    assert again.kernel == "gaussian"
     expected = final.splats.log_scales + log_scale_shift(final.splats.betas)[:, None]
     torch.testing.assert_close(again.splats.log_scales, expected)
     pose, k = np.eye(4), np.array([25.0, 25.0, 15.5, 11.5])
-    direct = rasterize(final.splats, pose, k, (24, 32), density="ges_scale").color
+    direct = rasterize(final.splats, pose, k, (24, 32), kernel="ges_scale").color
     torch.testing.assert_close(rasterize(folded(final.splats, "ges_scale"), pose, k, (24, 32)).color, direct)
 
 

@@ -38,7 +38,7 @@ EVERYTHING = replace(
     sh_degree=1,
     max_pixels=500,
     max_keyframes=4,
-    training=TrainingConfig(threads=1, density="exact", betas=True, exposure=True, poses=True, pose_visits=1),
+    training=TrainingConfig(threads=1, kernel="exact", betas=True, exposure=True, poses=True, pose_visits=1),
     skipping=SkipConfig(tiles=True, coarse_to_fine=True, converged_visits=3),
     density_control=DensityControlConfig(mode="relocate", every=7, prune_opacity=0.3),
 )

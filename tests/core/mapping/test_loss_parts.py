@@ -9,7 +9,7 @@ import torch
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping import losses
 from mvsgs_core.mapping.losses import LossConfig
-from mvsgs_core.rasterizer import densities
+from mvsgs_core.rasterizer import kernels
 from tests.support.shared_data import shared
 
 
@@ -59,4 +59,4 @@ def test_the_strength_of_the_scale_factor() -> None:
     with np.load(shared("golden/ges") / "phi.npz") as arrays:
         b = torch.from_numpy(arrays["b"]).double()
         theirs = 2 * torch.sigmoid(float(arrays["strength"]) * b)
-    torch.testing.assert_close(densities.scale_factor(b), theirs, atol=1e-6, rtol=0)
+    torch.testing.assert_close(kernels.scale_factor(b), theirs, atol=1e-6, rtol=0)

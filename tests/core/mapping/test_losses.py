@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mvsgs_core.mapping import losses
-from mvsgs_core.rasterizer import densities
+from mvsgs_core.rasterizer import kernels
 from tests.support.shared_data import shared
 
 
@@ -51,12 +51,12 @@ def test_gradient_has_the_released_codes_values(
 def test_scale_factor_has_the_released_codes_values() -> None:
     with np.load(shared("golden/ges") / "phi.npz") as arrays:
         b = torch.from_numpy(arrays["b"]).double().requires_grad_()
-        phi = densities.scale_factor(b)
+        phi = kernels.scale_factor(b)
         phi.sum().backward()
         np.testing.assert_allclose(phi.detach().numpy(), arrays["phi"], rtol=1e-5, atol=1e-6)
         assert b.grad is not None
         np.testing.assert_allclose(b.grad.numpy(), arrays["dphi_db"], atol=1e-6)
-        used = torch.exp(-3.0 + densities.log_scale_shift(b.detach()))
+        used = torch.exp(-3.0 + kernels.log_scale_shift(b.detach()))
         np.testing.assert_allclose(used.numpy(), arrays["scale_used_for_log_scale_minus3"], rtol=1e-4, atol=1e-6)
 
 
@@ -100,7 +100,7 @@ def test_without_the_mask_it_is_l1_and_ssim() -> None:
 def test_std_ratio_by_integration(beta: float) -> None:
     """Second moment of the exact form in the plane over that of the Gaussian, by quadrature."""
     r = np.linspace(1e-6, 80.0 ** (1.0 / beta), 1_000_000)
-    density = np.exp(-0.5 * r**beta)
-    variance = np.sum(r**3 * density) / np.sum(r * density) / 2
-    ratio = float(densities.gaussian_std_ratio(torch.tensor([beta], dtype=torch.float64)))
+    kernel = np.exp(-0.5 * r**beta)
+    variance = np.sum(r**3 * kernel) / np.sum(r * kernel) / 2
+    ratio = float(kernels.gaussian_std_ratio(torch.tensor([beta], dtype=torch.float64)))
     assert ratio == pytest.approx(np.sqrt(variance), rel=1e-3)

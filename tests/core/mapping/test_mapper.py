@@ -47,7 +47,7 @@ def score(mapper: OnlineMapper, view: RGBDKeyframe) -> float:
     length = mapper.unit or 1.0
     with torch.no_grad():
         render = rasterize(
-            final.splats, pose, view.intrinsics, view.image.shape[:2], density=final.density, near=1e-3 * length
+            final.splats, pose, view.intrinsics, view.image.shape[:2], kernel=final.kernel, near=1e-3 * length
         )
     return psnr(render.color.clamp(0, 1).numpy(), view.image.astype(np.float32) / 255.0)
 
@@ -207,13 +207,13 @@ def test_converged_keyframes_are_passed_over() -> None:
     assert mapper.iterations <= 4 * 6
 
 
-@pytest.mark.parametrize("density", ["gaussian", "exact", "ges_scale"])
-def test_every_density_trains_with_harmonics_and_exposure(density: str) -> None:
-    training = TrainingConfig(density=density, betas=True, exposure=True, threads=1)
+@pytest.mark.parametrize("kernel", ["gaussian", "exact", "ges_scale"])
+def test_every_kernel_trains_with_harmonics_and_exposure(kernel: str) -> None:
+    training = TrainingConfig(kernel=kernel, betas=True, exposure=True, threads=1)
     mapper = mapped(tiny_views(), replace(CONFIG, iterations=6, sh_degree=1, training=training))
     assert score(mapper, tiny_views()[1]) > 25.0
     betas = mapper.state.splats.betas.detach()
-    assert bool((betas != betas[0]).any()) == (density != "gaussian")
+    assert bool((betas != betas[0]).any()) == (kernel != "gaussian")
     assert mapper.snapshot().splats.sh.shape[1] == 4
     assert not np.allclose(mapper.snapshot().exposures, np.eye(3, 4))
 

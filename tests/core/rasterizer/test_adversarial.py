@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.rasterizer.densities import DENSITIES
+from mvsgs_core.rasterizer.kernels import KERNELS
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.rasterizer_scenes import copy, gradients, intrinsics, random_splats
@@ -36,7 +36,7 @@ def test_a_parameter_that_is_not_finite(backend: str, field: str) -> None:
     assert_finite(render, found)
     assert render.refused == 3
     assert not bool(render.visible[:3].any())
-    assert all(bool((found[name][:3] == 0).all()) for name in ("means", "sh", "screen"))
+    assert all(bool((found[name][:3] == 0).all()) for name in ("means", "sh", "means2d"))
     rest = Splats(*(t[3:] for t in clean.tensors().values()))
     without, _ = gradients(copy(rest), SIZE, backend=backend)
     torch.testing.assert_close(render.color, without.color, rtol=0, atol=1e-6)
@@ -104,12 +104,12 @@ EXTREMES = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", EXTREMES)
-def test_extremes_stay_finite(name: str, density: str) -> None:
+def test_extremes_stay_finite(name: str, kernel: str) -> None:
     splats = extremes(name)
     for antialiased in (False, True):
-        render, found = gradients(copy(splats), SIZE, backend="cpu", density=density, antialiased=antialiased)
+        render, found = gradients(copy(splats), SIZE, backend="cpu", kernel=kernel, antialiased=antialiased)
         assert_finite(render, found)
     if name == "zero quaternions":
         assert render.refused == 10
@@ -117,7 +117,7 @@ def test_extremes_stay_finite(name: str, density: str) -> None:
 
 @pytest.mark.parametrize("name", EXTREMES)
 def test_the_reference_stays_finite(name: str) -> None:
-    render, found = gradients(copy(extremes(name)), SIZE, backend="reference", density="exact")
+    render, found = gradients(copy(extremes(name)), SIZE, backend="reference", kernel="exact")
     assert_finite(render, found)
 
 
@@ -148,8 +148,8 @@ def test_nothing_in_view(backend: str) -> None:
 
 def test_what_does_not_fit_is_refused_with_its_name() -> None:
     splats, camera = random_splats(3), intrinsics(SIZE)
-    with pytest.raises(ValueError, match="density 'round'"):
-        rasterize(splats, np.eye(4), camera, SIZE, density="round")
+    with pytest.raises(ValueError, match="kernel 'round'"):
+        rasterize(splats, np.eye(4), camera, SIZE, kernel="round")
     with pytest.raises(ValueError, match="backend 'gpu'"):
         rasterize(splats, np.eye(4), camera, SIZE, backend="gpu")
     with pytest.raises(ValueError, match="world_from_cam is not finite"):

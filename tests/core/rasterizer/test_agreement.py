@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mvsgs_core.rasterizer import rasterize as rasterizer
-from mvsgs_core.rasterizer.densities import DENSITIES
+from mvsgs_core.rasterizer.kernels import KERNELS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.rasterizer_scenes import POSE, assert_agree, copy, gradients, intrinsics, random_splats
@@ -15,16 +15,16 @@ from tests.support.rasterizer_scenes import POSE, assert_agree, copy, gradients,
 BACKEND = "cpu"
 
 
-@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("bases", [1, 4, 9, 16])
-def test_random_scene(density: str, bases: int) -> None:
-    assert_agree(random_splats(200, bases, seed=bases), (40, 56), BACKEND, density=density)
+def test_random_scene(kernel: str, bases: int) -> None:
+    assert_agree(random_splats(200, bases, seed=bases), (40, 56), BACKEND, kernel=kernel)
 
 
-@pytest.mark.parametrize("density", ["gaussian", "exact"])
-def test_antialiased(density: str) -> None:
+@pytest.mark.parametrize("kernel", ["gaussian", "exact"])
+def test_antialiased(kernel: str) -> None:
     small = random_splats(300, log_scale=-4.5)
-    assert_agree(small, (40, 56), BACKEND, density=density, antialiased=True)
+    assert_agree(small, (40, 56), BACKEND, kernel=kernel, antialiased=True)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (33, 1), (17, 31), (16, 16)])
@@ -88,12 +88,12 @@ def test_tiles_left_out(backend: str) -> None:
         assert_agree(splats, size, BACKEND, tile_mask=mask)
 
 
-@pytest.mark.parametrize("density", ["gaussian", "exact"])
-def test_threads_and_repetition_change_nothing(density: str) -> None:
+@pytest.mark.parametrize("kernel", ["gaussian", "exact"])
+def test_threads_and_repetition_change_nothing(kernel: str) -> None:
     splats, size = random_splats(3000), (120, 100)
-    first, expected = gradients(copy(splats), size, backend=BACKEND, density=density, threads=1)
+    first, expected = gradients(copy(splats), size, backend=BACKEND, kernel=kernel, threads=1)
     for threads in (1, 2, 3):
-        render, found = gradients(copy(splats), size, backend=BACKEND, density=density, threads=threads)
+        render, found = gradients(copy(splats), size, backend=BACKEND, kernel=kernel, threads=threads)
         for name in ("color", "depth", "opacity", "weight_sum", "weight_max", "radii"):
             assert torch.equal(getattr(render, name), getattr(first, name)), name
         for name, wanted in expected.items():

@@ -33,9 +33,9 @@ SIZE = (20, 35)
 DEVICE = device_of("triton")
 
 
-@pytest.mark.parametrize("density", ["gaussian", "exact", "ges_scale"])
-def test_random_scene(density: str) -> None:
-    assert_agree(random_splats(40), SIZE, "triton", density=density)
+@pytest.mark.parametrize("kernel", ["gaussian", "exact", "ges_scale"])
+def test_random_scene(kernel: str) -> None:
+    assert_agree(random_splats(40), SIZE, "triton", kernel=kernel)
 
 
 def test_harmonics_of_degree_three_and_what_a_lower_degree_leaves_out() -> None:
@@ -58,17 +58,17 @@ def needles(count: int) -> Splats:
     return splats
 
 
-def pairs_of(splats: Splats, size: tuple[int, int], density: str, mask: torch.Tensor | None) -> tuple[int, list[int]]:
+def pairs_of(splats: Splats, size: tuple[int, int], kernel: str, mask: torch.Tensor | None) -> tuple[int, list[int]]:
     """(pairs that the C++ kernel blends, pairs of each tile in the Triton lists)."""
     from mvsgs_core.rasterizer.triton import backend as triton_backend
 
-    view = rasterizer.View(
-        pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, density=density,
+    view = rasterizer.RenderSettings(
+        pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, kernel=kernel,
         background=(0.0, 0.0, 0.0), tile_mask=mask, near=1e-3, antialiased=False, degree=0, weights=False, threads=1,
     )  # fmt: skip
     passed = native.load("rasterizer").forward(
         *splats.tensors().values(), pose=view.pose, intrinsics=view.intrinsics, near=view.near,
-        background=view.background, exact=density == "exact", antialiased=False, degree=0, tile_mask=mask,
+        background=view.background, exact=kernel == "exact", antialiased=False, degree=0, tile_mask=mask,
         weights=False, threads=1, color=torch.empty(*size, 3), depth=torch.empty(size), opacity=torch.empty(size),
         radii=torch.empty(len(splats)),
     )  # fmt: skip
@@ -76,15 +76,15 @@ def pairs_of(splats: Splats, size: tuple[int, int], density: str, mask: torch.Te
     return passed.pairs, lists.tile_begin.diff().tolist()
 
 
-@pytest.mark.parametrize("density", ["gaussian", "exact"])
-def test_as_many_pairs_as_the_kernel_for_cpus(density: str) -> None:
+@pytest.mark.parametrize("kernel", ["gaussian", "exact"])
+def test_as_many_pairs_as_the_kernel_for_cpus(kernel: str) -> None:
     """Exact spans of the ellipses on each row of blocks, no boxes."""
     size = (70, 90)
     for splats in (random_splats(80, bases=1), needles(40)):
-        expected, per_tile = pairs_of(splats, size, density, None)
+        expected, per_tile = pairs_of(splats, size, kernel, None)
         assert sum(per_tile) == expected > 100
     mask = torch.arange(30).reshape(rasterizer.tile_grid(size)) % 3 > 0
-    expected, per_tile = pairs_of(needles(40), size, density, mask)
+    expected, per_tile = pairs_of(needles(40), size, kernel, mask)
     assert sum(per_tile) == expected
     assert not any(np.array(per_tile)[~mask.flatten().numpy()])
 
@@ -103,7 +103,7 @@ def test_the_same_every_time() -> None:
     ],
 )  # fmt: skip
 def test_extremes(name: str) -> None:
-    options: dict[str, Any] = {"density": "exact", "antialiased": True}
+    options: dict[str, Any] = {"kernel": "exact", "antialiased": True}
     splats = Splats(*(tensor[::2] for tensor in extremes(name).tensors().values()))
     render, found = gradients(copy(splats, device=DEVICE), SIZE, backend="triton", **options)
     truth, expected = gradients(copy(splats), SIZE, backend="cpu", **options)
@@ -124,7 +124,7 @@ def test_parameters_that_are_not_finite() -> None:
     render, found = gradients(copy(splats, device=DEVICE), SIZE, backend="triton")
     assert render.refused == 12
     assert_finite(render, found)
-    assert all(bool((found[name][:12] == 0).all()) for name in ("means", "sh", "screen"))
+    assert all(bool((found[name][:12] == 0).all()) for name in ("means", "sh", "means2d"))
 
 
 def render_of(splats: Splats, size: tuple[int, int]) -> Render:

@@ -1,4 +1,4 @@
-"""The three density forms by name: how a splat's weight falls with the squared Mahalanobis distance m in the image.
+"""The three kernel forms by name: how a splat's weight falls with the squared Mahalanobis distance m in the image.
 
 - "gaussian": exp(-m / 2).
 - "exact": exp(-1/2 m^(beta/2)), the generalized exponential of GES (Hamdi et al. 2024, eq. 2) with the power inside;
@@ -13,22 +13,22 @@ import math
 import torch
 from torch import Tensor
 
-DENSITIES = ("gaussian", "exact", "ges_scale")
+KERNELS = ("gaussian", "exact", "ges_scale")
 
 BETA_RANGE = (0.1, 20.0)  # exponents outside are used as the nearer end, without gradient
 CENTER_M = 1e-6  # below this m the exact form is flat: for beta < 1 its slope has no bound at the center
 MIN_ALPHA = 1.0 / 255.0  # a splat ends where its alpha falls below this
 
 
-def check_density(density: str) -> None:
-    if density not in DENSITIES:
-        raise ValueError(f"density {density!r}: choose one of {', '.join(DENSITIES)}")
+def check_kernel(kernel: str) -> None:
+    if kernel not in KERNELS:
+        raise ValueError(f"kernel {kernel!r}: choose one of {', '.join(KERNELS)}")
 
 
-def neutral_beta(density: str) -> float:
+def neutral_beta(kernel: str) -> float:
     """The value of `Splats.betas` at which the form is the plain Gaussian."""
-    check_density(density)
-    return 0.0 if density == "ges_scale" else 2.0
+    check_kernel(kernel)
+    return 0.0 if kernel == "ges_scale" else 2.0
 
 
 def scale_factor(b: Tensor) -> Tensor:
@@ -41,18 +41,18 @@ def log_scale_shift(b: Tensor) -> Tensor:
     return math.log(2.0) + torch.nn.functional.logsigmoid(0.1 * b)
 
 
-def falloff(m: Tensor, betas: Tensor, density: str) -> Tensor:
+def falloff(m: Tensor, betas: Tensor, kernel: str) -> Tensor:
     """Density relative to the center at squared Mahalanobis distances `m` (..., N) of splats with `betas` (N,)."""
-    if density == "exact":
+    if kernel == "exact":
         exponent = 0.5 * betas.clamp(*BETA_RANGE)
         return torch.exp(-0.5 * m.clamp(min=CENTER_M) ** exponent)
     return torch.exp(-0.5 * m)
 
 
-def extent(opacity: Tensor, betas: Tensor, density: str) -> Tensor:
+def extent(opacity: Tensor, betas: Tensor, kernel: str) -> Tensor:
     """m (N,) at which opacity * falloff = 1/255; 0 where the opacity is below 1/255."""
     twice_log = 2.0 * torch.log((opacity / MIN_ALPHA).clamp(min=1.0))
-    if density == "exact":
+    if kernel == "exact":
         return twice_log ** (2.0 / betas.clamp(*BETA_RANGE))
     return twice_log
 
