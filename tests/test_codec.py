@@ -16,42 +16,16 @@ from hypothesis import strategies as st
 
 import msgs
 from msgs import End, Frame, GroundTruth, Keyframe, Message, Poses, SplatMap, Trajectory
-from msgs.codec import NEWEST, ArraySpec, CodecError, array_specs, decode, encode, type_name
+from msgs.codec import NEWEST, CodecError, decode, encode, type_name
+from tests.support.example_messages import MESSAGES, assert_equal, example
 from tests.support.shared_data import ROOT
 
 LIMIT = 4 * 2**20  # bytes of a message in the memory tests
-MESSAGES = list(msgs.TYPES.values())
 UNHURRIED = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
-
-
-def example(message_type: type, seed: int = 0, absent: bool = False) -> Message:
-    """A message of that type with random content; `absent` leaves out what may be None."""
-    rng = np.random.default_rng(seed)
-    sizes = {name: int(rng.integers(1, 9)) for name in "HWhwKNB"}
-    values: dict[str, Any] = {}
-    for name, spec in array_specs(message_type).items():
-        if isinstance(spec, ArraySpec):
-            shape = [dim if isinstance(dim, int) else sizes[dim] for dim in spec.dims]
-            values[name] = None if absent and spec.optional else (rng.random(shape) * 2).astype(spec.dtype)
-        else:
-            values[name] = {int: 7, float: 0.25, str: "exact", bool: True}.get(spec, {"a": {"b": [1, 2.5, None, "c"]}})
-    return message_type(**values)
 
 
 def frame(height: int = 48, width: int = 64) -> Frame:
     return Frame(1, 0.5, np.zeros((height, width, 3), np.uint8), np.ones(4))
-
-
-def assert_equal(a: Message, b: Message) -> None:
-    assert type(a) is type(b)
-    for field in fields(a):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            assert (x.dtype, x.shape) == (y.dtype, y.shape)
-            np.testing.assert_array_equal(x, y)
-        else:
-            assert x == y
-            assert isinstance(y, type(x))
 
 
 def refused(data: Any, match: str, **options: Any) -> None:

@@ -14,7 +14,7 @@ from msgs import GroundTruth, SplatMap, TrackingState, Trajectory, View
 from mvsgs_core import geometry
 from mvsgs_core.evaluation.scoring import render_view
 from nodes.evaluator import Evaluator
-from tests.core.evaluation.test_frame_store import full_after
+from tests.support.full_disk import full_after
 
 H, W, N, SCALE = 24, 32, 12, 0.5  # the estimate's unit is 2 true units
 INTRINSICS = np.array([30.0, 30.0, 15.5, 11.5])

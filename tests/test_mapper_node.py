@@ -20,21 +20,8 @@ from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from nodes.mapper import Mapper, mapper_config
-from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
-
-
-def view_message(index: int, t: float, scale: float = 1.0, segment: int = 0) -> View:
-    view = rgbd_keyframe(index, pose_on_arc(t), (24, 32))
-    assert view.normals is not None
-    return View(
-        index=index, timestamp=0.1 * index, image=view.image, intrinsics=view.intrinsics,
-        world_from_cam=view.world_from_cam, scale=scale, depth=view.depth, confidence=np.ones_like(view.depth),
-        normals=view.normals, segment=segment,
-    )  # fmt: skip
-
-
-def settings(**changes: object) -> Mapper.Config:
-    return Mapper.Config(iterations=4, refinement=3, threads=1, preview_period=0.0, device="cpu", **changes)  # type: ignore[arg-type]
+from tests.support.mapper_messages import settings, view_message
+from tests.support.tiny_scene import pose_on_arc
 
 
 def test_inputs_and_outputs_are_declared() -> None:

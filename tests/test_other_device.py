@@ -24,10 +24,10 @@ from mvsgs_core.mvs.interface import CostOptions, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
-from tests.core.fusion.test_consistency import view
-from tests.core.mvs.test_backends import SIZE, problem
-from tests.core.tracking.test_torch_adjustment import noisy
+from tests.support.depth_views import view
+from tests.support.keyframe_graphs import noisy
 from tests.support.pretend_device import DEVICE, PretendDevice
+from tests.support.stereo_problems import SIZE, problem
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 

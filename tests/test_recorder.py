@@ -22,7 +22,7 @@ from nodes import handlers, is_source, outputs
 from nodes.player import Player
 from nodes.recorder import GraphRecorder, Recorder
 from nodes.runtime.parameters import make_config
-from tests.test_codec import MESSAGES, assert_equal, example
+from tests.support.example_messages import MESSAGES, assert_equal, example
 
 
 def recorded(path: Path, count: int = 10, **config: Any) -> list[Frame | GroundTruth]:

@@ -19,7 +19,8 @@ from mvsgs_core.export.ply import read_ply
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from nodes.mapper import Mapper
 from nodes.resumed import Resumed
-from tests.test_mapper_node import pose_on_arc, settings, view_message
+from tests.support.mapper_messages import settings, view_message
+from tests.support.tiny_scene import pose_on_arc
 
 SMALL = [
     "device=cpu", "mapper.iterations=8", "mapper.refinement=20", "evaluator.lpips=off", "mapper.threads=1",

@@ -109,3 +109,13 @@ def test_no_file_has_more_than_400_lines() -> None:
 
 def test_no_module_is_called_utils() -> None:
     assert [name(p) for p in tracked_files() if p.stem in {"utils", "util", "helpers", "misc", "common"}] == []
+
+
+def test_tests_share_what_lies_in_support_only() -> None:
+    found = [
+        f"{name(path)}: {node.module}"
+        for path in python_files("tests")
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.ImportFrom) and node.module and ".test_" in f".{node.module}"
+    ]
+    assert found == []

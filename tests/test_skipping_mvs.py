@@ -7,8 +7,8 @@ import numpy as np
 from msgs import Depth, Keyframe, MapView, Poses
 from nodes import handlers, outputs
 from nodes.skipping_mvs import SkippingMvs
+from tests.support.keyframe_messages import SIZE, keyframe
 from tests.support.plane_scene import look, true_depth
-from tests.test_depth_nodes import SIZE, keyframe
 
 
 def node() -> SkippingMvs:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from mvsgs_core.geometry import inverse, quaternion_from_rotation
 
 HEIGHT, WIDTH = 48, 64
 
@@ -76,3 +80,28 @@ def write_photos(folder: Path, frames: int = 11, suffix: str = ".png") -> Path:
     for i in range(frames):
         write_image(folder / f"photo{i}{suffix}", 20 + i)
     return folder
+
+
+def huge_png(path: Path, width: int = 30_000, height: int = 30_000) -> None:
+    """66 bytes that promise 900 million pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")[:1]))
+
+
+POSES = []
+
+
+def colmap_text(folder: Path, names: list[str]) -> None:
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text("# cameras\n1 PINHOLE 64 48 50 51 32 24\n")
+    lines = ["# images"]
+    for i, name in enumerate(names):
+        cam_from_world = inverse(POSES[i])
+        q = quaternion_from_rotation(cam_from_world[:3, :3])
+        lines.append(" ".join(map(str, [i + 1, *q, *cam_from_world[:3, 3], 1, name])))
+        lines.append("1.5 2.5 -1 3 4 7" if i % 2 else "")  # an image without points has an empty line
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -93,3 +94,46 @@ def assert_agree(splats: Splats, size: tuple[int, int], backend: str, **options:
     assert render.refused == truth.refused
     assert relative_error(render.weight_sum, truth.weight_sum) < 1e-3  # type: ignore[arg-type]
     assert relative_error(render.weight_max, truth.weight_max) < 1e-2  # type: ignore[arg-type]
+
+
+def assert_finite(render: Render, found: dict[str, torch.Tensor]) -> None:
+    for name in ("color", "depth", "opacity", "radii", "weight_sum", "weight_max"):
+        assert bool(torch.isfinite(getattr(render, name)).all()), name
+    for name, gradient in found.items():
+        assert bool(torch.isfinite(gradient).all()), f"gradient of {name}"
+
+
+def extremes(name: str) -> Splats:
+    splats = random_splats(60)
+    if name == "zero quaternions":
+        splats.quaternions[:10] = 0.0
+    elif name == "tiny quaternions":
+        splats.quaternions[:10] *= 1e-7
+    elif name == "scales from 1e-12 to 1e6":
+        splats.log_scales[:] = torch.linspace(math.log(1e-12), math.log(1e6), 60)[:, None]
+    elif name == "scales beyond float32":
+        splats.log_scales[:20] = torch.linspace(30.0, 400.0, 20)[:, None]
+        splats.log_scales[20:40] = -torch.linspace(30.0, 400.0, 20)[:, None]
+    elif name == "aspect 1:1e5":
+        splats.log_scales[:30, 0] = math.log(10.0)
+        splats.log_scales[:30, 1:] = math.log(1e-4)
+        splats.log_scales[30:, 0] = math.log(1e-5)
+        splats.log_scales[30:, 1:] = 0.0
+    elif name == "opacity 0 and 1":
+        splats.opacity_logits[:30] = -200.0
+        splats.opacity_logits[30:] = 200.0
+    elif name == "exponents from 0.1 to 20":
+        splats.betas[:] = torch.linspace(0.1, 20.0, 60)
+    elif name == "exponents out of range":
+        splats.betas[:] = torch.linspace(-50.0, 1000.0, 60)
+    elif name == "coincident":
+        splats.means[:] = splats.means[0].clone()
+    elif name == "at and behind the near plane":
+        splats.means[:, 2] = torch.linspace(-1.0, 0.3, 60)
+    elif name == "in the camera":
+        splats.means[:] = torch.from_numpy(np.array([0.1, -0.05, 0.2])).float()
+    elif name == "far away":
+        splats.means[:] *= torch.logspace(0.0, 18.0, 60)[:, None]
+    elif name == "glaring":
+        splats.sh[:] *= 1e6
+    return splats

@@ -15,7 +15,7 @@ from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.bag_file import opened_bag
 from mvsgs_core.datasets.files import UnreadableImageError
 from mvsgs_core.datasets.ros import rgb_of
-from tests.core.datasets.test_hostile_files import huge_png
+from tests.support.dataset_folders import huge_png
 
 pytest.importorskip("rosbags")
 

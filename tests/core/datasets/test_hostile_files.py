@@ -6,7 +6,6 @@ import bz2
 import json
 import resource
 import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,18 +23,7 @@ from mvsgs_core.datasets.calibration import image_size
 from mvsgs_core.datasets.compression import decompress
 from mvsgs_core.datasets.exif import read_exif_lens
 from mvsgs_core.datasets.files import UnreadableImageError, natural_order, read_image
-from tests.core.datasets.test_images import colmap_text
-from tests.support.dataset_folders import write_image, write_photos, write_replica, write_tum
-
-
-def huge_png(path: Path, width: int = 30_000, height: int = 30_000) -> None:
-    """66 bytes that promise 900 million pixels."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")[:1]))
+from tests.support.dataset_folders import colmap_text, huge_png, write_image, write_photos, write_replica, write_tum
 
 
 def test_a_huge_header_costs_its_image_and_no_more(tmp_path: Path) -> None:

@@ -14,26 +14,13 @@ from PIL import Image
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.colmap import lens_of, read_colmap
 from mvsgs_core.geometry import inverse, quaternion_from_rotation, so3_exp
-from tests.support.dataset_folders import truncate, write_image, write_photos
+from tests.support.dataset_folders import POSES, colmap_text, truncate, write_image, write_photos
 
-POSES = []
 for i in range(4):
     pose = np.eye(4)
     pose[:3, :3] = so3_exp(np.array([0.1 * i, -0.2, 0.3]))
     pose[:3, 3] = (i, 2.0, -i)
     POSES.append(pose)
-
-
-def colmap_text(folder: Path, names: list[str]) -> None:
-    folder.mkdir(parents=True)
-    (folder / "cameras.txt").write_text("# cameras\n1 PINHOLE 64 48 50 51 32 24\n")
-    lines = ["# images"]
-    for i, name in enumerate(names):
-        cam_from_world = inverse(POSES[i])
-        q = quaternion_from_rotation(cam_from_world[:3, :3])
-        lines.append(" ".join(map(str, [i + 1, *q, *cam_from_world[:3, 3], 1, name])))
-        lines.append("1.5 2.5 -1 3 4 7" if i % 2 else "")  # an image without points has an empty line
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
 
 
 def colmap_binary(folder: Path, names: list[str]) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mvsgs_core.evaluation.frame_store import FrameStore
+from tests.support.full_disk import full_after
 
 RNG = np.random.default_rng(0)
 
@@ -19,17 +17,6 @@ RNG = np.random.default_rng(0)
 def frame(index: int) -> dict[str, np.ndarray]:
     image = np.random.default_rng(index).integers(0, 256, (24, 32, 3), np.uint8)
     return {"image": image, "depth": np.random.default_rng(index).random((12, 16), np.float32)}
-
-
-@contextmanager
-def full_after(size: int) -> Iterator[None]:
-    """As a disk that takes no more than `size` bytes of a file."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def check(store: FrameStore, indices: list[int]) -> None:

@@ -10,7 +10,7 @@ import pytest
 from mvsgs_core.evaluation.frames import ENDING, LEAST, Frames
 from mvsgs_core.evaluation.thinning import Thinned
 from mvsgs_core.held_out import is_held_out
-from tests.core.evaluation.test_frame_store import full_after
+from tests.support.full_disk import full_after
 
 INTRINSICS = np.array([30.0, 30.0, 15.5, 11.5])
 PLENTY = 1e9

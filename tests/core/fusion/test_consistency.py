@@ -11,19 +11,10 @@ from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig, fuse
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.torch_backend import TorchFusionBackend
 from mvsgs_core.fusion.views import DepthView, warps_between
+from tests.support.depth_views import SIZE, view
 from tests.support.plane_scene import intrinsics_of, look, true_depth
 
-SIZE = (40, 56)
 CONFIG = FusionConfig(device="cpu", threads=1, relative=0.01)
-
-
-def view(index: int, x: float, noise: float = 0.0, turn: float = 0.0) -> DepthView:
-    pose = look(x, turn)
-    depth = true_depth(pose, SIZE)
-    rng = np.random.default_rng(index)
-    depth = (depth * np.exp(noise * rng.normal(size=SIZE))).astype(np.float32)
-    confidence = rng.uniform(0.3, 1.0, SIZE).astype(np.float32)
-    return DepthView(index, depth, confidence, intrinsics_of(SIZE), pose, 1.0)
 
 
 def brute_force(

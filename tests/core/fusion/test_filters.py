@@ -7,7 +7,7 @@ import numpy as np
 from mvsgs_core.fusion.backend import NativeFusionBackend
 from mvsgs_core.fusion.filters import not_on_rim, not_speckle
 from mvsgs_core.fusion.fusion import FusionConfig, fuse
-from tests.core.fusion.test_consistency import view
+from tests.support.depth_views import view
 
 
 def test_the_rim_of_the_near_surface_goes_and_what_lies_behind_stays() -> None:

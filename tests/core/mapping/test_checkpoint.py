@@ -25,14 +25,12 @@ from mvsgs_core.mapping.checkpoints.files import (
 from mvsgs_core.mapping.checkpoints.keyframes import kept_keyframes
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.density_control import DensityControlConfig
-from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.mapper import MapperConfig
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.stats import Stats
-from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
+from tests.support.small_sessions import PLAIN, begun, view
+from tests.support.tiny_scene import pose_on_arc
 
-SIZE = (24, 32)
-PLAIN = MapperConfig(iterations=10, refinement=6, window=2, training=TrainingConfig(threads=1))
 EVERYTHING = replace(
     PLAIN,
     sh_degree=1,
@@ -42,33 +40,6 @@ EVERYTHING = replace(
     skipping=SkipConfig(tiles=True, coarse_to_fine=True, converged_visits=3),
     density_control=DensityControlConfig(mode="relocate", every=7, prune_opacity=0.3),
 )
-
-
-def view(index: int) -> RGBDKeyframe:
-    found = rgbd_keyframe(index, pose_on_arc(index / 8), SIZE)
-    if index != 1:
-        return replace(found, timestamp=0.1 * index)
-    image = found.image.astype(np.float32) / np.float32(255)
-    image[3:6, 4:9] = np.nan  # pixels to leave out
-    return replace(found, image=image, timestamp=0.1)
-
-
-def begun(config: MapperConfig) -> Atlas:
-    """Two segments, corrections, and iterations that are still owed."""
-    atlas = Atlas(OnlineMapper(config))
-    for index in range(6):
-        atlas.enter(int(index == 3))
-        atlas.current.add_keyframe(view(index))
-        atlas.came(index, 0.1 * index)
-        for _ in range(4):
-            atlas.current.step()
-    moved = pose_on_arc(0.3)
-    moved[:3, 3] += 0.02
-    for part in atlas.parts.values():
-        part.correct(np.array([2, 7]), np.stack([moved, moved]), np.array([1.1, 1.2]))
-    atlas.segment_of.update({3: 1, 2: 0})
-    atlas.revision = 4
-    return atlas
 
 
 def ended(atlas: Atlas) -> dict[str, torch.Tensor]:

@@ -15,7 +15,7 @@ from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
-from tests.core.mapping.test_mapper import CONFIG, mapped, score
+from tests.support.small_maps import CONFIG, mapped, score
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 HOLE = slice(20, 44)  # columns of the 64 in which a filter left nothing

@@ -9,47 +9,22 @@ import pytest
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping import training
 from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.map_state import PARAMETERS
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.optimizer import OptimizerConfig
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
-from mvsgs_core.rasterizer.rasterize import rasterize
+from tests.support.small_maps import CONFIG, mapped, score
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 TIMES = (0.0, 0.33, 0.66, 1.0)
-CONFIG = MapperConfig(iterations=16, refinement=20, training=TrainingConfig(threads=1))
 
 
 def tiny_views(origin: float = 0.0, unit: float = 1.0) -> list[RGBDKeyframe]:
     return [rgbd_keyframe(5 * k, pose_on_arc(t), origin=origin, unit=unit) for k, t in enumerate(TIMES)]
-
-
-def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:
-    mapper = OnlineMapper(config)
-    for view in views:
-        mapper.add_keyframe(view)
-    while mapper.step():
-        pass
-    for done in range(config.refinement):
-        mapper.refine(done, config.refinement)
-    return mapper
-
-
-def score(mapper: OnlineMapper, view: RGBDKeyframe) -> float:
-    final = mapper.snapshot()
-    pose = view.world_from_cam.copy()
-    pose[:3, 3] -= final.origin
-    length = mapper.unit or 1.0
-    with torch.no_grad():
-        render = rasterize(
-            final.splats, pose, view.intrinsics, view.image.shape[:2], kernel=final.kernel, near=1e-3 * length
-        )
-    return psnr(render.color.clamp(0, 1).numpy(), view.image.astype(np.float32) / 255.0)
 
 
 def test_a_view_between_the_keyframes_is_rendered_well() -> None:

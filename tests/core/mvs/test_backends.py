@@ -11,28 +11,10 @@ from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.interface import TILE, ChooseOptions, CostOptions, SmoothOptions
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.native import load
-from mvsgs_core.warp import relative_warp
-from tests.support.plane_scene import look, render
+from tests.support.stereo_problems import SIZE, problem
 
-SIZE = (36, 52)
 COST = CostOptions(radius=2, best=2)
 SMOOTH = SmoothOptions()
-
-
-def problem(seed: int = 0) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    poses = [look(0.0), look(0.15, 0.02), look(-0.1), look(0.3, -0.03)]
-    images = [render(p, SIZE)[0][..., 0].astype(np.float32) - 128.0 for p in poses]
-    intrinsics = render(poses[0], SIZE)[1]
-    warps = np.stack([relative_warp(intrinsics, poses[0], intrinsics, p) for p in poses[1:]])
-    first = 0.15 + 0.02 * rng.random(SIZE)
-    return {
-        "reference": images[0],
-        "neighbors": np.stack(images[1:]),
-        "warps": warps.astype(np.float32),
-        "first": first.astype(np.float32),
-        "step": np.full(SIZE, 0.02, dtype=np.float32),
-    }
 
 
 @pytest.mark.parametrize("radius", [1, 2, 3])

@@ -13,12 +13,13 @@ from mvsgs_core import native
 from mvsgs_core.rasterizer import rasterize as rasterizer
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.core.rasterizer.test_adversarial import assert_finite, extremes
 from tests.support.rasterizer_scenes import (
     POSE,
     assert_agree,
+    assert_finite,
     copy,
     device_of,
+    extremes,
     gradients,
     intrinsics,
     random_splats,

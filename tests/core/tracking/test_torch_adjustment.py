@@ -11,7 +11,7 @@ import torch
 from mvsgs_core.tracking.estimation import torch_adjustment
 from mvsgs_core.tracking.estimation.bundle_adjustment import DROID_LOCAL, Graph, Solution, Solver, adjust
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
-from tests.core.tracking.test_bundle_adjustment import moved, scene
+from tests.support.keyframe_graphs import noisy
 from tests.support.sequences import synthetic
 
 
@@ -29,10 +29,6 @@ def assert_equal(graph: Graph, solver: Solver) -> None:
     np.testing.assert_allclose(other.focal_factor, kernel.focal_factor, atol=1e-9)
     np.testing.assert_allclose((other.initial_cost, other.cost), (kernel.initial_cost, kernel.cost), rtol=1e-9)
     np.testing.assert_allclose(other.smallest_pivot, kernel.smallest_pivot, rtol=1e-5)
-
-
-def noisy(k: int = 5, m: int = 61) -> Graph:
-    return moved(scene(k=k, m=m, noise=0.5)[0], 1, 0.01, 0.05)
 
 
 @pytest.mark.parametrize("robust", ["none", "huber", "cauchy"])

@@ -1,0 +1,37 @@
+"""A map of the tiny scene, and how well it explains it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from mvsgs_core.image_metrics import psnr
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.rasterizer.rasterize import rasterize
+
+CONFIG = MapperConfig(iterations=16, refinement=20, training=TrainingConfig(threads=1))
+
+
+def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:
+    mapper = OnlineMapper(config)
+    for view in views:
+        mapper.add_keyframe(view)
+    while mapper.step():
+        pass
+    for done in range(config.refinement):
+        mapper.refine(done, config.refinement)
+    return mapper
+
+
+def score(mapper: OnlineMapper, view: RGBDKeyframe) -> float:
+    final = mapper.snapshot()
+    pose = view.world_from_cam.copy()
+    pose[:3, 3] -= final.origin
+    length = mapper.unit or 1.0
+    with torch.no_grad():
+        render = rasterize(
+            final.splats, pose, view.intrinsics, view.image.shape[:2], kernel=final.kernel, near=1e-3 * length
+        )
+    return psnr(render.color.clamp(0, 1).numpy(), view.image.astype(np.float32) / 255.0)

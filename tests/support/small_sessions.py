@@ -1,0 +1,45 @@
+"""Mapping that has begun, small enough to be saved and loaded often."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core.mapping.atlas import Session
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
+from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.training import TrainingConfig
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
+
+SIZE = (24, 32)
+
+
+PLAIN = MapperConfig(iterations=10, refinement=6, window=2, training=TrainingConfig(threads=1))
+
+
+def view(index: int) -> RGBDKeyframe:
+    found = rgbd_keyframe(index, pose_on_arc(index / 8), SIZE)
+    if index != 1:
+        return replace(found, timestamp=0.1 * index)
+    image = found.image.astype(np.float32) / np.float32(255)
+    image[3:6, 4:9] = np.nan  # pixels to leave out
+    return replace(found, image=image, timestamp=0.1)
+
+
+def begun(config: MapperConfig) -> Session:
+    """Two segments, corrections, and iterations that are still owed."""
+    session = Session(OnlineMapper(config))
+    for index in range(6):
+        session.enter(int(index == 3))
+        session.current.add_keyframe(view(index))
+        session.came(index, 0.1 * index)
+        for _ in range(4):
+            session.current.step()
+    moved = pose_on_arc(0.3)
+    moved[:3, 3] += 0.02
+    for part in session.parts.values():
+        part.correct(np.array([2, 7]), np.stack([moved, moved]), np.array([1.1, 1.2]))
+    session.segment_of.update({3: 1, 2: 0})
+    session.revision = 4
+    return session
