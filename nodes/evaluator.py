@@ -178,7 +178,7 @@ def _shutter(track: Track | None) -> str:
     if track is None or track.readout == 0.0:
         return ""
     taken_out = f"{1e3 * track.readout:.1f} ms a frame"
-    return f"Renders are rolled with the shutter that the tracker took out of the keyframes ({taken_out}). "
+    return f"The rolling shutter that the tracker took out of the keyframes is applied to renders ({taken_out}). "
 
 
 def _exposure(maps: dict[bool, FinishedMap]) -> str:

@@ -114,7 +114,7 @@ class Tracker(TrackerNode):
 
 
 def spread(readouts: list[float]) -> str:
-    """What keyframes were unrolled with, seconds: the estimate gets better while they go out."""
+    """What was taken out of the keyframes, seconds: the estimate gets better while they go out."""
     low, mean, high = (1e3 * float(f(readouts)) for f in (np.min, np.mean, np.max))
     return f"{mean:.1f} ms" if high - low < 0.05 else f"{mean:.1f} ms in the mean, {low:.1f} to {high:.1f}"
 

@@ -1,4 +1,4 @@
-"""DROID-SLAM as a tracker: images in; keyframes, corrected poses and the whole path out, as mvsgs_core.tracking does.
+"""DROID-SLAM as a tracker: images in; keyframes, corrected poses and the whole path out.
 
 What is done with a frame depends on the frames before it alone: the same stream always gives the same poses on a CPU.
 """

@@ -1,9 +1,9 @@
 """Renders as a rolling shutter would have taken them, so that they can be compared with the photographs.
 
-A map is rendered for one moment, the middle of the readout; the photograph's rows were read one after the other. With
-camera velocity (v, w), in the camera's axes, a point X of depth Z moves by dX/dt = -v - w x X, and its pixel by the
-projection of that: row r shows it (r / H - 1/2) * readout later (first order in the readout, as in the tracker).
-The velocity is that of the run's own trajectory, the depth that of the map's own render.
+A map is rendered for one moment, the middle of the readout; the photograph's rows were read one after the other.
+With camera velocity (v, w), in the camera's axes, a point X of depth Z moves by dX/dt = -v - w x X, and its pixel by
+the projection of that: row r shows it (r / H - 1/2) * readout later (first order in the readout, as in the
+tracker). The velocity is that of the run's own trajectory, the depth that of the map's own render.
 """
 
 from __future__ import annotations

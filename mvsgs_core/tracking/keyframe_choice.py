@@ -26,7 +26,7 @@ class KeyframeChoice:
         self._before = (-1, 0.0, 1.0)  # reference of the last frame, its flow in pixels, its share of points found
 
     def wants(self, index: int, reference: int, step: Step, width: int, limit: float) -> bool:
-        """Whether frame `index` is to become a keyframe. limit: flow since the reference, as a share of the width."""
+        """Whether frame `index` becomes a keyframe. limit: flow since the reference, as a share of the width."""
         known, flow, share = self._before
         flow, share = (flow, share) if known == reference else (0.0, 1.0)
         self._before = (reference, step.flow, step.share)

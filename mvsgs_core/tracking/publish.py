@@ -99,7 +99,7 @@ class Publisher:
         return out
 
     def corrections(self, everything: bool = False) -> Correction | None:
-        """Every keyframe that moved noticeably, or joined another segment, since it was last told; None: none did."""
+        """Keyframes that moved noticeably, or joined another segment, since they were last told; else None."""
         moved = []
         for index, told in self._told.items():
             if index not in self.graph.keyframes:

@@ -1,8 +1,8 @@
 """The tracker: images in; keyframes, corrected poses and the whole path out.
 
 Semi-dense matches (flow.py) of the newest keyframe give each frame's pose; keyframes join a graph (local_map.py) that
-dense bundle adjustment keeps consistent; before that, the first keyframes are solved from nothing (starting.py). A lost
-camera is looked for in the map, and starts a new segment meanwhile; loops (loop_closure.py) correct or join.
+dense bundle adjustment keeps consistent; before that, the first keyframes are solved from nothing (starting.py). A
+lost camera is looked for in the map, and starts a new segment meanwhile; loops (loop_closure.py) correct or join.
 All of it happens in `add`, in bounded portions: the same frames always give the same poses, however fast they come.
 """
 
@@ -160,8 +160,8 @@ class Tracker:
         self.graph = KeyframeGraph(self.intrinsics)
         self.graph.device = config.device
         self.calibration = Calibration(
-            self.graph, config.focal, self.stats, self.intrinsics, float(intrinsics[0]), not guessed, config.readout,
-            config.threads,
+            self.graph, config.focal, self.stats, self.intrinsics, float(intrinsics[0]), not guessed,
+            config.readout, config.threads,
         )  # fmt: skip
         self.flow = make_flow(config.flow)
         self.matcher = Matcher(self.flow)

@@ -1,4 +1,4 @@
-"""What the tracker finds out about the camera itself: its focal length, where that was a guess, and its readout."""
+"""What the tracker learns of the camera itself: the focal length, where that was a guess, and the readout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mvsgs_core.tracking.estimation.focal import FocalConfig, focal_of_all, obse
 from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout
 from mvsgs_core.tracking.graph import KeyframeGraph
 
-READOUT_AGAIN = (10, 20, 40)  # keyframes of the map at which the readout is estimated again: the first say little
+READOUT_AGAIN = (10, 20, 40)  # keyframes of the map at which the readout is estimated again
 
 
 @dataclass

@@ -3,8 +3,9 @@
 And images as a global shutter would have taken them: poses, stereo and the map are all of one moment.
 
 Rows of an image are taken one after the other. A point at row v that moves at w pixels a second was seen
-w * readout * (v / H - 1/2) from where a global shutter would have seen it in the middle of the readout; the graph moves
-all points back by that (first order in the readout). On hand-held Kinect sequences this is most of the error.
+w * readout * (v / H - 1/2) from where a global shutter would have seen it in the middle of the readout; the
+graph moves all points back by that (first order in the readout). On hand-held Kinect sequences this is most of
+the error.
 """
 
 from __future__ import annotations
@@ -70,8 +71,8 @@ def checked_readout(readout: float | None) -> float | None:
     """A readout that the user gave, None where it is to be estimated. Raises ValueError where it can't be one."""
     if readout is not None and not 0.0 <= readout <= SLOWEST:
         raise ValueError(
-            f"tracker.readout={readout:g}: it is the seconds from the first row to the last, 0 to {SLOWEST:g} "
-            "(25 milliseconds are 0.025), 0 for a global shutter"
+            f"tracker.readout={readout:g}: it is the seconds from the first row to the last, "
+            f"0 to {SLOWEST:g} (25 milliseconds are 0.025), 0 for a global shutter"
         )
     return readout
 

@@ -1,4 +1,4 @@
-"""Renders are rolled as the camera's shutter would have seen them."""
+"""Renders are as the camera's rolling shutter would have seen them."""
 
 from __future__ import annotations
 
