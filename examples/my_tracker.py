@@ -66,7 +66,7 @@ class Strided(Node):
             return
         indices, times, poses, keyframes = zip(*self._track, strict=True)
         started = any(keyframes[1:])
-        lost = TrackingState.LOST if started else TrackingState.NOT_STARTED
+        lost = TrackingState.LOST if started else TrackingState.NOT_INITIALIZED
         known = [pose is not None and started for pose in poses]
         yield Trajectory(
             np.array(indices, np.int64),

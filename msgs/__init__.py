@@ -27,7 +27,7 @@ class TrackingState(IntEnum):
 
     TRACKED = 0
     LOST = 1  # no pose: the frame could not be matched with the map
-    NOT_STARTED = 2  # no pose: before the start-up succeeded
+    NOT_INITIALIZED = 2  # no pose: before the start-up succeeded
     DEGENERATE = 3  # a pose, but the motion gives no depth (pure rotation) or the image no texture
 
 
@@ -129,7 +129,7 @@ class Trajectory:
     state: Annotated[np.ndarray, "uint8 N"]  # TrackingState
     segment: Annotated[np.ndarray, "int32 N"]
     focal_factor: float = 1.0  # by which the tracker multiplied the focal lengths of the frames, if they were guessed
-    readout: float = 0.0  # seconds of the rolling shutter that was taken out of the keyframes, first row to last
+    readout_time: float = 0.0  # seconds of the rolling shutter that was taken out of the keyframes, first row to last
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class Evaluator(Node):
             track.state,
             track.segment,
             track.focal_factor,
-            track.readout,
+            track.readout_time,
         )
         yield from ()
 
@@ -175,9 +175,9 @@ def _finished(message: SplatMap) -> FinishedMap:
 
 
 def _shutter(track: Track | None) -> str:
-    if track is None or track.readout == 0.0:
+    if track is None or track.readout_time == 0.0:
         return ""
-    taken_out = f"{1e3 * track.readout:.1f} ms a frame"
+    taken_out = f"{1e3 * track.readout_time:.1f} ms a frame"
     return f"The rolling shutter that the tracker took out of the keyframes is applied to renders ({taken_out}). "
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from msgs import Frame, GroundTruth, Keyframe, TrackingState, Trajectory
 from mvsgs_core.tracking.coarse_depth import coarse_map
-from mvsgs_core.tracking.estimation.rolling_shutter import checked_readout, unrolled
+from mvsgs_core.tracking.estimation.rolling_shutter import checked_readout_time, rectified
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.posed import PosedConfig
@@ -25,11 +25,13 @@ class PosedTracker(Node):
         area: int = 320 * 240  # pixels of the tracker's own image, aspect kept; at most twice enlarged
         flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
         keyframe_flow: float = 0.05  # of the width: median flow that makes a keyframe
-        keyframe_share: float = 0.5  # of the textured points: fewer found make a keyframe
+        keyframe_fraction: float = 0.5  # of the textured points: fewer found make a keyframe
         recent: int = 3  # keyframes before a new one that it is matched with
         proximity: int = 3  # older keyframes that it is matched with
         steps: int = 5  # of the triangulation
-        readout: float = 0.0  # seconds of the camera's rolling shutter, 0 for a global one: true poses do not tell it
+        readout_time: float = (
+            0.0  # seconds of the camera's rolling shutter, 0 for a global one: true poses do not tell it
+        )
         threads: int | None = None  # of the C++ kernels; null: 1
 
     config: Config
@@ -37,15 +39,15 @@ class PosedTracker(Node):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c = self.config
-        checked_readout(c.readout)
+        checked_readout_time(c.readout_time)
         self._tracker = Core(
             PosedConfig(
                 area=c.area,
                 flow=c.flow,
-                readout=c.readout,
+                readout_time=c.readout_time,
                 threads=c.threads or 1,
                 front_end=FrontEndConfig(
-                    still_flow=0.0, keyframe_flow=c.keyframe_flow, keyframe_share=c.keyframe_share
+                    still_flow=0.0, keyframe_flow=c.keyframe_flow, keyframe_fraction=c.keyframe_fraction
                 ),
                 local_map=LocalMapConfig(recent=c.recent, proximity=c.proximity, steps=c.steps),
             )
@@ -97,7 +99,7 @@ class PosedTracker(Node):
             keyframe=np.array([index in self._keyframes for index in order], bool).reshape(n),
             state=np.where(known, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8),
             segment=np.where(known, 0, -1).astype(np.int32),
-            readout=self.config.readout,
+            readout_time=self.config.readout_time,
         )
 
     def _join(self, index: int) -> Iterator[Keyframe]:
@@ -125,7 +127,7 @@ class PosedTracker(Node):
         return Keyframe(
             index=index,
             timestamp=frame.timestamp,
-            image=unrolled(frame.image, keyframe.image, self.config.readout),
+            image=rectified(frame.image, keyframe.image, self.config.readout_time),
             intrinsics=frame.intrinsics,
             world_from_cam=np.asarray(pose, dtype=np.float64),
             scale=1.0,

@@ -12,11 +12,11 @@ from mvsgs_core import geometry
 from mvsgs_core.tracking import tracker as core
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.coarse_depth import coarse_map
-from mvsgs_core.tracking.estimation.rolling_shutter import checked_readout, unrolled
+from mvsgs_core.tracking.estimation.rolling_shutter import checked_readout_time, rectified
 from mvsgs_core.tracking.front_end import FrontEndConfig
+from mvsgs_core.tracking.initializer import InitializationConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
-from mvsgs_core.tracking.starting import StartingConfig
 from nodes.tracking import TrackerNode
 
 
@@ -28,7 +28,7 @@ class Tracker(TrackerNode):
         area: int = 320 * 240  # pixels of the tracker's own image, aspect kept; at most twice enlarged
         flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
         keyframe_flow: float = 0.05  # of the width: median flow that makes a keyframe
-        keyframe_share: float = 0.5  # of the textured points: fewer found make a keyframe
+        keyframe_fraction: float = 0.5  # of the textured points: fewer found make a keyframe
         still_flow: float = 0.001  # of the width: median flow below which a frame is skipped
         start_keyframes: int = 6  # before a start is tried
         window: int = 12  # keyframes of the local bundle adjustment
@@ -36,8 +36,10 @@ class Tracker(TrackerNode):
         proximity: int = 3  # older keyframes that it is matched with
         steps: int = 5  # of the local bundle adjustment
         global_edges: int = 6  # of each keyframe in the global bundle adjustment
-        readout: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
-        unroll: bool = True  # keyframes' images are sent as a global shutter would have taken them
+        readout_time: float | None = (
+            None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
+        )
+        rectify_rolling_shutter: bool = True  # keyframes' images are sent as a global shutter would have taken them
         loops: bool = True  # old keyframes are looked for by appearance
         known_flow: float = 0.13  # of the width: no keyframe is made for a view this near to an old one; 0: always
         known_from: int = 64  # keyframes of a map: a smaller one takes every view
@@ -58,18 +60,18 @@ class Tracker(TrackerNode):
                 threads=c.threads or 1,
                 device=_device(c.device),
                 front_end=FrontEndConfig(
-                    still_flow=c.still_flow, keyframe_flow=c.keyframe_flow, keyframe_share=c.keyframe_share
+                    still_flow=c.still_flow, keyframe_flow=c.keyframe_flow, keyframe_fraction=c.keyframe_fraction
                 ),
                 local_map=LocalMapConfig(window=c.window, recent=c.recent, proximity=c.proximity, steps=c.steps),
                 back_end=BackEndConfig(edges=c.global_edges),
-                starting=StartingConfig(keyframes=c.start_keyframes),
-                readout=checked_readout(c.readout),
+                initialization=InitializationConfig(keyframes=c.start_keyframes),
+                readout_time=checked_readout_time(c.readout_time),
                 loops=c.loops,
                 covisibility=CovisibilityConfig(min_keyframes=c.known_from, max_flow=c.known_flow),
             )
         )
 
-        self._unrolled: list[float] = []  # seconds of readout that were taken out of each keyframe's image
+        self._readout_times: list[float] = []  # seconds of readout time that were taken out of each keyframe's image
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
         self._frames[frame.index] = frame
@@ -87,18 +89,18 @@ class Tracker(TrackerNode):
         return self._tracker.focal_factor
 
     @property
-    def _readout(self) -> float:
-        return self._tracker.readout if self.config.unroll else 0.0
+    def _readout_time(self) -> float:
+        return self._tracker.readout_time if self.config.rectify_rolling_shutter else 0.0
 
     def _keyframe(self, index: int) -> Keyframe:
         frame, keyframe = self._frames[index], self._tracker.keyframe(index)
         inverse_depth, weight = coarse_map(keyframe)
-        with self.stats.time("unrolling"):
-            image = unrolled(frame.image, keyframe.image, self._readout)
-        self._unrolled.append(0.0 if keyframe.image.velocity is None else self._readout)
-        if max(self._unrolled) > 0.0:
-            self.stats.values["rolling shutter taken out of keyframes"] = spread(self._unrolled)
-        if self._readout and keyframe.image.velocity is None:
+        with self.stats.time("rectification"):
+            image = rectified(frame.image, keyframe.image, self._readout_time)
+        self._readout_times.append(0.0 if keyframe.image.velocity is None else self._readout_time)
+        if max(self._readout_times) > 0.0:
+            self.stats.values["rolling shutter taken out of keyframes"] = spread(self._readout_times)
+        if self._readout_time and keyframe.image.velocity is None:
             self.stats.count("keyframes with the rolling shutter still in: no velocity")
         return Keyframe(
             index=index,

@@ -10,7 +10,7 @@ import numpy as np
 
 from msgs import Frame, Keyframe, Poses, Trajectory
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.frames import Path
+from mvsgs_core.tracking import frames
 from mvsgs_core.tracking.publish import Correction
 from mvsgs_core.tracking.tracker import Update
 from nodes import Node
@@ -30,7 +30,7 @@ class CoreTracker(Protocol):
 
     def finish(self) -> Iterator[Update]: ...
 
-    def path(self) -> Path: ...
+    def trajectory(self) -> frames.Trajectory: ...
 
 
 class TrackerNode(Node, ABC):
@@ -54,26 +54,26 @@ class TrackerNode(Node, ABC):
         return 1.0
 
     @property
-    def _readout(self) -> float:
+    def _readout_time(self) -> float:
         """Seconds of the rolling shutter that was taken out of the keyframes' images."""
         return 0.0
 
     def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
         for update in self._core.finish():
             yield from self._send(update)
-        path = self._core.path()
+        trajectory = self._core.trajectory()
         self._report()
         if self._core.nothing:
             self.stats.nothing(self._core.nothing)
         yield Trajectory(
-            index=path.index,
-            timestamp=path.timestamp,
-            world_from_cam=path.world_from_cam,
-            keyframe=path.keyframe,
-            state=path.state,
-            segment=path.segment,
+            index=trajectory.index,
+            timestamp=trajectory.timestamp,
+            world_from_cam=trajectory.world_from_cam,
+            keyframe=trajectory.keyframe,
+            state=trajectory.state,
+            segment=trajectory.segment,
             focal_factor=self._focal_factor,
-            readout=self._readout,
+            readout_time=self._readout_time,
         )
 
     def _send(self, update: Update) -> Iterator[Keyframe | Poses]:

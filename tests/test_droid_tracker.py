@@ -34,10 +34,10 @@ def test_noise_gives_honest_finite_messages() -> None:
     assert any("noise" in warning for warning in node.stats.warnings)
     keyframes = [m for m in sent if isinstance(m, Keyframe)]
     poses = [m for m in sent if isinstance(m, Poses)]
-    path = sent[-1]
-    assert isinstance(path, Trajectory)
+    trajectory = sent[-1]
+    assert isinstance(trajectory, Trajectory)
     assert len(keyframes) >= 5
-    told: set[int] = set()
+    published: set[int] = set()
     for message in sent[:-1]:
         if isinstance(message, Keyframe):
             assert message.image is frames[message.index].image
@@ -48,33 +48,33 @@ def test_noise_gives_honest_finite_messages() -> None:
             assert message.inverse_depth.shape == message.inverse_depth_weight.shape == (8, 10)
             np.testing.assert_array_equal(message.inverse_depth > 0, message.inverse_depth_weight > 0)
             assert message.inverse_depth_weight.max() <= 1
-            told.add(message.index)
+            published.add(message.index)
         elif isinstance(message, Poses):
-            assert set(message.index.tolist()) <= told
+            assert set(message.index.tolist()) <= published
             assert np.isfinite(message.world_from_cam).all()
             assert np.all(message.scale > 0)
     assert [p.revision for p in poses] == list(range(1, len(poses) + 1))
-    assert path.index.tolist() == list(range(COUNT))
-    assert path.index[path.keyframe].tolist() == [k.index for k in keyframes]
-    np.testing.assert_array_equal(poses[-1].world_from_cam, path.world_from_cam[path.keyframe])
-    assert np.isfinite(path.world_from_cam).all()
-    assert set(path.state.tolist()) <= {TrackingState.TRACKED, TrackingState.DEGENERATE}
+    assert trajectory.index.tolist() == list(range(COUNT))
+    assert trajectory.index[trajectory.keyframe].tolist() == [k.index for k in keyframes]
+    np.testing.assert_array_equal(poses[-1].world_from_cam, trajectory.world_from_cam[trajectory.keyframe])
+    assert np.isfinite(trajectory.world_from_cam).all()
+    assert set(trajectory.state.tolist()) <= {TrackingState.TRACKED, TrackingState.DEGENERATE}
     assert node.stats.counts["keyframes"] == len(keyframes)
 
 
 def test_too_few_frames_are_not_started() -> None:
     node, sent, _ = run(TRIAL, count=3)
-    (path,) = sent
-    assert isinstance(path, Trajectory)
-    assert np.isnan(path.world_from_cam).all()
-    assert set(path.state.tolist()) == {TrackingState.NOT_STARTED}
+    (trajectory,) = sent
+    assert isinstance(trajectory, Trajectory)
+    assert np.isnan(trajectory.world_from_cam).all()
+    assert set(trajectory.state.tolist()) == {TrackingState.NOT_INITIALIZED}
     assert any("never started" in warning for warning in node.stats.warnings)
 
 
 def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
-    (path,) = list(DroidTracker(TRIAL).on_end())
-    assert isinstance(path, Trajectory)
-    assert len(path.index) == 0
+    (trajectory,) = list(DroidTracker(TRIAL).on_end())
+    assert isinstance(trajectory, Trajectory)
+    assert len(trajectory.index) == 0
 
 
 def test_missing_weights_are_said_before_anything_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -153,12 +153,12 @@ def test_frames_are_rendered_with_the_focal_length_that_the_tracker_found(evalua
 def test_renders_are_rolled_with_the_shutter_that_the_tracker_took_out(evaluator: Evaluator) -> None:
     poses, index, none = _poses(), np.arange(N), np.zeros(N, np.int32)
     poses[:, :3, 3] += ORIGIN
-    track = Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, readout=0.02)
+    track = Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, readout_time=0.02)
     list(evaluator.on_trajectory(track))
     list(evaluator.on_splat_map(_splat_map(True)))
     finished, view = evaluator.evaluation.maps[True], evaluator.evaluation.views()[5]
     assert view.shutter is not None
-    assert view.shutter.readout == 0.02
+    assert view.shutter.readout_time == 0.02
     moved = geometry.se3_log(geometry.inverse(poses[4]) @ poses[6])
     np.testing.assert_allclose(view.shutter.velocity, moved * 15, atol=1e-7)
     color = render_view(finished.splats, finished.kernel, view, (H, W)).color

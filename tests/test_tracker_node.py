@@ -62,19 +62,19 @@ def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
         assert keyframe.inverse_depth_weight.max() <= 1
         np.testing.assert_array_equal(known, keyframe.inverse_depth_weight > 0)
     assert [p.revision for p in poses] == list(range(1, len(poses) + 1))
-    told: set[int] = set()
+    published: set[int] = set()
     for message in sent:  # nothing is corrected that was not sent before
         if isinstance(message, Keyframe):
-            told.add(message.index)
+            published.add(message.index)
         elif isinstance(message, Poses):
-            assert set(message.index.tolist()) <= told
+            assert set(message.index.tolist()) <= published
             assert np.all(message.scale > 0)
-    path = sent[-1]
-    np.testing.assert_array_equal(path.index, [frame.index for frame in frames])
-    assert path.index[path.keyframe].tolist() == indices
-    np.testing.assert_array_equal(poses[-1].world_from_cam, path.world_from_cam[path.keyframe])
-    assert path.state.dtype == np.uint8
-    assert path.segment.dtype == np.int32
+    trajectory = sent[-1]
+    np.testing.assert_array_equal(trajectory.index, [frame.index for frame in frames])
+    assert trajectory.index[trajectory.keyframe].tolist() == indices
+    np.testing.assert_array_equal(poses[-1].world_from_cam, trajectory.world_from_cam[trajectory.keyframe])
+    assert trajectory.state.dtype == np.uint8
+    assert trajectory.segment.dtype == np.int32
     assert node.stats.counts["frames"] == len(frames)
     assert "front end" in node.stats.seconds
 
@@ -99,14 +99,16 @@ def test_a_guessed_focal_length_is_estimated_and_sent() -> None:
     for frame in frames:
         sent += list(node.on_frame(Frame(frame.index, frame.timestamp, frame.image, frame.intrinsics * wrong, True)))
     sent += list(node.on_end())
-    path = sent[-1]
-    assert isinstance(path, Trajectory)
+    trajectory = sent[-1]
+    assert isinstance(trajectory, Trajectory)
     keyframes = of_type(sent, Keyframe)
     assert keyframes
     for keyframe in keyframes:
         np.testing.assert_allclose(keyframe.intrinsics, frames[0].intrinsics, rtol=0.03)
-        np.testing.assert_array_equal(keyframe.intrinsics[:2], path.focal_factor * wrong[:2] * frames[0].intrinsics[:2])
-    assert node.stats.counts["focal length over its guess"] == path.focal_factor
+        np.testing.assert_array_equal(
+            keyframe.intrinsics[:2], trajectory.focal_factor * wrong[:2] * frames[0].intrinsics[:2]
+        )
+    assert node.stats.counts["focal length over its guess"] == trajectory.focal_factor
 
 
 def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
@@ -152,19 +154,21 @@ def test_the_newest_view_is_sent() -> None:
 
 
 def test_what_was_taken_out_of_the_keyframes_is_told() -> None:
-    """The estimate of the readout changes while keyframes go out: the report has what each was sent with."""
+    """The estimate of the readout time changes while keyframes go out: the report has what each was sent with."""
     frames, _ = rolling_messages(40)
-    node = Tracker(Tracker.Config(readout=0.5 / FPS))
+    node = Tracker(Tracker.Config(readout_time=0.5 / FPS))
     for n, frame in enumerate(frames):
         if n == 30:  # as the tracker does when it knows better
             assert node._tracker.graph is not None
-            node._tracker.graph.readout = 0.4 / FPS
+            node._tracker.graph.readout_time = 0.4 / FPS
         list(node.on_frame(frame))
     list(node.on_end())
     early, late = 0.5 / FPS, 0.4 / FPS
-    assert set(node._unrolled) == {early, late}
-    told = node.stats.values["rolling shutter taken out of keyframes"]
-    assert told == f"{1e3 * np.mean(node._unrolled):.1f} ms in the mean, {1e3 * late:.1f} to {1e3 * early:.1f}"
+    assert set(node._readout_times) == {early, late}
+    published = node.stats.values["rolling shutter taken out of keyframes"]
+    assert (
+        published == f"{1e3 * np.mean(node._readout_times):.1f} ms in the mean, {1e3 * late:.1f} to {1e3 * early:.1f}"
+    )
     assert spread([0.02, 0.02]) == "20.0 ms"
 
 
@@ -192,10 +196,10 @@ def test_true_poses_come_with_depths_in_their_unit() -> None:
     ratio = np.concatenate(ratios)
     assert len(ratio) > 1000
     assert abs(np.median(ratio) - 1.0) < 0.02
-    path = sent[-1]
-    assert isinstance(path, Trajectory)
-    np.testing.assert_array_equal(path.world_from_cam, [t.world_from_cam for t in truths])
-    assert path.index[path.keyframe].tolist() == [k.index for k in keyframes]
+    trajectory = sent[-1]
+    assert isinstance(trajectory, Trajectory)
+    np.testing.assert_array_equal(trajectory.world_from_cam, [t.world_from_cam for t in truths])
+    assert trajectory.index[trajectory.keyframe].tolist() == [k.index for k in keyframes]
 
 
 def test_true_poses_that_hardly_move_say_what_to_lower() -> None:
@@ -226,10 +230,10 @@ def test_frames_without_a_true_pose_are_left_out_and_reported() -> None:
     for frame, truth in zip(frames, [*truths[:3], blind, *truths[4:]]):
         list(node.on_frame(frame))
         list(node.on_ground_truth(truth))
-    path = list(node.on_end())[-1]
-    assert isinstance(path, Trajectory)
-    assert np.isnan(path.world_from_cam[3]).all()
-    assert path.state[3] == TrackingState.LOST
+    trajectory = list(node.on_end())[-1]
+    assert isinstance(trajectory, Trajectory)
+    assert np.isnan(trajectory.world_from_cam[3]).all()
+    assert trajectory.state[3] == TrackingState.LOST
     assert any("without a true pose" in warning for warning in node.stats.warnings)
 
 
@@ -251,42 +255,42 @@ def check_global_shutter(keyframes: list[Keyframe], frames: list[Frame]) -> None
     assert min(gains) > 0.0, gains
 
 
-@pytest.mark.parametrize("unroll", [True, False])
-def test_keyframes_are_as_a_global_shutter_would_have_taken_them(unroll: bool) -> None:
+@pytest.mark.parametrize("rectify_rolling_shutter", [True, False])
+def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling_shutter: bool) -> None:
     frames, _ = rolling_messages(30)
-    node = Tracker(Tracker.Config(readout=0.5 / FPS, unroll=unroll))
+    node = Tracker(Tracker.Config(readout_time=0.5 / FPS, rectify_rolling_shutter=rectify_rolling_shutter))
     sent = [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end())
-    (path,) = of_type(sent, Trajectory)
+    (trajectory,) = of_type(sent, Trajectory)
     keyframes = of_type(sent, Keyframe)
-    if unroll:
-        assert path.readout == 0.5 / FPS
+    if rectify_rolling_shutter:
+        assert trajectory.readout_time == 0.5 / FPS
         check_global_shutter(keyframes, frames)
     else:
-        assert path.readout == 0.0
+        assert trajectory.readout_time == 0.0
         assert all(k.image is frames[k.index].image for k in keyframes)
 
 
 def test_keyframes_with_true_poses_are_as_a_global_shutter_would_have_taken_them() -> None:
     frames, truths = rolling_messages(30)
-    node = PosedTracker(PosedTracker.Config(readout=0.5 / FPS))
+    node = PosedTracker(PosedTracker.Config(readout_time=0.5 / FPS))
     sent: list[msgs.Message] = []
     for frame, truth in zip(frames, truths, strict=True):
         sent += [*node.on_frame(frame), *node.on_ground_truth(truth)]
     sent += list(node.on_end())
-    assert sent[-1].readout == 0.5 / FPS  # type: ignore[union-attr]
+    assert sent[-1].readout_time == 0.5 / FPS  # type: ignore[union-attr]
     check_global_shutter(of_type(sent, Keyframe), frames)
 
 
 @pytest.mark.parametrize("node", [Tracker, PosedTracker])
-@pytest.mark.parametrize("readout", [25.0, -0.01, float("nan")])
-def test_a_readout_in_another_unit_is_refused(node: type[Tracker] | type[PosedTracker], readout: float) -> None:
-    with pytest.raises(ValueError, match=r"tracker\.readout=.*seconds.*0 to 0\.2"):
-        node(node.Config(readout=readout))  # type: ignore[arg-type]
+@pytest.mark.parametrize("readout_time", [25.0, -0.01, float("nan")])
+def test_a_readout_in_another_unit_is_refused(node: type[Tracker] | type[PosedTracker], readout_time: float) -> None:
+    with pytest.raises(ValueError, match=r"tracker\.readout_time=.*seconds.*0 to 0\.2"):
+        node(node.Config(readout_time=readout_time))  # type: ignore[arg-type]
 
 
 def test_a_keyframe_whose_shutter_stays_in_is_counted() -> None:
     frames, _ = rolling_messages(30)
-    node = Tracker(Tracker.Config(readout=0.5 / FPS))
+    node = Tracker(Tracker.Config(readout_time=0.5 / FPS))
     slow = [replace(f, timestamp=10 * f.timestamp) for f in frames]  # too far apart to know a velocity
     keyframes = of_type([m for f in slow for m in node.on_frame(f)], Keyframe)
     assert len(keyframes) > 5

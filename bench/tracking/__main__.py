@@ -27,7 +27,7 @@ from bench.tracking.baselines import Peer, aligned_error
 from bench.tracking.cases import CASES, Case
 from bench.tracking.parts import global_adjustment_seconds
 from mvsgs_core.datasets import Item
-from mvsgs_core.tracking.frames import Path, State
+from mvsgs_core.tracking.frames import State, Trajectory
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
 
 
@@ -35,7 +35,7 @@ from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
 class Result:
     """One run over one sequence. Errors in the unit of the truth (meters)."""
 
-    path: Path
+    path: Trajectory
     keyframe_errors: list[float]  # of each segment
     frame_errors: list[float]
     length: float  # of the true path
@@ -63,7 +63,7 @@ def run(items: Sequence[Item], config: TrackerConfig | None = None) -> Result:
     for _ in tracker.finish():
         pass
     end = time.process_time() - start
-    path = tracker.path()
+    path = tracker.trajectory()
     truth = {i.index: i.world_from_cam for i in items if i.world_from_cam is not None}
     segments = sorted({int(s) for s in path.segment if s >= 0})
     known = np.isin(path.index, list(truth)) & np.isfinite(path.world_from_cam).all(axis=(1, 2))
@@ -80,7 +80,7 @@ def run(items: Sequence[Item], config: TrackerConfig | None = None) -> Result:
     )
 
 
-def _ate(path: Path, truth: dict[int, np.ndarray], chosen: np.ndarray) -> float:
+def _ate(path: Trajectory, truth: dict[int, np.ndarray], chosen: np.ndarray) -> float:
     if chosen.sum() < 3:
         return float("nan")
     found = path.world_from_cam[chosen, :3, 3]

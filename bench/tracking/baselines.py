@@ -15,7 +15,7 @@ from bench.tracking.cases import CASES
 from mvsgs_core import geometry
 from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
 from mvsgs_core.datasets import Item
-from mvsgs_core.tracking.frames import Path
+from mvsgs_core.tracking.frames import Trajectory
 
 AREA = 512 * 384  # pixels of COLMAP's images: 2.6 times those of the tracker
 SUCCESS = 0.5  # share of the frames that COLMAP must register for its error to be a mark
@@ -57,7 +57,7 @@ def solve_case(name: str, folder: File) -> Peer:
     return solve(case.items()[:: case.peer_stride], place, 1)
 
 
-def rows(name: str, peer: Peer, path: Path, items: Sequence[Item], seconds: float) -> list[Row]:
+def rows(name: str, peer: Peer, path: Trajectory, items: Sequence[Item], seconds: float) -> list[Row]:
     """Both errors over the frames that COLMAP registered and we posed; seconds: processor time of our whole run."""
     model = peer.model
     if model is None:

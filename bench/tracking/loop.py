@@ -54,7 +54,7 @@ def close_loop(items: Sequence[Item], drift: float = 0.25) -> Closed:
         del graph.edges[a, b]
     _let_drift(graph, order, drift)
     for index in order:
-        tracker.publisher.tell(index)
+        tracker.publisher.publish(index)
     before = {index: graph.world_from_cam(index) for index in order}
     units = {item.index: _unit(graph, item) for item in items if item.index in place}
     error = _error(graph, order, items)

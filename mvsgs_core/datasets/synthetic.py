@@ -115,13 +115,13 @@ class Synthetic:
 
     def _light(self, s: float) -> np.ndarray:
         """(H, W, 3) float32 of an instant; of a rolling shutter, whose middle row is read at frame s."""
-        readout, (height, width) = self.difficulties.rolling_shutter, self.size
-        if readout == 0:
+        readout_time, (height, width) = self.difficulties.rolling_shutter, self.size
+        if readout_time == 0:
             return self._view(self.path.pose(s), self.intrinsics, self.size, s).color
         strips = []
         for top in range(0, height, STRIP):
             rows = min(STRIP, height - top)
-            at = s + readout * ((top + (rows - 1) / 2) / height - 0.5)
+            at = s + readout_time * ((top + (rows - 1) / 2) / height - 0.5)
             lens = self.intrinsics - [0.0, 0.0, 0.0, top]
             strips.append(self._view(self.path.pose(at), lens, (rows, width), at).color)
         return np.concatenate(strips)

@@ -1,4 +1,4 @@
-"""DROID-SLAM as a tracker: images in; keyframes, corrected poses and the whole path out.
+"""DROID-SLAM as a tracker: images in; keyframes, corrected poses and the whole trajectory out.
 
 What is done with a frame depends on the frames before it alone: the same stream always gives the same poses on a CPU.
 """
@@ -25,7 +25,7 @@ from mvsgs_core.droid.video import Video, VideoFrame
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.networks.droid import DroidNet
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.frames import Path, State
+from mvsgs_core.tracking.frames import State, Trajectory
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT
 from mvsgs_core.tracking.publish import Publisher, Update
 
@@ -39,7 +39,7 @@ class DroidConfig:
     area: int = AREA  # pixels of the image that the networks see, aspect kept
     correlation: str = "volume"  # of the frontend: volume (fast) or on_the_fly (little memory)
     global_correlation: str = "on_the_fly"  # of the backend; volume: one edge's at a time
-    tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
+    tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not published
     device: str = "cpu"
     threads: int = 1  # of the bundle adjustment
 
@@ -56,7 +56,7 @@ class DroidSlam:
         self.frames: list[StoredFrame] = []
         self._states: list[State] = []
         self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
-        self._path = _empty_path()
+        self._trajectory = _empty_trajectory()
 
     def add(self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> Update:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow."""
@@ -67,7 +67,7 @@ class DroidSlam:
             small = self.framing.image(image)
             self.frames.append(StoredFrame.of(index, timestamp, small))
         self.stats.count("frames")
-        self._states.append(State.TRACKED if self.frontend.started else State.NOT_STARTED)
+        self._states.append(State.TRACKED if self.frontend.started else State.NOT_INITIALIZED)
         if (len(self.frames) - 1) % self.config.preset.stride:
             self.stats.skip("frames between strides")
             return Update(self._states[-1])
@@ -92,12 +92,12 @@ class DroidSlam:
         every = self.config.preset.backend_every
         if kept and every and self.frontend.started and len(self.video) % every == 0:
             self._adjust_globally(self.config.preset.backend_steps[-1:])
-        return self._tell(self.frontend.settled)
+        return self._publish(self.frontend.settled)
 
     @property
     def pending(self) -> set[int]:
-        """Frames that may still become keyframes that are told: their images are needed until then."""
-        return set() if self.framing is None else set(self.video.keyframes) - self.publisher.told
+        """Frames that may still become keyframes that are published: their images are needed until then."""
+        return set() if self.framing is None else set(self.video.keyframes) - self.publisher.published
 
     def finish(self) -> Iterator[Update]:
         """The stream has ended: a start by force if there was none, then the global bundle adjustment."""
@@ -111,21 +111,21 @@ class DroidSlam:
                 f"{self.config.preset.filter_threshold:g} cells or more (filter_threshold) since the one before"
             )
             self.stats.warn(self.nothing)
-            self._path = self._collect(None)
-            yield Update(State.NOT_STARTED)
+            self._trajectory = self._collect(None)
+            yield Update(State.NOT_INITIALIZED)
             return
         self.nothing = ""
-        yield self._tell(len(self.video))
+        yield self._publish(len(self.video))
         self._adjust_globally(self.config.preset.backend_steps)
-        self._path = self._collect(self._fill())
+        self._trajectory = self._collect(self._fill())
         self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.video.keyframes))
         if self.networks.not_finite:
             self.stats.warn(f"{self.networks.not_finite} network outputs were not finite and were ignored")
         yield Update(State.TRACKED, (), self.publisher.corrections(True))
 
-    def path(self) -> Path:
+    def trajectory(self) -> Trajectory:
         """Every frame's pose, after `finish`."""
-        return self._path
+        return self._trajectory
 
     def keyframe(self, index: int) -> VideoFrame:
         return self.video.keyframes[index]
@@ -151,12 +151,12 @@ class DroidSlam:
         self.frontend = Frontend(self.video, self.graph, config.preset, self.stats)
         self.publisher = Publisher(self.video, config.tolerance)
 
-    def _tell(self, settled: int) -> Update:
+    def _publish(self, settled: int) -> Update:
         """Keyframes that have become settled, after corrections of those before."""
         correction = self.publisher.corrections()
-        new = [frame for frame in self.video.frames[:settled] if frame.index not in self.publisher.told]
+        new = [frame for frame in self.video.frames[:settled] if frame.index not in self.publisher.published]
         for frame in new:
-            self.publisher.tell(frame.index)
+            self.publisher.publish(frame.index)
         self.stats.count("keyframes", len(new))
         if self.frontend.started:
             position = max(0, len(self.video) - 2)
@@ -188,17 +188,17 @@ class DroidSlam:
         poses = {frame.index: pose for frame, pose in zip(others, found)}
         return poses | {index: frame.cam_from_world for index, frame in own.items()}
 
-    def _collect(self, cam_from_world: dict[int, np.ndarray] | None) -> Path:
+    def _collect(self, cam_from_world: dict[int, np.ndarray] | None) -> Trajectory:
         count = len(self.frames)
         poses = np.full((count, 4, 4), np.nan)
         states = np.array(self._states, np.uint8).reshape(count)
         if cam_from_world is not None:
             poses = geometry.inverse(np.stack([cam_from_world[frame.index] for frame in self.frames]))
-            states[states == State.NOT_STARTED] = State.TRACKED
+            states[states == State.NOT_INITIALIZED] = State.TRACKED
             unknown = ~np.isfinite(poses).all(axis=(1, 2))
             poses[unknown], states[unknown] = np.nan, State.LOST
         keyframes = self.video.keyframes if cam_from_world is not None else {}
-        return Path(
+        return Trajectory(
             index=np.array([frame.index for frame in self.frames], np.int64),
             timestamp=np.array([frame.timestamp for frame in self.frames], np.float64),
             world_from_cam=poses,
@@ -208,9 +208,9 @@ class DroidSlam:
         )
 
 
-def _empty_path() -> Path:
+def _empty_trajectory() -> Trajectory:
     none = np.zeros(0)
-    return Path(
+    return Trajectory(
         none.astype(np.int64),
         none,
         np.zeros((0, 4, 4)),

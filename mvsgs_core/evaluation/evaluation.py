@@ -132,7 +132,7 @@ class Evaluation:
             index = int(tracked.index[k])
             photograph = photographs[index]
             focal = 1.0 if photograph.as_mapped else tracked.focal_factor
-            rolling = tracked.readout and not photograph.as_mapped
+            rolling = tracked.readout_time and not photograph.as_mapped
             views.append(
                 scoring.View(
                     index,
@@ -141,7 +141,7 @@ class Evaluation:
                     photograph.intrinsics * [focal, focal, 1.0, 1.0],
                     photograph.image,
                     near,
-                    Shutter(tracked.readout, moving[k]) if rolling else None,
+                    Shutter(tracked.readout_time, moving[k]) if rolling else None,
                     None if exposures is None else exposures[k],
                 )
             )

@@ -2,7 +2,7 @@
 
 A map is rendered for one moment, the middle of the readout; the photograph's rows were read one after the other.
 With camera velocity (v, w), in the camera's axes, a point X of depth Z moves by dX/dt = -v - w x X, and its pixel by
-the projection of that: row r shows it (r / H - 1/2) * readout later (first order in the readout, as in the
+the projection of that: row r shows it (r / H - 1/2) * readout_time later (first order in the readout time, as in the
 tracker). The velocity is that of the run's own trajectory, the depth that of the map's own render.
 """
 
@@ -23,7 +23,7 @@ LONGEST_GAP = 0.25  # seconds between frames: over a longer one the velocity is 
 class Shutter:
     """How one photograph was read out."""
 
-    readout: float  # seconds from the first row to the last
+    readout_time: float  # seconds from the first row to the last
     velocity: np.ndarray  # (6,) of the camera in its own axes: translation a second in map units, rotation in radians
 
 
@@ -51,20 +51,20 @@ def pixel_velocity(depth: np.ndarray, intrinsics: np.ndarray, velocity: np.ndarr
     return np.asarray(intrinsics[:2] * (moves[..., :2] - points[..., :2] / z * moves[..., 2:]) / z)
 
 
-def rolled(color: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray, shutter: Shutter) -> np.ndarray:
+def apply_rolling_shutter(color: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray, shutter: Shutter) -> np.ndarray:
     """A render (H, W, 3) float32 with its depth (H, W), 0 unknown, as the shutter would have seen it.
 
     Where nothing is rendered, the median depth stands in.
     """
     known = np.isfinite(depth) & (depth > 0)
-    if shutter.readout == 0.0 or not shutter.velocity.any() or not known.any():
+    if shutter.readout_time == 0.0 or not shutter.velocity.any() or not known.any():
         return color
     full = np.where(known, depth, np.median(depth[known]))
     u, v = pixel_grid(*depth.shape)
-    moved = pixel_velocity(full, intrinsics, shutter.velocity) * (shutter.readout * (v / len(v) - 0.5))[..., None]
+    moved = pixel_velocity(full, intrinsics, shutter.velocity) * (shutter.readout_time * (v / len(v) - 0.5))[..., None]
     at = (np.dstack([u, v]) - moved).astype(np.float32)
     result = cv2.remap(color, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.clip(result, 0.0, 1.0)
 
 
-__all__ = ["LONGEST_GAP", "Shutter", "pixel_velocity", "rolled", "velocities"]
+__all__ = ["LONGEST_GAP", "Shutter", "apply_rolling_shutter", "pixel_velocity", "velocities"]

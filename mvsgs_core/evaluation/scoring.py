@@ -14,7 +14,7 @@ from mvsgs_core import image_metrics
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation.frames import ENDING
 from mvsgs_core.evaluation.lpips import Lpips
-from mvsgs_core.evaluation.rolling_shutter import Shutter, rolled
+from mvsgs_core.evaluation.rolling_shutter import Shutter, apply_rolling_shutter
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
@@ -72,7 +72,7 @@ def render_view(splats: Splats, kernel: str, view: View, size: tuple[int, int]) 
         )
     color, depth = render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
     if view.shutter is not None:
-        color = rolled(color, depth, view.intrinsics, view.shutter)
+        color = apply_rolling_shutter(color, depth, view.intrinsics, view.shutter)
     return Rendered(color, depth, render.opacity.cpu().numpy())
 
 

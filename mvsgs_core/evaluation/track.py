@@ -12,7 +12,7 @@ from mvsgs_core.evaluation import trajectory
 from mvsgs_core.held_out import is_held_out
 
 TRACKED, DEGENERATE = 0, 3
-STATES = ("tracked", "lost", "not_started", "degenerate")  # what the numbers in `Track.state` mean
+STATES = ("tracked", "lost", "not_initialized", "degenerate")  # what the numbers in `Track.state` mean
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Track:
     state: np.ndarray  # see STATES
     segment: np.ndarray
     focal_factor: float = 1.0  # on the focal lengths of the frames, where they were guessed
-    readout: float = 0.0  # seconds of the rolling shutter
+    readout_time: float = 0.0  # seconds of the rolling shutter
 
     @property
     def posed(self) -> np.ndarray:

@@ -25,7 +25,7 @@ class Difficulties:
     jump_start: int = 60  # first frame after the jump
     drop: float = 0.0  # share of frames lost at random, 0 to 1; their time stamps are missing
     motion_blur: float = 0.0  # exposure time as a share of the time between two frames, 0 to 1
-    rolling_shutter: float = 0.0  # readout, first row to last, as a share of the time between two frames, 0 to 1
+    rolling_shutter: float = 0.0  # readout time, first row to last, as a share of the time between two frames, 0 to 1
     exposure: float = 0.0  # brightness drifts by up to so many stops up and down
     noise: float = 0.0  # standard deviation of the sensor's noise at mid gray, 8-bit levels
     gloss: float = 0.0  # strength of highlights, 1 is plausible: surfaces that change with the view

@@ -5,20 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.frames import Path, State
+from mvsgs_core.tracking.frames import State, Trajectory
 from mvsgs_core.tracking.graph import KeyframeGraph
 
 
-def warn_of_gaps(stats: Stats, path: Path) -> None:
+def warn_of_gaps(stats: Stats, trajectory: Trajectory) -> None:
     """Frames without a pose, and a map in several segments."""
-    segments = len(np.unique(path.segment[path.keyframe]))
+    segments = len(np.unique(trajectory.segment[trajectory.keyframe]))
     if segments > 1:
         stats.warn(f"the map is in {segments} segments: no verified loop joins them")
-    lost, unstarted = int(np.sum(path.state == State.LOST)), int(np.sum(path.state == State.NOT_STARTED))
+    lost, unstarted = (
+        int(np.sum(trajectory.state == State.LOST)),
+        int(np.sum(trajectory.state == State.NOT_INITIALIZED)),
+    )
     if lost:
-        stats.warn(f"{lost} of {len(path.state)} frames were lost")
+        stats.warn(f"{lost} of {len(trajectory.state)} frames were lost")
     if segments and unstarted:
-        stats.warn(f"{unstarted} of {len(path.state)} frames came before a start and have no pose")
+        stats.warn(f"{unstarted} of {len(trajectory.state)} frames came before a start and have no pose")
 
 
 def warn_of_few_matches(stats: Stats, graph: KeyframeGraph, enough: int) -> None:

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.estimation.focal import FocalConfig
 from mvsgs_core.tracking.front_end import FrontEndConfig
+from mvsgs_core.tracking.initializer import InitializationConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.places.loop_closure import LoopConfig
 from mvsgs_core.tracking.places.recovery import RecoveryConfig
-from mvsgs_core.tracking.starting import StartingConfig
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,13 @@ class TrackerConfig:
     flow: str = "lucas_kanade"  # mvsgs_core.tracking.matching.flow.FLOWS, or module:Class
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
     loops: bool = True  # look for old keyframes by appearance
-    readout: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated
-    texture: float = 0.05  # share of the cells that must be textured for an image to be of any use
+    readout_time: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated
+    texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
     matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is told
     threads: int = 1
     device: str = "cpu"  # of the local and global bundle adjustment, see Solver; single frames stay on the CPU
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
-    starting: StartingConfig = field(default_factory=StartingConfig)
+    initialization: InitializationConfig = field(default_factory=InitializationConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     focal: FocalConfig = field(default_factory=FocalConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)

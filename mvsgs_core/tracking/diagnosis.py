@@ -33,14 +33,16 @@ class Diagnosis:
     """Collects what happens to frames before a start. Shares of the width are of the tracker's image."""
 
     def __init__(self, front_end: FrontEndConfig, texture: float) -> None:
-        """texture: share of the cells that must be textured for an image to be of any use."""
+        """texture: fraction of the cells that must be textured for an image to be of any use."""
         self.front_end = front_end
         self.texture = texture
-        self.blank = Measured()  # frames without texture: share of the cells that are textured
-        self.lost = Measured()  # frames that could not be followed: share of the points that survived
-        self.jumped = Measured()  # of these: displacement by features, where enough of them agree, share of the width
-        self.followed = Measured()  # frames that were: displacement since the last keyframe, share of the width
-        self.most = 0  # keyframes that ever waited for a start
+        self.blank = Measured()  # frames without texture: fraction of the cells that are textured
+        self.lost = Measured()  # frames that could not be followed: fraction of the points that survived
+        self.jumped = (
+            Measured()
+        )  # of these: displacement by features, where enough of them agree, fraction of the width
+        self.followed = Measured()  # frames that were: displacement since the last keyframe, fraction of the width
+        self.max_waiting = 0  # keyframes that ever waited for a start
         self.attempts: dict[str, tuple[int, str]] = {}  # starts that failed: how often, and what the last one measured
 
     def no_texture(self, frame: TrackingImage) -> None:
@@ -53,19 +55,19 @@ class Diagnosis:
         elif frame.cells.textured.mean() < self.texture:
             self.no_texture(frame)
         else:
-            self.lost.add(step.share)
+            self.lost.add(step.fraction)
             here, there = match_features(reference, frame)
             if len(here):
                 self.jumped.add(float(np.median(np.linalg.norm(there - here, axis=1))) / frame.size[1])
 
     def failed(self, failure: str) -> None:
-        """A start was tried. failure: of a Start."""
+        """A start was tried. failure: of a Reconstruction."""
         kind = failure.partition(":")[0]
         self.attempts[kind] = (self.attempts.get(kind, (0, ""))[0] + 1, failure)
 
     def waiting(self, keyframes: int) -> None:
         """So many keyframes wait for a start."""
-        self.most = max(self.most, keyframes)
+        self.max_waiting = max(self.max_waiting, keyframes)
 
     def reason(self, needed: int) -> str:
         """In words. needed: keyframes that a start takes."""
@@ -83,7 +85,7 @@ class Diagnosis:
             return (
                 f"steps too wide: {self.lost.frames} of {frames} frames could not be followed from the one before "
                 f"(median displacement {jump}{found}; {100 * self.lost.median:.0f} % of the matches survive, "
-                f"{100 * self.front_end.lost_share:.0f} % are needed): more frames a second, or smaller steps, help"
+                f"{100 * self.front_end.lost_fraction:.0f} % are needed): more frames a second, or smaller steps, help"
             )
         if self.attempts:
             kind = max(self.attempts, key=lambda k: self.attempts[k][0])
@@ -92,7 +94,7 @@ class Diagnosis:
         return (
             f"too little motion: the image moved by {100 * self.followed.median:.1f} % of its width in the median "
             f"({100 * max(self.followed.values):.1f} % at most) since the last keyframe, over {frames} frames: "
-            f"{self.most} of {needed} keyframes that a start takes"
+            f"{self.max_waiting} of {needed} keyframes that a start takes"
         )
 
 

@@ -22,7 +22,7 @@ class State(IntEnum):
 
     TRACKED = 0
     LOST = 1
-    NOT_STARTED = 2
+    NOT_INITIALIZED = 2
     DEGENERATE = 3
 
 
@@ -51,7 +51,7 @@ class FrameRecord:
 
 
 @dataclass(frozen=True)
-class Path:
+class Trajectory:
     """All frames, N, in order."""
 
     index: np.ndarray  # (N,) int64
@@ -62,7 +62,7 @@ class Path:
     segment: np.ndarray  # (N,) int32
 
 
-def solve_path(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver) -> Path:
+def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver) -> Trajectory:
     """Final poses: a keyframe's own, else motion-only bundle adjustment against the reference as it is now."""
     n = len(records)
     poses = np.full((n, 4, 4), np.nan)
@@ -73,7 +73,7 @@ def solve_path(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver)
         own = graph.keyframes.get(record.index)
         if own is not None:
             poses[k], keyframe[k], segment[k] = graph.world_from_cam(record.index), True, own.segment
-            if state[k] in (State.LOST, State.NOT_STARTED):
+            if state[k] in (State.LOST, State.NOT_INITIALIZED):
                 state[k] = State.TRACKED
             continue
         if record.same_as is not None:
@@ -81,7 +81,7 @@ def solve_path(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver)
             poses[k], segment[k], state[k] = poses[other], segment[other], state[other]
             continue
         if record.reference is None or record.reference not in graph.keyframes:
-            state[k] = State.NOT_STARTED if state[k] == State.NOT_STARTED else State.LOST
+            state[k] = State.NOT_INITIALIZED if state[k] == State.NOT_INITIALIZED else State.LOST
             continue
         reference = graph.keyframes[record.reference]
         relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
@@ -93,7 +93,7 @@ def solve_path(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver)
         poses[k], segment[k] = geometry.inverse(found.cam_from_world), reference.segment
         if state[k] != State.DEGENERATE:
             state[k] = State.TRACKED
-    return Path(
+    return Trajectory(
         index=np.array([r.index for r in records], np.int64).reshape(n),
         timestamp=np.array([r.timestamp for r in records], np.float64).reshape(n),
         world_from_cam=poses,
@@ -103,4 +103,4 @@ def solve_path(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver)
     )
 
 
-__all__ = ["FrameRecord", "Path", "State", "solve_path"]
+__all__ = ["FrameRecord", "State", "Trajectory", "solve_trajectory"]

@@ -19,9 +19,9 @@ from mvsgs_core.tracking.places.localization import Localization, localize
 class FrontEndConfig:
     still_flow: float = 0.001  # of the width: median flow below which a frame did not move and is skipped
     keyframe_flow: float = 0.05  # of the width: median flow since the last keyframe that makes one
-    keyframe_share: float = 0.5  # of the textured points: fewer found make a keyframe
-    feature_share: float = 0.5  # fewer found, and features are tried
-    lost_share: float = 0.2  # fewer found: the frame is lost
+    keyframe_fraction: float = 0.5  # of the textured points: fewer found make a keyframe
+    feature_fraction: float = 0.5  # fewer found, and features are tried
+    lost_fraction: float = 0.2  # fewer found: the frame is lost
     lost_inliers: float = 0.5  # of the matches, within 2 pixels of one pose: fewer, and the frame is lost
 
 
@@ -30,7 +30,7 @@ class Step:
     """One frame against the reference keyframe."""
 
     matches: Matches
-    share: float  # of the textured points that were found
+    fraction: float  # of the textured points that were found
     flow: float  # pixels, median since the reference
     still: bool  # nothing moved since the last frame: nothing was done
     localization: Localization | None  # None before the start
@@ -75,11 +75,11 @@ class FrontEnd:
         moved = float(np.median(np.hypot(field[..., 0], field[..., 1])))
         if moved < self.config.still_flow * image.size[1] and self.step is not None and self._same(image):
             return Step(
-                self.step.matches, self.step.share, self.step.flow, True, self.step.localization if started else None
+                self.step.matches, self.step.fraction, self.step.flow, True, self.step.localization if started else None
             )
         self._set_velocity(image, field)
         guess = self.carried + sample_field(field, self.carried)
-        matches, share = self.matcher.match(self.reference, image, guess, self.config.feature_share)
+        matches, fraction = self.matcher.match(self.reference, image, guess, self.config.feature_fraction)
         alive = matches.alive
         flow = np.inf
         if alive.any():
@@ -89,7 +89,7 @@ class FrontEnd:
             start = self.pose if self.pose is not None else self.graph.keyframes[self.reference.index].cam_from_world
             found = localize(self.graph, {self.reference.index: matches}, start, self.solver)
             guess, _ = self.graph.predict_pose(self.reference.index, found.cam_from_world)
-        step = Step(matches, share, flow, False, found)
+        step = Step(matches, fraction, flow, False, found)
         if self.is_lost(step):
             image.velocity = None
         else:
@@ -101,15 +101,15 @@ class FrontEnd:
 
     def is_lost(self, step: Step) -> bool:
         """Too few points found, or no pose that they agree on."""
-        if step.share < self.config.lost_share or step.matches.alive.sum() < 30:
+        if step.fraction < self.config.lost_fraction or step.matches.alive.sum() < 30:
             return True
         found = step.localization
         return found is not None and (bool(found.failure) or found.inliers < self.config.lost_inliers)
 
     def wants_keyframe(self, step: Step, flow: float) -> bool:
-        """flow: share of the width that the image must have moved."""
+        """flow: fraction of the width that the image must have moved."""
         assert self.reference is not None
-        return step.flow > flow * self.reference.size[1] or step.share < self.config.keyframe_share
+        return step.flow > flow * self.reference.size[1] or step.fraction < self.config.keyframe_fraction
 
     def _set_velocity(self, image: TrackingImage, field: np.ndarray) -> None:
         """Image velocity from the flow since the last frame, for the rolling shutter."""

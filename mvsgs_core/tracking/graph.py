@@ -12,7 +12,7 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, So
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
 
-# What resists a change of an inverse depth d in each step, as a share of 1 / d². It is no prior: drawn to the depths
+# What resists a change of an inverse depth d in each step, as a fraction of 1 / d². It is no prior: drawn to the depths
 # that keyframes were given, whole maps bend (rotation against depth), by 5 % on the synthetic room.
 DAMPING = 0.5
 
@@ -53,8 +53,8 @@ class Edge:
 
     target: np.ndarray  # (2, M) float32, 0 where lost
     weight: np.ndarray  # (M,) float16, 0 to 1
-    shift: np.ndarray  # (2, M) float16 pixels by which a second of readout moves the target
-    share: float  # of the textured points that were found
+    shift: np.ndarray  # (2, M) float16 pixels by which a second of readout time moves the target
+    fraction: float  # of the textured points that were found
 
 
 class KeyframeGraph:
@@ -63,7 +63,7 @@ class KeyframeGraph:
     def __init__(self, intrinsics: np.ndarray) -> None:
         self.intrinsics = np.asarray(intrinsics, dtype=np.float64)  # (4,) at the tracker's size
         self.device = "cpu"  # of the bundle adjustments of several keyframes, see Solver
-        self.readout = 0.0  # seconds that the camera needs for an image, from the first row to the last
+        self.readout_time = 0.0  # seconds that the camera needs for an image, from the first row to the last
         self.keyframes: dict[int, Keyframe] = {}  # by frame index
         self.edges: dict[tuple[int, int], Edge] = {}  # by frame indices
 
@@ -75,15 +75,15 @@ class KeyframeGraph:
         for pair in [pair for pair in self.edges if index in pair]:
             del self.edges[pair]
 
-    def connect(self, source: int, to: int, matches: Matches, min_share: float) -> bool:
+    def connect(self, source: int, to: int, matches: Matches, min_fraction: float) -> bool:
         """Adds an edge; False, and no edge, where too few of the textured points were found."""
         textured = self.keyframes[source].image.cells.textured
-        share = float(matches.alive[textured].sum() / max(1, textured.sum()))
-        if share < min_share or matches.alive.sum() < 30:
+        fraction = float(matches.alive[textured].sum() / max(1, textured.sum()))
+        if fraction < min_fraction or matches.alive.sum() < 30:
             return False
         target = np.nan_to_num(matches.target.T).astype(np.float32)
         shift = np.zeros(target.shape, np.float16) if matches.shift is None else matches.shift.T.astype(np.float16)
-        self.edges[source, to] = Edge(target, matches.weight.astype(np.float16), shift, share)
+        self.edges[source, to] = Edge(target, matches.weight.astype(np.float16), shift, fraction)
         return True
 
     def neighbors(self, index: int) -> set[int]:
@@ -92,7 +92,7 @@ class KeyframeGraph:
     def predict(self, source: int, to: int) -> tuple[np.ndarray, np.ndarray]:
         """Where the points of `source` should be seen in `to`: (M, 2), NaN behind it; and inside the image (M,)."""
         at, inside = self.predict_pose(source, self.keyframes[to].cam_from_world)
-        return at + self.readout * self.keyframes[to].image.shutter(at), inside
+        return at + self.readout_time * self.keyframes[to].image.shutter(at), inside
 
     def predict_pose(
         self, source: int, cam_from_world: np.ndarray, at_infinity: bool = False
@@ -116,7 +116,7 @@ class KeyframeGraph:
     def pixels(self, index: int) -> np.ndarray:
         """Where a global shutter would have seen the points of a keyframe: (2, M) float64."""
         image = self.keyframes[index].image
-        return np.asarray((image.cells.points - self.readout * image.cell_shutter).T)
+        return np.asarray((image.cells.points - self.readout_time * image.cell_shutter).T)
 
     def problem(self, indices: Iterable[int], free_poses: set[int], free_depths: set[int]) -> Graph:
         """The bundle adjustment of these keyframes and every edge among them that has something free at an end."""
@@ -133,7 +133,7 @@ class KeyframeGraph:
         target = np.empty((len(pairs), 2, cells))
         for n, (a, b) in enumerate(pairs):
             edge = self.edges[a, b]
-            target[n] = edge.target - self.readout * edge.shift
+            target[n] = edge.target - self.readout_time * edge.shift
             information[n] = self.keyframes[a].image.cells.information.T * edge.weight
         inverse_depth = np.stack([k.inverse_depth for k in frames])
         return Graph(

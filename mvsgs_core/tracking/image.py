@@ -74,7 +74,7 @@ class TrackingImage:
         return find_cells(self.gray)
 
     def shutter(self, points: np.ndarray) -> np.ndarray:
-        """(N, 2) pixels by which a second of readout moves what is seen at points (N, 2)."""
+        """(N, 2) pixels by which a second of readout time moves what is seen at points (N, 2)."""
         if self.velocity is None:
             return np.zeros(points.shape)
         at = np.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0)

@@ -12,7 +12,7 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.front_end import FrontEndConfig, Step
 
 LATE_FLOW = 2.0  # of the flow that makes a keyframe: the next frame may have moved by so much, and not further
-LATE_SHARE = 0.8  # of the share of points below which a keyframe is made: the next frame must still find so many
+LATE_FRACTION = 0.8  # of the fraction of points below which a keyframe is made: the next frame must still find so many
 LAST = 0.25  # of the flow that makes a keyframe: what is enough at the end of the stream
 
 HELD_OUT = "keyframes that were to be held out"
@@ -23,24 +23,24 @@ class KeyframeChoice:
 
     def __init__(self, config: FrontEndConfig) -> None:
         self.config = config
-        self._before = (-1, 0.0, 1.0)  # reference of the last frame, its flow in pixels, its share of points found
+        self._before = (-1, 0.0, 1.0)  # reference of the last frame, its flow in pixels, its fraction of points found
 
     def wants(self, index: int, reference: int, step: Step, width: int, limit: float) -> bool:
-        """Whether frame `index` becomes a keyframe. limit: flow since the reference, as a share of the width."""
-        known, flow, share = self._before
-        flow, share = (flow, share) if known == reference else (0.0, 1.0)
-        self._before = (reference, step.flow, step.share)
-        if step.flow <= limit * width and step.share >= self.config.keyframe_share:
+        """Whether frame `index` becomes a keyframe. limit: flow since the reference, as a fraction of the width."""
+        known, flow, fraction = self._before
+        flow, fraction = (flow, fraction) if known == reference else (0.0, 1.0)
+        self._before = (reference, step.flow, step.fraction)
+        if step.flow <= limit * width and step.fraction >= self.config.keyframe_fraction:
             return False
         if not is_held_out(index):
             return True
         late = 2.0 * step.flow - flow > LATE_FLOW * limit * width
-        return late or 2.0 * step.share - share < LATE_SHARE * self.config.keyframe_share
+        return late or 2.0 * step.fraction - fraction < LATE_FRACTION * self.config.keyframe_fraction
 
     def shows_new(self, step: Step, width: int) -> bool:
         """Whether the last frame of a stream shows enough that its reference does not."""
-        lost = 1.0 - LAST * (1.0 - self.config.keyframe_share)
-        return step.flow > LAST * self.config.keyframe_flow * width or step.share < lost
+        lost = 1.0 - LAST * (1.0 - self.config.keyframe_fraction)
+        return step.flow > LAST * self.config.keyframe_flow * width or step.fraction < lost
 
 
 def newest(indices: Iterable[int]) -> int | None:

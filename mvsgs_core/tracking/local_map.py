@@ -23,9 +23,9 @@ class LocalMapConfig:
     steps: int = 5  # of the local bundle adjustment
     robust_scale: float = 1.0  # pixels
     tolerance: float = (
-        0.01  # share of the cost: a step that gains less is the last (0.001 costs more and gains nothing)
+        0.01  # fraction of the cost: a step that gains less is the last (0.001 costs more and gains nothing)
     )
-    min_share: float = 0.25  # of the textured points that an edge must have found
+    min_fraction: float = 0.25  # of the textured points that an edge must have found
 
 
 class LocalMap:
@@ -50,7 +50,7 @@ class LocalMap:
             recent, proximity = sorted(matches), proximity + self.config.recent - len(matches)
         for index in recent:
             if index in matches:
-                self.graph.connect(index, image.index, matches[index], self.config.min_share)
+                self.graph.connect(index, image.index, matches[index], self.config.min_fraction)
             else:
                 self.match_edge(index, image.index)
             self.match_edge(image.index, index)
@@ -66,8 +66,8 @@ class LocalMap:
         """Matches an edge from where the map says the points should be."""
         guess, _ = self.graph.predict(source, to)
         a, b = self.graph.keyframes[source].image, self.graph.keyframes[to].image
-        matches, _ = self.matcher.match(a, b, guess, self.config.min_share if enough is None else enough)
-        return self.graph.connect(source, to, matches, self.config.min_share)
+        matches, _ = self.matcher.match(a, b, guess, self.config.min_fraction if enough is None else enough)
+        return self.graph.connect(source, to, matches, self.config.min_fraction)
 
     def nearby(self, index: int, candidates: list[int], count: int, apart: int = 2) -> list[int]:
         """Keyframes that see the same from close by: smallest mean flow first, no two next to each other in time."""
@@ -119,7 +119,7 @@ class LocalMap:
         return sorted((index for index in flows if flows[index] < limit), key=lambda index: flows[index])
 
     def agreement(self, index: int, pixels: float = 2.0) -> float:
-        """Share of the matches to and from a keyframe that its pose and the depths explain."""
+        """Fraction of the matches to and from a keyframe that its pose and the depths explain."""
         good = total = 0
         for source, to in self.graph.edges:
             if index not in (source, to):

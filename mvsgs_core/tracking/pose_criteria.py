@@ -21,7 +21,7 @@ from mvsgs_core.tracking.places.localization import Localization, located
 class PoseCriteria:
     """What makes a pose certain."""
 
-    share: float = 0.12  # of the keyframe's textured points, found
+    fraction: float = 0.12  # of the keyframe's textured points, found
     count: int = 50  # matches with known depth
     inliers: float = 0.7  # of these, within 2 pixels of the pose
     spread: float = 0.1  # of the image area: hull of the inliers
@@ -34,8 +34,8 @@ def verified(graph: KeyframeGraph, index: int, matches: Matches, found: Localiza
     turned = keyframe.triangulated.sum() < criteria.count
     if turned:
         known = matches.alive
-    share = matches.alive.sum() / max(1, keyframe.image.cells.textured.sum())
-    if found.failure or share < criteria.share or known.sum() < criteria.count:
+    fraction = matches.alive.sum() / max(1, keyframe.image.cells.textured.sum())
+    if found.failure or fraction < criteria.fraction or known.sum() < criteria.count:
         return False
     agree = known & located(graph, index, matches, found.cam_from_world, at_infinity=turned)
     if agree.sum() < criteria.inliers * known.sum():

@@ -26,7 +26,7 @@ FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to 
 class PosedConfig:
     area: int = 320 * 240  # pixels of the tracker's image
     flow: str = "lucas_kanade"
-    readout: float = 0.0  # seconds of a rolling shutter, 0 for a global one: it is not estimated here
+    readout_time: float = 0.0  # seconds of a rolling shutter, 0 for a global one: it is not estimated here
     threads: int = 1
     front_end: FrontEndConfig = field(default_factory=lambda: FrontEndConfig(still_flow=0.0))
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
@@ -131,7 +131,7 @@ class PosedTracker:
     def _set_up(self, height: int, width: int, intrinsics: np.ndarray) -> None:
         self.size = tracking_size(height, width, self.config.area)
         self.graph = KeyframeGraph(scale_intrinsics(intrinsics, (height, width), self.size))
-        self.graph.readout = self.config.readout
+        self.graph.readout_time = self.config.readout_time
         self.flow = make_flow(self.config.flow)
         matcher = Matcher(self.flow)
         self.choice = KeyframeChoice(self.config.front_end)

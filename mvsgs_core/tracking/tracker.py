@@ -1,7 +1,7 @@
-"""The tracker: images in; keyframes, corrected poses and the whole path out.
+"""The tracker: images in; keyframes, corrected poses and the whole trajectory out.
 
 Semi-dense matches (flow.py) of the newest keyframe give each frame's pose; keyframes join a graph (local_map.py) that
-dense bundle adjustment keeps consistent; before that, the first keyframes are solved from nothing (starting.py). A
+dense bundle adjustment keeps consistent; before that, the first keyframes are solved from nothing (initializer.py). A
 lost camera is looked for in the map, and starts a new segment meanwhile; loops (loop_closure.py) correct or join.
 All of it happens in `add`, in bounded portions: the same frames always give the same poses, however fast they come.
 """
@@ -21,12 +21,13 @@ from mvsgs_core.tracking.back_end import BackEnd
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
-from mvsgs_core.tracking.estimation.calibration import READOUT_AGAIN, Calibration
+from mvsgs_core.tracking.estimation.calibration import REESTIMATED_AT, Calibration
 from mvsgs_core.tracking.estimation.focal import FocalConfig
-from mvsgs_core.tracking.frames import FrameRecord, Path, State, solve_path
+from mvsgs_core.tracking.frames import FrameRecord, State, Trajectory, solve_trajectory
 from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
+from mvsgs_core.tracking.initializer import Initializer
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import make_flow
@@ -36,7 +37,6 @@ from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
 from mvsgs_core.tracking.places.loop_closure import LoopCloser
 from mvsgs_core.tracking.places.recovery import Recovery
 from mvsgs_core.tracking.publish import Publisher, Update
-from mvsgs_core.tracking.starting import Starter
 
 
 class Tracker:
@@ -55,14 +55,14 @@ class Tracker:
         self.graph: KeyframeGraph | None = None
         self._since = 0  # frames since the last keyframe
         self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
-        self._path = solve_path([], KeyframeGraph(np.ones(4)), Solver())
+        self._trajectory = solve_trajectory([], KeyframeGraph(np.ones(4)), Solver())
 
     def add(
         self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray, guessed: bool = False
     ) -> Update:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow.
 
-        guessed: the focal length is to be estimated; keyframes are told when it is settled, see `focal_factor`.
+        guessed: the focal length is to be estimated; keyframes are published when it is settled, see `focal_factor`.
         """
         if self.graph is None:
             self.set_up(image.shape[0], image.shape[1], intrinsics, guessed)
@@ -72,7 +72,7 @@ class Tracker:
         with self.stats.time("image"):
             frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color)
         self.stats.count("frames")
-        record = FrameRecord(index, timestamp, State.NOT_STARTED)
+        record = FrameRecord(index, timestamp, State.NOT_INITIALIZED)
         self.records.append(record)
         self._since += 1
         if self.front_end.reference is None:
@@ -93,10 +93,10 @@ class Tracker:
 
     @property
     def pending(self) -> set[int]:
-        """Frames that may still become keyframes that are told: their images are needed until then."""
+        """Frames that may still become keyframes that are published: their images are needed until then."""
         if self.graph is None:
             return set()
-        waiting = set(self.starter.waiting) | set(self.publisher.held)
+        waiting = set(self.initializer.waiting) | set(self.publisher.held)
         if self.started:
             return waiting | set(self._tail)
         last = self.front_end.last  # the end of the stream may force a start with it
@@ -108,9 +108,9 @@ class Tracker:
         return 1.0 if self.graph is None else self.calibration.focal_factor
 
     @property
-    def readout(self) -> float:
+    def readout_time(self) -> float:
         """Seconds that the camera's rolling shutter needs for an image, as far as it is known; 0: global."""
-        return 0.0 if self.graph is None else self.graph.readout
+        return 0.0 if self.graph is None else self.graph.readout_time
 
     def finish(self) -> Iterator[Update]:
         """The stream has ended: a start by force if there was none, and the global bundle adjustment."""
@@ -121,16 +121,16 @@ class Tracker:
         else:
             yield from self._end_with_a_keyframe()
         if self.started:
-            self.calibration.estimate_readout(self.local_map.members(self.segment)[-40:])
+            self.calibration.estimate_readout_time(self.local_map.members(self.segment)[-40:])
         if self.publisher.held:
             yield Update(State.TRACKED, self._settle())
         with self.stats.time("global bundle adjustment"):
             for segment in sorted({k.segment for k in self.graph.keyframes.values()}):
-                if set(self.local_map.members(segment)) <= self.publisher.told:
+                if set(self.local_map.members(segment)) <= self.publisher.published:
                     self.back_end.put_right(segment, self.stats)
         with self.stats.time("frames without a pose"):
             found = self.recovery.fill_in(self.records)
-            self._path = solve_path(self.records, self.graph, Solver(steps=8, threads=self.config.threads))
+            self._trajectory = solve_trajectory(self.records, self.graph, Solver(steps=8, threads=self.config.threads))
         self.stats.count("frames posed in the end", found)
         self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.graph.keyframes))
         if self.started:
@@ -139,15 +139,15 @@ class Tracker:
         self.stats.counts["matches that needed features"] = self.matcher.feature_calls
         self.nothing = ""
         if not self.graph.keyframes:
-            self.nothing = f"tracking never started: {self.starter.reason}"
+            self.nothing = f"tracking never started: {self.initializer.reason}"
             self.stats.warn(self.nothing)
-        warn_of_gaps(self.stats, self._path)
+        warn_of_gaps(self.stats, self._trajectory)
         warn_of_few_matches(self.stats, self.graph, self.config.matches)
-        yield Update(State.TRACKED if self.started else State.NOT_STARTED, (), self.publisher.corrections(True))
+        yield Update(State.TRACKED if self.started else State.NOT_INITIALIZED, (), self.publisher.corrections(True))
 
-    def path(self) -> Path:
+    def trajectory(self) -> Trajectory:
         """Every frame's pose, after `finish`."""
-        return self._path
+        return self._trajectory
 
     def keyframe(self, index: int) -> Keyframe:
         assert self.graph is not None
@@ -161,14 +161,14 @@ class Tracker:
         self.graph.device = config.device
         self.calibration = Calibration(
             self.graph, config.focal, self.stats, self.intrinsics, float(intrinsics[0]), not guessed,
-            config.readout, config.threads,
+            config.readout_time, config.threads,
         )  # fmt: skip
         self.flow = make_flow(config.flow)
         self.matcher = Matcher(self.flow)
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, config.threads)
         self.choice = KeyframeChoice(config.front_end)
         self.diagnosis = Diagnosis(config.front_end, config.texture)
-        self.starter = Starter(self.graph, self.matcher, config.starting, config.threads, self.diagnosis)
+        self.initializer = Initializer(self.graph, self.matcher, config.initialization, config.threads, self.diagnosis)
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, config.threads)
         self.loops = LoopCloser(self.graph, self.local_map, config.loop)
         self.recovery = Recovery(self.graph, self.matcher, self.loops.retrieval, config.recovery, config.front_end)
@@ -178,13 +178,13 @@ class Tracker:
 
     def _begin(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """First keyframe of a segment that has not started yet."""
-        record.state = State.NOT_STARTED
+        record.state = State.NOT_INITIALIZED
         if frame.cells.textured.mean() < self.config.texture:
             self.stats.count("frames without texture")
             self.diagnosis.no_texture(frame)
             return Update(record.state)
         self.recovery.keep(frame)
-        self.starter.add(frame, self.segment)
+        self.initializer.add(frame, self.segment)
         self._refer_to(frame)
         self.front_end.pose = None
         self._since = 0
@@ -195,22 +195,22 @@ class Tracker:
         assert self.front_end.reference is not None
         self.recovery.keep(frame)
         reference, width = self.front_end.reference.index, frame.size[1]
-        if not self.choice.wants(frame.index, reference, step, width, self.starter.flow(self._since)):
-            if self.starter.waiting == [reference] and is_held_out(reference) and not is_held_out(frame.index):
-                self.starter.abandon()
+        if not self.choice.wants(frame.index, reference, step, width, self.initializer.flow(self._since)):
+            if self.initializer.waiting == [reference] and is_held_out(reference) and not is_held_out(frame.index):
+                self.initializer.abandon()
                 return self._begin(frame, record)
-            return Update(State.NOT_STARTED)
+            return Update(State.NOT_INITIALIZED)
         with self.stats.time("start"):
-            self.starter.add(frame, self.segment, step.matches)
+            self.initializer.add(frame, self.segment, step.matches)
             self._refer_to(frame)
             self._since = 0
-            waiting = list(self.starter.waiting)
-            started = self.starter.try_start(focal=self._unknown_focal())
+            waiting = list(self.initializer.waiting)
+            started = self.initializer.initialize(focal=self._unknown_focal())
         if not started:
             place = self.recovery.relocalize(frame) if self.segment > 0 else None
             if place is None:
-                return Update(State.NOT_STARTED)
-            self.starter.abandon()
+                return Update(State.NOT_INITIALIZED)
+            self.initializer.abandon()
             self.segment -= 1
             return self._resume(frame, record, place)
         return self._started(waiting, record)
@@ -218,7 +218,7 @@ class Tracker:
     def _started(self, waiting: list[int], record: FrameRecord) -> Update:
         assert self.graph is not None
         self.started = True
-        self.calibration.estimate_readout(waiting)
+        self.calibration.estimate_readout_time(waiting)
         self.local_map.adjust_window(waiting[-1])
         self.calibration.refine(waiting)
         self.front_end.pose = self.graph.keyframes[waiting[-1]].cam_from_world
@@ -227,7 +227,7 @@ class Tracker:
                 self.loops.add(index)
         self.stats.count("keyframes", len(waiting))
         record.state = State.TRACKED
-        return Update(State.TRACKED, self._tell(waiting))
+        return Update(State.TRACKED, self._publish(waiting))
 
     def _go_on(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """A tracked frame; perhaps a keyframe."""
@@ -270,8 +270,8 @@ class Tracker:
         self.stats.count("keyframes")
         self.covisible_keyframes.made(frame.index)
         self._since = 0
-        if len(self.graph.keyframes) in READOUT_AGAIN:
-            self.calibration.estimate_readout(self.local_map.members(self.segment)[-12:])
+        if len(self.graph.keyframes) in REESTIMATED_AT:
+            self.calibration.estimate_readout_time(self.local_map.members(self.segment)[-12:])
         self.calibration.refine(self.local_map.members(self.segment))
         self._close_loops(frame.index)
         for index in self.local_map.members(self.segment)[: -self.config.local_map.window]:
@@ -279,7 +279,7 @@ class Tracker:
         self._refer_to(frame)
         self.front_end.pose = self.graph.keyframes[frame.index].cam_from_world
         correction = self.publisher.corrections()
-        return Update(record.state, self._tell([frame.index]), correction)
+        return Update(record.state, self._publish([frame.index]), correction)
 
     def _end_with_a_keyframe(self) -> Iterator[Update]:
         """The last frames show what no keyframe does: one of them becomes one."""
@@ -296,13 +296,13 @@ class Tracker:
         self.front_end.refer_to(image)
         self._tail = {}
 
-    def _tell(self, keyframes: list[int]) -> tuple[int, ...]:
-        return self.publisher.tell_all(keyframes, self.calibration.settled)
+    def _publish(self, keyframes: list[int]) -> tuple[int, ...]:
+        return self.publisher.publish_all(keyframes, self.calibration.settled)
 
     def _settle(self) -> tuple[int, ...]:
         """Keyframes that were held back, with the focal length as far as it is known."""
         self.calibration.settle(list(self.publisher.held))
-        return self._tell([])
+        return self._publish([])
 
     def _unknown_focal(self) -> FocalConfig | None:
         return None if self.calibration.settled else self.config.focal
@@ -342,7 +342,7 @@ class Tracker:
     def _lose(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The frame could not be matched: look for it in the map, else begin anew."""
         assert self.graph is not None
-        record.state = State.LOST if self.started else State.NOT_STARTED
+        record.state = State.LOST if self.started else State.NOT_INITIALIZED
         record.forget()
         if frame.cells.textured.mean() < self.config.texture:
             self.stats.count("frames without texture")
@@ -352,17 +352,17 @@ class Tracker:
             place = self.recovery.lost(frame)
         if place is not None:
             if not self.started:
-                self.starter.abandon()
+                self.initializer.abandon()
                 self.segment -= 1
             return self._resume(frame, record, place)
         if not self.started:
-            self.starter.abandon()
+            self.initializer.abandon()
             return self._begin(frame, record)
         if self.recovery.hopeless:
             self.started = False
             self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self.graph.keyframes.values()))
-            told = self._settle() if self.publisher.held else ()
-            return Update(self._begin(frame, record).state, told)
+            published = self._settle() if self.publisher.held else ()
+            return Update(self._begin(frame, record).state, published)
         return Update(record.state)
 
     def _resume(self, frame: TrackingImage, record: FrameRecord, place: PlaceMatch) -> Update:
@@ -387,14 +387,14 @@ class Tracker:
         if frame is None or reference is None:
             return
         if step is not None and frame.index not in self.graph.keyframes:
-            self.starter.add(frame, self.segment, step.matches)
-        waiting = list(self.starter.waiting)
+            self.initializer.add(frame, self.segment, step.matches)
+        waiting = list(self.initializer.waiting)
         record = next(r for r in self.records if r.index == frame.index)
-        if self.starter.try_start(True, self._unknown_focal()):
-            self.stats.warn(f"the start was forced at the end of the stream: {self.starter.reason}")
+        if self.initializer.initialize(True, self._unknown_focal()):
+            self.stats.warn(f"the start was forced at the end of the stream: {self.initializer.reason}")
             yield self._started(waiting, record)
         else:
-            self.starter.abandon()
+            self.initializer.abandon()
 
 
 __all__ = ["Tracker", "TrackerConfig", "Update"]

@@ -89,7 +89,7 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
     assert switches <= switched
     others = ("voxel", "map_voxel", "map_voxel_error", "fill", "density_control", "kernel", "loss", "sh_degree")
     assert {f"mapper.{name}" for name in others} <= switched
-    assert {"mvs", "depth_fusion", "tracker", "tracker.still_flow", "tracker.readout"} <= switched
+    assert {"mvs", "depth_fusion", "tracker", "tracker.still_flow", "tracker.readout_time"} <= switched
 
 
 def test_a_partial_ablation_shows_the_variants_it_has(tmp_path: Path) -> None:

@@ -23,13 +23,13 @@ class Solver:
 
     steps: int = 5  # accepted steps at most
     adaptive: bool = True  # Levenberg-Marquardt; False: plain Gauss-Newton, every step taken
-    lm: float = 1e-4  # share of the diagonal added to it, after the Schur complement
+    lm: float = 1e-4  # fraction of the diagonal added to it, after the Schur complement
     ep: float = 1e-6  # added to the diagonal, after the Schur complement
     robust: str = "cauchy"  # none, huber, cauchy
     robust_scale: float = 1.0  # whitened pixels
     min_z: float = 0.05  # scaled depth in the target keyframe below which a cell has no weight
     min_inverse_depth: float = 1e-3  # per unit of the map
-    tolerance: float = 1e-3  # adaptive: ends where the cost falls by less than this share
+    tolerance: float = 1e-3  # adaptive: ends where the cost falls by less than this fraction
     threads: int = 1  # of the C++ kernel
     device: str = "cpu"  # cpu: the C++ kernel; cuda or cuda:<number>, torch: PyTorch there, or on the CPU
 

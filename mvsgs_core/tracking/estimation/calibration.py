@@ -1,4 +1,4 @@
-"""What the tracker learns of the camera itself: the focal length, where that was a guess, and the readout."""
+"""What the tracker learns of the camera itself: the focal length, where that was a guess, and the readout time."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.estimation.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
-from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout
+from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout_time
 from mvsgs_core.tracking.graph import KeyframeGraph
 
-READOUT_AGAIN = (10, 20, 40)  # keyframes of the map at which the readout is estimated again
+REESTIMATED_AT = (10, 20, 40)  # keyframes of the map at which the readout time is estimated again
 
 
 @dataclass
@@ -25,11 +25,11 @@ class Calibration:
     given: np.ndarray  # (4,) intrinsics that came with the frames, at the tracker's size
     pixels: float  # the focal length that came with the frames, at their own size
     settled: bool  # from the start on, where the intrinsics are no guess
-    readout: float | None  # seconds; None: to be estimated
+    readout_time: float | None  # seconds; None: to be estimated
     threads: int
 
     def __post_init__(self) -> None:
-        self.graph.readout = self.readout or 0.0
+        self.graph.readout_time = self.readout_time or 0.0
         self.guessed = not self.settled
 
     @property
@@ -90,13 +90,13 @@ class Calibration:
                 f"%, and {used:.0f} px was used: run again with dataset.intrinsics=[fx,fy,cx,cy] set to it"
             )
 
-    def estimate_readout(self, members: list[int]) -> None:
+    def estimate_readout_time(self, members: list[int]) -> None:
         """Of a rolling shutter, from these keyframes."""
-        if self.readout is not None:
+        if self.readout_time is not None:
             return
         with self.stats.time("rolling shutter"):
-            self.graph.readout = estimate_readout(self.graph, members, self.threads)
-        self.stats.values["rolling shutter"] = f"{1e3 * self.graph.readout:.1f} ms"
+            self.graph.readout_time = estimate_readout_time(self.graph, members, self.threads)
+        self.stats.values["rolling shutter"] = f"{1e3 * self.graph.readout_time:.1f} ms"
 
     def _sensible(self) -> bool:
         return self.config.bounds[0] < self.focal_factor < self.config.bounds[1]
@@ -120,4 +120,4 @@ class Calibration:
             )
 
 
-__all__ = ["READOUT_AGAIN", "Calibration"]
+__all__ = ["REESTIMATED_AT", "Calibration"]

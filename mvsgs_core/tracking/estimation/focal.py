@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
-from mvsgs_core.tracking.estimation.initialization import Start, StartCriteria, start_up
+from mvsgs_core.tracking.estimation.structure_from_motion import Reconstruction, ReconstructionCriteria, reconstruct
 from mvsgs_core.tracking.graph import KeyframeGraph
 
 # Matches that count as one: points of an image share its lens, shutter and pose, and err together. So many make the
 # curvature's deviation that of what was found on hand-held sequences whose focal length is known.
 TOGETHER = 64
 PARTS = 3  # of the keyframes, in their order, each of which is asked alone ...
-LEAST = 4  # ... where it has so many
+MIN_KEYFRAMES = 4  # ... where it has so many
 
 
 @dataclass(frozen=True)
@@ -27,24 +27,24 @@ class FocalConfig:
     bounds: tuple[float, float] = (0.35, 3.0)  # on the guess: what lies outside is no solution
     keyframes: int = 12  # before anything is certain
     limit: int = 30  # keyframes that wait for it at most
-    probe: float = 0.1  # share by which the focal length is made wrong ...
+    probe: float = 0.1  # fraction by which the focal length is made wrong ...
     certain: float = 0.03  # ... and that of the cost which it must then rise by to be certain,
     usable: float = 0.002  # or, at the limit, to be better than the guess
-    doubt: float = 0.03  # standard deviation, as a share, above which it is told
-    drift: float = 0.01  # share by which the whole stream may contradict what was used, beyond its own uncertainty
+    doubt: float = 0.03  # standard deviation, as a fraction, above which it is told
+    drift: float = 0.01  # fraction by which the whole stream may contradict what was used, beyond its own uncertainty
 
 
-def start_with_unknown_focal(
-    graph: KeyframeGraph, order: list[int], criteria: StartCriteria, config: FocalConfig, threads: int
-) -> Start:
-    """`start_up` from several focal lengths, each then free; the lowest cost wins and is written to the graph."""
+def reconstruct_with_unknown_focal(
+    graph: KeyframeGraph, order: list[int], criteria: ReconstructionCriteria, config: FocalConfig, threads: int
+) -> Reconstruction:
+    """`reconstruct` from several focal lengths, each then free; the lowest cost wins and is written to the graph."""
     guess = graph.intrinsics
     criteria = replace(criteria, certain_cost=0.0)  # with a free focal length, a wrong start can be cheap too
-    best: tuple[Start, np.ndarray] | None = None
-    failed: Start | None = None
+    best: tuple[Reconstruction, np.ndarray] | None = None
+    failed: Reconstruction | None = None
     for factor in config.factors:
         graph.intrinsics = guess * [factor, factor, 1.0, 1.0]
-        start = start_up(graph, order, criteria, threads, free_focal=True)
+        start = reconstruct(graph, order, criteria, threads, free_focal=True)
         if not start.failure and not config.bounds[0] < factor * start.focal_factor < config.bounds[1]:
             start = replace(
                 start, failure=f"no focal length in a sensible range: {factor * start.focal_factor:.2f} times the guess"
@@ -68,7 +68,7 @@ def refine_focal(graph: KeyframeGraph, members: list[int], threads: int) -> str:
 
 
 def observability(graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0) -> float:
-    """Share by which the cost rises where the focal length is wrong by `probe`, the rest adjusted to it; the graph
+    """Fraction by which the cost rises where the focal length is wrong by `probe`, the rest adjusted to it; the graph
     stays as it is. The lesser of both directions. factor: on the graph's focal length, what is taken for right."""
     problem = graph.problem(members, set(members[1:]), set(members))
     problem.intrinsics = problem.intrinsics * [factor, factor, 1.0, 1.0]
@@ -92,7 +92,7 @@ def focal_of_all(graph: KeyframeGraph, members: list[int], threads: int) -> floa
 
 
 def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0) -> float:
-    """Standard deviation of the focal length that these keyframes give, as a share; infinite where they don't tell.
+    """Standard deviation of the focal length that these keyframes give, as a fraction; infinite where they don't tell.
 
     factor: what they give, on the graph's focal length.
 
@@ -106,7 +106,7 @@ def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads:
     curvature = TOGETHER**0.5 * probe / float(np.sqrt(matches * rise))
     found, weights = [], []
     for part in np.array_split(np.array(members), PARTS):
-        if len(part) < LEAST:
+        if len(part) < MIN_KEYFRAMES:
             continue
         part_rise = observability(graph, part.tolist(), probe, threads, factor)
         own = focal_of_all(graph, part.tolist(), threads)
@@ -115,9 +115,16 @@ def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads:
             weights.append(part_rise)
     if len(found) < 2:
         return curvature
-    logs, shares = np.array(found), np.array(weights) / sum(weights)
-    spread = float(np.sqrt(shares @ np.square(logs - shares @ logs) / (len(logs) - 1)))
+    logs, fractions = np.array(found), np.array(weights) / sum(weights)
+    spread = float(np.sqrt(fractions @ np.square(logs - fractions @ logs) / (len(logs) - 1)))
     return float(np.hypot(curvature, spread))
 
 
-__all__ = ["FocalConfig", "focal_of_all", "observability", "refine_focal", "start_with_unknown_focal", "uncertainty"]
+__all__ = [
+    "FocalConfig",
+    "focal_of_all",
+    "observability",
+    "reconstruct_with_unknown_focal",
+    "refine_focal",
+    "uncertainty",
+]

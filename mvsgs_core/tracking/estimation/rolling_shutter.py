@@ -3,8 +3,8 @@
 And images as a global shutter would have taken them: poses, stereo and the map are all of one moment.
 
 Rows of an image are taken one after the other. A point at row v that moves at w pixels a second was seen
-w * readout * (v / H - 1/2) from where a global shutter would have seen it in the middle of the readout; the
-graph moves all points back by that (first order in the readout). On hand-held Kinect sequences this is most of
+w * readout_time * (v / H - 1/2) from where a global shutter would have seen it in the middle of the readout; the
+graph moves all points back by that (first order in the readout time). On hand-held Kinect sequences this is most of
 the error.
 """
 
@@ -19,62 +19,62 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 
-LONGEST = 0.035  # seconds: most cameras need less than a frame at 30 a second
-SLOWEST = 0.2  # seconds: a readout that is given and longer is a mistake, of the unit for one
-LEAST_GAIN = 0.02  # of the robust cost: what a global shutter gains by chance is less
+MAX_ESTIMATED = 0.035  # seconds: most cameras need less than a frame at 30 a second
+MAX_READOUT_TIME = 0.2  # seconds: a readout time that is given and longer is a mistake, of the unit for one
+MIN_GAIN = 0.02  # of the robust cost: what a global shutter gains by chance is less
 
 
-def estimate_readout(graph: KeyframeGraph, indices: Iterable[int], threads: int) -> float:
+def estimate_readout_time(graph: KeyframeGraph, indices: Iterable[int], threads: int) -> float:
     """Seconds, 0 for a global shutter or where the matches hardly tell. Leaves the graph as it is.
 
-    The graph's own readout where nothing can be said: an adjustment failed, or the cost has no least.
+    The graph's own readout time where nothing can be said: an adjustment failed, or the cost has no least.
     """
     order = sorted(indices)
-    tried = np.linspace(0.0, LONGEST, 4)
-    before, costs = graph.readout, []
+    tried = np.linspace(0.0, MAX_ESTIMATED, 4)
+    before, costs = graph.readout_time, []
     try:
-        for readout in tried:
-            graph.readout = float(readout)
+        for readout_time in tried:
+            graph.readout_time = float(readout_time)
             problem = graph.problem(order, set(order[1:]), set(order))
             solution = adjust(problem, Solver(steps=3, robust_scale=1.0, tolerance=0.0, threads=threads))
             if solution.failure:
                 return before
             costs.append(solution.cost)
     finally:
-        graph.readout = before
+        graph.readout_time = before
     bend, slope, level = np.polyfit(tried, costs, 2)
     if bend <= 0.0:
         return before
-    best = float(np.clip(-0.5 * slope / bend, 0.0, LONGEST))
+    best = float(np.clip(-0.5 * slope / bend, 0.0, MAX_ESTIMATED))
     gain = level - float(np.polyval([bend, slope, level], best))
-    return best if gain > LEAST_GAIN * costs[0] else 0.0
+    return best if gain > MIN_GAIN * costs[0] else 0.0
 
 
-def unrolled(image: np.ndarray, frame: TrackingImage, readout: float) -> np.ndarray:
+def rectified(image: np.ndarray, frame: TrackingImage, readout_time: float) -> np.ndarray:
     """An image (H, W, 3) uint8 as a global shutter would have taken it in the middle of the readout.
 
     frame: the same image as the tracker has it. The image itself is returned where its velocity is not known. Pixels
     that were not seen repeat those at the border.
     """
-    if readout == 0.0 or frame.velocity is None:
+    if readout_time == 0.0 or frame.velocity is None:
         return image
     height, width = image.shape[:2]
     zoom = np.array([width / frame.size[1], height / frame.size[0]], np.float32)
     velocity = cv2.resize(frame.velocity * zoom, (width, height), interpolation=cv2.INTER_LINEAR)
     u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
-    late = np.float32(readout) * (v / height - 0.5)
+    late = np.float32(readout_time) * (v / height - 0.5)
     x, y = u + velocity[..., 0] * late, v + velocity[..., 1] * late
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def checked_readout(readout: float | None) -> float | None:
-    """A readout that the user gave, None where it is to be estimated. Raises ValueError where it can't be one."""
-    if readout is not None and not 0.0 <= readout <= SLOWEST:
+def checked_readout_time(readout_time: float | None) -> float | None:
+    """A readout time that the user gave, None where it is to be estimated. Raises ValueError where it can't be one."""
+    if readout_time is not None and not 0.0 <= readout_time <= MAX_READOUT_TIME:
         raise ValueError(
-            f"tracker.readout={readout:g}: it is the seconds from the first row to the last, "
-            f"0 to {SLOWEST:g} (25 milliseconds are 0.025), 0 for a global shutter"
+            f"tracker.readout_time={readout_time:g}: it is the seconds from the first row to the last, "
+            f"0 to {MAX_READOUT_TIME:g} (25 milliseconds are 0.025), 0 for a global shutter"
         )
-    return readout
+    return readout_time
 
 
-__all__ = ["LONGEST", "SLOWEST", "checked_readout", "estimate_readout", "unrolled"]
+__all__ = ["MAX_ESTIMATED", "MAX_READOUT_TIME", "checked_readout_time", "estimate_readout_time", "rectified"]

@@ -20,19 +20,19 @@ class Matcher:
     def match(self, a: TrackingImage, b: TrackingImage, guess: np.ndarray, enough: float) -> tuple[Matches, float]:
         """Points of a's cells (M) in b. guess: (M, 2), NaN where there is none.
 
-        enough: share of the textured points below which features are tried; 0 never tries them.
-        Returns the matches and the share of the textured points that were found.
+        enough: fraction of the textured points below which features are tried; 0 never tries them.
+        Returns the matches and the fraction of the textured points that were found.
         """
         self.calls += 1
-        matches, share = self._flow(a, b, guess)
-        if share < enough:
+        matches, fraction = self._flow(a, b, guess)
+        if fraction < enough:
             self.feature_calls += 1
             spread = self.features.match(a, b, a.cells.points, guess)
             if spread.alive.sum() > 0:
-                other, other_share = self._flow(a, b, spread.target)
-                if other_share > share:
-                    return other, other_share
-        return matches, share
+                other, other_fraction = self._flow(a, b, spread.target)
+                if other_fraction > fraction:
+                    return other, other_fraction
+        return matches, fraction
 
     def _flow(self, a: TrackingImage, b: TrackingImage, guess: np.ndarray) -> tuple[Matches, float]:
         cells = a.cells
@@ -44,8 +44,8 @@ class Matcher:
         if len(wanted):
             found = self.flow.match(a, b, cells.points[wanted], guess[wanted])
             target[wanted], weight[wanted] = found.target, found.weight
-        share = float((weight > 0).sum() / max(1, cells.textured.sum()))
-        return Matches(target, weight, b.shutter(target)), share
+        fraction = float((weight > 0).sum() / max(1, cells.textured.sum()))
+        return Matches(target, weight, b.shutter(target)), fraction
 
 
 __all__ = ["Matcher"]

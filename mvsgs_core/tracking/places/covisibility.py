@@ -24,7 +24,7 @@ class CovisibilityConfig:
     max_flow: float = 0.13  # of the width: a view nearer to an old keyframe than this is known; 0: none ever is
     age: int = 12  # references since a keyframe was made, before it counts as old: the local window, and its baselines
     candidates: int = 2  # old keyframes that are tried, the nearest first
-    share: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new
+    fraction: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new
     inliers: float = 0.8  # of its matches, within 2 pixels of one pose
     agreement: float = 2.0  # pixels, median between where the map says its points are and where they are: more is drift
 
@@ -54,7 +54,7 @@ class CovisibleKeyframes:
         self._refer(None)
 
     def limit(self, reference: int, usual: float) -> float:
-        """Median flow, as a share of the width, at which another keyframe is needed; usual: that of a young one."""
+        """Median flow, as a fraction of the width, at which another keyframe is needed; usual: that of a young one."""
         return max(usual, self.config.max_flow) if reference == self.followed else usual
 
     def find(self, frame: TrackingImage, pose: np.ndarray, reference: int) -> PlaceMatch | None:
@@ -78,11 +78,13 @@ class CovisibleKeyframes:
     def _verify(self, frame: TrackingImage, pose: np.ndarray, index: int) -> PlaceMatch | None:
         expected, _ = self.graph.predict_pose(index, pose)
         keyframe = self.graph.keyframes[index]
-        matches, share = self.local_map.matcher.match(keyframe.image, frame, expected, 0.0)
+        matches, fraction = self.local_map.matcher.match(keyframe.image, frame, expected, 0.0)
         seen = matches.alive & keyframe.triangulated
-        if share < self.config.share or not seen.any():
+        if fraction < self.config.fraction or not seen.any():
             return None
-        apart = np.linalg.norm(expected + self.graph.readout * frame.shutter(expected) - matches.target, axis=1)[seen]
+        apart = np.linalg.norm(expected + self.graph.readout_time * frame.shutter(expected) - matches.target, axis=1)[
+            seen
+        ]
         if not np.median(apart) < self.config.agreement:
             return None
         found = localize(self.graph, {index: matches}, pose, self.solver)

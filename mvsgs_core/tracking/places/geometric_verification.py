@@ -37,9 +37,9 @@ def verify_place(
     if len(from_keyframe) < 15:
         return None
     guess = spread(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * image.size[1])
-    matches, share = matcher.match(keyframe.image, image, guess, 0.0)
+    matches, fraction = matcher.match(keyframe.image, image, guess, 0.0)
     known = matches.alive & keyframe.triangulated
-    if share < criteria.share or known.sum() < criteria.count:
+    if fraction < criteria.fraction or known.sum() < criteria.count:
         return None
     u, v = keyframe.points[known].T.astype(np.float64)
     fx, fy, cx, cy = graph.intrinsics

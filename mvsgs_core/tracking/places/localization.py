@@ -16,7 +16,7 @@ class Localization:
     """A pose and how well the matches support it."""
 
     cam_from_world: np.ndarray  # (4, 4)
-    inliers: float  # share of the matches with known depth that agree with the pose
+    inliers: float  # fraction of the matches with known depth that agree with the pose
     count: int  # matches with known depth
     error: float  # pixels, median over those matches
     failure: str = ""
@@ -42,7 +42,7 @@ def localize(
     weights = np.stack([np.where(f.triangulated, matches[i].weight, 0.0) for i, f in zip(order, frames)])
     if (weights > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
         weights = np.stack([matches[i].weight for i in order])
-    target = np.stack([np.nan_to_num(_unrolled(matches[i], graph.readout).T) for i in order])
+    target = np.stack([np.nan_to_num(_rectified(matches[i], graph.readout_time).T) for i in order])
     information = np.stack([f.image.cells.information.T for f in frames]) * weights[:, None]
     problem = Graph(
         cam_from_world=np.stack([*(f.cam_from_world for f in frames), start]),
@@ -77,13 +77,13 @@ def located(
     """
     expected, _ = graph.predict_pose(index, cam_from_world, at_infinity)
     with np.errstate(invalid="ignore"):
-        apart = np.linalg.norm(expected - _unrolled(matches, graph.readout), axis=1)
+        apart = np.linalg.norm(expected - _rectified(matches, graph.readout_time), axis=1)
     return np.asarray(matches.alive & (apart < INLIER))
 
 
-def _unrolled(matches: Matches, readout: float) -> np.ndarray:
+def _rectified(matches: Matches, readout_time: float) -> np.ndarray:
     """Targets (M, 2) as a global shutter would have seen them."""
-    return matches.target if matches.shift is None else matches.target - readout * matches.shift
+    return matches.target if matches.shift is None else matches.target - readout_time * matches.shift
 
 
 __all__ = ["INLIER", "Localization", "localize", "located"]

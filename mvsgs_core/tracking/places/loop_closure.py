@@ -79,7 +79,7 @@ class LoopCloser:
                 if failure:
                     return Closure(found.index, index, False, None, failure)
             closure = Closure(found.index, index, not agrees)
-        self.graph.connect(found.index, index, found.matches, self.config.criteria.share)
+        self.graph.connect(found.index, index, found.matches, self.config.criteria.fraction)
         self.local_map.match_edge(index, found.index)
         return closure
 

@@ -11,7 +11,7 @@ import pytest
 from mvsgs_core import geometry
 from mvsgs_core.droid.presets import Preset
 from mvsgs_core.droid.system import DroidConfig, DroidSlam
-from mvsgs_core.tracking.frames import Path, State
+from mvsgs_core.tracking.frames import State, Trajectory
 from mvsgs_core.tracking.tracker import Update
 from tests.support import droid_oracle as oracle
 
@@ -37,9 +37,9 @@ def run(
     return system, updates + list(system.finish())
 
 
-def errors(path: Path) -> tuple[np.ndarray, float]:
+def errors(trajectory: Trajectory) -> tuple[np.ndarray, float]:
     """Distances from the true positions after Sim(3) alignment, and the scale found."""
-    truth, found = oracle.path(COUNT)[path.index][:, :3, 3], path.world_from_cam[:, :3, 3]
+    truth, found = oracle.path(COUNT)[trajectory.index][:, :3, 3], trajectory.world_from_cam[:, :3, 3]
     scale, rotation, translation = geometry.umeyama(found, truth)
     return np.linalg.norm(scale * found @ rotation.T + translation - truth, axis=1), scale
 
@@ -51,22 +51,22 @@ def tracked() -> tuple[DroidSlam, list[Update]]:
 
 def test_all_poses_are_found(tracked: tuple[DroidSlam, list[Update]]) -> None:
     system, _ = tracked
-    path = system.path()
-    distance, _ = errors(path)
-    assert len(path.index) == COUNT
-    assert 6 <= path.keyframe.sum() < COUNT / 2
-    assert distance[path.keyframe].max() < 0.005  # of a path of 1.3
-    inside = path.index <= path.index[path.keyframe].max()
+    trajectory = system.trajectory()
+    distance, _ = errors(trajectory)
+    assert len(trajectory.index) == COUNT
+    assert 6 <= trajectory.keyframe.sum() < COUNT / 2
+    assert distance[trajectory.keyframe].max() < 0.005  # of a trajectory of 1.3
+    inside = trajectory.index <= trajectory.index[trajectory.keyframe].max()
     assert distance[inside].max() < 0.008
     # beyond the last keyframe poses start at its own; the published damping slows their solution on so small a map
     assert distance.max() < 0.05
-    assert set(path.state.tolist()) == {State.TRACKED}
+    assert set(trajectory.state.tolist()) == {State.TRACKED}
     assert not system.stats.warnings
 
 
 def test_depths_are_found_and_trusted(tracked: tuple[DroidSlam, list[Update]]) -> None:
     system, _ = tracked
-    _, scale = errors(system.path())
+    _, scale = errors(system.trajectory())
     assert system.framing is not None
     h, w = system.framing.grid
     for frame in system.video.frames[1:-1]:
@@ -86,35 +86,35 @@ def test_depths_are_found_and_trusted(tracked: tuple[DroidSlam, list[Update]]) -
 
 def test_what_is_told_is_never_taken_back(tracked: tuple[DroidSlam, list[Update]]) -> None:
     system, updates = tracked
-    told: list[int] = []
+    published: list[int] = []
     for update in updates:
         if update.correction is not None:
-            assert set(update.correction.index.tolist()) <= set(told) | set(update.keyframes)
+            assert set(update.correction.index.tolist()) <= set(published) | set(update.keyframes)
             assert np.all(update.correction.scale > 0)
-        told += update.keyframes
-    path = system.path()
-    assert told == path.index[path.keyframe].tolist()
+        published += update.keyframes
+    trajectory = system.trajectory()
+    assert published == trajectory.index[trajectory.keyframe].tolist()
     last = updates[-1].correction
     assert last is not None
-    np.testing.assert_array_equal(last.world_from_cam, path.world_from_cam[path.keyframe])
+    np.testing.assert_array_equal(last.world_from_cam, trajectory.world_from_cam[trajectory.keyframe])
     assert system.stats.skipped["frames between strides"] == COUNT // 2
 
 
 def test_noise_of_the_network_is_averaged(tracked: tuple[DroidSlam, list[Update]]) -> None:
     system, _ = run(CONFIG, noise=0.1, frames=range(24))
-    distance, _ = errors(system.path())
+    distance, _ = errors(system.trajectory())
     assert 1e-4 < np.sqrt(np.mean(distance**2)) < 0.02
 
 
 def test_the_same_stream_gives_the_same_poses() -> None:
-    first, second = (run(CONFIG, frames=range(20))[0].path().world_from_cam for _ in range(2))
+    first, second = (run(CONFIG, frames=range(20))[0].trajectory().world_from_cam for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
 def test_a_short_stream_starts_by_force() -> None:
     system, _ = run(replace(CONFIG, preset=replace(SMALL, warmup=12)), frames=range(16))
     assert any("forced" in warning for warning in system.stats.warnings)
-    distance, _ = errors(system.path())
+    distance, _ = errors(system.trajectory())
     assert distance.max() < 0.01
 
 
@@ -122,31 +122,31 @@ def test_a_camera_at_rest_never_starts() -> None:
     system = DroidSlam(CONFIG, net=oracle.Oracle(oracle.path(1), INTRINSICS / 8))
     for n in range(6):
         system.add(n, n / 30, oracle.image(0, HEIGHT, WIDTH), INTRINSICS)
-    assert [update.state for update in system.finish()] == [State.NOT_STARTED]
-    path = system.path()
-    assert np.isnan(path.world_from_cam).all()
-    assert path.state.tolist() == [State.NOT_STARTED] * 6
+    assert [update.state for update in system.finish()] == [State.NOT_INITIALIZED]
+    trajectory = system.trajectory()
+    assert np.isnan(trajectory.world_from_cam).all()
+    assert trajectory.state.tolist() == [State.NOT_INITIALIZED] * 6
     assert any("never started" in warning for warning in system.stats.warnings)
 
 
 def test_the_global_adjustment_on_the_way_rescales_consistently() -> None:
     config = replace(CONFIG, preset=replace(SMALL, backend_every=8, backend_steps=(8,)))
     system = DroidSlam(config, net=oracle.Oracle(oracle.path(COUNT), INTRINSICS / 8))
-    told: dict[int, np.ndarray] = {}
+    published: dict[int, np.ndarray] = {}
     scales: dict[int, float] = {}
     for n in range(COUNT):
         update = system.add(n, n / 30, oracle.image(n, HEIGHT, WIDTH), INTRINSICS)
         if update.correction is not None:
             scales |= dict(zip(update.correction.index.tolist(), update.correction.scale.tolist()))
-        told |= {index: system.keyframe(index).inverse_depth for index in update.keyframes}
+        published |= {index: system.keyframe(index).inverse_depth for index in update.keyframes}
         if len(system.video) == 8 and "global bundle adjustment" in system.stats.seconds:
             break
     assert np.mean([frame.inverse_depth.mean() for frame in system.video.frames]) == pytest.approx(1.0, rel=0.02)
-    early = list(told)[:4]  # told before the map was rescaled
+    early = list(published)[:4]  # published before the map was rescaled
     for index in early:
-        ratio = np.median(told[index] / system.keyframe(index).inverse_depth)
+        ratio = np.median(published[index] / system.keyframe(index).inverse_depth)
         assert scales.get(index, 1.0) == pytest.approx(ratio, rel=0.005)
     assert np.ptp(np.log([scales.get(index, 1.0) for index in early])) < 0.05
     list(system.finish())
-    distance, _ = errors(system.path())
-    assert distance[system.path().keyframe].max() < 0.008
+    distance, _ = errors(system.trajectory())
+    assert distance[system.trajectory().keyframe].max() < 0.008

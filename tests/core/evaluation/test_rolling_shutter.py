@@ -8,7 +8,7 @@ import pytest
 from mvsgs_core import geometry
 from mvsgs_core.camera import project, unproject
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
-from mvsgs_core.evaluation.rolling_shutter import Shutter, pixel_velocity, rolled, velocities
+from mvsgs_core.evaluation.rolling_shutter import Shutter, apply_rolling_shutter, pixel_velocity, velocities
 from mvsgs_core.image_metrics import psnr
 
 VELOCITY = np.array([0.3, -0.2, 0.4, 0.2, -0.1, 0.3])
@@ -50,18 +50,20 @@ def test_a_rolled_render_shows_what_the_rolling_camera_saw() -> None:
         around = np.array([still[n + k].world_from_cam for k in (-1, 0, 1)])
         velocity = velocities(np.array([-1, 0, 1]) / FPS, around, np.ones(3, dtype=bool))[1]
         color, target = item.image.astype(np.float32) / 255, seen.image.astype(np.float32) / 255
-        ours = rolled(color, item.depth, item.intrinsics, Shutter(0.8 / FPS, velocity))
+        ours = apply_rolling_shutter(color, item.depth, item.intrinsics, Shutter(0.8 / FPS, velocity))
         inner = np.s_[8:-8, 8:-8]
         assert psnr(ours[inner], target[inner]) > psnr(color[inner], target[inner]) + 4.0
-        wrong = rolled(color, item.depth, item.intrinsics, Shutter(0.8 / FPS, -velocity))
+        wrong = apply_rolling_shutter(color, item.depth, item.intrinsics, Shutter(0.8 / FPS, -velocity))
         assert psnr(wrong[inner], target[inner]) < psnr(color[inner], target[inner])
 
 
-@pytest.mark.parametrize("readout", [0.0, 0.02])
-def test_nothing_moves_without_readout_velocity_or_depth(readout: float) -> None:
+@pytest.mark.parametrize("readout_time", [0.0, 0.02])
+def test_nothing_moves_without_readout_velocity_or_depth(readout_time: float) -> None:
     color = np.random.default_rng(0).random((12, 16, 3)).astype(np.float32)
     lens = np.array([20.0, 21.0, 7.5, 5.5])
     depth = np.ones((12, 16), np.float32)
-    assert rolled(color, depth * 0, lens, Shutter(readout, VELOCITY)) is color
-    assert rolled(color, depth, lens, Shutter(readout, VELOCITY * 0)) is color
-    assert (rolled(color, depth, lens, Shutter(readout, VELOCITY)) is color) == (readout == 0.0)
+    assert apply_rolling_shutter(color, depth * 0, lens, Shutter(readout_time, VELOCITY)) is color
+    assert apply_rolling_shutter(color, depth, lens, Shutter(readout_time, VELOCITY * 0)) is color
+    assert (apply_rolling_shutter(color, depth, lens, Shutter(readout_time, VELOCITY)) is color) == (
+        readout_time == 0.0
+    )

@@ -27,7 +27,7 @@ def test_frames_are_counted_by_state_and_pose() -> None:
     counts = track(state=state, world_from_cam=poses).counts()
     assert counts["frames"] == N
     assert counts["frames_tracked"] == 5
-    assert counts["frames_without_pose"] == {"tracked": 1, "lost": 1, "not_started": 2, "state 9": 1}
+    assert counts["frames_without_pose"] == {"tracked": 1, "lost": 1, "not_initialized": 2, "state 9": 1}
     assert counts["frames_degenerate"] == 1
     assert (counts["first_tracked"], counts["last_tracked"]) == (2, 10)
 
@@ -40,7 +40,7 @@ def test_held_out_frames_that_became_keyframes_are_named() -> None:
 def test_no_frame_has_a_pose() -> None:
     counts = track(world_from_cam=np.full((N, 4, 4), np.nan), state=np.full(N, 2, np.uint8)).counts()
     assert counts["frames_tracked"] == counts["segments"] == 0
-    assert counts["frames_without_pose"] == {"not_started": N}
+    assert counts["frames_without_pose"] == {"not_initialized": N}
     assert counts["first_tracked"] is None
 
 

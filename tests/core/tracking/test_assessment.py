@@ -20,15 +20,15 @@ def test_small_images_are_enlarged_at_most_twice(size: tuple[int, int], expected
 
 
 def test_small_images_do_not_bend_the_map() -> None:
-    """At 160x120 itself, depths were 9 % off the scale of the path, and the error of the path 0.4 %."""
+    """At 160x120 itself, depths were 9 % off the scale of the trajectory, and the error of the trajectory 0.4 %."""
     items = synthetic(frames=60, size=(120, 160))
-    tracker, path, _ = track(items)
-    error, length = ate(path, items)
+    tracker, trajectory, _ = track(items)
+    error, length = ate(trajectory, items)
     assert error < 0.0025 * length
     true = np.stack([np.asarray(i.world_from_cam)[:3, 3] for i in items])
-    scale, _, _ = geometry.umeyama(path.world_from_cam[:, :3, 3], true)
+    scale, _, _ = geometry.umeyama(trajectory.world_from_cam[:, :3, 3], true)
     ratios = []
-    for index in path.index[path.keyframe]:
+    for index in trajectory.index[trajectory.keyframe]:
         keyframe, depth = tracker.keyframe(int(index)), items[int(index)].depth
         assert depth is not None
         u, v = (keyframe.points.astype(int) // 2).T

@@ -42,8 +42,8 @@ def jumping() -> list[Item]:
     ],
 )
 def test_the_reason_is_what_was_measured(items: object, kind: str, figures: str) -> None:
-    tracker, path, _ = track(items())  # type: ignore[operator]
-    assert not np.isfinite(path.world_from_cam).any()
+    tracker, trajectory, _ = track(items())  # type: ignore[operator]
+    assert not np.isfinite(trajectory.world_from_cam).any()
     assert kind in tracker.nothing
     assert re.search(figures, tracker.nothing), tracker.nothing
     assert tracker.nothing in list(tracker.stats.warnings)

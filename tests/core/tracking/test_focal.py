@@ -10,7 +10,7 @@ import pytest
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.datasets.synthetic import Synthetic
-from mvsgs_core.tracking.frames import Path
+from mvsgs_core.tracking.frames import Trajectory
 from mvsgs_core.tracking.tracker import Tracker, Update
 from tests.support.sequences import ate
 
@@ -38,31 +38,31 @@ def straight() -> tuple[Item, ...]:
     return tuple(items)
 
 
-def track_guessing(items: tuple[Item, ...]) -> tuple[Tracker, Path, list[Update]]:
+def track_guessing(items: tuple[Item, ...]) -> tuple[Tracker, Trajectory, list[Update]]:
     tracker = Tracker()
     updates = [tracker.add(i.index, i.timestamp, i.image, GUESS, guessed=True) for i in items]
     updates += tracker.finish()
-    return tracker, tracker.path(), updates
+    return tracker, tracker.trajectory(), updates
 
 
 @pytest.mark.parametrize("focal", [0.5, 1.3])  # fields of view of 90 and 42 degrees; the guess is 65
 def test_the_focal_length_is_found(focal: float) -> None:
     items = room(focal)
-    tracker, path, updates = track_guessing(items)
+    tracker, trajectory, updates = track_guessing(items)
     true = focal * SIZE[1] / GUESS[0]
     assert abs(true - 1.0) > 0.3, "the guess must be wrong"
     assert tracker.focal_factor == pytest.approx(true, rel=0.03)
-    error, length = ate(path, items)
+    error, length = ate(trajectory, items)
     assert error < 0.004 * length
-    assert np.isfinite(path.world_from_cam).all()
-    told = [index for update in updates for index in update.keyframes]
-    assert told == path.index[path.keyframe].tolist()
+    assert np.isfinite(trajectory.world_from_cam).all()
+    published = [index for update in updates for index in update.keyframes]
+    assert published == trajectory.index[trajectory.keyframe].tolist()
     assert tracker.stats.warnings == []
     values = tracker.stats.values
     assert values["focal_px"] == pytest.approx(focal * SIZE[1], rel=0.03)
     assert 0.0 < values["focal_sigma_percent"] < 3.0
     assert abs(values["focal_px"] / (focal * SIZE[1]) - 1.0) < 3 * values["focal_sigma_percent"] / 100
-    if path.keyframe.sum() >= tracker.config.focal.keyframes:
+    if trajectory.keyframe.sum() >= tracker.config.focal.keyframes:
         assert values["focal_checked_px"] == pytest.approx(focal * SIZE[1], rel=0.03)
 
 
@@ -81,10 +81,10 @@ def test_keyframes_wait_until_the_focal_length_is_settled() -> None:
 
 
 def test_a_camera_that_never_turns_keeps_the_guess_and_says_so() -> None:
-    tracker, path, _ = track_guessing(straight())
+    tracker, trajectory, _ = track_guessing(straight())
     assert tracker.focal_factor == 1.0
     assert any("guess is kept" in warning for warning in tracker.stats.warnings)
-    assert path.keyframe.sum() >= 4
+    assert trajectory.keyframe.sum() >= 4
 
 
 def test_a_known_focal_length_is_left_alone() -> None:

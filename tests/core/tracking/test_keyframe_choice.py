@@ -15,14 +15,14 @@ from tests.support.sequences import synthetic, track, tracked_room
 WIDTH, LIMIT = 320, 0.05  # a keyframe after 16 pixels
 
 
-def step(flow: float, share: float = 0.9) -> Step:
-    return Step(Matches(np.zeros((0, 2)), np.zeros(0)), share, flow, False, None)
+def step(flow: float, fraction: float = 0.9) -> Step:
+    return Step(Matches(np.zeros((0, 2)), np.zeros(0)), fraction, flow, False, None)
 
 
-def chosen(flows: list[float], shares: list[float] | None = None, first: int = 1) -> list[int]:
+def chosen(flows: list[float], fractions: list[float] | None = None, first: int = 1) -> list[int]:
     """Frames that are wanted as keyframes, all of them seen from one reference."""
     choice = KeyframeChoice(FrontEndConfig())
-    steps = [step(f, s) for f, s in zip(flows, shares or [0.9] * len(flows))]
+    steps = [step(f, s) for f, s in zip(flows, fractions or [0.9] * len(flows))]
     return [n for n, s in enumerate(steps, start=first) if choice.wants(n, 0, s, WIDTH, LIMIT)]
 
 
@@ -45,18 +45,18 @@ def test_the_newest_frame_that_is_not_held_out_ends_the_stream() -> None:
 
 
 def test_no_frame_of_the_room_that_is_held_out_is_mapped() -> None:
-    tracker, path, _ = tracked_room()
-    keyframes = path.index[path.keyframe].tolist()
+    tracker, trajectory, _ = tracked_room()
+    keyframes = trajectory.index[trajectory.keyframe].tolist()
     assert not [k for k in keyframes if is_held_out(k)]
     assert tracker.stats.counts[HELD_OUT] == 0
-    assert np.isfinite(path.world_from_cam).all()
-    assert keyframes[-1] == len(path.index) - 1, "the newest view"
+    assert np.isfinite(trajectory.world_from_cam).all()
+    assert keyframes[-1] == len(trajectory.index) - 1, "the newest view"
 
 
 def test_frames_that_had_to_stay_are_counted() -> None:
     items = [replace(i, index=n, timestamp=n / 20.0) for n, i in enumerate(synthetic(frames=80)[::5])]
-    tracker, path, _ = track(items)
-    stayed = [k for k in path.index[path.keyframe].tolist() if is_held_out(k)]
+    tracker, trajectory, _ = track(items)
+    stayed = [k for k in trajectory.index[trajectory.keyframe].tolist() if is_held_out(k)]
     assert stayed, "one keyframe follows the other"
     assert tracker.stats.counts[HELD_OUT] == len(stayed)
 
@@ -65,7 +65,7 @@ def test_a_camera_that_comes_to_rest_makes_no_keyframe_in_the_end() -> None:
     items = synthetic(frames=80)
     moving = list(items[:41])
     still = [replace(items[40], index=n, timestamp=n / 20.0) for n in range(41, 50)]
-    _, path, _ = track([*moving, *still])
-    last = path.index[path.keyframe].tolist()[-1]
+    _, trajectory, _ = track([*moving, *still])
+    last = trajectory.index[trajectory.keyframe].tolist()[-1]
     assert last <= 40
     assert last >= 39, "the newest view that is not held out, or the last frame before the rest"

@@ -31,26 +31,26 @@ def covered(items: list[Item], noisy: range, black: range) -> list[Item]:
 
 def test_a_lost_run_that_begins_with_black_frames_does_not_end_the_tracker() -> None:
     items = covered(list(synthetic(frames=80)), range(44, 47), range(47, 50))[:60]
-    _, path, _ = track(items)
-    known = np.isfinite(path.world_from_cam).all(axis=(1, 2))
+    _, trajectory, _ = track(items)
+    known = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))
     assert known[:44].all()
     assert not known[44:50].any()
     assert known[51:].all()
-    assert (path.state[44:50] == State.LOST).all()
+    assert (trajectory.state[44:50] == State.LOST).all()
 
 
 def test_each_lost_run_is_followed_from_its_own_keyframes() -> None:
     """The second run's first frame has no image: it must not go on from where the first run was followed to."""
     items = covered(list(synthetic(frames=80)), range(30, 32), range(0))
     items = covered(items, range(47, 49), range(49, 51))[:62]
-    _, path, _ = track(items)
-    known = np.isfinite(path.world_from_cam).all(axis=(1, 2))
+    _, trajectory, _ = track(items)
+    known = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))
     lost = [*range(30, 32), *range(47, 51)]
     assert not known[lost].any()
     truth = np.stack([np.asarray(i.world_from_cam) for i in items])
-    scale, rotation, shift = geometry.umeyama(path.world_from_cam[known, :3, 3], truth[known, :3, 3])
+    scale, rotation, shift = geometry.umeyama(trajectory.world_from_cam[known, :3, 3], truth[known, :3, 3])
     errors = np.linalg.norm(
-        scale * path.world_from_cam[known, :3, 3] @ rotation.T + shift - truth[known, :3, 3], axis=1
+        scale * trajectory.world_from_cam[known, :3, 3] @ rotation.T + shift - truth[known, :3, 3], axis=1
     )
     assert errors.max() < 0.02, "meters"
 
@@ -69,19 +69,21 @@ def test_frames_before_the_start_are_verified_or_have_no_pose() -> None:
     tracker = Tracker()
     tracker.set_up(items[0].image.shape[0], items[0].image.shape[1], items[0].intrinsics, False)
     for item in items[:before]:  # as a start leaves them that was given up
-        tracker.records.append(FrameRecord(item.index, item.timestamp, State.NOT_STARTED))
+        tracker.records.append(FrameRecord(item.index, item.timestamp, State.NOT_INITIALIZED))
         tracker.recovery.keep(TrackingImage.of(item.index, item.timestamp, item.image, tracker.size, False))
     for item in items[before:]:
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
     list(tracker.finish())
-    path = tracker.path()
-    known = np.isfinite(path.world_from_cam).all(axis=(1, 2))
-    np.testing.assert_array_equal(known, np.isin(path.state, (State.TRACKED, State.DEGENERATE)))
+    trajectory = tracker.trajectory()
+    known = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))
+    np.testing.assert_array_equal(known, np.isin(trajectory.state, (State.TRACKED, State.DEGENERATE)))
     assert known[8:].all(), "what is verified is posed"
     truth = np.stack([np.asarray(i.world_from_cam) for i in items])
-    scale, rotation, shift = geometry.umeyama(path.world_from_cam[path.keyframe, :3, 3], truth[path.keyframe, :3, 3])
+    scale, rotation, shift = geometry.umeyama(
+        trajectory.world_from_cam[trajectory.keyframe, :3, 3], truth[trajectory.keyframe, :3, 3]
+    )
     errors = np.linalg.norm(
-        scale * path.world_from_cam[known, :3, 3] @ rotation.T + shift - truth[known, :3, 3], axis=1
+        scale * trajectory.world_from_cam[known, :3, 3] @ rotation.T + shift - truth[known, :3, 3], axis=1
     )
     assert errors.max() < 0.2, "meters: frames that nothing verified were up to 0.32 off"
     assert any("have no pose" in warning for warning in tracker.stats.warnings)

@@ -7,7 +7,7 @@ import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
-from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout
+from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout_time
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
@@ -16,8 +16,8 @@ from tests.support.sequences import tracked_room
 SIZE = (120, 160)
 
 
-def graph_of(readout: float, count: int = 7, noise: float = 0.1) -> tuple[KeyframeGraph, np.ndarray]:
-    """Keyframes of a shaking camera whose rows are read within `readout` seconds, and their true poses."""
+def graph_of(readout_time: float, count: int = 7, noise: float = 0.1) -> tuple[KeyframeGraph, np.ndarray]:
+    """Keyframes of a shaking camera whose rows are read within `readout_time` seconds, and their true poses."""
     random = np.random.default_rng(0)
     graph = KeyframeGraph(np.array([130.0, 130.0, 79.5, 59.5]))
     poses = geometry.se3_exp(random.normal(0.0, [0.1, 0.1, 0.03, 0.03, 0.03, 0.03], (count, 6)))
@@ -27,7 +27,7 @@ def graph_of(readout: float, count: int = 7, noise: float = 0.1) -> tuple[Keyfra
         image.velocity = np.tile(random.normal(0.0, 200.0, 2), (15, 20, 1)).astype(np.float32)
         depths = random.uniform(0.5, 1.5, 300)
         graph.add(Keyframe(image, poses[index], depths, np.full(300, 100.0), 0))
-    graph.readout = readout
+    graph.readout_time = readout_time
     for a in range(count):
         for b in range(count):
             if a == b:
@@ -43,35 +43,35 @@ def graph_of(readout: float, count: int = 7, noise: float = 0.1) -> tuple[Keyfra
             )
             target = pixels[0].T
             for _ in range(3):  # where it is seen depends on the row where it is seen
-                target = pixels[0].T + readout * other.shutter(target)
+                target = pixels[0].T + readout_time * other.shutter(target)
             target = target + random.normal(0.0, noise, target.shape)
             inside = np.all((target > 0) & (target < [159, 119]), axis=1)
             graph.connect(a, b, Matches(target, inside.astype(np.float64), other.shutter(target)), 0.0)
-    graph.readout = 0.0
+    graph.readout_time = 0.0
     return graph, poses
 
 
-@pytest.mark.parametrize("readout", [0.0, 0.01, 0.025])
-def test_readout_is_found(readout: float) -> None:
-    graph, _ = graph_of(readout)
+@pytest.mark.parametrize("readout_time", [0.0, 0.01, 0.025])
+def test_readout_is_found(readout_time: float) -> None:
+    graph, _ = graph_of(readout_time)
     assert len(graph.edges) > 20
-    assert estimate_readout(graph, graph.keyframes, threads=1) == pytest.approx(readout, abs=0.002)
-    assert graph.readout == 0.0, "only the caller changes the graph"
+    assert estimate_readout_time(graph, graph.keyframes, threads=1) == pytest.approx(readout_time, abs=0.002)
+    assert graph.readout_time == 0.0, "only the caller changes the graph"
 
 
 def test_poses_are_right_once_it_is_taken_out() -> None:
     errors = {}
-    for readout in (0.0, 0.025):
+    for readout_time in (0.0, 0.025):
         graph, poses = graph_of(0.025)
-        graph.readout = readout
+        graph.readout_time = readout_time
         indices = set(graph.keyframes)
         solver = Solver(steps=20, tolerance=0.0)
         assert not graph.optimize(indices, indices - {0, 1}, indices, solver).failure
-        errors[readout] = max(np.abs(graph.keyframes[n].cam_from_world - poses[n]).max() for n in indices)
+        errors[readout_time] = max(np.abs(graph.keyframes[n].cam_from_world - poses[n]).max() for n in indices)
     assert errors[0.025] < 0.2 * errors[0.0]
 
 
 def test_the_synthetic_camera_has_a_global_shutter() -> None:
     tracker, _, _ = tracked_room()
     assert tracker.graph is not None
-    assert tracker.graph.readout == 0.0
+    assert tracker.graph.readout_time == 0.0

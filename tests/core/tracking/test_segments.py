@@ -28,36 +28,38 @@ def out_and_back() -> list[Item]:
 def test_a_lost_segment_is_joined_by_a_loop() -> None:
     items = out_and_back()
     tracker = Tracker()
-    told: dict[int, int] = {}  # segment of each keyframe when it was told
-    states, joined_at, moved, told_last = [], None, set(), {}
+    published: dict[int, int] = {}  # segment of each keyframe when it was published
+    states, joined_at, moved, last_published = [], None, set(), {}
     for item in items:
         update = tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
         states.append(update.state)
-        told |= {index: tracker.keyframe(index).segment for index in update.keyframes}
+        published |= {index: tracker.keyframe(index).segment for index in update.keyframes}
         if update.correction is not None:
             moved |= set(update.correction.index.tolist()) if joined_at is None else set()
             assert update.correction.segment is not None
-            told_last |= dict(zip(update.correction.index.tolist(), update.correction.segment.tolist()))
+            last_published |= dict(zip(update.correction.index.tolist(), update.correction.segment.tolist()))
         if joined_at is None and tracker.stats.counts.get("segments joined"):
             joined_at = item.index
             assert update.correction is not None
             moved = set(update.correction.index.tolist())
     list(tracker.finish())
-    path = tracker.path()
+    trajectory = tracker.trajectory()
     assert all(state == State.LOST for state in states[BEFORE : BEFORE + COVERED])
-    second = {index for index, segment in told.items() if segment == 1}
+    second = {index for index, segment in published.items() if segment == 1}
     assert len(second) >= 6, "there was no segment of its own"
     assert min(second) > BEFORE + COVERED
     assert joined_at is not None
-    assert second <= moved | {joined_at}, "the second segment must be told where it lies in the first"
-    assert all(told_last[index] == 0 for index in second), "receivers must hear of the join"
+    assert second <= moved | {joined_at}, "the second segment must be published where it lies in the first"
+    assert all(last_published[index] == 0 for index in second), "receivers must hear of the join"
     assert tracker.publisher.highest_segment == 1  # so that a later loss does not give the number again
-    assert set(path.segment[path.keyframe]) == {0}
-    assert set(path.segment[np.isfinite(path.world_from_cam).all(axis=(1, 2))]) == {0}  # one map for the evaluator
+    assert set(trajectory.segment[trajectory.keyframe]) == {0}
+    assert set(trajectory.segment[np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))]) == {
+        0
+    }  # one map for the evaluator
     assert not any("segments" in warning for warning in tracker.stats.warnings)
-    posed = np.isfinite(path.world_from_cam).all(axis=(1, 2))
+    posed = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))
     assert posed[: BEFORE - 1].all()
     assert not posed[BEFORE : BEFORE + COVERED].any()
     assert posed[BEFORE + COVERED :].all()
-    error, length = ate(path, items)
+    error, length = ate(trajectory, items)
     assert error < 0.003 * length

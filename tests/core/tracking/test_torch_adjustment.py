@@ -105,7 +105,7 @@ def test_a_tracker_on_torch_finds_the_same_path() -> None:
             tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
         assert tracker.started
         list(tracker.finish())
-        paths.append(tracker.path().world_from_cam)
+        paths.append(tracker.trajectory().world_from_cam)
     np.testing.assert_allclose(paths[0], paths[1], atol=1e-5)
 
 

@@ -16,35 +16,35 @@ from tests.support.shared_data import shared
 
 def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:
     items = synthetic(frames=80)
-    tracker, path, updates = tracked_room()
-    error, length = ate(path, items)
+    tracker, trajectory, updates = tracked_room()
+    error, length = ate(trajectory, items)
     assert error < 0.003 * length
-    assert (path.state == State.TRACKED).all()
-    assert np.isfinite(path.world_from_cam).all()
-    told = [index for update in updates for index in update.keyframes]
-    assert sorted(told) == sorted(set(told)) == path.index[path.keyframe].tolist()
-    assert 8 <= len(told) <= 30
+    assert (trajectory.state == State.TRACKED).all()
+    assert np.isfinite(trajectory.world_from_cam).all()
+    published = [index for update in updates for index in update.keyframes]
+    assert sorted(published) == sorted(set(published)) == trajectory.index[trajectory.keyframe].tolist()
+    assert 8 <= len(published) <= 30
     assert tracker.stats.warnings == []
 
 
 @pytest.mark.parametrize("flow", sorted(FLOWS.keys() - {"raft_small"}))  # a network: `bench.learned` tracks with it
 def test_every_choice_of_flow_without_weights_starts_and_tracks(flow: str) -> None:
     items = synthetic(frames=80)[:28]
-    tracker, path, updates = track(items, TrackerConfig(flow=flow))
-    assert any(update.keyframes for update in updates[: len(items)]), tracker.starter.reason
+    tracker, trajectory, updates = track(items, TrackerConfig(flow=flow))
+    assert any(update.keyframes for update in updates[: len(items)]), tracker.initializer.reason
     assert tracker.stats.warnings == []
-    assert (path.state == State.TRACKED).all()
-    error, length = ate(path, items)
+    assert (trajectory.state == State.TRACKED).all()
+    error, length = ate(trajectory, items)
     assert error < 0.003 * length
 
 
 def test_depths_agree_with_the_truth() -> None:
     items = synthetic(frames=80)
-    tracker, path, _ = tracked_room()
-    found, true = path.world_from_cam[:, :3, 3], np.stack([np.asarray(i.world_from_cam)[:3, 3] for i in items])
+    tracker, trajectory, _ = tracked_room()
+    found, true = trajectory.world_from_cam[:, :3, 3], np.stack([np.asarray(i.world_from_cam)[:3, 3] for i in items])
     scale, _, _ = geometry.umeyama(found, true)
     ratios, known = [], []
-    for index in path.index[path.keyframe][2:-2]:
+    for index in trajectory.index[trajectory.keyframe][2:-2]:
         keyframe, depth = tracker.keyframe(int(index)), items[int(index)].depth
         assert depth is not None
         u, v = keyframe.points.astype(int).T
@@ -64,34 +64,34 @@ def test_the_same_frames_give_the_same_path() -> None:
 
 
 def test_corrections_end_where_the_path_is() -> None:
-    _, path, updates = tracked_room()
+    _, trajectory, updates = tracked_room()
     last = next(u.correction for u in reversed(updates) if u.correction is not None)
-    keyframes = path.keyframe
-    np.testing.assert_array_equal(last.index, path.index[keyframes])
-    np.testing.assert_array_equal(last.world_from_cam, path.world_from_cam[keyframes])
+    keyframes = trajectory.keyframe
+    np.testing.assert_array_equal(last.index, trajectory.index[keyframes])
+    np.testing.assert_array_equal(last.world_from_cam, trajectory.world_from_cam[keyframes])
     assert np.all((last.scale > 0.8) & (last.scale < 1.25))
 
 
 def test_a_turning_start_waits_for_parallax_and_is_filled_in_later() -> None:
     items = synthetic(frames=75, pure_rotation=20)
-    _, path, updates = track(items)
+    _, trajectory, updates = track(items)
     first = next(n for n, u in enumerate(updates) if u.keyframes)
     assert first >= 20, "a start was made of nothing but rotation"
-    error, length = ate(path, items)
+    error, length = ate(trajectory, items)
     assert error < 0.01 * length
-    assert np.mean(path.state == State.TRACKED) > 0.9
+    assert np.mean(trajectory.state == State.TRACKED) > 0.9
 
 
 def test_a_covered_lens_is_lost_and_found_again() -> None:
     items = synthetic(frames=90, covered=12, covered_start=50)
-    tracker, path, updates = track(items)
-    assert (path.state[50:62] == State.LOST).all()
-    assert not np.isfinite(path.world_from_cam[50:62]).any()
-    assert (path.state[64:] == State.TRACKED).all()
-    assert len({int(s) for s in path.segment[path.segment >= 0]}) == 1
+    tracker, trajectory, updates = track(items)
+    assert (trajectory.state[50:62] == State.LOST).all()
+    assert not np.isfinite(trajectory.world_from_cam[50:62]).any()
+    assert (trajectory.state[64:] == State.TRACKED).all()
+    assert len({int(s) for s in trajectory.segment[trajectory.segment >= 0]}) == 1
     assert not any(update.keyframes for update in updates[50:62])
     assert any("lost" in warning for warning in tracker.stats.warnings)
-    error, length = ate(path, items)
+    error, length = ate(trajectory, items)
     assert error < 0.01 * length
 
 
@@ -102,11 +102,11 @@ def test_a_jump_to_an_unseen_place_starts_a_segment_of_its_own() -> None:
     for item in elsewhere:
         n = len(items)
         items.append(type(item)(n, n / 20.0, item.image, item.intrinsics, item.world_from_cam, item.depth))
-    tracker, path, _ = track(items)
-    assert (path.segment[:30] == 0).all()
-    assert (path.segment[37:] == 1).all()
+    tracker, trajectory, _ = track(items)
+    assert (trajectory.segment[:30] == 0).all()
+    assert (trajectory.segment[37:] == 1).all()
     for segment in (0, 1):
-        error, length = ate(path, items, path.segment == segment)
+        error, length = ate(trajectory, items, trajectory.segment == segment)
         assert error < 0.02 * length
     assert any("2 segments" in warning for warning in tracker.stats.warnings)
 
@@ -116,8 +116,8 @@ def test_a_room_without_texture_is_not_tracked_and_says_so() -> None:
         type(item)(item.index, item.timestamp, np.full_like(item.image, 128), item.intrinsics)
         for item in synthetic(frames=80)[:10]
     ]
-    tracker, path, updates = track(items)
-    assert (path.state == State.NOT_STARTED).all()
+    tracker, trajectory, updates = track(items)
+    assert (trajectory.state == State.NOT_INITIALIZED).all()
     assert not any(update.keyframes for update in updates)
     assert any("never started" in warning for warning in tracker.stats.warnings)
 
@@ -126,17 +126,17 @@ def test_a_camera_at_rest_makes_no_keyframes() -> None:
     items = synthetic(frames=80)
     still = [type(i)(n, n / 20.0, items[40].image, i.intrinsics) for n, i in zip(range(41, 61), items)]
     moving = list(items[:41])
-    tracker, path, updates = track(moving + still)
+    tracker, trajectory, updates = track(moving + still)
     assert not any(update.keyframes for update in updates[41:61])
     assert tracker.stats.skipped["frames that did not move"] >= 19
-    shift = np.linalg.norm(path.world_from_cam[41:, :3, 3] - path.world_from_cam[40, :3, 3], axis=1)
+    shift = np.linalg.norm(trajectory.world_from_cam[41:, :3, 3] - trajectory.world_from_cam[40, :3, 3], axis=1)
     assert shift.max() < 1e-3
 
 
 def test_a_real_hand_held_sequence() -> None:
     items = list(open_dataset("tum", path=shared("data/tum_fr1_xyz"), stop=60))
-    _, path, _ = track(items)
-    known = np.isin(path.index, [i.index for i in items if i.world_from_cam is not None])
-    error, _ = ate(path, items, known)
+    _, trajectory, _ = track(items)
+    known = np.isin(trajectory.index, [i.index for i in items if i.world_from_cam is not None])
+    error, _ = ate(trajectory, items, known)
     assert error < 0.015, "meters"
-    assert (path.state == State.TRACKED).all()
+    assert (trajectory.state == State.TRACKED).all()

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core.tracking.diagnosis import Diagnosis
-from mvsgs_core.tracking.estimation.focal import FocalConfig, start_with_unknown_focal
-from mvsgs_core.tracking.estimation.initialization import StartCriteria, start_up
+from mvsgs_core.tracking.estimation.focal import FocalConfig, reconstruct_with_unknown_focal
+from mvsgs_core.tracking.estimation.structure_from_motion import ReconstructionCriteria, reconstruct
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches, spread
@@ -16,24 +16,26 @@ from mvsgs_core.tracking.matching.matcher import Matcher
 
 
 @dataclass(frozen=True)
-class StartingConfig:
+class InitializationConfig:
     keyframes: int = 6  # before a start is tried
     limit: int = 10  # keyframes held; the oldest goes first
     flow: float = 0.035  # of the width: median flow between them; falls to a third while the camera is slow
     patience: int = 40  # frames without a keyframe over which it falls
     back: int = 5  # keyframes that each is matched with
-    min_share: float = 0.25  # of the textured points that an edge must have found
-    criteria: StartCriteria = field(default_factory=StartCriteria)
-    forced: StartCriteria = field(
-        default_factory=lambda: StartCriteria(max_cost=1.0, min_turn_error=0.3, min_parallax=1.0, min_baseline=0.01)
+    min_fraction: float = 0.25  # of the textured points that an edge must have found
+    criteria: ReconstructionCriteria = field(default_factory=ReconstructionCriteria)
+    forced: ReconstructionCriteria = field(
+        default_factory=lambda: ReconstructionCriteria(
+            max_cost=1.0, min_turn_error=0.3, min_parallax=1.0, min_baseline=0.01
+        )
     )  # at the end of the stream
 
 
-class Starter:
+class Initializer:
     """The keyframes of a segment that has not started."""
 
     def __init__(
-        self, graph: KeyframeGraph, matcher: Matcher, config: StartingConfig, threads: int, diagnosis: Diagnosis
+        self, graph: KeyframeGraph, matcher: Matcher, config: InitializationConfig, threads: int, diagnosis: Diagnosis
     ) -> None:
         self.graph = graph
         self.matcher = matcher
@@ -49,7 +51,7 @@ class Starter:
         return self.diagnosis.reason(self.config.keyframes)
 
     def flow(self, since: int) -> float:
-        """Share of the width that makes a keyframe, so many frames after the last one."""
+        """Fraction of the width that makes a keyframe, so many frames after the last one."""
         return self.config.flow * max(1.0 / 3.0, 1.0 - since / self.config.patience)
 
     def add(self, image: TrackingImage, segment: int, matches: Matches | None = None) -> None:
@@ -68,7 +70,7 @@ class Starter:
             self.graph.remove(index)
         self.waiting = []
 
-    def try_start(self, forced: bool = False, focal: FocalConfig | None = None) -> bool:
+    def initialize(self, forced: bool = False, focal: FocalConfig | None = None) -> bool:
         """Solves the waiting keyframes; True where that succeeded: they are then part of the map.
 
         focal: how the graph's focal length is found too; None where it is known.
@@ -78,9 +80,9 @@ class Starter:
         self.attempts += 1
         criteria = self.config.forced if forced else self.config.criteria
         if focal is None:
-            start = start_up(self.graph, self.waiting, criteria, self.threads)
+            start = reconstruct(self.graph, self.waiting, criteria, self.threads)
         else:
-            start = start_with_unknown_focal(self.graph, self.waiting, criteria, focal, self.threads)
+            start = reconstruct_with_unknown_focal(self.graph, self.waiting, criteria, focal, self.threads)
         if start.failure:
             self.diagnosis.failed(start.failure)
             if len(self.waiting) >= self.config.limit:
@@ -95,7 +97,7 @@ class Starter:
 
     def _connect(self, image: TrackingImage, earlier: list[int], matches: Matches) -> None:
         """Edges both ways with the keyframes before, the guesses chained from one to the next."""
-        share = self.config.min_share
+        fraction = self.config.min_fraction
         points = image.cells.points.astype(np.float64)
         newest = earlier[-1]
         near = self.graph.keyframes[newest].points.astype(np.float64)
@@ -110,13 +112,13 @@ class Starter:
                 hop = link.target.T[seen].astype(np.float64)
                 there = spread(near[matches.alive], (matches.target - near)[matches.alive], hop)
                 guess = spread(start[seen], there - start[seen], start)
-                forward, _ = self.matcher.match(old, image, guess, share)
-            self.graph.connect(index, image.index, forward, share)
+                forward, _ = self.matcher.match(old, image, guess, fraction)
+            self.graph.connect(index, image.index, forward, fraction)
             if forward.alive.sum() < 30:
                 continue
             at = forward.target[forward.alive]
             guess = spread(at, old.cells.points[forward.alive] - at, points)
-            self.graph.connect(image.index, index, self.matcher.match(image, old, guess, share)[0], share)
+            self.graph.connect(image.index, index, self.matcher.match(image, old, guess, fraction)[0], fraction)
 
 
-__all__ = ["Starter", "StartingConfig"]
+__all__ = ["InitializationConfig", "Initializer"]

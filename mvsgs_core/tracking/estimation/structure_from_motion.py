@@ -18,7 +18,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 
 
 @dataclass(frozen=True)
-class StartCriteria:
+class ReconstructionCriteria:
     """When a start counts as one. Pixels at the tracker's size."""
 
     certain_cost: float = 0.2  # below, no other start is tried
@@ -29,7 +29,7 @@ class StartCriteria:
 
 
 @dataclass(frozen=True)
-class Start:
+class Reconstruction:
     """A start-up attempt; `failure` is empty where it may be used, else the kind of reason, a colon, the figures."""
 
     cam_from_world: np.ndarray  # (K, 4, 4)
@@ -42,9 +42,9 @@ class Start:
     focal_factor: float = 1.0  # on the graph's focal length, where it was free
 
 
-def start_up(
-    graph: KeyframeGraph, order: list[int], criteria: StartCriteria, threads: int, free_focal: bool = False
-) -> Start:
+def reconstruct(
+    graph: KeyframeGraph, order: list[int], criteria: ReconstructionCriteria, threads: int, free_focal: bool = False
+) -> Reconstruction:
     """Solves keyframes `order` of the graph, without changing it. free_focal: the focal length is unknown too."""
     everything = set(order)
     problem = graph.problem(order, everything - {order[0]}, everything)
@@ -57,7 +57,7 @@ def start_up(
             f"no parallax: a camera that only turned explains the matches to {turned:.1f} pixels, "
             f"{criteria.min_turn_error:.1f} or more are parallax"
         )
-        return Start(problem.cam_from_world, ones, 0.0 * ones, np.inf, turned, 0.0, reason)
+        return Reconstruction(problem.cam_from_world, ones, 0.0 * ones, np.inf, turned, 0.0, reason)
     starts = [np.tile(np.eye(4), (k, 1, 1)), *_essential_starts(graph, order)]
     best: Solution | None = None
     for poses in starts:
@@ -78,7 +78,7 @@ def start_up(
                 break
     if best is None:
         nothing = np.ones((k, m))
-        return Start(
+        return Reconstruction(
             starts[0],
             nothing,
             0.0 * nothing,
@@ -109,7 +109,7 @@ def start_up(
     elif known.sum() < 0.3 * np.mean(problem.information[:, 0] > 0) * k * m:
         failure = f"too few points could be triangulated: {known.sum()} of {k * m}"
     information = best.information * scale**2
-    return Start(poses, depths, information, cost, parallax, baseline, failure, best.focal_factor)
+    return Reconstruction(poses, depths, information, cost, parallax, baseline, failure, best.focal_factor)
 
 
 def _rotation_error(problem: Graph, threads: int, free_focal: bool) -> float:
@@ -160,7 +160,7 @@ def _essential_starts(graph: KeyframeGraph, order: list[int]) -> list[np.ndarray
             continue
         edge = graph.edges[a, b]
         moved = np.linalg.norm(edge.target.T - graph.keyframes[a].points, axis=1)[edge.weight > 0]
-        rated.append((float(np.median(moved)) * edge.share, a, b))
+        rated.append((float(np.median(moved)) * edge.fraction, a, b))
     camera = matrix(graph.intrinsics)
     starts = []
     for _, a, b in sorted(rated, reverse=True)[:2]:
@@ -181,4 +181,4 @@ def _essential_starts(graph: KeyframeGraph, order: list[int]) -> list[np.ndarray
     return starts
 
 
-__all__ = ["Start", "StartCriteria", "start_up"]
+__all__ = ["Reconstruction", "ReconstructionCriteria", "reconstruct"]
