@@ -151,9 +151,9 @@ def rasterizer_rows(size: tuple[int, int], count: int, device: torch.device, pea
             Row(f"{label}: forward", taken[0], "ms"),
             Row(f"{label}: backward", taken[1], "ms"),
             Row(f"{label}: pairs of splats and tiles", float(done.pairs), ""),
-            Row(f"{label}: share of the memory's bandwidth", 100.0 * memory / ours, "%"),
-            Row(f"{label}: share of the float32 peak", 100.0 * arithmetic / ours, "%"),
-            Row(f"{label}: share of the roofline", 100.0 * max(memory, arithmetic) / ours, "%"),
+            Row(f"{label}: fraction of the memory's bandwidth", 100.0 * memory / ours, "%"),
+            Row(f"{label}: fraction of the float32 peak", 100.0 * arithmetic / ours, "%"),
+            Row(f"{label}: fraction of the roofline", 100.0 * max(memory, arithmetic) / ours, "%"),
         ]
         if beside:
             rows.append(Row(f"{label}: gsplat, forward", taken[2], "ms"))

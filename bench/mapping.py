@@ -63,8 +63,8 @@ class Run:
             if value >= level:
                 if k == 0 or value == self.psnr[k - 1]:
                     return self.seconds[k]
-                share = (level - self.psnr[k - 1]) / (value - self.psnr[k - 1])
-                return self.seconds[k - 1] + share * (self.seconds[k] - self.seconds[k - 1])
+                fraction = (level - self.psnr[k - 1]) / (value - self.psnr[k - 1])
+                return self.seconds[k - 1] + fraction * (self.seconds[k] - self.seconds[k - 1])
         return float("inf")
 
 

@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from typing import Any
 
-LEAST_SUBJECTS = 3  # that share a figure before it becomes a column
+MIN_SUBJECTS = 3  # that share a figure before it becomes a column
 
 Row = dict[str, Any]
 
@@ -46,11 +46,11 @@ def _shared(rows: list[Row]) -> dict[str, dict[str, Row]]:
         if colon:
             found.setdefault(subject, {})[figure] = row
     for figure, times in Counter(figure for figures in found.values() for figure in figures).most_common():
-        if times < LEAST_SUBJECTS:
+        if times < MIN_SUBJECTS:
             break
         subjects = [subject for subject, figures in found.items() if figure in figures]
         among = Counter(other for subject in subjects for other in found[subject])
-        shared = {other for other, count in among.items() if count >= LEAST_SUBJECTS}
+        shared = {other for other, count in among.items() if count >= MIN_SUBJECTS}
         if len(shared) >= 2:
             return {s: {other: row for other, row in found[s].items() if other in shared} for s in subjects}
     return {}

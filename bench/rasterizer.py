@@ -15,7 +15,7 @@ Roofline: what an ideal implementation needs at the peaks measured here with the
 - projection forward and backward, at the same rate;
 - traffic to memory of parameters, gradients, pairs, sums and images, at the rate of a copy.
 
-Sorting and finding tiles count by their traffic alone. Beside it, the share if every lane that the kernel evaluates
+Sorting and finding tiles count by their traffic alone. Beside it, the fraction if every lane that the kernel evaluates
 counted (4x4 pixels go together), and a simpler estimate of exponentials and bytes: the densities that the kernel
 evaluates at their own rate, no other arithmetic.
 """
@@ -199,11 +199,11 @@ class Round:
     bound: Roofline | None = None
     alone: Roofline | None = None  # with one thread
 
-    def share(self, which: str = "necessary") -> float:
+    def fraction(self, which: str = "necessary") -> float:
         """Of the roofline, %."""
         return 100.0 * float(getattr(self.bound, which)) / self.fast.total()
 
-    def share_alone(self) -> float:
+    def fraction_alone(self) -> float:
         assert self.alone is not None
         return 100.0 * self.alone.necessary / self.one.total()
 
@@ -236,19 +236,19 @@ def compare(size: tuple[int, int], count: int, threads: int, rounds: int) -> lis
         faster = [each.plain.total() / each.fast.total() for each in measured]
         alone = [each.one.total() / each.fast.total() for each in measured]
         rows += [
-            timed(f"{label}: both", both, "ms", most=MARKS[size[0], kernel]),
+            timed(f"{label}: both", both, "ms", maximum=MARKS[size[0], kernel]),
             timed(f"{label}: plain loops, forward", [ms for ms, _ in plain], "ms"),
             timed(f"{label}: plain loops, backward", [ms for _, ms in plain], "ms"),
-            timed(f"{label}: times faster than plain loops", faster, "x", least=SPEEDUP),
+            timed(f"{label}: times faster than plain loops", faster, "x", minimum=SPEEDUP),
             Row(f"{label}: mean difference to plain loops", float((image - other).abs().mean()), ""),
             timed(f"{label}: times faster than with 1 thread", alone, "x"),
             Row(f"{label}: pairs of splat and pixel that get color", done.contributed / 1e6, "million"),
             Row(f"{label}: pairs evaluated", done.evaluated / 1e6, "million"),
             timed(f"{label}: roofline", [e.bound.necessary for e in measured if e.bound], "ms"),
-            timed(f"{label}: share of the roofline", [e.share() for e in measured], "%", least=ROOFLINE),
-            timed(f"{label}: share if all lanes counted", [e.share("evaluated") for e in measured], "%"),
-            timed(f"{label}: share by exponentials and bytes only", [e.share("simple") for e in measured], "%"),
-            timed(f"{label}: share of the roofline, 1 thread", [e.share_alone() for e in measured], "%"),
+            timed(f"{label}: fraction of the roofline", [e.fraction() for e in measured], "%", minimum=ROOFLINE),
+            timed(f"{label}: fraction if all lanes counted", [e.fraction("evaluated") for e in measured], "%"),
+            timed(f"{label}: fraction by exponentials and bytes only", [e.fraction("simple") for e in measured], "%"),
+            timed(f"{label}: fraction of the roofline, 1 thread", [e.fraction_alone() for e in measured], "%"),
         ]
     for kernel in KERNELS[1:]:
         price = totals[kernel] / totals["gaussian"]

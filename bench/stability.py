@@ -146,8 +146,8 @@ def box_view(index: int, x: float, size: tuple[int, int] = SIZE, origin: float =
     return RGBDKeyframe(index, image, intrinsics, pose, np.full(size, 2.0, dtype=np.float32), normals=normals)
 
 
-def mapped(name: str, views: list[RGBDKeyframe], config: MapperConfig, least: float | None = None) -> Row:
-    """The whole mapper on these views; least: dB that its keyframes must reach, None: only finiteness is looked at."""
+def mapped(name: str, views: list[RGBDKeyframe], config: MapperConfig, minimum: float | None = None) -> Row:
+    """The whole mapper on these views; minimum: dB that its keyframes must reach, None: only finiteness counts."""
     mapper = OnlineMapper(config)
     for posed in views:
         mapper.add_keyframe(posed)
@@ -167,8 +167,8 @@ def mapped(name: str, views: list[RGBDKeyframe], config: MapperConfig, least: fl
     reached = float(np.mean(scores)) if scores else 0.0
     score = f"{reached:.1f} dB" if scores else "no view"
     text = f"{mapper.iterations} iterations, {len(mapper.state)} splats, {score}; refused {refused or 'nothing'}"
-    goal = f"{FINITE}, quality not judged" if least is None else f"{FINITE}, >= {least:g} dB"
-    met = finite and (least is None or reached >= least)
+    goal = f"{FINITE}, quality not judged" if minimum is None else f"{FINITE}, >= {minimum:g} dB"
+    met = finite and (minimum is None or reached >= minimum)
     return Row(name, f"{text}; {len(mapper.log.warnings)} warnings", "", goal, met)
 
 

@@ -33,17 +33,19 @@ def at_least(name: str, value: float, unit: str, limit: float) -> Row:
     return Row(name, value, unit, f">= {limit:g}", bool(value >= limit))
 
 
-def timed(name: str, values: Sequence[float], unit: str, most: float | None = None, least: float | None = None) -> Row:
+def timed(
+    name: str, values: Sequence[float], unit: str, maximum: float | None = None, minimum: float | None = None
+) -> Row:
     """The median of repeated measurements with their spread. A goal is met where all of them meet it.
 
     values: one a round; what is compared runs in turns within each round, so that whatever else the machine does meets
-    both. Of the goals `most` and `least` at most one is given.
+    both. Of the goals `maximum` and `minimum` at most one is given.
     """
     value, spread = statistics.median(values), (max(values) - min(values)) / 2
-    if most is not None:
-        return Row(name, value, unit, f"<= {most:g}, all of {len(values)}", max(values) <= most, spread)
-    if least is not None:
-        return Row(name, value, unit, f">= {least:g}, all of {len(values)}", min(values) >= least, spread)
+    if maximum is not None:
+        return Row(name, value, unit, f"<= {maximum:g}, all of {len(values)}", max(values) <= maximum, spread)
+    if minimum is not None:
+        return Row(name, value, unit, f">= {minimum:g}, all of {len(values)}", min(values) >= minimum, spread)
     return Row(name, value, unit, spread=spread)
 
 

@@ -24,7 +24,7 @@ from bench.baselines.colmap_poses import Model
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.runs import Matrix, figure, folder, stage_seconds
 from bench.table import Row, main
-from bench.tracking.baselines import Peer, solve
+from bench.tracking.baselines import Baseline, solve
 from launch.placement import available_cores
 from msgs import GroundTruth
 from mvsgs_core import image_metrics
@@ -102,7 +102,7 @@ def frames_of(settings: dict[str, Any]) -> dict[int, GroundTruth]:
     return {message.index: message for message in messages if isinstance(message, GroundTruth)}
 
 
-def solve_poses(ours: Ours, place: Path, threads: int, resume: bool) -> tuple[Peer, list[int]]:
+def solve_poses(ours: Ours, place: Path, threads: int, resume: bool) -> tuple[Baseline, list[int]]:
     """COLMAP's model, from the images as they come, and the frames that it got."""
     stride = max(1, round(len(ours.frames) / EVENLY))
     known = {*ours.keyframes, *(i for i in ours.frames if is_held_out(i) or i % stride == 0)}
@@ -211,12 +211,13 @@ def map_rows(scene: str, ours: Ours, model: Model, trained: list[Trained]) -> li
     return rows
 
 
-def protocol(scene: str, ours: Ours, peer: Peer, frames: list[int]) -> Row:
+def protocol(scene: str, ours: Ours, baseline: Baseline, frames: list[int]) -> Row:
     """What both had, as a row."""
     height, width = next(iter(ours.frames.values())).image.shape[:2]
     text = (
         f"{len(ours.frames)} frames, maps of {len(ours.keyframes)} keyframes at {width}x{height}, scored on "
-        f"{len(ours.held_out)} held-out frames; COLMAP got {len(frames)} of the frames at {peer.size[1]}x{peer.size[0]}"
+        f"{len(ours.held_out)} held-out frames; COLMAP got {len(frames)} of the frames at "
+        f"{baseline.size[1]}x{baseline.size[0]}"
     )
     return Row(f"{scene}: protocol", text)
 
@@ -230,19 +231,19 @@ def compare(scene: str, options: argparse.Namespace, overrides: list[str], made:
         return [Row(f"{scene}: ours", f"failed: see {place / 'ours' / 'runs.log'}", "", "a report", False)]
     threads = options.threads or available_cores()
     resume = options.resume or options.collect
-    peer, frames = solve_poses(ours, place / "colmap", threads, resume)
-    rows = [protocol(scene, ours, peer, frames)]
-    if peer.model is None:
-        return [*rows, Row(f"{scene}: COLMAP", peer.why)]
-    rows += pose_rows(scene, ours, peer.model, frames)
+    baseline, frames = solve_poses(ours, place / "colmap", threads, resume)
+    rows = [protocol(scene, ours, baseline, frames)]
+    if baseline.model is None:
+        return [*rows, Row(f"{scene}: COLMAP", baseline.why)]
+    rows += pose_rows(scene, ours, baseline.model, frames)
     kept = place / "trained.json"
     if not resume:
         kept.unlink(missing_ok=True)
     try:
-        trained = train_longer(peer.model, ours, options.longest, threads, kept)
+        trained = train_longer(baseline.model, ours, options.longest, threads, kept)
     except ValueError as error:
         return [*rows, Row(f"{scene}: map, COLMAP + splatting", str(error))]
-    return rows + map_rows(scene, ours, peer.model, trained)
+    return rows + map_rows(scene, ours, baseline.model, trained)
 
 
 def markdown(rows: list[Row]) -> str:
@@ -274,7 +275,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     if options.quick:
         scenes, options.longest = [QUICK], 1.0
         overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
-    made = pieces.Pieces.of(options, folder(options, "peers"))
+    made = pieces.Pieces.of(options, folder(options, "baselines"))
     rows = [row for scene in scenes for row in compare(scene, options, overrides, made)]
     (made.output / "table.md").write_text((markdown(rows) + made.note).strip() + "\n")
     return rows
@@ -289,4 +290,4 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
-    main(measure, "Peers on the same frames", arguments)
+    main(measure, "Baselines on the same frames", arguments)

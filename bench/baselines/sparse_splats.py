@@ -30,7 +30,7 @@ class SparseConfig:
 
     seconds: float = 60.0  # of optimization
     iterations: int | None = None  # of optimization, whatever the time; None: as many as the seconds allow
-    settle: float = 0.5  # last share of it in which learning rates fall to a tenth and no splat is added
+    settle: float = 0.5  # last fraction of it in which learning rates fall to a tenth and no splat is added
     seed: int = 0
     initial_opacity: float = 0.1
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -16,17 +16,17 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from bench.depth.baselines import peer_rows
+from bench.depth.baselines import baseline_rows
 from bench.depth.calibration import calibration_rows
 from bench.depth.curves import curve_rows
 from bench.depth.data import SHARED, SOURCES, Scene, load_scene
 from bench.depth.failures import failure_rows
 from bench.depth.kernel import kernel_rows
-from bench.depth.oracle import ceiling_rows
+from bench.depth.oracle import oracle_rows
 from bench.depth.parts import Variant, part_variants, skip_variants, variant_rows
 from bench.depth.photos import PHOTOS, photo_rows
 from bench.depth.pictures import write_pictures
-from bench.depth.pose_refinement import polished
+from bench.depth.pose_refinement import refine_poses
 from bench.depth.run import Run, run, score, surest
 from bench.depth.sensor import sensor_offset, without_offset
 from bench.depth.tracked import load_tracked
@@ -110,33 +110,33 @@ def sensor_section(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def polished_section(options: argparse.Namespace) -> list[Row]:
+def pose_refinement_section(options: argparse.Namespace) -> list[Row]:
     """With dataset poses that were made to fit the images; "aligned": each map scaled by its median ratio to the truth.
 
     Aligned, because positions that are a few millimeters off leave the scale of single maps some percent off.
     """
     rows = []
     for name in [] if options.quick else available(("redkitchen", "fr1_xyz")):
-        scene, before, after = polished(load_scene(name, SMALL))
+        scene, before, after = refine_poses(load_scene(name, SMALL))
         found = run(scene.views, CascadeConfig(area=SMALL), FusionConfig())
         kept = [f.depth for f in found.fused]
         as_they_are, aligned = score(kept, scene), score(kept, scene, align=True)
         rows += [
-            Row(f"{name}, polished poses: residual of matches before", before, "px"),
-            Row(f"{name}, polished poses: residual of matches", after, "px"),
-            Row(f"{name}, polished poses: inliers", as_they_are.inliers),
-            Row(f"{name}, polished poses: inliers, aligned", aligned.inliers),
-            Row(f"{name}, polished poses: completeness", as_they_are.completeness),
+            Row(f"{name}, refined poses: residual of matches before", before, "px"),
+            Row(f"{name}, refined poses: residual of matches", after, "px"),
+            Row(f"{name}, refined poses: inliers", as_they_are.inliers),
+            Row(f"{name}, refined poses: inliers, aligned", aligned.inliers),
+            Row(f"{name}, refined poses: completeness", as_they_are.completeness),
         ]
     return rows
 
 
-def ceiling_section(options: argparse.Namespace) -> list[Row]:
+def oracle_section(options: argparse.Namespace) -> list[Row]:
     """What a stereo without fault could reach with the dataset's poses, and with the tracker's."""
-    rows = ceiling_rows(load_scene("room", SMALL, QUICK if options.quick else None), SMALL, tracked=False)
+    rows = oracle_rows(load_scene("room", SMALL, QUICK if options.quick else None), SMALL, tracked=False)
     for name in [] if options.quick else available(("redkitchen", "fr1_xyz")):
-        rows += ceiling_rows(load_scene(name, SMALL), SMALL, tracked=False)
-        rows += ceiling_rows(load_tracked(name, SMALL), SMALL, tracked=True)
+        rows += oracle_rows(load_scene(name, SMALL), SMALL, tracked=False)
+        rows += oracle_rows(load_tracked(name, SMALL), SMALL, tracked=True)
     return rows
 
 
@@ -149,13 +149,13 @@ def calibration_section(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def peers_section(options: argparse.Namespace) -> list[Row]:
+def baselines_section(options: argparse.Namespace) -> list[Row]:
     names = ("room",) if options.quick else ("room", "redkitchen")
     rows = []
     for name in available(names):
-        rows += peer_rows(*measured(name, SMALL, QUICK if options.quick else None, False), align=False)
+        rows += baseline_rows(*measured(name, SMALL, QUICK if options.quick else None, False), align=False)
     if not options.quick and available(("redkitchen",)):
-        rows += peer_rows(*measured("redkitchen", SMALL, None, True), align=True)
+        rows += baseline_rows(*measured("redkitchen", SMALL, None, True), align=True)
     return rows
 
 
@@ -234,12 +234,12 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "quality": partial(quality_section, area=SMALL, tracked=False),
     "tracked": partial(quality_section, area=SMALL, tracked=True),
     "sensor": sensor_section,
-    "ceiling": ceiling_section,
-    "polished": polished_section,
+    "oracle": oracle_section,
+    "pose_refinement": pose_refinement_section,
     "large": partial(quality_section, area=LARGE, tracked=False),
     "large_tracked": partial(quality_section, area=LARGE, tracked=True),
     "calibration": calibration_section,
-    "peers": peers_section,
+    "baselines": baselines_section,
     "photos": photos_section,
     "parts": partial(variants_section, title="parts", variants=part_variants(SMALL)),
     "skips": partial(variants_section, title="skips", variants=skip_variants(SMALL)),

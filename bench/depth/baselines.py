@@ -14,7 +14,7 @@ from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.warp import relative_warp
 
 
-def peer_rows(scene: Scene, found: Run, align: bool) -> list[Row]:
+def baseline_rows(scene: Scene, found: Run, align: bool) -> list[Row]:
     """Outliers at equal completeness against a plain plane sweep; both figures against SGBM."""
     by_index = {v.index: v for v in scene.views}
     plain: list[np.ndarray] = []
@@ -111,13 +111,13 @@ def sgbm(reference: StereoView, neighbor: StereoView, search: SearchRange) -> np
     shift = float(p2[1, 3] if vertical else p2[0, 3])
     if shift > 0:  # the neighbor lies on the other side: matched from it, or mirrored
         images = [np.ascontiguousarray(i[:, ::-1]) for i in images]
-    least = max(0, int(abs(shift) * search.low) - 1)
-    wanted = int(np.ceil((abs(shift) * search.high - least + 2) / 16)) * 16
-    count = min(max(16, wanted), (images[0].shape[1] - least - 1) // 16 * 16)
+    lowest = max(0, int(abs(shift) * search.low) - 1)
+    wanted = int(np.ceil((abs(shift) * search.high - lowest + 2) / 16)) * 16
+    count = min(max(16, wanted), (images[0].shape[1] - lowest - 1) // 16 * 16)
     if count < 16:  # a camera that moved forward: rectification stretches the images, and OpenCV would throw
         return np.zeros((height, width), np.float32)
     matcher = cv2.StereoSGBM.create(
-        minDisparity=least, numDisparities=count, blockSize=5, P1=8 * 25, P2=32 * 25, disp12MaxDiff=1,
+        minDisparity=lowest, numDisparities=count, blockSize=5, P1=8 * 25, P2=32 * 25, disp12MaxDiff=1,
         uniquenessRatio=10, speckleWindowSize=50, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     disparity = matcher.compute(images[0], images[1]).astype(np.float32) / 16.0
@@ -125,7 +125,7 @@ def sgbm(reference: StereoView, neighbor: StereoView, search: SearchRange) -> np
         disparity = disparity[:, ::-1]
     if vertical:
         disparity = disparity.T
-    good = disparity > max(least, 0.5)
+    good = disparity > max(lowest, 0.5)
     rectified = np.where(good, abs(shift) / np.where(good, disparity, 1.0), 0.0)
     return _unrectify(rectified, reference, r1, p1)
 

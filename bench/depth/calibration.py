@@ -68,16 +68,16 @@ def fit(features: np.ndarray, labels: np.ndarray, ridge: float = 1e-3) -> np.nda
 def reliability(
     probability: np.ndarray, labels: np.ndarray, bins: int = 10
 ) -> tuple[float, list[tuple[float, float, float]]]:
-    """Expected calibration error, and (mean confidence, inliers, share of pixels) of each bin."""
+    """Expected calibration error, and (mean confidence, inliers, fraction of pixels) of each bin."""
     curve = []
     error = 0.0
     which = np.minimum((probability * bins).astype(int), bins - 1)
     for b in range(bins):
         inside = which == b
         if inside.any():
-            share = float(inside.mean())
-            curve.append((float(probability[inside].mean()), float(labels[inside].mean()), share))
-            error += share * abs(curve[-1][0] - curve[-1][1])
+            fraction = float(inside.mean())
+            curve.append((float(probability[inside].mean()), float(labels[inside].mean()), fraction))
+            error += fraction * abs(curve[-1][0] - curve[-1][1])
     return error, curve
 
 
@@ -102,7 +102,7 @@ def calibration_rows(scene: Scene, found: Run, align: bool, bins: int = 5) -> li
         error, curve = reliability(np.concatenate(probability), np.concatenate(labels), bins)
         text = ", ".join(f"{c:.2f}: {i:.2f} ({100 * s:.0f} %)" for c, i, s in curve)
         rows.append(Row(f"calibration, {scene.name}, {kind}: error", error))
-        rows.append(Row(f"calibration, {scene.name}, {kind}: confidence: inliers (share of pixels)", text))
+        rows.append(Row(f"calibration, {scene.name}, {kind}: confidence: inliers (fraction of pixels)", text))
     return rows
 
 
@@ -122,7 +122,7 @@ def main() -> None:
                 probability = 1.0 / (1.0 + np.exp(-features @ w))
                 error, curve = reliability(probability, labels)
                 text = " ".join(f"{c:.2f}:{i:.2f}({s:.2f})" for c, i, s in curve)
-                print(f"  {name:12s} {tag:12s} calibration error {error:.3f}  confidence:inliers(share) {text}")
+                print(f"  {name:12s} {tag:12s} calibration error {error:.3f}  confidence:inliers(fraction) {text}")
 
 
 if __name__ == "__main__":

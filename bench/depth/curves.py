@@ -51,8 +51,8 @@ def settings(area: int) -> dict[str, dict[str, CascadeConfig]]:
         return replace(base, stereo=replace(stereo, stages=stages))
 
     def stepped(step: float) -> CascadeConfig:
-        most = round(first.hypotheses * first.step / step)
-        return staged(replace(first, step=step, hypotheses=most), *stereo.stages[1:])
+        most_hypotheses = round(first.hypotheses * first.step / step)
+        return staged(replace(first, step=step, hypotheses=most_hypotheses), *stereo.stages[1:])
 
     return {
         "size": {label: replace(base, area=a) for label, a in AREAS.items()},

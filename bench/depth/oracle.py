@@ -42,7 +42,7 @@ class _Choice(Cascade):
 
 
 @dataclass(frozen=True)
-class Ceiling:
+class Oracle:
     """Of a scene; ratios, one array a keyframe, are of depth to the true one."""
 
     carried: list[np.ndarray]  # (P,) pixels that a neighbor's true depth reaches
@@ -51,10 +51,10 @@ class Ceiling:
     across: np.ndarray  # (M,) pixels from a match to the epipolar line
 
 
-def ceiling_rows(scene: Scene, area: int, tracked: bool) -> list[Row]:
+def oracle_rows(scene: Scene, area: int, tracked: bool) -> list[Row]:
     """`tracked`: as the benchmark scores the tracker's depths, each map is aligned by its median ratio to the truth."""
-    found = ceiling(scene, area)
-    title = f"ceiling, {scene.name}"
+    found = oracle(scene, area)
+    title = f"oracle, {scene.name}"
     kinds = {"true depths carried over": found.carried, "matches triangulated": found.triangulated}
     rows = [
         Row(f"{title}: {what}, within 5 %{', aligned' if align and not tracked else ''}", within(ratios, align))
@@ -74,7 +74,7 @@ def within(ratios: list[np.ndarray], align: bool) -> float:
     return float(np.mean(np.abs(np.concatenate(known) - 1.0) < INLIER))
 
 
-def ceiling(scene: Scene, area: int) -> Ceiling:
+def oracle(scene: Scene, area: int) -> Oracle:
     """Raises ValueError where no keyframe with true depth has a neighbor to compare with."""
     carried, triangulated, distances = [], [], []
     for view, truth, neighbors in _references(scene, area):
@@ -86,7 +86,7 @@ def ceiling(scene: Scene, area: int) -> Ceiling:
         distances += [match.distances(inverse) for match in matches]
     if not any(r.size for r in carried) or not any(r.size for r in triangulated):
         raise ValueError(f"{scene.name}: no keyframe with true depth has a neighbor to compare with")
-    return Ceiling(carried, triangulated, *np.concatenate(distances, axis=1))
+    return Oracle(carried, triangulated, *np.concatenate(distances, axis=1))
 
 
 _Neighbor = tuple[StereoView, np.ndarray | None]

@@ -85,5 +85,5 @@ def _figures(scene: Scene, found: Run, align: bool) -> dict[str, tuple[float, st
         "inliers": (kept.inliers, ""),
         "completeness": (kept.completeness, ""),
         "processor ms": (1000 * found.processor_seconds, "ms"),
-        "share skipped": (float(np.sum(totals) / everything) if everything else 0.0, ""),
+        "fraction skipped": (float(np.sum(totals) / everything) if everything else 0.0, ""),
     }

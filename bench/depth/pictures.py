@@ -53,7 +53,7 @@ def _colored(depth: np.ndarray, span: tuple[float, float]) -> np.ndarray:
 def _error(depth: np.ndarray, truth: np.ndarray, tolerance: float) -> np.ndarray:
     both = (depth > 0) & (truth > 0)
     relative = np.where(both, np.abs(depth - truth) / np.where(both, truth, 1.0), 0.0)
-    share = np.clip((relative / tolerance - 1.0) / 2.0, 0.0, 1.0)
-    colors = np.stack([np.zeros_like(share), 200 * (1.0 - share), 255 * share], axis=-1).astype(np.uint8)
+    fraction = np.clip((relative / tolerance - 1.0) / 2.0, 0.0, 1.0)
+    colors = np.stack([np.zeros_like(fraction), 200 * (1.0 - fraction), 255 * fraction], axis=-1).astype(np.uint8)
     colors[~both] = _UNKNOWN
     return np.asarray(colors)

@@ -18,7 +18,7 @@ from mvsgs_core.mvs.views import StereoView
 
 
 @dataclass(frozen=True)
-class PolishOptions:
+class PoseRefinementOptions:
     """How far poses may go, and what matches count."""
 
     reach: int = 3  # keyframes before and after that a keyframe is matched with
@@ -39,9 +39,9 @@ class _Matches:
     seen: np.ndarray  # (M, 2) pixels in the target
 
 
-def polished(scene: Scene, options: PolishOptions | None = None) -> tuple[Scene, float, float]:
-    """The scene with polished poses, and the median residual of its matches before and after, in pixels."""
-    o = options or PolishOptions()
+def refine_poses(scene: Scene, options: PoseRefinementOptions | None = None) -> tuple[Scene, float, float]:
+    """The scene with refined poses, and the median residual of its matches before and after, in pixels."""
+    o = options or PoseRefinementOptions()
     views = scene.views
     poses = [v.world_from_cam for v in views]
     sources, rays, matches = _all_matches(views, o)
@@ -68,7 +68,7 @@ def _track(image: np.ndarray, other: np.ndarray, points: np.ndarray) -> tuple[np
     return np.asarray(found), np.asarray(good).ravel() > 0
 
 
-def _all_matches(views: list[StereoView], o: PolishOptions) -> tuple[np.ndarray, np.ndarray, list[_Matches]]:
+def _all_matches(views: list[StereoView], o: PoseRefinementOptions) -> tuple[np.ndarray, np.ndarray, list[_Matches]]:
     """Source keyframe (P,) and viewing ray (P, 3) of each point; matches, tracked there and back."""
     images = [_bytes(v) for v in views]
     sources, rays, matches = [], [], []
@@ -134,7 +134,7 @@ def _initial_depths(
 
 def _step(
     views: list[StereoView], poses: list[np.ndarray], held: list[np.ndarray], rays: np.ndarray, inverse: np.ndarray,
-    matches: list[_Matches], width: np.ndarray, o: PolishOptions,
+    matches: list[_Matches], width: np.ndarray, o: PoseRefinementOptions,
 ) -> tuple[list[np.ndarray], np.ndarray]:  # fmt: skip
     """One Gauss-Newton step; points are eliminated (Schur). Poses move by exp(x) on the camera's side."""
     count, points = len(poses), len(inverse)

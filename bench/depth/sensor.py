@@ -17,11 +17,11 @@ from mvsgs_core import geometry
 
 POINTS = 400  # of each map
 APART = 3  # keyframes: nearer ones see everything from the same distance
-LARGEST = 0.1  # relative difference: occlusions and moving things count as much, not more
+MAX_DIFFERENCE = 0.1  # relative difference: occlusions and moving things count as much, not more
 STEPS = 3  # on both sides of the best so far, at each refinement
 REFINEMENTS = 4  # each halves the steps
 FIRST = 0.04, 0.04  # steps: of the offset times the median depth, and of the logarithm of the scale
-EXPLAINS = 0.1  # share of the difference that an offset must explain to be believed
+EXPLAINS = 0.1  # fraction of the difference that an offset must explain to be believed
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class SensorOffset:
     """What makes the sensor's maps agree best."""
 
     offset: float  # of true inverse depth over measured, per meter
-    before: float  # mean relative difference of carried depths, at most LARGEST each, best scale, no offset
+    before: float  # mean relative difference of carried depths, at most MAX_DIFFERENCE each, best scale, no offset
     after: float  # with the offset
 
     @property
@@ -54,7 +54,7 @@ def sensor_offset(scene: Scene) -> SensorOffset:
     median = float(np.median(np.concatenate([m.depths for m in maps])))
 
     def search(offsets: bool) -> tuple[float, float]:
-        best, least = np.zeros(2), _difference(maps, 0.0, 1.0)
+        best, lowest = np.zeros(2), _difference(maps, 0.0, 1.0)
         step = np.array(FIRST) * (1.0 if offsets else 0.0, 1.0)
         for _ in range(REFINEMENTS):
             middle = best
@@ -62,10 +62,10 @@ def sensor_offset(scene: Scene) -> SensorOffset:
                 for j in range(-STEPS, STEPS + 1):
                     tried = middle + step * (i, j)
                     found = _difference(maps, tried[0] / median, float(np.exp(tried[1])) * (1.0 + tried[0]))
-                    if found < least:
-                        best, least = tried, found
+                    if found < lowest:
+                        best, lowest = tried, found
             step = step / 2.0
-        return float(best[0]) / median, least
+        return float(best[0]) / median, lowest
 
     _, before = search(offsets=False)
     offset, after = search(offsets=True)
@@ -79,7 +79,7 @@ def without_offset(scene: Scene, offset: float) -> Scene:
 
 
 def _difference(maps: list[_Map], offset: float, scale: float) -> float:
-    """Mean relative difference of depths carried from each map to the others, at most LARGEST each."""
+    """Mean relative difference of depths carried from each map to the others, at most MAX_DIFFERENCE each."""
     total, count = 0.0, 0
     for i, source in enumerate(maps):
         z = _shifted(source.depths, offset, scale)
@@ -101,9 +101,9 @@ def _difference(maps: list[_Map], offset: float, scale: float) -> float:
             known = there > 0
             found = _shifted(there[known], offset, scale)
             apart = np.abs(local[inside, 2][known] - found) / found
-            total += float(np.minimum(apart, LARGEST).sum())
+            total += float(np.minimum(apart, MAX_DIFFERENCE).sum())
             count += len(apart)
-    return total / count if count else LARGEST  # maps that no longer meet do not agree
+    return total / count if count else MAX_DIFFERENCE  # maps that no longer meet do not agree
 
 
 def _maps(scene: Scene) -> list[_Map]:

@@ -117,7 +117,7 @@ def measure(quick: bool) -> list[Row]:
 
 def _rows(outcomes: list[dict[str, Any]]) -> list[Row]:
     through = [o for o in outcomes if "ended" not in o]
-    largest = max(through, key=lambda o: o["bytes"])
+    max_memory = max(through, key=lambda o: o["bytes"])
     slowest = max(through, key=lambda o: o["seconds"])
     hostile = [o for o in outcomes if o.get("hostile")]
     read = sum(bool(o.get("frames")) for o in hostile)
@@ -131,6 +131,6 @@ def _rows(outcomes: list[dict[str, Any]]) -> list[Row]:
         at_most("errors that are no plain text", sum(not o.get("plain", True) for o in through), "", 0),
         Row("refused", ", ".join(f"{n} {name}" for name, n in sorted(refused.items()))),
         Row("read in spite of it", sum(o["error"] is None for o in through), "files"),
-        at_most("largest memory", largest["bytes"] / 1e6, f"MB, {largest['kind']}", MEMORY),
+        at_most("largest memory", max_memory["bytes"] / 1e6, f"MB, {max_memory['kind']}", MEMORY),
         at_most("longest time", slowest["seconds"], f"s, {slowest['kind']}", TIMEOUT),
     ]

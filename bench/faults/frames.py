@@ -48,21 +48,21 @@ def measure(quick: bool) -> list[Row]:
 def _decoder(count: int) -> list[Row]:
     frames = mutated(np.random.default_rng(0))
     answers: Counter[str] = Counter()
-    slowest, largest = 0.0, 0
+    slowest, max_memory = 0.0, 0
     for i in range(count):
         data = next(frames)
         answer, seconds = _decode(data)
         answers[answer] += 1
         slowest = max(slowest, seconds)
         if i % TRACED == 0 or seconds > LONG:
-            largest = max(largest, _memory(data))
+            max_memory = max(max_memory, _memory(data))
     others = count - answers["message"] - answers["CodecError"]
     return [
         Row("mutated frames to the decoder", count, "frames"),
         Row("  of them messages all the same", answers["message"], "frames"),
         at_most("  answers but a message or CodecError", others, "frames", 0),
         at_most("  slowest decode, processor time", 1e3 * slowest, "ms", 50),
-        at_most("  largest memory of one decode", largest / 1e6, "MB", 64),
+        at_most("  largest memory of one decode", max_memory / 1e6, "MB", 64),
     ]
 
 
@@ -130,8 +130,8 @@ class _Robot:
                 self._images.add(frame.image.tobytes())
                 if number in (self._goal // 3, 2 * self._goal // 3):
                     publisher.send(b"N" + bytes(GIANT))
-                share = (self._count - self.mutated) // (self._goal - number)
-                for data in itertools.islice(bad, share):
+                quota = (self._count - self.mutated) // (self._goal - number)
+                for data in itertools.islice(bad, quota):
                     publisher.send(b"N" + data[1:])  # else no reader sees it
                     self.mutated += 1
                 if self._stop.wait(max(0.0, began + 1 / RATE - time.monotonic())):

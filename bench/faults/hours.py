@@ -52,7 +52,7 @@ def _watched(folder: Path, frames: int) -> tuple[Samples, list[tuple[float, int]
     output, progress = folder / "out", folder / "progress"
     command = [
         sys.executable, str(ROOT / "launch/run_all.py"), f"output={output}", *OVERRIDES,
-        "dataset._target_=bench.to_and_fro.ToAndFro", f"dataset.frames={frames}", f"dataset.progress={progress}",
+        "dataset._target_=bench.faults.to_and_fro.ToAndFro", f"dataset.frames={frames}", f"dataset.progress={progress}",
     ]  # fmt: skip
     samples = Samples()
     with (folder / "log").open("w+") as log:

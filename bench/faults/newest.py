@@ -20,8 +20,8 @@ from mvsgs_core.rasterizer.splats import Splats
 from nodes import Node
 from nodes.mapper import Mapper
 
-LEAST_COVERED = 0.99  # share of a frame's pixels above half opacity
-MOST_TIME = 5.0  # % of the mapper's
+MIN_COVERED = 0.99  # fraction of a frame's pixels above half opacity
+MAX_TIME = 5.0  # % of the mapper's
 PERIOD = 1e-9  # s between previews: one for each message
 
 
@@ -54,12 +54,12 @@ def _live(sent: list[Keyframe | View | Poses]) -> list[Row]:
                 covered.append(_coverage(preview, message, len(preview.means)))
                 without.append(_coverage(preview, message, known))
     spent = mapper.stats.seconds
-    share = spent["provisional"] / sum(spent.values())
+    fraction = spent["provisional"] / sum(spent.values())
     return [
-        at_least("newest: keyframe in the preview that it gives rise to", min(covered), "least covered", LEAST_COVERED),
+        at_least("newest: keyframe in the preview that it gives rise to", min(covered), "least covered", MIN_COVERED),
         Row("newest: the same by the map alone", min(without), "least covered"),
         Row("newest: until that preview is made", 1e3 * float(np.median(delays)), "ms, median"),
-        at_most("newest: provisional splats, of the mapper's time", 100 * share, "%", MOST_TIME),
+        at_most("newest: provisional splats, of the mapper's time", 100 * fraction, "%", MAX_TIME),
     ]
 
 

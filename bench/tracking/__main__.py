@@ -19,11 +19,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench import tracking_curve
 from bench.runs import folder
 from bench.table import Row, at_most, main
-from bench.tracking import baselines, loop, memory
-from bench.tracking.baselines import Peer, aligned_error
+from bench.tracking import baselines, curves, loop, memory
+from bench.tracking.baselines import Baseline, aligned_error
 from bench.tracking.cases import CASES, Case
 from bench.tracking.parts import global_adjustment_seconds
 from mvsgs_core.datasets import Item
@@ -142,9 +141,9 @@ def curve(name: str, items: Sequence[Item], folder: File) -> list[Row]:
         milliseconds = 1e3 * result.total / len(items)
         return milliseconds, 100.0 * max(result.keyframe_errors, default=float("nan")), result.keyframes
 
-    points = tracking_curve.measure(one)
-    tracking_curve.draw(folder / f"{name}.svg", points)
-    return tracking_curve.rows(name, points)
+    points = curves.measure(one)
+    curves.draw(folder / f"{name}.svg", points)
+    return curves.rows(name, points)
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
@@ -154,24 +153,24 @@ def measure(options: argparse.Namespace) -> list[Row]:
     place = folder(options, "tracking")
     rows: list[Row] = []
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as beside:
-        peers: dict[str, Future[Peer]] = {}
+        solved: dict[str, Future[Baseline]] = {}
         for name in chosen if options.colmap and whole else []:
-            if CASES[name].peer_stride and not CASES[name].hard and CASES[name].there:
-                peers[name] = beside.submit(baselines.solve_case, name, place / "colmap")
+            if CASES[name].baseline_stride and not CASES[name].hard and CASES[name].there:
+                solved[name] = beside.submit(baselines.solve_case, name, place / "colmap")
         long = whole and (not options.only or "memory" in options.only)
         long_run = beside.submit(memory.follow, options.frames) if long else None
         for name in chosen:
             rows += rows_of_case(name, CASES[name], options)
         if options.curve and whole:
-            for name in tracking_curve.SEQUENCES:
+            for name in curves.SEQUENCES:
                 if name in chosen and CASES[name].there:
                     rows += curve(name, CASES[name].items(), place)
         if not options.only:
             rows += parts(options)
-        for name, peer in peers.items():
-            items = CASES[name].items()[:: CASES[name].peer_stride]
+        for name, baseline in solved.items():
+            items = CASES[name].items()[:: CASES[name].baseline_stride]
             ours = run(items)
-            rows += baselines.rows(name, peer.result(), ours.path, items, ours.total + ours.end)
+            rows += baselines.rows(name, baseline.result(), ours.path, items, ours.total + ours.end)
         if long_run is not None:
             rows += memory.rows(long_run.result())
     return rows

@@ -18,11 +18,11 @@ from mvsgs_core.datasets import Item
 from mvsgs_core.tracking.frames import Trajectory
 
 AREA = 512 * 384  # pixels of COLMAP's images: 2.6 times those of the tracker
-SUCCESS = 0.5  # share of the frames that COLMAP must register for its error to be a mark
+SUCCESS = 0.5  # fraction of the frames that COLMAP must register for its error to be a mark
 
 
 @dataclass(frozen=True)
-class Peer:
+class Baseline:
     """What COLMAP made of a sequence; `model` is None where it found none, `why` says so."""
 
     model: Model | None
@@ -30,7 +30,7 @@ class Peer:
     size: tuple[int, int]
 
 
-def solve(items: Sequence[Item], folder: File, threads: int) -> Peer:
+def solve(items: Sequence[Item], folder: File, threads: int) -> Baseline:
     """COLMAP's model of the frames. One that an earlier call left in `folder` for the same images is taken again."""
     size = items[0].image.shape[0], items[0].image.shape[1]
     small = fit_size(*size, AREA) if size[0] * size[1] > AREA else size
@@ -41,33 +41,33 @@ def solve(items: Sequence[Item], folder: File, threads: int) -> Peer:
         digest.update(index.to_bytes(8, "little") + image.tobytes())
     key = folder / "images.sha256"
     if key.exists() and key.read_text() == digest.hexdigest():
-        return Peer(load(folder), "", small)
+        return Baseline(load(folder), "", small)
     key.unlink(missing_ok=True)
     model, why = reconstruct(frames, intrinsics, folder, threads)
     if model is not None:
         key.write_text(digest.hexdigest())
-    return Peer(model, why, small)
+    return Baseline(model, why, small)
 
 
-def solve_case(name: str, folder: File) -> Peer:
+def solve_case(name: str, folder: File) -> Baseline:
     """`solve` for a sequence of the benchmark, by one thread: for a process of its own, beside which ours is timed."""
     case = CASES[name]
     place = folder / "".join(c if c.isalnum() else "_" for c in name)
     place.mkdir(parents=True, exist_ok=True)
-    return solve(case.items()[:: case.peer_stride], place, 1)
+    return solve(case.items()[:: case.baseline_stride], place, 1)
 
 
-def rows(name: str, peer: Peer, path: Trajectory, items: Sequence[Item], seconds: float) -> list[Row]:
+def rows(name: str, baseline: Baseline, path: Trajectory, items: Sequence[Item], seconds: float) -> list[Row]:
     """Both errors over the frames that COLMAP registered and we posed; seconds: processor time of our whole run."""
-    model = peer.model
+    model = baseline.model
     if model is None:
-        return [Row(f"{name}: pycolmap", peer.why)]
+        return [Row(f"{name}: pycolmap", baseline.why)]
     truth = {i.index: i.world_from_cam for i in items if i.world_from_cam is not None}
     theirs = dict(zip(model.index.tolist(), model.world_from_cam, strict=True))
     posed = np.isfinite(path.world_from_cam).all(axis=(1, 2))
     ours = dict(zip(path.index[posed].tolist(), path.world_from_cam[posed], strict=True))
     both = sorted(set(theirs) & set(ours) & set(truth))
-    registered = f"{len(theirs)} of {len(items)} frames{_every(name)}, {peer.size[1]}x{peer.size[0]}"
+    registered = f"{len(theirs)} of {len(items)} frames{_every(name)}, {baseline.size[1]}x{baseline.size[0]}"
     if len(both) < 3:
         return [Row(f"{name}: pycolmap", f"registered {registered}")]
     wanted = np.stack([truth[n][:3, 3] for n in both])
@@ -83,7 +83,7 @@ def rows(name: str, peer: Peer, path: Trajectory, items: Sequence[Item], seconds
 
 
 def _every(name: str) -> str:
-    stride = CASES[name].peer_stride
+    stride = CASES[name].baseline_stride
     return "" if stride == 1 else f", one of {stride}"
 
 

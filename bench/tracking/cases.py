@@ -13,7 +13,7 @@ from mvsgs_core.datasets import Item, open_dataset
 
 @dataclass(frozen=True)
 class Case:
-    """`goal`: ATE of the keyframes, in centimeters, or as a share of the path where it ends with %."""
+    """`goal`: ATE of the keyframes, in centimeters, or as a fraction of the path where it ends with %."""
 
     reader: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -21,7 +21,7 @@ class Case:
     goal: str = ""
     hard: bool = False  # what counts is that the loss is reported and nothing wrong goes out
     quick: bool = False
-    peer_stride: int = 2  # every nth frame is for COLMAP, and for us beside it; 0: none
+    baseline_stride: int = 2  # every nth frame is for COLMAP, and for us beside it; 0: none
 
     @property
     def path(self) -> Path | None:
@@ -45,12 +45,12 @@ def _room(**options: Any) -> Mapping[str, Any]:
 
 
 CASES: dict[str, Case] = {
-    "tum_fr1_xyz": Case("tum", folder="tum_fr1_xyz", goal="1.1", quick=True, peer_stride=1),
+    "tum_fr1_xyz": Case("tum", folder="tum_fr1_xyz", goal="1.1", quick=True, baseline_stride=1),
     "redkitchen": Case("seven_scenes", {"registered": False}, "seven_scenes_redkitchen", goal="4.5"),
     "redkitchen, color camera 525": Case("seven_scenes", {}, "seven_scenes_redkitchen", goal="4.5"),
-    "icl_nuim_of_kt0": Case("icl_nuim", folder="icl_nuim_of_kt0", peer_stride=1),
+    "icl_nuim_of_kt0": Case("icl_nuim", folder="icl_nuim_of_kt0", baseline_stride=1),
     "room": Case("synthetic", _room(frames=120), goal="0.3%", quick=True),
-    "room, loop": Case("synthetic", _room(frames=300, loop=True), goal="0.3%", peer_stride=3),
+    "room, loop": Case("synthetic", _room(frames=300, loop=True), goal="0.3%", baseline_stride=3),
     "room, motion blur": Case("synthetic", _room(frames=120, motion_blur=0.5)),
     "room, noise and exposure": Case("synthetic", _room(frames=120, noise=6.0, exposure=0.5)),
     "room, gloss": Case("synthetic", _room(frames=120, gloss=0.5)),

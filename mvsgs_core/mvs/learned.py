@@ -38,7 +38,7 @@ class Network(NamedTuple):
 NETWORKS = {
     "mvsformer": Network("mvsformer", "state_dict", mvsformer.MULTIPLE, None),
     "mvsformer_p": Network("mvsformer_p", "state_dict", mvsformer.MULTIPLE, None),
-    # of its published weights, by `python -m bench.learned_calibration`: three quarters of the depths are within 5 % of
+    # of its published weights, by `python -m bench.learned.calibration`: three quarters of the depths are within 5 % of
     # the truth where it says 0.25
     "itermvs": Network("itermvs", "model", itermvs.MULTIPLE, (2.69, 1.27)),
 }

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench import ablation, curves, memory, plots, record, scenes, stress
-from bench.baselines import __main__ as peers
+from bench import ablation, curves, memory, plots, record, scenes
+from bench.baselines import __main__ as baselines
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.runs import CONF, Matrix, Run, Setting, choices, figure, said
+from bench.stress import __main__ as stress
 from bench.table import Row, at_least, at_most
 from launch.compose import compose
 from launch.parameters import GraphError
@@ -26,7 +27,12 @@ from mvsgs_core.mapping.training import TrainingConfig
 from tests.support.shared_data import ROOT
 
 SEARCH = f"hydra.searchpath=[file://{CONF}]"
-MAINS = sorted(p.stem for p in (ROOT / "bench").glob("*.py") if re.search(r"^ +main\(measure", p.read_text(), re.M))
+FILES = [*(ROOT / "bench").glob("*.py"), *(ROOT / "bench").glob("*/__main__.py")]
+MAINS = sorted(
+    file.parent.name if file.stem == "__main__" else file.stem
+    for file in FILES
+    if re.search(r"^ +main\(measure", file.read_text(), re.M)
+)
 
 
 def report(psnr: float = 25.0, wall: float = 10.0, **more: Any) -> dict[str, Any]:
@@ -100,7 +106,7 @@ def test_settings_override_choices_and_parameters(tmp_path: Path) -> None:
 
 
 def test_a_slow_node_and_the_track_recorder_stand_in_the_graph() -> None:
-    graph = compose([SEARCH, "+scene=room", "depth_fusion._target_=bench.slow_fusion.SlowFusion"])
+    graph = compose([SEARCH, "+scene=room", "depth_fusion._target_=bench.stress.slow_fusion.SlowFusion"])
     assert graph.slots["depth_fusion"].config["factor"] == 10.0
     with pytest.raises(GraphError, match="recorder has no choice"):
         compose(["recorder=track"])
@@ -186,14 +192,14 @@ def test_an_ablation_of_one_run_calls_nothing_real() -> None:
     assert "±" not in text
 
 
-def test_peers_stand_in_one_table_of_poses_and_one_of_maps() -> None:
+def test_baselines_stand_in_one_table_of_poses_and_one_of_maps() -> None:
     rows = [
         Row("room: poses, ours: ATE", 0.5, "%"), Row("room: poses, COLMAP: ATE", None, "%"),
         Row("room: map, ours: held-out PSNR", 30.0, "dB"),
         Row("room: map, COLMAP, equal time: held-out PSNR", 20.0, "dB"),
         Row("room: map, ours: splats", 9), Row("fox: COLMAP", "no model"),
     ]  # fmt: skip
-    text = peers.markdown(rows)
+    text = baselines.markdown(rows)
     assert "| room | poses, ours |" not in text
     assert "| room | COLMAP | – % |" in text
     assert "| room | ours | 30 dB | 9 |\n| room | COLMAP, equal time | 20 dB |  |" in text
@@ -205,16 +211,16 @@ def test_the_error_of_other_poses_is_taken_over_common_frames_after_alignment() 
     for i, pose in truth.items():
         pose[:3, 3] = (i, i % 2, 0.1 * i)
     frames = {i: GroundTruth(i, 0.0, np.zeros((2, 2, 3), np.uint8), np.ones(4), p, None) for i, p in truth.items()}
-    ours = peers.Ours(report(), {"index": [0, 5, 3], "keyframe": [True, False, True], "world_from_cam": []}, frames)
+    ours = baselines.Ours(report(), {"index": [0, 5, 3], "keyframe": [True, False, True], "world_from_cam": []}, frames)
     theirs = {i: pose.copy() for i, pose in truth.items() if i != 2}
     for pose in theirs.values():
         pose[:3, 3] = 3.0 * pose[:3, 3] + 7.0
-    assert peers.ate_percent(theirs, ours, list(range(6))) == pytest.approx(0.0, abs=1e-9)
+    assert baselines.ate_percent(theirs, ours, list(range(6))) == pytest.approx(0.0, abs=1e-9)
     theirs[4][:3, 3] += 1.0
-    worse = peers.ate_percent(theirs, ours, list(range(6)))
+    worse = baselines.ate_percent(theirs, ours, list(range(6)))
     assert worse is not None
     assert worse > 1.0
-    assert peers.ate_percent(theirs, ours, [0, 2]) is None
+    assert baselines.ate_percent(theirs, ours, [0, 2]) is None
     assert (ours.keyframes, ours.held_out, ours.optimization) == ([0, 3], [5], 3.0)
 
 
@@ -224,28 +230,28 @@ def test_the_offline_map_is_trained_until_twice_the_time_brings_little(
     scores = {3.0: 20.0, 6.0: 22.0, 12.0: 22.5, 24.0: 22.55, 48.0: 30.0}
     asked: list[float] = []
 
-    def train(model: Any, ours: peers.Ours, config: SparseConfig) -> peers.Trained:
+    def train(model: Any, ours: baselines.Ours, config: SparseConfig) -> baselines.Trained:
         asked.append(config.seconds)
-        return peers.Trained(config.seconds + 0.1, scores[config.seconds], 0.8, 10, 20, config.seconds)
+        return baselines.Trained(config.seconds + 0.1, scores[config.seconds], 0.8, 10, 20, config.seconds)
 
-    monkeypatch.setattr(peers, "train", train)
-    ours = peers.Ours(report(), {"index": [], "keyframe": [], "world_from_cam": []}, {})
-    model = peers.Model(*(np.zeros(0) for _ in range(4)), {"mapping": 5.0}, 9.0)
+    monkeypatch.setattr(baselines, "train", train)
+    ours = baselines.Ours(report(), {"index": [], "keyframe": [], "world_from_cam": []}, {})
+    model = baselines.Model(*(np.zeros(0) for _ in range(4)), {"mapping": 5.0}, 9.0)
     kept = tmp_path / "trained.json"
-    cut_short = peers.train_longer(model, ours, 2.0, 1, kept)
-    assert not peers.converged(cut_short)
-    found = peers.train_longer(model, ours, 64.0, 1, kept)
+    cut_short = baselines.train_longer(model, ours, 2.0, 1, kept)
+    assert not baselines.converged(cut_short)
+    found = baselines.train_longer(model, ours, 64.0, 1, kept)
     assert asked == [3.0, 6.0, 12.0, 24.0]  # the first two once
-    assert peers.converged(found)
-    rows = {row.name: row for row in peers.map_rows("room", ours, model, found)}
+    assert baselines.converged(found)
+    rows = {row.name: row for row in baselines.map_rows("room", ours, model, found)}
     assert rows["room: map, COLMAP + splatting, 8 times as long: gain by twice the time"].value == pytest.approx(0.05)
     assert rows["room: COLMAP + splatting, gain by the last doubling of its time"].met
-    short = {row.name: row for row in peers.map_rows("room", ours, model, cut_short)}
+    short = {row.name: row for row in baselines.map_rows("room", ours, model, cut_short)}
     assert not short["room: COLMAP + splatting, gain by the last doubling of its time"].met
-    text = peers.markdown(list(rows.values()))
+    text = baselines.markdown(list(rows.values()))
     assert text.endswith("gain by the last doubling of its time: 0.05 dB (< 0.1: converged)\n")
-    other = peers.Ours(report(time={"wall": 9.0, "stages": {"mapper": {"insertion": 6.0}}}), ours.track, {})
-    peers.train_longer(model, other, 1.0, 1, kept)
+    other = baselines.Ours(report(time={"wall": 9.0, "stages": {"mapper": {"insertion": 6.0}}}), ours.track, {})
+    baselines.train_longer(model, other, 1.0, 1, kept)
     assert asked[-1] == 6.0  # results of another time are no start
 
 
@@ -371,8 +377,8 @@ def test_each_benchmark_explains_itself() -> None:
         "    try: runpy.run_module('bench.' + name, run_name='__main__')\n"
         "    except SystemExit as ended: assert ended.code == 0, name\n"
     )
-    names = [*MAINS, "record", "compare", "colmap_poses"]
-    assert {"scenes", "peers", "stress", "curves", "ablation"} <= set(names)
+    names = [*MAINS, "record", "compare", "baselines.colmap_poses"]
+    assert {"scenes", "baselines", "stress", "curves", "ablation"} <= set(names)
     done = subprocess.run([sys.executable, "-c", code, *names], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.count("usage:") == len(names)
     assert done.stdout.count("--quick") >= len(MAINS)

@@ -99,7 +99,7 @@ def test_the_simulated_grid_is_sparse_noisy_and_partly_wrong() -> None:
 
 
 def test_sections_have_names_and_the_map_says_where_its_figures_come_from() -> None:
-    assert {"quality", "tracked", "ceiling", "peers", "photos", "skips", "curves", "failures", "calibration"} <= set(
+    assert {"quality", "tracked", "oracle", "baselines", "photos", "skips", "curves", "failures", "calibration"} <= set(
         SECTIONS
     )
     rows = map_section(None)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Polishing of dataset poses, on the synthetic room with poses that were spoiled on purpose."""
+"""Refinement of dataset poses, on the synthetic room with poses that were spoiled on purpose."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.depth.data import load_scene
-from bench.depth.pose_refinement import polished
+from bench.depth.pose_refinement import refine_poses
 from mvsgs_core import geometry
 
 
@@ -29,7 +29,7 @@ def test_spoiled_rotations_are_found_again_and_scale_stays() -> None:
         replace(v, world_from_cam=v.world_from_cam @ geometry.se3_exp(x))
         for v, x in zip(scene.views, spoil, strict=True)
     ]
-    better, before, after = polished(replace(scene, views=views))
+    better, before, after = refine_poses(replace(scene, views=views))
     assert after < 0.3 * before
     assert _turns(better.views, scene.views) < 0.25 * _turns(views, scene.views)
     length = [

@@ -30,7 +30,7 @@ def test_every_row_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = gpu.measure_on(device, (((18, 24), 30),), 64, (128, 160), rounds=1)
     names = [row.name for row in rows]
     assert len(set(names)) == len(names)
-    for part in ("gaussian: forward", "exact: backward", "share of the roofline", "training iteration", "RAFT"):
+    for part in ("gaussian: forward", "exact: backward", "fraction of the roofline", "training iteration", "RAFT"):
         assert any(part in name for name in names), part
     assert all(isinstance(row.value, float) and row.value > 0 for row in rows)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.faults.hours import MAX_BYTES, Samples, _rows
+from bench.faults.to_and_fro import ToAndFro
 from bench.table import Row
-from bench.to_and_fro import ToAndFro
 from msgs import Frame, GroundTruth
 
 COUNTS = {"keyframes": 20, "frames": 1000, "frames_tracked": 1000}

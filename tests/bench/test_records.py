@@ -29,12 +29,12 @@ def test_repeated_runs_are_merged_with_their_spread() -> None:
 
 
 def test_a_timed_figure_is_a_median_with_its_spread_and_meets_its_goal_where_all_of_it_does() -> None:
-    within, beyond = (timed("ratio", values, "x", most=1.5) for values in ([1.2, 1.0, 1.4], [1.2, 1.0, 1.6]))
+    within, beyond = (timed("ratio", values, "x", maximum=1.5) for values in ([1.2, 1.0, 1.4], [1.2, 1.0, 1.6]))
     assert (within.value, within.spread, within.met) == (1.2, pytest.approx(0.2), True)
     assert (beyond.value, beyond.met) == (1.2, False)  # the median alone would
     assert within.goal == "<= 1.5, all of 3"
-    assert timed("speed", [3.9, 5.0, 6.0], "x", least=4.0).met is False
-    assert timed("speed", [4.1, 5.0, 6.0], "x", least=4.0).met is True
+    assert timed("speed", [3.9, 5.0, 6.0], "x", minimum=4.0).met is False
+    assert timed("speed", [4.1, 5.0, 6.0], "x", minimum=4.0).met is True
     assert timed("time", [2.0, 1.0], "s") == Row("time", 1.5, "s", spread=0.5)
     kept = record.merge([[asdict(beyond)]])
     assert kept[0]["spread"] == pytest.approx(0.3)

@@ -13,6 +13,6 @@ def test_a_pass_says_whether_quality_was_judged() -> None:
     finite = mapped("finite", views, config)
     assert finite.met
     assert "quality not judged" in finite.goal
-    bad = mapped("bad", views, config, least=60.0)
+    bad = mapped("bad", views, config, minimum=60.0)
     assert bad.met is False
     assert ">= 60 dB" in bad.goal

@@ -1,4 +1,4 @@
-"""The tracking benchmark's own logic: fronts, memory, peers, and a loop that a small map follows."""
+"""The tracking benchmark's own logic: fronts, memory, baselines, and a loop that a small map follows."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from pathlib import Path as File
 import numpy as np
 import pytest
 
-from bench import tracking_curve
 from bench.baselines.colmap_poses import Model, load
-from bench.tracking import baselines, memory
-from bench.tracking.baselines import Peer
+from bench.tracking import baselines, curves, memory
+from bench.tracking.baselines import Baseline
+from bench.tracking.curves import Point
 from bench.tracking.memory import Sample
-from bench.tracking_curve import Point
 from mvsgs_core.datasets import Item
 from mvsgs_core.tracking.frames import Path
 
@@ -22,20 +21,20 @@ def test_the_default_is_on_the_front_unless_something_is_faster_and_better_by_mo
         Point("default", "", 20.0, 1.0, 50), Point("size", "small", 10.0, 1.5, 50),
         Point("size", "odd", 19.9, 0.99, 50), Point("size", "bad", 30.0, 2.0, 50),
     ]  # fmt: skip
-    rows = tracking_curve.rows("room", points)
+    rows = curves.rows("room", points)
     assert [r.unit.rsplit(", ", 1)[1] for r in rows[:4]] == [
         "not on the front", "on the front", "on the front", "not on the front",
     ]  # fmt: skip
     assert rows[-1].met
-    assert tracking_curve.rows("room", [points[0], Point("flow", "dis", 9.0, np.nan, 0)])[1].value == "not tracked"
-    worse = tracking_curve.rows("room", [*points, Point("window", "6", 15.0, 0.5, 50)])[-1]
+    assert curves.rows("room", [points[0], Point("flow", "dis", 9.0, np.nan, 0)])[1].value == "not tracked"
+    worse = curves.rows("room", [*points, Point("window", "6", 15.0, 0.5, 50)])[-1]
     assert (worse.met, worse.value) == (False, "no: window 6")
-    tracking_curve.draw(tmp_path / "room.svg", points)
+    curves.draw(tmp_path / "room.svg", points)
     assert "odd" in (tmp_path / "room.svg").read_text()
 
 
 def test_settings_of_the_curve_differ_from_the_default_and_from_each_other() -> None:
-    configs = list(tracking_curve.settings().values())
+    configs = list(curves.settings().values())
     assert all(a != b for k, a in enumerate(configs) for b in configs[:k])
 
 
@@ -70,12 +69,12 @@ def test_colmap_is_a_mark_only_where_it_registers_most_frames(registered: int, g
     ours[3] = np.nan
     model = Model(np.arange(registered), 2.0 * theirs, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), {}, 30.0)
     path = Path(np.arange(20), np.zeros(20), ours, np.ones(20, bool), np.zeros(20, np.uint8), np.zeros(20, np.int32))
-    rows = baselines.rows("room", Peer(model, "", (240, 320)), path, items, 3.0)
+    rows = baselines.rows("room", Baseline(model, "", (240, 320)), path, items, 3.0)
     assert f"{registered} of 20 frames" in rows[0].unit
     assert rows[1].goal == goal
     assert rows[1].value == pytest.approx(0.5, rel=0.1)
     assert rows[2].value == 10.0
-    none = baselines.rows("room", Peer(None, "no model", (240, 320)), path, items, 3.0)
+    none = baselines.rows("room", Baseline(None, "no model", (240, 320)), path, items, 3.0)
     assert [r.value for r in none] == ["no model"]
 
 
@@ -91,7 +90,7 @@ def test_colmaps_model_is_kept_for_the_same_images_only(tmp_path: File, monkeypa
     monkeypatch.setattr(baselines, "reconstruct", fake)
     items, _ = moving(5)
     for used in (items, items, items[:4]):
-        peer = baselines.solve(used, tmp_path, 1)
-        assert peer.model is not None
-        assert peer.model.processor_seconds == 2.0
+        baseline = baselines.solve(used, tmp_path, 1)
+        assert baseline.model is not None
+        assert baseline.model.processor_seconds == 2.0
     assert calls == [5, 4]

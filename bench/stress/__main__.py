@@ -55,7 +55,7 @@ class Outcome:
     completeness: float | None
     psnr: float | None  # dB, of the frames that `scored` names
     keyframes: float | None
-    tracked: float  # share of the frames
+    tracked: float  # fraction of the frames
     segments: float
     splats: float
     wall: float | None  # s
@@ -236,7 +236,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         pinned = Matrix(["room"], overrides=overrides, prefix=("taskset", "-c", "0"))
         others += one_run("one core", pinned, options, easy)
     if "slow_node" in groups:
-        slow = "depth_fusion._target_=bench.slow_fusion.SlowFusion"
+        slow = "depth_fusion._target_=bench.stress.slow_fusion.SlowFusion"
         others += one_run(
             "depth fusion 10 times as slow", Matrix(["room"], overrides=[*overrides, slow]), options, easy
         )

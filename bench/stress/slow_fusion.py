@@ -1,4 +1,4 @@
-"""Depth fusion slowed down, as `depth_fusion._target_=bench.slow_fusion.SlowFusion`: what a slow node does to a run."""
+"""Slow depth fusion, `depth_fusion._target_=bench.stress.slow_fusion.SlowFusion`: what a slow node does to a run."""
 
 from __future__ import annotations
 

@@ -137,8 +137,8 @@ def picture(scene: Scene, images: Sequence[np.ndarray], methods: Sequence[Maps],
 def _colors(depth: np.ndarray, low: float, high: float) -> np.ndarray:
     """(H, W, 3) uint8 by inverse depth from `low` (red) to `high` (blue); dark gray where unknown."""
     known = depth > 0
-    share = (1 / np.where(known, depth, high) - 1 / high) / (1 / low - 1 / high)
-    colors = cv2.applyColorMap((255 * np.clip(share, 0, 1)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    fraction = (1 / np.where(known, depth, high) - 1 / high) / (1 / low - 1 / high)
+    colors = cv2.applyColorMap((255 * np.clip(fraction, 0, 1)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
     return np.where(known[..., None], colors, np.uint8(40))
 
 

@@ -1,6 +1,6 @@
 """A source whose camera moves to and fro through the room, for as long as one likes.
 
-`dataset._target_=bench.to_and_fro.ToAndFro dataset.frames=10000`.
+`dataset._target_=bench.faults.to_and_fro.ToAndFro dataset.frames=10000`.
 
 What grows with the length of such a stream, and not with what the camera sees, should not.
 """

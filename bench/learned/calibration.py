@@ -1,4 +1,4 @@
-"""Fits and checks what IterMVS's confidence means: `python -m bench.learned_calibration`.
+"""Fits and checks what IterMVS's confidence means: `python -m bench.learned.calibration`.
 
 Prints the offset and slope for mvsgs_core/mvs/learned.py, by logistic regression of "within 5 % of the truth" on the
 logit of the network's confidence, and how well they hold, also on a sequence that took no part.
@@ -14,7 +14,7 @@ import torch
 
 from bench.depth.calibration import INLIER, fit, load, reliability
 from bench.depth.data import SHARED, SOURCES
-from bench.learned import AREA, photographs
+from bench.learned.__main__ import AREA, photographs
 from mvsgs_core.mvs.cascade import CascadeConfig, CascadeDepth
 from mvsgs_core.mvs.learned import NETWORKS, LearnedCascade, LearnedConfig, logit
 
@@ -64,7 +64,7 @@ def main() -> None:
             probability = 1 / (1 + np.exp(-offset - slope * logit(confidence)))
             error, curve = reliability(probability, inlier)
             text = " ".join(f"{c:.2f}:{i:.2f}({s:.2f})" for c, i, s in curve)
-            print(f"  {name:18s} {tag:12s} calibration error {error:.3f}  confidence:inliers(share) {text}")
+            print(f"  {name:18s} {tag:12s} calibration error {error:.3f}  confidence:inliers(fraction) {text}")
 
 
 if __name__ == "__main__":
