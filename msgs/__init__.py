@@ -88,7 +88,7 @@ class Depth:
 
 
 @dataclass(frozen=True)
-class View:
+class FusedKeyframe:
     """A keyframe with its refined and filtered depth: what the mapper adds to the map."""
 
     index: int
@@ -192,8 +192,10 @@ class End:
     stats: Mapping[str, Any] = field(default_factory=dict)
 
 
-Message = Frame | GroundTruth | Keyframe | Depth | View | Poses | Trajectory | SplatMap | Preview | MapView | End
+Message = (
+    Frame | GroundTruth | Keyframe | Depth | FusedKeyframe | Poses | Trajectory | SplatMap | Preview | MapView | End
+)
 TYPES: dict[str, type] = {
     t.__name__: t
-    for t in (Frame, GroundTruth, Keyframe, Depth, View, Poses, Trajectory, SplatMap, Preview, MapView, End)
+    for t in (Frame, GroundTruth, Keyframe, Depth, FusedKeyframe, Poses, Trajectory, SplatMap, Preview, MapView, End)
 }

@@ -23,7 +23,7 @@ from msgs import statistics
 from msgs.header import MAX_TEXT, unpack
 from mvsgs_core.printable import printable
 
-VERSION = 1
+VERSION = 2
 RELIABLE = b"R"  # first byte of a frame, which readers subscribe to: every message ...
 NEWEST = b"N"  # ... or only the newest
 SMALL_BYTES = 4096  # an array up to this is copied: who keeps a pose does not keep its frame's images

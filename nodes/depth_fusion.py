@@ -1,4 +1,4 @@
-"""Depth -> View: depth maps refined by their neighbors' and filtered, with two keyframes of lag. Poses pass through."""
+"""Depth -> FusedKeyframe: depth maps refined by their neighbors' and filtered, with two keyframes of lag."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from msgs import Depth, Poses, View
+from msgs import Depth, FusedKeyframe, Poses
 from mvsgs_core import camera
 from mvsgs_core.fusion.fusion import DepthFusion as Fusion
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
@@ -29,7 +29,7 @@ class FusionNode(Node, ABC):
     @abstractmethod
     def _make_fusion(self) -> Fusion: ...
 
-    def on_depth(self, depth: Depth) -> Iterator[View]:
+    def on_depth(self, depth: Depth) -> Iterator[FusedKeyframe]:
         self._depths[depth.index] = depth
         view = DepthView(
             index=depth.index,
@@ -51,7 +51,7 @@ class FusionNode(Node, ABC):
         self._fusion.move(self._poses)
         yield poses
 
-    def on_end(self) -> Iterator[View]:
+    def on_end(self) -> Iterator[FusedKeyframe]:
         yield from self._timed(self._fusion.flush())
         if self.stats.counts.get("keyframes") and not self.stats.counts["pixels kept"]:
             self.stats.nothing(self._why_nothing())
@@ -69,7 +69,7 @@ class FusionNode(Node, ABC):
             f"{', '.join(shares)} (a pixel can fail more than one)"
         )
 
-    def _timed(self, fused: Iterator[FusedDepth]) -> Iterator[View]:
+    def _timed(self, fused: Iterator[FusedDepth]) -> Iterator[FusedKeyframe]:
         while True:
             with self.stats.time("fusion"):
                 found = next(fused, None)
@@ -77,7 +77,7 @@ class FusionNode(Node, ABC):
                 return
             yield self._message(found)
 
-    def _message(self, found: FusedDepth) -> View:
+    def _message(self, found: FusedDepth) -> FusedKeyframe:
         message = self._depths.pop(found.view.index)
         self.stats.count("keyframes")
         for name, value in found.counts.items():
@@ -86,7 +86,7 @@ class FusionNode(Node, ABC):
             self.stats.warn(f"some keyframes: {found.problem}")
             self.stats.count(found.problem)
         self.stats.values["part kept"] = found.counts["kept"] / found.counts["pixels"]
-        return View(
+        return FusedKeyframe(
             index=message.index,
             timestamp=message.timestamp,
             image=message.image,

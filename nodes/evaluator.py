@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from msgs import GroundTruth, SplatMap, Trajectory, View
+from msgs import FusedKeyframe, GroundTruth, SplatMap, Trajectory
 from mvsgs_core import weights
 from mvsgs_core.atomic_file import replace_text, replacing
 from mvsgs_core.evaluation import html, pictures, statistics
@@ -30,7 +30,7 @@ from nodes import Node
 
 
 class Evaluator(Node):
-    """GroundTruth, View, Trajectory and SplatMap -> report files in `output`; sends nothing."""
+    """GroundTruth, FusedKeyframe, Trajectory and SplatMap -> report files in `output`; sends nothing."""
 
     @dataclass
     class Config:
@@ -70,7 +70,7 @@ class Evaluator(Node):
         self.evaluation.add_frame(truth.index, truth.image, truth.intrinsics, truth.world_from_cam, truth.depth)
         yield from ()
 
-    def on_view(self, view: View) -> Iterator[None]:
+    def on_fused_keyframe(self, view: FusedKeyframe) -> Iterator[None]:
         self.evaluation.add_keyframe(view.index, view.image, view.intrinsics, view.depth, view.scale)
         yield from ()
 

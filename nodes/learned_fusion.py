@@ -1,4 +1,4 @@
-"""Depth -> View: depth maps refined by V-FUSE, then the paper's filters."""
+"""Depth -> FusedKeyframe: depth maps refined by V-FUSE, then the paper's filters."""
 
 from __future__ import annotations
 

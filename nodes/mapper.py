@@ -1,4 +1,4 @@
-"""View, Poses, Keyframe -> SplatMap, Preview: builds the map, optimizes it between keyframes, refines it at the end."""
+"""FusedKeyframe, Poses, Keyframe -> SplatMap, Preview: builds the map, optimizes it, refines it at the end."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs import Keyframe, MapView, Poses, Preview, SplatMap, View
+from msgs import FusedKeyframe, Keyframe, MapView, Poses, Preview, SplatMap
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.mapping.atlas import Atlas
@@ -41,7 +41,7 @@ class Mapper(Node):
     Poses say that a loop joined two, so are their maps; of those that stay apart, the one with the most keyframes is
     refined and sent.
 
-    Keyframes are read for the previews alone: until a keyframe's View comes, its coarse depth stands in for it there.
+    Keyframes are read for the previews alone: until a keyframe's FusedKeyframe comes, its coarse depth stands in there.
     """
 
     @dataclass
@@ -107,7 +107,7 @@ class Mapper(Node):
     def mapper(self) -> OnlineMapper:
         return self.atlas.current
 
-    def on_view(self, view: View) -> Iterator[Preview | MapView]:
+    def on_fused_keyframe(self, view: FusedKeyframe) -> Iterator[Preview | MapView]:
         self._provisional.came(view.index)
         if not self._is_new_view(view):
             return
@@ -196,7 +196,7 @@ class Mapper(Node):
         if self._checkpoints is not None:
             self._checkpoints.last(self.atlas)
 
-    def _is_new_view(self, view: View) -> bool:
+    def _is_new_view(self, view: FusedKeyframe) -> bool:
         if self._replay is None or self._replay.view(view.index, view.world_from_cam, view.scale):
             return True
         self.stats.skip(
@@ -235,7 +235,7 @@ class Mapper(Node):
             f"{int(counts.get('inserted', 0))} splats; all of them faded out"
         )
 
-    def _save_image(self, view: View) -> None:
+    def _save_image(self, view: FusedKeyframe) -> None:
         """A disk that is full costs images, not the map."""
         if not self.config.save_images or self.config.output is None:
             return

@@ -15,7 +15,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from msgs import Depth, Frame, GroundTruth, Keyframe, Message, Poses, Trajectory, View
+from msgs import Depth, Frame, FusedKeyframe, GroundTruth, Keyframe, Message, Poses, Trajectory
 from msgs.codec import ArraySpec, array_specs, encode
 from nodes import Node
 
@@ -92,7 +92,7 @@ class GraphRecorder(Recorder):
     def on_depth(self, message: Depth) -> None:
         self._write(message)
 
-    def on_view(self, message: View) -> None:
+    def on_fused_keyframe(self, message: FusedKeyframe) -> None:
         self._write(message)
 
     def on_poses(self, message: Poses) -> None:

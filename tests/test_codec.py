@@ -79,7 +79,7 @@ def test_a_default_is_left_out_and_comes_back() -> None:
     poses = Poses(1, np.zeros(1, np.int64), np.zeros((1, 4, 4)), np.ones(1))
     assert b"segment" not in bytes(encode(poses))  # readers of before this field take it
     assert decode(encode(poses)).message.segment is None
-    assert b"unfiltered" not in bytes(encode(example(msgs.View, absent=True)))
+    assert b"unfiltered" not in bytes(encode(example(msgs.FusedKeyframe, absent=True)))
     joined = decode(encode(replace(poses, segment=np.array([3], np.int32)))).message
     assert joined.segment.tolist() == [3]
     wrong = with_header(bytes(encode(guessed)), lambda c: c["scalars"].__setitem__("intrinsics_guessed", 1))
@@ -191,7 +191,7 @@ def test_foreign_and_damaged_frames_are_named() -> None:
     data = bytes(encode(frame()))
     refused(b"", "too short")
     refused(b"GET / HTTP/1.1\r\n\r\n", "no message")
-    refused(data[:4] + b"\x02" + data[5:], "version 2")
+    refused(data[:4] + b"\x03" + data[5:], "version 3")
     refused(data[:6] + b"\x01" + data[7:], "flags 1")
     refused(data.replace(b"Frame", b"Fname"), "type 'Fname'")
     refused(data.replace(b"Frame", b"Fr\xffme"), "not ASCII")
@@ -245,7 +245,7 @@ def test_arrays_hold_only_what_their_type_allows() -> None:
 @UNHURRIED
 @given(st.binary(max_size=4096))
 def test_random_bytes_are_refused(data: bytes) -> None:
-    for prefix in (b"", b"RMVS\x01\x05\0\0", b"RMVS\x01\x03\0\0" + struct.pack("<I", len(data)) + b"End"):
+    for prefix in (b"", b"RMVS\x02\x05\0\0", b"RMVS\x02\x03\0\0" + struct.pack("<I", len(data)) + b"End"):
         with pytest.raises(CodecError):
             decode(prefix + data)
 
@@ -331,7 +331,7 @@ def nested(levels: int, opening: bytes) -> bytes:
     ],
 )
 def test_a_false_length_allocates_little(header: bytes) -> None:
-    data = b"RMVS\x01\x03\0\0" + struct.pack("<I", len(header)) + b"End" + header
+    data = b"RMVS\x02\x03\0\0" + struct.pack("<I", len(header)) + b"End" + header
     tracemalloc.start()
     refused(data, "End|header", max_bytes=LIMIT)
     _, peak = tracemalloc.get_traced_memory()

@@ -1,4 +1,4 @@
-"""Keyframe -> Depth -> View through the nodes, on a rendered scene whose depth is known in closed form."""
+"""Keyframe -> Depth -> FusedKeyframe through the nodes, on a rendered scene whose depth is known in closed form."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from msgs import Depth, Keyframe, Poses, View
+from msgs import Depth, FusedKeyframe, Keyframe, Poses
 from nodes import handlers, outputs
 from nodes.coarse_depth import CoarseDepth
 from nodes.depth_fusion import DepthFusion
@@ -28,7 +28,7 @@ def test_contract() -> None:
     assert set(handlers(Mvs)) == {Keyframe, Poses}
     assert set(outputs(Mvs)) == {Depth, Poses}
     assert set(handlers(DepthFusion)) == {Depth, Poses}
-    assert set(outputs(DepthFusion)) == {View, Poses}
+    assert set(outputs(DepthFusion)) == {FusedKeyframe, Poses}
     assert set(outputs(CoarseDepth)) == {Depth, Poses}
 
 

@@ -37,7 +37,7 @@ def types(stats: dict[str, Any]) -> None:
 def test_a_text_of_60000_nuls_and_forty_more_of_them() -> None:
     node = Counting()
     for i in range(40):
-        node.stats.warn(f"View.image must be uint8, not {i}" + "\x00" * 60_000)
+        node.stats.warn(f"FusedKeyframe.image must be uint8, not {i}" + "\x00" * 60_000)
         node.stats.warn("\ud800" * 60_000)
     stats = sent(node)["node"]
     types(stats)

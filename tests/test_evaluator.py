@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msgs import GroundTruth, SplatMap, TrackingState, Trajectory, View
+from msgs import FusedKeyframe, GroundTruth, SplatMap, TrackingState, Trajectory
 from mvsgs_core import geometry
-from mvsgs_core.evaluation.scoring import render_view
+from mvsgs_core.evaluation.scoring import render_frame
 from nodes.evaluator import Evaluator
 from tests.support.full_disk import full_after
 
@@ -79,8 +79,8 @@ def _feed(node: Evaluator, lost: tuple[int, ...] = (), upstream: dict[str, Any] 
     depth = np.full((H // 2, W // 2), 2.0, np.float32)
     image = np.zeros((H, W, 3), np.uint8)
     normals = np.zeros((H // 2, W // 2, 3), np.float32)
-    view = View(3, 0.1, image, INTRINSICS, world_from_cam[3], 1.0, depth, np.ones_like(depth), normals, 0)
-    list(node.on_view(view))
+    view = FusedKeyframe(3, 0.1, image, INTRINSICS, world_from_cam[3], 1.0, depth, np.ones_like(depth), normals, 0)
+    list(node.on_fused_keyframe(view))
     for refined in (False, True):
         list(node.on_splat_map(_splat_map(refined)))
     node.upstream |= upstream or {
@@ -161,8 +161,8 @@ def test_renders_are_rolled_with_the_shutter_that_the_tracker_took_out(evaluator
     assert view.shutter.readout_time == 0.02
     moved = geometry.se3_log(geometry.inverse(poses[4]) @ poses[6])
     np.testing.assert_allclose(view.shutter.velocity, moved * 15, atol=1e-7)
-    color = render_view(finished.splats, finished.kernel, view, (H, W)).color
-    still = render_view(finished.splats, finished.kernel, replace(view, shutter=None), (H, W)).color
+    color = render_frame(finished.splats, finished.kernel, view, (H, W)).color
+    still = render_frame(finished.splats, finished.kernel, replace(view, shutter=None), (H, W)).color
     assert np.abs(color - still).max() > 1e-3
     list(evaluator.on_end())
     assert "20.0 ms a frame" in evaluator.report["protocol"]
@@ -178,8 +178,8 @@ def test_frames_between_keyframes_are_rendered_at_an_exposure_between_theirs(eva
     finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.views()
     for frame, gain in ((0, 1.0), (2, 2 / 3), (3, 0.5), (5, 5 / 6), (6, 1.0)):
         view = views[frame]
-        color = render_view(finished.splats, finished.kernel, view, (H, W)).color
-        plain = render_view(finished.splats, finished.kernel, replace(view, exposure=None), (H, W)).color
+        color = render_frame(finished.splats, finished.kernel, view, (H, W)).color
+        plain = render_frame(finished.splats, finished.kernel, replace(view, exposure=None), (H, W)).color
         np.testing.assert_allclose(color, gain * plain, atol=1e-5)
     list(evaluator.on_end())
     assert "interpolated in time" in evaluator.report["protocol"]
@@ -333,7 +333,7 @@ def test_without_any_frame_the_map_is_scored_on_what_was_mapped(tmp_path: Path) 
     """A source that sends no GroundTruth, as a robot in a hurry: the keyframes' own images remain."""
     node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
     report = _feed(node)
-    assert report["rendering"]["all"]["count"] == 1  # the one View
+    assert report["rendering"]["all"]["count"] == 1  # the one FusedKeyframe
     assert report["rendering"]["frames"][0]["index"] == 3
 
 

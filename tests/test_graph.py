@@ -220,8 +220,8 @@ def test_every_choice_file_of_the_project_composes() -> None:
     slots, _ = vocabulary(CONF)
     stands_for_the_stages = [
         *(f"{slot}._target_=null" for slot in ("tracker", "mvs", "depth_fusion")),
-        "mapper.reads={View: dataset, Poses: dataset}",
-        "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, View: dataset, SplatMap: mapper}",
+        "mapper.reads={FusedKeyframe: dataset, Poses: dataset}",
+        "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, FusedKeyframe: dataset, SplatMap: mapper}",
     ]
     for slot in slots:
         for path in sorted((CONF / slot).glob("*.yaml")):

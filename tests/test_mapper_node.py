@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nodes
-from msgs import Keyframe, MapView, Poses, Preview, SplatMap, View
+from msgs import FusedKeyframe, Keyframe, MapView, Poses, Preview, SplatMap
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.image_metrics import psnr
@@ -25,13 +25,13 @@ from tests.support.tiny_scene import pose_on_arc
 
 
 def test_inputs_and_outputs_are_declared() -> None:
-    assert nodes.handlers(Mapper) == {View: "on_view", Poses: "on_poses", Keyframe: "on_keyframe"}
+    assert nodes.handlers(Mapper) == {FusedKeyframe: "on_fused_keyframe", Poses: "on_poses", Keyframe: "on_keyframe"}
     assert set(nodes.outputs(Mapper)) == {SplatMap, Preview, MapView}
 
 
 def test_what_the_map_shows_is_sent_for_the_keyframe_before() -> None:
     node = Mapper(settings(map_views=True))
-    sent = [m for k in range(3) for m in node.on_view(view_message(7 * k, k / 2)) if isinstance(m, MapView)]
+    sent = [m for k in range(3) for m in node.on_fused_keyframe(view_message(7 * k, k / 2)) if isinstance(m, MapView)]
     assert [m.index for m in sent] == [0, 7]
     assert node.mapper.iterations == 8  # what the two were owed was done before
     view = view_message(0, 0.0)
@@ -44,7 +44,7 @@ def test_what_the_map_shows_is_sent_for_the_keyframe_before() -> None:
 def test_two_maps_leave_the_mapper_before_and_after_the_refinement(tmp_path: Path) -> None:
     node = Mapper(settings(output=str(tmp_path / "run")))
     for k in range(3):
-        list(node.on_view(view_message(7 * k, k / 2)))
+        list(node.on_fused_keyframe(view_message(7 * k, k / 2)))
     while node.on_idle() is not None:
         pass
     before, after = list(node.on_end())
@@ -63,7 +63,7 @@ def test_the_cameras_and_on_request_the_images_are_beside_the_map(tmp_path: Path
     node = Mapper(settings(output=str(tmp_path), save_images=True))
     sent = [view_message(7 * k, k / 2) for k in range(3)]
     for view in sent:
-        list(node.on_view(view))
+        list(node.on_fused_keyframe(view))
     *_, last = node.on_end()
     cameras = read_cameras(tmp_path / "cameras.json")
     assert cameras.keyframes.tolist() == [0, 7, 14]
@@ -79,7 +79,7 @@ def test_the_cameras_and_on_request_the_images_are_beside_the_map(tmp_path: Path
 def test_a_disk_that_takes_no_images_does_not_cost_the_map(tmp_path: Path) -> None:
     (tmp_path / "keyframes").write_text("in the folder's place")
     node = Mapper(settings(output=str(tmp_path), save_images=True))
-    list(node.on_view(view_message(0, 0.5)))
+    list(node.on_fused_keyframe(view_message(0, 0.5)))
     list(node.on_end())
     assert len(read_ply(tmp_path / "map.ply").splats)
     assert node.stats.skipped["images_not_saved"] == 1
@@ -89,7 +89,7 @@ def test_a_disk_that_takes_no_images_does_not_cost_the_map(tmp_path: Path) -> No
 def test_without_refinement_both_maps_are_the_same() -> None:
     node = Mapper(settings())
     node.config.refinement = 0
-    list(node.on_view(view_message(0, 0.5)))
+    list(node.on_fused_keyframe(view_message(0, 0.5)))
     before, after = list(node.on_end())
     assert np.array_equal(before.means, after.means)
     assert before.iterations == after.iterations == 4
@@ -98,7 +98,7 @@ def test_without_refinement_both_maps_are_the_same() -> None:
 def test_an_idle_slice_ends_soon_and_says_when_there_is_nothing_to_do() -> None:
     node = Mapper(settings())
     assert node.on_idle() is None
-    list(node.on_view(view_message(0, 0.5)))
+    list(node.on_fused_keyframe(view_message(0, 0.5)))
     assert node.on_idle() == []
     while node.on_idle() is not None:
         pass
@@ -107,7 +107,7 @@ def test_an_idle_slice_ends_soon_and_says_when_there_is_nothing_to_do() -> None:
 
 def test_poses_move_the_map() -> None:
     node = Mapper(settings())
-    list(node.on_view(view_message(0, 0.5)))
+    list(node.on_fused_keyframe(view_message(0, 0.5)))
     while node.on_idle() is not None:  # what it owes comes before a correction, whenever that arrives
         pass
     moved = pose_on_arc(0.5)
@@ -122,7 +122,7 @@ def test_poses_move_the_map() -> None:
 def test_parts_between_which_tracking_was_lost_do_not_mix_and_the_largest_is_sent() -> None:
     node = Mapper(settings())
     for index, segment in [(0, 0), (1, 1), (2, 1), (3, 0), (4, 1)]:
-        list(node.on_view(view_message(index, index / 5, segment=segment)))
+        list(node.on_fused_keyframe(view_message(index, index / 5, segment=segment)))
     before, after = list(node.on_end())
     assert before.keyframes.tolist() == after.keyframes.tolist() == [1, 2, 4]
     assert set(after.anchors.tolist()) <= {1, 2, 4}
@@ -133,15 +133,15 @@ def test_parts_between_which_tracking_was_lost_do_not_mix_and_the_largest_is_sen
 def test_the_maps_of_segments_that_a_loop_joins_become_one() -> None:
     node = Mapper(settings())
     for index, segment in [(0, 0), (1, 0), (2, 1), (3, 1)]:
-        list(node.on_view(view_message(index, index / 5, segment=segment)))
+        list(node.on_fused_keyframe(view_message(index, index / 5, segment=segment)))
     parts = [len(mapper.state) for mapper in node.atlas.parts.values()]
     moved = np.stack([pose_on_arc(k / 5) for k in (2, 3, 4)])
     moved[:, :3, 3] += [0.5, 0.0, 0.0]
     joined = np.zeros(3, np.int32)
     list(node.on_poses(Poses(1, np.array([2, 3, 4]), moved, np.full(3, 2.0), joined)))
     assert len(node.mapper.state) == sum(parts)
-    list(node.on_view(view_message(4, 0.8, segment=1)))  # on its way when its segment was joined
-    list(node.on_view(view_message(5, 1.0, segment=0)))
+    list(node.on_fused_keyframe(view_message(4, 0.8, segment=1)))  # on its way when its segment was joined
+    list(node.on_fused_keyframe(view_message(5, 1.0, segment=0)))
     before, after = list(node.on_end())
     assert before.keyframes.tolist() == after.keyframes.tolist() == [0, 1, 2, 3, 4, 5]
     assert set(after.anchors.tolist()) >= {0, 2}
@@ -154,7 +154,7 @@ def test_the_maps_of_segments_that_a_loop_joins_become_one() -> None:
 def test_a_pose_that_is_none_is_counted_once_whatever_the_segments() -> None:
     node = Mapper(settings())
     for index, segment in ((0, 0), (1, 0), (2, 1), (3, 1)):
-        list(node.on_view(view_message(index, 0.2 * index, segment=segment)))
+        list(node.on_fused_keyframe(view_message(index, 0.2 * index, segment=segment)))
     assert len(node.atlas.parts) == 2
     poses = np.stack([pose_on_arc(k / 5) for k in (0, 2)])
     poses[0, 0, 3] = np.nan
@@ -166,11 +166,11 @@ def test_a_pose_that_is_none_is_counted_once_whatever_the_segments() -> None:
 
 def test_a_segment_of_which_only_poses_are_known_yet_waits_for_its_views() -> None:
     node = Mapper(settings())
-    list(node.on_view(view_message(2, 0.4, segment=1)))
+    list(node.on_fused_keyframe(view_message(2, 0.4, segment=1)))
     zero = np.zeros(1, np.int32)
     list(node.on_poses(Poses(1, np.array([2]), pose_on_arc(0.4)[None], np.ones(1), zero)))
-    list(node.on_view(view_message(3, 0.6, segment=0)))
-    list(node.on_view(view_message(4, 0.8, segment=2)))
+    list(node.on_fused_keyframe(view_message(3, 0.6, segment=0)))
+    list(node.on_fused_keyframe(view_message(4, 0.8, segment=2)))
     assert [len(mapper.views) for mapper in node.atlas.parts.values()] == [2, 1]
     assert "segments_joined" not in node.stats.counts
 
@@ -178,7 +178,7 @@ def test_a_segment_of_which_only_poses_are_known_yet_waits_for_its_views() -> No
 def test_a_preview_is_capped_and_relative_to_the_origin() -> None:
     node = Mapper(settings(preview_splats=100))
     node.config.preview_period = 1e-9
-    (preview,) = list(node.on_view(view_message(0, 0.5)))
+    (preview,) = list(node.on_fused_keyframe(view_message(0, 0.5)))
     assert isinstance(preview, Preview)
     assert 50 <= len(preview.means) <= 100
     assert preview.render.shape == preview.image.shape
@@ -198,7 +198,7 @@ def test_refusals_reach_the_statistics() -> None:
     node = Mapper(settings())
     message = view_message(0, 0.5)
     message.depth[:3] = np.nan
-    list(node.on_view(message))
+    list(node.on_fused_keyframe(message))
     assert node.stats.counts["refused_depths"] == 96
     assert len(node.stats.warnings) == 1
 
@@ -217,7 +217,7 @@ def test_unfiltered_depth_reaches_the_map() -> None:
     node, message = Mapper(settings()), view_message(0, 0.5)
     depth = message.depth.copy()
     depth[:, :16] = 0.0
-    list(node.on_view(replace(message, depth=depth, unfiltered=message.depth)))
+    list(node.on_fused_keyframe(replace(message, depth=depth, unfiltered=message.depth)))
     assert node.stats.counts["filled"] == 6 * 4
 
 
@@ -238,7 +238,7 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
     chosen: dict[str, Any] = {str(k): v for k, v in OmegaConf.merge(OmegaConf.load(path), small).items()}
     node = Mapper(Mapper.Config(**{k: v for k, v in chosen.items() if k not in ("_target_", "reads")}))
     for k in range(3):
-        list(node.on_view(view_message(7 * k, k / 2)))
+        list(node.on_fused_keyframe(view_message(7 * k, k / 2)))
     before, after = [m for m in node.on_end() if isinstance(m, SplatMap)]
     assert before.iterations == 90
     assert after.kernel == chosen["kernel"]
@@ -267,18 +267,18 @@ def keyframe_message(index: int, t: float) -> Keyframe:
 
 def test_a_keyframe_without_depth_yet_is_in_the_preview_and_not_in_the_map() -> None:
     node, plain = Mapper(replace(settings(), preview_period=1e-9)), Mapper(settings())
-    list(node.on_view(view_message(0, 0.0)))
+    list(node.on_fused_keyframe(view_message(0, 0.0)))
     (preview,) = node.on_keyframe(keyframe_message(7, 1.0))
     assert isinstance(preview, Preview)
     assert len(preview.means) > len(node.mapper.state)
     (moved,) = [*node.on_poses(poses_of(7, 1.0)), *node.on_keyframe(keyframe_message(7, 1.0))][-1:]
     assert isinstance(moved, Preview)
-    (after,) = node.on_view(view_message(7, 1.0))
+    (after,) = node.on_fused_keyframe(view_message(7, 1.0))
     assert isinstance(after, Preview)
     assert len(after.means) == len(node.mapper.state)
-    list(plain.on_view(view_message(0, 0.0)))
+    list(plain.on_fused_keyframe(view_message(0, 0.0)))
     list(plain.on_poses(poses_of(7, 1.0)))
-    list(plain.on_view(view_message(7, 1.0)))
+    list(plain.on_fused_keyframe(view_message(7, 1.0)))
     for name in PARAMETERS:  # keyframes that came for the preview leave the map as it is
         torch.testing.assert_close(getattr(node.mapper.state.splats, name), getattr(plain.mapper.state.splats, name))
 
@@ -291,6 +291,6 @@ def poses_of(index: int, t: float) -> Poses:
 def test_previews_that_nobody_reads_are_not_made() -> None:
     node = Mapper(replace(settings(), preview_period=1e-9))
     node.unread = frozenset({Preview})
-    assert not list(node.on_view(view_message(0, 0.0)))
+    assert not list(node.on_fused_keyframe(view_message(0, 0.0)))
     assert not list(node.on_keyframe(keyframe_message(7, 1.0)))
     assert "provisional" not in node.stats.seconds

@@ -10,7 +10,7 @@ import numpy as np
 
 from launch.compose import compose
 from launch.inline import run_inline
-from msgs import Depth, Keyframe, SplatMap, Trajectory, View
+from msgs import Depth, FusedKeyframe, Keyframe, SplatMap, Trajectory
 
 # Hardly more than the least sizes that the networks take: what comes out is noise at any size.
 PATH = [
@@ -30,7 +30,7 @@ def test_the_papers_path_runs_to_a_map_and_says_that_it_is_noise(tmp_path: Path)
         sent.setdefault(type(message), []).append(message)
 
     run_inline(compose([*PATH, f"output={tmp_path}"]), observe)
-    keyframes, depths, views = (sent[kind] for kind in (Keyframe, Depth, View))
+    keyframes, depths, views = (sent[kind] for kind in (Keyframe, Depth, FusedKeyframe))
     assert len(keyframes) == len(depths) == len(views) >= 5
     (track,) = sent[Trajectory]
     assert np.isfinite(track.world_from_cam).all()

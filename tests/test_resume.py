@@ -14,7 +14,7 @@ import pytest
 import nodes
 from launch.compose import compose
 from launch.inline import run_inline
-from msgs import Poses, Preview, SplatMap, View
+from msgs import FusedKeyframe, Poses, Preview, SplatMap
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from nodes.mapper import Mapper
@@ -28,8 +28,8 @@ SMALL = [
 ]  # fmt: skip
 ROOM = ["dataset.size=[96,128]", "dataset.options.frames=80", "tracker.threads=1"]
 ALONE = [
-    "dataset=resumed", "mapper.reads={View: dataset, Poses: dataset}",
-    "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, View: dataset, SplatMap: mapper}",
+    "dataset=resumed", "mapper.reads={FusedKeyframe: dataset, Poses: dataset}",
+    "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, FusedKeyframe: dataset, SplatMap: mapper}",
     "tracker._target_=null", "mvs._target_=null", "depth_fusion._target_=null",
 ]  # fmt: skip
 
@@ -43,7 +43,7 @@ def inline(output: Path, *overrides: str, until: int = 10**9) -> tuple[dict[str,
     sent: list[Any] = []
 
     def observe(slot: str, node: nodes.Node, message: Any) -> None:
-        if isinstance(message, View) and message.index > until:
+        if isinstance(message, FusedKeyframe) and message.index > until:
             raise Cut
         if slot in ("mapper", "mvs"):
             sent.append(message)
@@ -114,9 +114,9 @@ def test_without_its_stream_it_is_refined_and_reported(cut_off: Path, tmp_path: 
     assert found["mapper"].stats.counts["views"] == len(info.keyframes)
 
 
-def abort_after(node: Mapper, count: int, change: Callable[[View], View] = lambda view: view) -> None:
+def abort_after(node: Mapper, count: int, change: Callable[[FusedKeyframe], FusedKeyframe] = lambda view: view) -> None:
     for k in range(count):
-        list(node.on_view(change(view_message(k, k / 8))))
+        list(node.on_fused_keyframe(change(view_message(k, k / 8))))
     node.on_abort("power")
 
 
@@ -127,7 +127,7 @@ def test_a_tracker_that_went_another_way_leaves_the_map_as_it_is(tmp_path: Path)
     for k in range(8):
         pose = pose_on_arc(k / 8)
         pose[:3, 3] *= 1.3
-        list(node.on_view(replace(view_message(k, k / 8), world_from_cam=pose)))
+        list(node.on_fused_keyframe(replace(view_message(k, k / 8), world_from_cam=pose)))
         if k > 3:
             list(node.on_poses(Poses(k, np.array([0]), 2 * pose[None], np.ones(1))))
     maps = [m for m in node.on_end() if isinstance(m, SplatMap)]
@@ -142,7 +142,7 @@ def test_a_tracker_that_went_another_way_leaves_the_map_as_it_is(tmp_path: Path)
 def test_a_stream_of_which_nothing_is_in_the_map_is_not_taken(tmp_path: Path) -> None:
     abort_after(Mapper(settings(output=str(tmp_path))), 3)
     node = Mapper(settings(output=str(tmp_path), resume=str(tmp_path)))
-    list(node.on_view(view_message(7, 0.9)))
+    list(node.on_fused_keyframe(view_message(7, 0.9)))
     assert len(node.mapper.views) == 3
     assert any("none of its keyframes came up to frame 2" in text for text in node.stats.warnings)
 
@@ -154,13 +154,13 @@ def test_corrections_that_the_checkpoint_has_are_not_taken_twice(tmp_path: Path)
         return Poses(revision, np.array([0]), pose[None], np.ones(1))
 
     first = Mapper(settings(output=str(tmp_path)))
-    list(first.on_view(view_message(0, 0.0)))
+    list(first.on_fused_keyframe(view_message(0, 0.0)))
     list(first.on_poses(correction(1, 0.3)))
     list(first.on_poses(correction(2, 0.1)))
     first.on_abort("power")
     node = Mapper(settings(output=str(tmp_path), resume=str(tmp_path)))
     before = node.mapper.snapshot().splats.means
-    list(node.on_view(view_message(0, 0.0)))
+    list(node.on_fused_keyframe(view_message(0, 0.0)))
     list(node.on_poses(correction(1, 0.3)))
     assert node.mapper.snapshot().world_from_cam[0, 0, 3] == pytest.approx(pose_on_arc(0.0)[0, 3] + 0.1)
     list(node.on_poses(correction(2, 0.1)))
@@ -181,7 +181,7 @@ def test_a_refinement_that_was_cut_off_goes_on_where_it_was(tmp_path: Path) -> N
 
         node.config.refinement, node.rest = 9, rest
         for k in range(3):
-            list(node.on_view(view_message(k, k / 8)))
+            list(node.on_fused_keyframe(view_message(k, k / 8)))
         try:
             return [m for m in node.on_end() if isinstance(m, SplatMap)][-1]
         except Cut:
@@ -201,7 +201,7 @@ def test_a_refinement_that_was_cut_off_goes_on_where_it_was(tmp_path: Path) -> N
 def test_who_watches_is_left_with_the_refined_map() -> None:
     node = Mapper(settings())
     node.config.preview_period = 1e9
-    list(node.on_view(view_message(0, 0.5)))
+    list(node.on_fused_keyframe(view_message(0, 0.5)))
     before, preview, after = list(node.on_end())
     assert isinstance(preview, Preview)
     assert isinstance(before, SplatMap)
@@ -215,11 +215,11 @@ def test_a_map_without_splats_is_nothing_with_its_reason(tmp_path: Path) -> None
     assert none.stats.values["nothing"] == "the mapper made no splat: no keyframe with depth came to it"
     blind = Mapper(settings(output=str(tmp_path)))
     for k in range(2):
-        list(blind.on_view(replace(view_message(k, 0.1), depth=np.zeros((24, 32), np.float32))))
+        list(blind.on_fused_keyframe(replace(view_message(k, 0.1), depth=np.zeros((24, 32), np.float32))))
     list(blind.on_end())
     assert "none of 2 keyframes had a pixel with depth" in blind.stats.values["nothing"]
     refused = Mapper(settings(output=str(tmp_path)))
-    list(refused.on_view(replace(view_message(0, 0.1), world_from_cam=np.full((4, 4), np.nan))))
+    list(refused.on_fused_keyframe(replace(view_message(0, 0.1), world_from_cam=np.full((4, 4), np.nan))))
     list(refused.on_end())
     assert "all 1 keyframes were refused (a keyframe with a pose" in refused.stats.values["nothing"]
     assert list(tmp_path.iterdir()) == []

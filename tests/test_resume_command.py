@@ -57,7 +57,7 @@ def test_a_stream_that_is_gone_leaves_the_checkpoint_to_be_refined(tmp_path: Pat
     assert {(e.message.__name__, e.sender, e.reader) for e in after.edges if e.reader == "evaluator"} == {
         ("GroundTruth", "dataset", "evaluator"),
         ("Trajectory", "dataset", "evaluator"),
-        ("View", "dataset", "evaluator"),
+        ("FusedKeyframe", "dataset", "evaluator"),
         ("SplatMap", "mapper", "evaluator"),
     }
 

@@ -98,7 +98,7 @@ def numbers(frames: list[Frame]) -> list[int]:
         END[:-1],
         END + b"\0",
         b"N",
-        b"NMVS\x01\x05\0\0",
+        b"NMVS\x02\x05\0\0",
     ],
     ids=["empty", "false length", "unfinished", "cut off", "longer", "a byte", "a prefix"],
 )

@@ -11,7 +11,7 @@ import torch
 from bench.table import Row, at_least, at_most
 from launch.compose import compose
 from launch.inline import run_inline
-from msgs import Keyframe, Poses, Preview, View
+from msgs import FusedKeyframe, Keyframe, Poses, Preview
 from mvsgs_core.geometry import quaternion_from_rotation
 from mvsgs_core.rasterizer.kernels import neutral_beta
 from mvsgs_core.rasterizer.rasterize import rasterize
@@ -27,10 +27,10 @@ PERIOD = 1e-9  # s between previews: one for each message
 
 def measure(quick: bool) -> list[Row]:
     size = ["dataset.size=[120,160]", "dataset.stop=60"] if quick else []
-    sent: list[Keyframe | View | Poses] = []
+    sent: list[Keyframe | FusedKeyframe | Poses] = []
 
     def keep(slot: str, node: Node, message: Any) -> None:
-        if isinstance(message, Keyframe | View) or (isinstance(message, Poses) and slot == "depth_fusion"):
+        if isinstance(message, Keyframe | FusedKeyframe) or (isinstance(message, Poses) and slot == "depth_fusion"):
             sent.append(message)
 
     without_map = ["evaluator.max_frames=0", "mapper.preview_period=0", "mapper.iterations=0", "mapper.refinement=0"]
@@ -38,13 +38,13 @@ def measure(quick: bool) -> list[Row]:
     return _live(sent)
 
 
-def _live(sent: list[Keyframe | View | Poses]) -> list[Row]:
+def _live(sent: list[Keyframe | FusedKeyframe | Poses]) -> list[Row]:
     """A mapper that gets keyframes when the tracker has them, four of them before their depth."""
     mapper = Mapper(Mapper.Config(preview_period=PERIOD))
     covered, without, delays = [], [], []
     for message in sent:
-        if isinstance(message, View):
-            list(mapper.on_view(message))
+        if isinstance(message, FusedKeyframe):
+            list(mapper.on_fused_keyframe(message))
         elif isinstance(message, Poses):
             list(mapper.on_poses(message))
         else:

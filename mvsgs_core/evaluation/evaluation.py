@@ -116,7 +116,7 @@ class Evaluation:
             "notes": notes + self._frames.notes(),
         }
 
-    def views(self, refined: bool = True) -> list[scoring.View]:
+    def views(self, refined: bool = True) -> list[scoring.ScoredFrame]:
         """All frames with a pose in the main part of the map whose image is there, in the order of the stream."""
         finished, tracked = self.maps[refined], self.track
         assert tracked is not None
@@ -134,7 +134,7 @@ class Evaluation:
             focal = 1.0 if photograph.as_mapped else tracked.focal_factor
             rolling = tracked.readout_time and not photograph.as_mapped
             views.append(
-                scoring.View(
+                scoring.ScoredFrame(
                     index,
                     bool(tracked.keyframe[k]),
                     from_world @ finished.keyframe_poses.get(index, tracked.world_from_cam[k]),
@@ -174,7 +174,7 @@ class Evaluation:
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
         views = scoring.choose(self.views(refined), self.max_frames)
-        scores = [scoring.score_view(finished.splats, finished.kernel, v, self.lpips) for v in views]
+        scores = [scoring.score_frame(finished.splats, finished.kernel, v, self.lpips) for v in views]
         self.scores[refined] = scores
         held_out = sum(score.held_out for score in scores)
         few = f"{held_out} of the {len(scores)} frames scored are held out: their mean and their worst say little"

@@ -21,7 +21,7 @@ from mvsgs_core.rasterizer.splats import Splats
 
 
 @dataclass(frozen=True)
-class View:
+class ScoredFrame:
     """A frame to score, at its native resolution."""
 
     index: int
@@ -63,7 +63,7 @@ class Rendered(NamedTuple):
     opacity: np.ndarray  # (H, W) float32 in 0..1
 
 
-def render_view(splats: Splats, kernel: str, view: View, size: tuple[int, int]) -> Rendered:
+def render_frame(splats: Splats, kernel: str, view: ScoredFrame, size: tuple[int, int]) -> Rendered:
     """What the map shows from the view, at (height, width)."""
     exposure = None if view.exposure is None else torch.from_numpy(view.exposure)
     with torch.inference_mode():
@@ -76,10 +76,10 @@ def render_view(splats: Splats, kernel: str, view: View, size: tuple[int, int]) 
     return Rendered(color, depth, render.opacity.cpu().numpy())
 
 
-def score_view(splats: Splats, kernel: str, view: View, lpips: Lpips | None) -> Score:
+def score_frame(splats: Splats, kernel: str, view: ScoredFrame, lpips: Lpips | None) -> Score:
     """Scores one view. Nothing is fitted to its photograph, exposure neither."""
     photograph = view.photograph().astype(np.float32) / 255.0
-    color, _, opacity = render_view(splats, kernel, view, photograph.shape[:2])
+    color, _, opacity = render_frame(splats, kernel, view, photograph.shape[:2])
     distance = None
     if lpips is not None:
         images = [torch.from_numpy(i).permute(2, 0, 1)[None].contiguous() for i in (color, photograph)]
@@ -94,7 +94,7 @@ def score_view(splats: Splats, kernel: str, view: View, lpips: Lpips | None) -> 
     )
 
 
-def choose(views: list[View], limit: int) -> list[View]:
+def choose(views: list[ScoredFrame], limit: int) -> list[ScoredFrame]:
     """All views, in the order of the stream, or where there are more than `limit` as many of each kind, spread evenly
     over the run, and its last ones: the last, and of many the last few, for the end of a stream is where maps fail."""
     if len(views) <= limit:
@@ -152,10 +152,10 @@ def _mean(scores: Sequence[Score]) -> dict[str, float | int | None]:
     }
 
 
-def comparison(splats: Splats, kernel: str, view: View, width: int = 400) -> dict[str, np.ndarray]:
+def comparison(splats: Splats, kernel: str, view: ScoredFrame, width: int = 400) -> dict[str, np.ndarray]:
     """Pictures (h, w, 3) uint8 of a view for the report: photograph, render, error, rendered depth."""
     photograph = view.photograph()
-    color, depth, _ = render_view(splats, kernel, view, photograph.shape[:2])
+    color, depth, _ = render_frame(splats, kernel, view, photograph.shape[:2])
     size = (max(1, round(photograph.shape[0] * width / photograph.shape[1])), width)
     error = np.abs(color - photograph.astype(np.float32) / 255.0).mean(axis=2)
     pictures = {

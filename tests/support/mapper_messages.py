@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from msgs import View
+from msgs import FusedKeyframe
 from nodes.mapper import Mapper
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 
-def view_message(index: int, t: float, scale: float = 1.0, segment: int = 0) -> View:
+def view_message(index: int, t: float, scale: float = 1.0, segment: int = 0) -> FusedKeyframe:
     view = rgbd_keyframe(index, pose_on_arc(t), (24, 32))
     assert view.normals is not None
-    return View(
+    return FusedKeyframe(
         index=index, timestamp=0.1 * index, image=view.image, intrinsics=view.intrinsics,
         world_from_cam=view.world_from_cam, scale=scale, depth=view.depth, confidence=np.ones_like(view.depth),
         normals=view.normals, segment=segment,

@@ -52,8 +52,8 @@ def checkpoint_info(output: Path | str) -> CheckpointInfo:
     To go on where the source can be read again: the same graph from the stream's beginning, with `mapper.resume=output`
     and, where the node has that parameter, `mvs.resume_after=info.stereo_after()`. The tracker finds its poses again,
     keyframes that are mapped already are passed over. Where it cannot, or `finished`: `dataset=resumed
-    dataset.path=output mapper.resume=output mapper.reads={View: dataset, Poses: dataset}`, tracker, mvs and
-    depth_fusion off, and the evaluator's Trajectory and View from dataset.
+    dataset.path=output mapper.resume=output mapper.reads={FusedKeyframe: dataset, Poses: dataset}`, tracker, mvs and
+    depth_fusion off, and the evaluator's Trajectory and FusedKeyframe from dataset.
     """
     problems = []
     for file in state_files(Path(output)):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.evaluation.scoring import Score, View, choose, score_view, summarize
+from mvsgs_core.evaluation.scoring import Score, ScoredFrame, choose, score_frame, summarize
 from mvsgs_core.rasterizer.splats import Splats
 
 INTRINSICS = np.array([30.0, 30.0, 15.5, 11.5])
 
 
-def view(index: int, keyframe: bool = False) -> View:
-    return View(index, keyframe, np.eye(4), INTRINSICS, lambda: np.full((24, 32, 3), 128, np.uint8), 0.01)
+def view(index: int, keyframe: bool = False) -> ScoredFrame:
+    return ScoredFrame(index, keyframe, np.eye(4), INTRINSICS, lambda: np.full((24, 32, 3), 128, np.uint8), 0.01)
 
 
 def score(index: int, psnr: float, keyframe: bool = False, coverage: float = 1.0) -> Score:
@@ -76,5 +76,5 @@ def test_coverage_is_the_share_of_pixels_that_the_map_shows() -> None:
     quaternions = torch.zeros(count, 4)
     quaternions[:, 0] = 1.0
     splats = Splats(means, log_scales, quaternions, logits, torch.zeros(count, 1, 3), torch.full((count,), 2.0))
-    found = score_view(splats, "gaussian", view(3), None)
+    found = score_frame(splats, "gaussian", view(3), None)
     assert found.coverage == pytest.approx(0.5, abs=0.06)
