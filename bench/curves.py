@@ -17,10 +17,10 @@ from bench import pieces, plots
 from bench.runs import Matrix, Run, Setting, figure, folder, stage_seconds
 from bench.table import Row, main
 
-# The cascade of the core with one stage more: scale, step, hypotheses, radius, small_jump, large_jump
-_COARSEST = "{scale: 4, step: 0.7, hypotheses: 64, radius: 3, small_jump: 0.3, large_jump: 2.0}"
-_MIDDLE = "{scale: 2, step: 0.5, hypotheses: 15, radius: 3, small_jump: 0.1, large_jump: 0.8}"
-_FINE = "{scale: 1, step: 0.35, hypotheses: 11, radius: 3, small_jump: 0.05, large_jump: 0.4}"
+# The cascade of the core with one stage more: scale, step, hypotheses, radius, p1, p2
+_COARSEST = "{scale: 4, step: 0.7, hypotheses: 64, radius: 3, p1: 0.3, p2: 2.0}"
+_MIDDLE = "{scale: 2, step: 0.5, hypotheses: 15, radius: 3, p1: 0.1, p2: 0.8}"
+_FINE = "{scale: 1, step: 0.35, hypotheses: 11, radius: 3, p1: 0.05, p2: 0.4}"
 CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point and its overrides
     "tracker.area": {f"{a // 1000}k": (f"tracker.area={a}",) for a in (19200, 38400)},
     "tracker.window": {str(n): (f"tracker.window={n}",) for n in (6, 20)},
@@ -28,7 +28,7 @@ CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point 
     "mvs.neighbors": {str(n): (f"mvs.neighbors={n}",) for n in (2, 6)},
     "mvs.stages": {"3 stages": (f"mvs.stages=[{_COARSEST},{_MIDDLE},{_FINE}]",)},
     "depth_fusion.confidence": {f"{c}": (f"depth_fusion.confidence={c}",) for c in (0.6, 0.9)},
-    "depth_fusion.least_views": {"3": ("depth_fusion.least_views=3",)},
+    "depth_fusion.min_views": {"3": ("depth_fusion.min_views=3",)},
     "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 60, 120)},
     "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200)},
     "mapper.max_splats": {f"{n // 1000}k": (f"mapper.max_splats={n}",) for n in (10000, 20000)},

@@ -13,7 +13,7 @@ from msgs import Depth, FusedKeyframe, Poses
 from mvsgs_core import camera
 from mvsgs_core.fusion.fusion import DepthFusion as Fusion
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
-from mvsgs_core.fusion.views import DepthView
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
 from nodes import Node
 
 
@@ -31,7 +31,7 @@ class FusionNode(Node, ABC):
 
     def on_depth(self, depth: Depth) -> Iterator[FusedKeyframe]:
         self._depths[depth.index] = depth
-        view = DepthView(
+        view = KeyframeDepth(
             index=depth.index,
             depth=depth.depth,
             confidence=depth.confidence,
@@ -114,9 +114,9 @@ class DepthFusion(FusionNode):
         check: bool = True  # geometric consistency
         relative: float = 0.02  # relative depth difference that still agrees
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
-        least_views: int = 2  # views that must agree, the reference counted
+        min_views: int = 2  # views that must agree, the reference counted
         confidence: float = 0.77  # least confidence of a kept pixel
-        rim: int = 2  # pixels: nothing is kept that close to something farther; 0: off
+        discontinuity_radius: int = 2  # pixels: nothing is kept that close to something farther; 0: off
         speckle: int = 200  # pixels: patches up to this size are not kept; 0: off
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
         threads: int | None = None  # of the C++ kernels; null: all
@@ -135,9 +135,9 @@ class DepthFusion(FusionNode):
                 check=c.check,
                 relative=c.relative,
                 round_trip=c.round_trip,
-                least_views=c.least_views,
+                min_views=c.min_views,
                 confidence=c.confidence,
-                rim=c.rim,
+                discontinuity_radius=c.discontinuity_radius,
                 speckle=c.speckle,
                 device=c.device,
                 threads=c.threads,

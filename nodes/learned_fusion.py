@@ -27,7 +27,7 @@ class LearnedFusion(FusionNode):
         check: bool = True  # geometric consistency
         relative: float = 0.01  # relative depth difference that still agrees
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
-        least_views: int = 3  # views that must agree, the reference counted
+        min_views: int = 3  # views that must agree, the reference counted
         confidence: float = 0.7  # least confidence of a kept pixel; that of swr is relative to the image
         device: str = "auto"  # auto (CUDA if there is one), cpu, cuda
         threads: int | None = None  # of the C++ kernels; null: all
@@ -49,9 +49,9 @@ class LearnedFusion(FusionNode):
                 check=c.check,
                 relative=c.relative,
                 round_trip=c.round_trip,
-                least_views=c.least_views,
+                min_views=c.min_views,
                 confidence=c.confidence,
-                rim=0,  # the paper has neither
+                discontinuity_radius=0,  # the paper has neither
                 speckle=0,
                 device=c.device,
                 threads=c.threads,

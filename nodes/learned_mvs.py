@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 
 from mvsgs_core.mvs.cascade import CascadeConfig
-from mvsgs_core.mvs.hypotheses import RangeChoice
+from mvsgs_core.mvs.hypotheses import RangeConfig
 from mvsgs_core.mvs.learned import RANDOM, LearnedCascade, LearnedConfig
-from mvsgs_core.mvs.neighbors import NeighborChoice
+from mvsgs_core.mvs.neighbors import NeighborConfig
 from nodes.mvs import StereoNode
 
 
@@ -26,7 +26,7 @@ class LearnedMvs(StereoNode):
         window: int = 8  # keyframes before the reference that may be neighbors
         neighbors: int = 4  # views that a reference is matched with
         range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
-        least_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
+        min_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
         device: str = "auto"  # auto (CUDA if there is one), cpu, cuda
         threads: int | None = None  # of PyTorch; null: as the launcher sets it
         resume_after: int | None = None  # keyframes up to this frame are in a resumed map: neighbors of others only
@@ -47,8 +47,8 @@ class LearnedMvs(StereoNode):
                 area=c.area,
                 lag=c.lag,
                 window=c.window,
-                neighbors=NeighborChoice(count=c.neighbors),
-                ranges=RangeChoice(margin=c.range_margin, least_cells=c.least_cells),
+                neighbors=NeighborConfig(count=c.neighbors),
+                ranges=RangeConfig(margin=c.range_margin, min_cells=c.min_cells),
             ),
             LearnedConfig(network=c.network, file=c.weights, area=c.network_area, device=device),
         )

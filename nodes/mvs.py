@@ -11,9 +11,9 @@ import numpy as np
 
 from msgs import Depth, Keyframe, Poses
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth
-from mvsgs_core.mvs.hypotheses import RangeChoice
-from mvsgs_core.mvs.neighbors import NeighborChoice
-from mvsgs_core.mvs.skipping import SkipChoice
+from mvsgs_core.mvs.hypotheses import RangeConfig
+from mvsgs_core.mvs.neighbors import NeighborConfig
+from mvsgs_core.mvs.pruning import PruningConfig
 from mvsgs_core.mvs.stereo import Stage, StereoConfig
 from nodes import Node
 
@@ -106,11 +106,11 @@ class Mvs(StereoNode):
         lag: int = 2  # keyframes after the reference that are waited for
         window: int = 8  # keyframes before the reference that may be neighbors
         neighbors: int = 4  # views that a reference is matched with
-        best_views: int = 3  # of these, per pixel and hypothesis: the others may be occluded
+        top_k: int = 3  # of these, per pixel and hypothesis: the others may be occluded
         stages: list[dict[str, Any]] = field(default_factory=list)  # of the cascade, empty: the defaults of the core
         paths: int = 8  # directions of the smoothing, 4 or 8
         range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
-        least_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
+        min_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
         skip_cells: bool = True  # hypotheses that the tracker's depths around rule out
         skip_certain: float = 1.0  # later stages where the one before was more certain than this; 1: nowhere
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
@@ -121,8 +121,8 @@ class Mvs(StereoNode):
 
     def _make_cascade(self) -> Cascade:
         c = self.config
-        skips = SkipChoice(outside_cells=c.skip_cells, certain=c.skip_certain)
-        stereo = StereoConfig(best_views=c.best_views, paths=c.paths, skips=skips)
+        skips = PruningConfig(outside_cells=c.skip_cells, certain=c.skip_certain)
+        stereo = StereoConfig(top_k=c.top_k, paths=c.paths, skips=skips)
         if c.stages:
             stereo = replace(stereo, stages=tuple(Stage(**stage) for stage in c.stages))
         return Cascade(
@@ -132,8 +132,8 @@ class Mvs(StereoNode):
                 window=c.window,
                 device=c.device,
                 threads=c.threads,
-                neighbors=NeighborChoice(count=c.neighbors),
-                ranges=RangeChoice(margin=c.range_margin, least_cells=c.least_cells),
+                neighbors=NeighborConfig(count=c.neighbors),
+                ranges=RangeConfig(margin=c.range_margin, min_cells=c.min_cells),
                 stereo=stereo,
             )
         )

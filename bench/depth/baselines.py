@@ -10,7 +10,7 @@ from bench.depth.run import Run, score
 from bench.table import Row, at_least
 from mvsgs_core import camera, geometry
 from mvsgs_core.mvs.hypotheses import SearchRange
-from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.warp import relative_warp
 
 
@@ -54,7 +54,7 @@ def baseline_rows(scene: Scene, found: Run, align: bool) -> list[Row]:
 
 
 def plane_sweep(
-    reference: StereoView, neighbors: list[StereoView], search: SearchRange, hypotheses: int
+    reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange, hypotheses: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Depth and confidence (H, W): fronto-parallel planes, box ZNCC 7x7, mean over views, winner takes all.
 
@@ -88,7 +88,7 @@ def plane_sweep(
     return (1.0 / inverse_depths[best]).astype(np.float32), np.clip(second - lowest, 0.0, 1.0)
 
 
-def sgbm(reference: StereoView, neighbor: StereoView, search: SearchRange) -> np.ndarray:
+def sgbm(reference: StereoKeyframe, neighbor: StereoKeyframe, search: SearchRange) -> np.ndarray:
     """Depth (H, W) in the reference by StereoSGBM on the rectified pair; 0 where it gives none."""
     height, width = reference.size
     relative = geometry.inverse(neighbor.world_from_cam) @ reference.world_from_cam
@@ -130,7 +130,9 @@ def sgbm(reference: StereoView, neighbor: StereoView, search: SearchRange) -> np
     return _unrectify(rectified, reference, r1, p1)
 
 
-def _unrectify(depth: np.ndarray, reference: StereoView, rotation: np.ndarray, projection: np.ndarray) -> np.ndarray:
+def _unrectify(
+    depth: np.ndarray, reference: StereoKeyframe, rotation: np.ndarray, projection: np.ndarray
+) -> np.ndarray:
     """Depth of the rectified camera, looked up from the reference's pixels (nearest; z along the reference's axis)."""
     height, width = reference.size
     u, v = camera.pixel_grid(height, width)

@@ -42,7 +42,7 @@ def settings(area: int) -> dict[str, dict[str, CascadeConfig]]:
     """Curve -> label -> configuration; all else at its default."""
     base, stereo = CascadeConfig(area=area), StereoConfig()
     first = stereo.stages[0]
-    coarse = Stage(4, first.step, 64, first.radius, first.small_jump, first.large_jump)
+    coarse = Stage(4, first.step, 64, first.radius, first.p1, first.p2)
     coarsest = replace(coarse, scale=8, hypotheses=32)
     middle = Stage(2, 0.5, 15, first.radius, 0.1, 0.8)
     between = replace(middle, scale=4)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core.datasets import Item, open_dataset
-from mvsgs_core.mvs.views import StereoView, prepare_view
+from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 
 SHARED = Path(os.environ.get("MVSGS_SHARED", Path(__file__).resolve().parents[2] / "shared")) / "data"
 COARSE = (30, 40)  # cells of the simulated tracker grid
@@ -49,7 +49,7 @@ class Scene:
 
     name: str
     items: list[Item]
-    views: list[StereoView]
+    views: list[StereoKeyframe]
     truths: list[np.ndarray | None]  # (H, W) float32 at the views' size, 0 = unknown
     tolerance: float
 
@@ -76,7 +76,7 @@ def load_scene(
     for number, item in enumerate(items):
         coarse_from = item.depth if item.depth is not None else known[min(number // 2, len(known) - 1)]
         grid, weight = coarse_grid(coarse_from, seed=number)
-        view = prepare_view(
+        view = prepare_keyframe(
             item.index, item.image, item.intrinsics, _pose(item), area=area, scales=scales,
             inverse_depth=grid, weight=weight,
         )  # fmt: skip

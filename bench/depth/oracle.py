@@ -22,8 +22,8 @@ from bench.table import Row
 from mvsgs_core.fusion.backend import NativeFusionBackend
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.hypotheses import SearchRange
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.mvs.stereo import StereoDepth, empty_depth
-from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import LucasKanade
 from mvsgs_core.warp import apply_warp, relative_warp
@@ -37,7 +37,7 @@ NOISE = 0.5  # pixels, of a match; those farther off count less (Cauchy)
 class _Choice(Cascade):
     """The cascade's choice of neighbors, without its stereo."""
 
-    def _estimate(self, reference: StereoView, neighbors: list[StereoView], search: SearchRange) -> StereoDepth:
+    def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
         return empty_depth(reference.size)
 
 
@@ -89,10 +89,10 @@ def oracle(scene: Scene, area: int) -> Oracle:
     return Oracle(carried, triangulated, *np.concatenate(distances, axis=1))
 
 
-_Neighbor = tuple[StereoView, np.ndarray | None]
+_Neighbor = tuple[StereoKeyframe, np.ndarray | None]
 
 
-def _references(scene: Scene, area: int) -> Iterator[tuple[StereoView, np.ndarray, list[_Neighbor]]]:
+def _references(scene: Scene, area: int) -> Iterator[tuple[StereoKeyframe, np.ndarray, list[_Neighbor]]]:
     """Keyframes with true depth, and the neighbors that stereo would match them with, with theirs."""
     cascade = _Choice(CascadeConfig(area=area))
     chosen = [one for view in scene.views for one in cascade.add(view)] + list(cascade.flush())
@@ -103,11 +103,11 @@ def _references(scene: Scene, area: int) -> Iterator[tuple[StereoView, np.ndarra
             yield one.view, truth, [known[index] for index in one.neighbors]
 
 
-def _warp(reference: StereoView, neighbor: StereoView) -> np.ndarray:
+def _warp(reference: StereoKeyframe, neighbor: StereoKeyframe) -> np.ndarray:
     return relative_warp(reference.intrinsics, reference.world_from_cam, neighbor.intrinsics, neighbor.world_from_cam)
 
 
-def _carried(view: StereoView, truth: np.ndarray, neighbors: list[_Neighbor]) -> np.ndarray:
+def _carried(view: StereoKeyframe, truth: np.ndarray, neighbors: list[_Neighbor]) -> np.ndarray:
     """Ratio of depth (P,) of the neighbor that fits best; P is 0 where no neighbor has true depth."""
     maps = [(neighbor, depth) for neighbor, depth in neighbors if depth is not None]
     if not maps:
@@ -121,7 +121,7 @@ def _carried(view: StereoView, truth: np.ndarray, neighbors: list[_Neighbor]) ->
     return np.asarray(np.take_along_axis(ratios, best[None], axis=0)[0])
 
 
-def _corners(view: StereoView, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _corners(view: StereoKeyframe, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (C, 2) float64 of corners on smooth known depth, and their inverse depths (C,)."""
     kernel = np.ones((AROUND, AROUND), np.uint8)
     farthest = cv2.dilate(truth, kernel)
@@ -135,7 +135,7 @@ def _corners(view: StereoView, truth: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return pixels, 1.0 / truth[v, u].astype(np.float64)
 
 
-def _image(view: StereoView) -> TrackingImage:
+def _image(view: StereoKeyframe) -> TrackingImage:
     return TrackingImage(view.index, 0.0, np.clip(np.rint(view.gray(1) + 128.0), 0, 255).astype(np.uint8))
 
 
@@ -149,7 +149,7 @@ class _Match:
     good: np.ndarray  # (C,) bool: found
 
     @staticmethod
-    def of(view: StereoView, neighbor: StereoView, corners: np.ndarray, inverse: np.ndarray) -> _Match:
+    def of(view: StereoKeyframe, neighbor: StereoKeyframe, corners: np.ndarray, inverse: np.ndarray) -> _Match:
         warp = _warp(view, neighbor)
         x, y, z = apply_warp(warp, corners[:, 0], corners[:, 1], inverse)
         guess = np.where(z[:, None] > 0, np.stack([x, y], axis=1), np.nan)

@@ -23,7 +23,7 @@ from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.cascade import CascadeConfig
 from mvsgs_core.mvs.interface import CostOptions
-from mvsgs_core.mvs.views import StereoView, prepare_view
+from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 from mvsgs_core.warp import apply_warp, relative_warp
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker
@@ -59,7 +59,7 @@ def photo_rows(area: int, names: list[str]) -> list[Row]:
     return rows
 
 
-def load_photos(photos: Photos, area: int) -> list[StereoView]:
+def load_photos(photos: Photos, area: int) -> list[StereoKeyframe]:
     """Keyframes with poses and coarse depth: triangulated by the posed tracker, or all by the tracker."""
     keyframes: dict[int, Keyframe] = {}
     latest: dict[int, tuple[np.ndarray, float]] = {}
@@ -82,7 +82,7 @@ def load_photos(photos: Photos, area: int) -> list[StereoView]:
             ))  # fmt: skip
     take(tracker.on_end())
     views = [
-        prepare_view(
+        prepare_keyframe(
             k.index, k.image, k.intrinsics, k.world_from_cam, area=area, scales=(1, 2), inverse_depth=k.inverse_depth,
             weight=k.inverse_depth_weight, scale=k.scale, segment=k.segment,
         )
@@ -91,7 +91,7 @@ def load_photos(photos: Photos, area: int) -> list[StereoView]:
     return [v.moved(*latest[v.index]) if v.index in latest else v for v in views]
 
 
-def _scores(name: str, views: list[StereoView], found: Run) -> list[Row]:
+def _scores(name: str, views: list[StereoKeyframe], found: Run) -> list[Row]:
     by_index = {v.index: v for v in views}
     differences, correlations, near_points = [], [], []
     for stereo, fused in zip(found.stereo, found.fused, strict=True):
@@ -133,7 +133,7 @@ def _difference(one: FusedDepth, other: FusedDepth) -> np.ndarray:
     return np.asarray(difference[(there > 0) & (difference < 0.25)])
 
 
-def _correlation(fused: FusedDepth, reference: StereoView, other: StereoView) -> np.ndarray:
+def _correlation(fused: FusedDepth, reference: StereoKeyframe, other: StereoKeyframe) -> np.ndarray:
     """(K,) ZNCC of kept pixels that `other` sees."""
     kept = fused.depth > 0
     inverse = np.where(kept, 1.0 / np.where(kept, fused.depth, 1.0), 1.0).astype(np.float32)
@@ -144,7 +144,7 @@ def _correlation(fused: FusedDepth, reference: StereoView, other: StereoView) ->
     return np.asarray(found[kept & (found > -1.5)])
 
 
-def _ratio_to_points(fused: FusedDepth, reference: StereoView) -> np.ndarray:
+def _ratio_to_points(fused: FusedDepth, reference: StereoKeyframe) -> np.ndarray:
     """(K,) kept depth over the tracker's in its confident cells."""
     cells = reference.inverse_depth.shape
     depth = cv2.resize(fused.depth, cells[::-1], interpolation=cv2.INTER_NEAREST)

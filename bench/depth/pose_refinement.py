@@ -13,8 +13,8 @@ import numpy as np
 
 from bench.depth.data import Scene
 from mvsgs_core import geometry
-from mvsgs_core.mvs.hypotheses import RangeChoice, search_range
-from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.hypotheses import RangeConfig, search_range
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def refine_poses(scene: Scene, options: PoseRefinementOptions | None = None) -> 
     return replace(scene, views=moved), before, after
 
 
-def _bytes(view: StereoView) -> np.ndarray:
+def _bytes(view: StereoKeyframe) -> np.ndarray:
     return np.clip(view.gray(1) + 128.0, 0.0, 255.0).astype(np.uint8)
 
 
@@ -68,7 +68,9 @@ def _track(image: np.ndarray, other: np.ndarray, points: np.ndarray) -> tuple[np
     return np.asarray(found), np.asarray(good).ravel() > 0
 
 
-def _all_matches(views: list[StereoView], o: PoseRefinementOptions) -> tuple[np.ndarray, np.ndarray, list[_Matches]]:
+def _all_matches(
+    views: list[StereoKeyframe], o: PoseRefinementOptions
+) -> tuple[np.ndarray, np.ndarray, list[_Matches]]:
     """Source keyframe (P,) and viewing ray (P, 3) of each point; matches, tracked there and back."""
     images = [_bytes(v) for v in views]
     sources, rays, matches = [], [], []
@@ -96,7 +98,7 @@ def _all_matches(views: list[StereoView], o: PoseRefinementOptions) -> tuple[np.
 
 
 def _residual(
-    views: list[StereoView], poses: list[np.ndarray], rays: np.ndarray, inverse: np.ndarray, m: _Matches
+    views: list[StereoKeyframe], poses: list[np.ndarray], rays: np.ndarray, inverse: np.ndarray, m: _Matches
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels found minus predicted (M, 2); points (M, 3) in the target, times inverse depth; turned rays (M, 3)."""
     relative = geometry.inverse(poses[m.target]) @ poses[m.source]
@@ -109,10 +111,10 @@ def _residual(
 
 
 def _initial_depths(
-    views: list[StereoView], poses: list[np.ndarray], sources: np.ndarray, rays: np.ndarray, matches: list[_Matches]
+    views: list[StereoKeyframe], poses: list[np.ndarray], sources: np.ndarray, rays: np.ndarray, matches: list[_Matches]
 ) -> np.ndarray:
     """(P,) inverse depths: of 48 in the keyframe's range, that of the least robust residual."""
-    choice = RangeChoice()
+    choice = RangeConfig()
     limits = []
     for view in views:
         found = search_range(view, views, None, choice)
@@ -133,7 +135,7 @@ def _initial_depths(
 
 
 def _step(
-    views: list[StereoView], poses: list[np.ndarray], held: list[np.ndarray], rays: np.ndarray, inverse: np.ndarray,
+    views: list[StereoKeyframe], poses: list[np.ndarray], held: list[np.ndarray], rays: np.ndarray, inverse: np.ndarray,
     matches: list[_Matches], width: np.ndarray, o: PoseRefinementOptions,
 ) -> tuple[list[np.ndarray], np.ndarray]:  # fmt: skip
     """One Gauss-Newton step; points are eliminated (Schur). Poses move by exp(x) on the camera's side."""

@@ -9,9 +9,9 @@ import numpy as np
 
 from bench.depth.data import Scene
 from mvsgs_core.fusion.fusion import DepthFusion, FusedDepth, FusionConfig
-from mvsgs_core.fusion.views import DepthView
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth
-from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Score:
     relative_error: float  # mean absolute, of the kept ones
 
 
-def run(views: list[StereoView], cascade: CascadeConfig, fusion: FusionConfig) -> Run:
+def run(views: list[StereoKeyframe], cascade: CascadeConfig, fusion: FusionConfig) -> Run:
     """Stereo and fusion of views in stream order."""
     stereo_node, fusion_node = Cascade(cascade), DepthFusion(fusion)
     begin = time.process_time()
@@ -65,9 +65,9 @@ def run(views: list[StereoView], cascade: CascadeConfig, fusion: FusionConfig) -
     return Run(stereo, fused, median[0], median[1], (time.process_time() - begin) / max(1, len(views)))
 
 
-def depth_view(found: CascadeDepth) -> DepthView:
+def depth_view(found: CascadeDepth) -> KeyframeDepth:
     view = found.view
-    return DepthView(
+    return KeyframeDepth(
         view.index, found.result.depth, found.result.confidence, view.intrinsics, view.world_from_cam, view.scale,
         view.segment,
     )  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 from bench.depth.data import SHARED, SOURCES, Scene
 from msgs import Frame, Keyframe, Poses
 from mvsgs_core.datasets import Item, open_dataset
-from mvsgs_core.mvs.views import prepare_view
+from mvsgs_core.mvs.keyframe import prepare_keyframe
 from nodes.tracker import Tracker
 
 
@@ -55,7 +55,7 @@ def load_tracked(name: str, area: int, scales: tuple[int, ...] = (1, 2)) -> Scen
     items, keyframes, latest = _track(name)
     views, truths, ratios = [], [], []
     for index, keyframe in sorted(keyframes.items()):
-        view = prepare_view(
+        view = prepare_keyframe(
             index, keyframe.image, keyframe.intrinsics, keyframe.world_from_cam, area=area, scales=scales,
             inverse_depth=keyframe.inverse_depth, weight=keyframe.inverse_depth_weight, scale=keyframe.scale,
             segment=keyframe.segment,

@@ -32,12 +32,12 @@ class NativeFusionBackend:
         )
 
     def splat(
-        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, least_confidence: float,
+        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, min_neighbor_confidence: float,
         size: tuple[int, int],
     ) -> np.ndarray:  # fmt: skip
         return np.asarray(
             self._kernels.splat_depths(
-                depths, confidences, back, least_confidence, size[0], size[1], threads=self._threads
+                depths, confidences, back, min_neighbor_confidence, size[0], size[1], threads=self._threads
             )
         )
 
@@ -51,12 +51,12 @@ class NativeFusionBackend:
         warps: np.ndarray,
         sigma: float,
         violation: float,
-        least_confidence: float,
+        min_neighbor_confidence: float,
     ) -> Fused:
         return Fused(
             *self._kernels.fuse_depth(
                 depth, confidence, neighbor_depths, neighbor_confidences, splatted, warps, sigma, violation,
-                least_confidence, threads=self._threads,
+                min_neighbor_confidence, threads=self._threads,
             )
         )  # fmt: skip
 

@@ -8,7 +8,7 @@ import numpy as np
 _STEPS = 5000  # of a filter in int16: per unit of the logarithm of depth, so 1 % is 50
 
 
-def not_on_rim(depth: np.ndarray, radius: int, jump: float = 0.05) -> np.ndarray:
+def discontinuity_mask(depth: np.ndarray, radius: int, jump: float = 0.05) -> np.ndarray:
     """False within `radius` pixels of a known depth that is farther by more than `jump`, relative.
 
     The windows of stereo let a near surface grow over what lies behind it, in all views alike: no other view objects.
@@ -22,14 +22,14 @@ def not_on_rim(depth: np.ndarray, radius: int, jump: float = 0.05) -> np.ndarray
     return np.asarray((depth > 0) & (farthest > (1.0 - jump) * inverse))
 
 
-def not_speckle(depth: np.ndarray, least_pixels: int, relative: float) -> np.ndarray:
-    """False in connected patches of up to `least_pixels`; neighboring depths that differ by `relative` are apart."""
+def not_speckle(depth: np.ndarray, max_pixels: int, relative: float) -> np.ndarray:
+    """False in connected patches of up to `max_pixels`; neighboring depths that differ by `relative` are apart."""
     known = depth > 0
-    if least_pixels <= 0 or not known.any():
+    if max_pixels <= 0 or not known.any():
         return np.asarray(known)
     logarithm = np.log(np.maximum(depth, 1e-30) / np.median(depth[known]))
     limit = np.iinfo(np.int16)
     steps = np.clip(_STEPS * logarithm, limit.min + 1, limit.max)
     patches = np.where(known, steps, limit.min).astype(np.int16)
-    cv2.filterSpeckles(patches, limit.min, least_pixels, int(_STEPS * relative))
+    cv2.filterSpeckles(patches, limit.min, max_pixels, int(_STEPS * relative))
     return np.asarray(patches > limit.min)

@@ -10,10 +10,10 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.fusion.backend import make_fusion_backend
 from mvsgs_core.fusion.confidence import features_of, probability_of_inlier
-from mvsgs_core.fusion.filters import not_on_rim, not_speckle
+from mvsgs_core.fusion.filters import discontinuity_mask, not_speckle
 from mvsgs_core.fusion.interface import FusionBackend
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, warps_between
 from mvsgs_core.fusion.normals import normals_of
-from mvsgs_core.fusion.views import DepthView, warps_between
 
 ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
 
@@ -28,14 +28,14 @@ class FusionConfig:
     refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
     sigma: float = 0.01  # relative depth: width of the support
     violation: float = 1.0  # weight of free-space violations against support
-    least_confidence: float = 0.1  # a neighbor's pixel below takes no part in the refinement
+    min_neighbor_confidence: float = 0.1  # a neighbor's pixel below takes no part in the refinement
     check: bool = True  # geometric consistency
     relative: float = 0.02  # relative depth difference that still agrees
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
-    least_views: int = 2  # views that must agree, the reference counted
+    min_views: int = 2  # views that must agree, the reference counted
     confidence: float = 0.77  # least confidence of a kept pixel
-    rim: int = 2  # pixels: nothing is kept that close to something farther; 0: off
+    discontinuity_radius: int = 2  # pixels: nothing is kept that close to something farther; 0: off
     speckle: int = 200  # pixels: patches up to this size are not kept; 0: off
     device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda"
     threads: int | None = None  # of the C++ kernels; None: all
@@ -45,7 +45,7 @@ class FusionConfig:
 class FusedDepth:
     """One keyframe's filtered depth."""
 
-    view: DepthView  # as it came, pose and scale corrected
+    view: KeyframeDepth  # as it came, pose and scale corrected
     depth: np.ndarray  # (H, W) float32, 0 where filtered out
     unfiltered: np.ndarray  # (H, W) float32 refined depth before the filters
     confidence: np.ndarray  # (H, W) float32 refined, calibrated
@@ -62,10 +62,10 @@ class DepthFusion:
     def __init__(self, config: FusionConfig | None = None) -> None:
         self.config = config or FusionConfig()
         self._backend = make_fusion_backend(self.config.device, self.config.threads)
-        self._views: list[DepthView] = []
+        self._views: list[KeyframeDepth] = []
         self._waiting: list[int] = []
 
-    def add(self, view: DepthView) -> Iterator[FusedDepth]:
+    def add(self, view: KeyframeDepth) -> Iterator[FusedDepth]:
         """Fused depth of the keyframe `lag` before this one; of all that wait if a new segment or size starts."""
         if self._views and (view.segment != self._views[-1].segment or view.size != self._views[-1].size):
             yield from self.flush()
@@ -92,12 +92,12 @@ class DepthFusion:
         neighbors = nearest_views(reference, others, self.config.neighbors)
         return fuse(self._prepared(reference, neighbors), neighbors, self.config, self._backend)
 
-    def _prepared(self, reference: DepthView, neighbors: list[DepthView]) -> DepthView:
+    def _prepared(self, reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> KeyframeDepth:
         """Where a subclass puts a network in the place of the weight-free refinement."""
         return reference
 
 
-def nearest_views(reference: DepthView, others: list[DepthView], count: int) -> list[DepthView]:
+def nearest_views(reference: KeyframeDepth, others: list[KeyframeDepth], count: int) -> list[KeyframeDepth]:
     """Of the maps that have depth at all, those that see most of the reference's points; ties: the wider baseline."""
     known = reference.depth > 0
     if not known.any():
@@ -126,7 +126,9 @@ def nearest_views(reference: DepthView, others: list[DepthView], count: int) -> 
     return [entry[3] for entry in sorted(scored, key=lambda entry: entry[:3])[:count]]
 
 
-def fuse(reference: DepthView, neighbors: list[DepthView], config: FusionConfig, backend: FusionBackend) -> FusedDepth:
+def fuse(
+    reference: KeyframeDepth, neighbors: list[KeyframeDepth], config: FusionConfig, backend: FusionBackend
+) -> FusedDepth:
     """Refines and filters one map with its neighbors', all of one size."""
     known = reference.depth > 0
     depth, confidence = reference.depth, reference.confidence
@@ -139,10 +141,10 @@ def fuse(reference: DepthView, neighbors: list[DepthView], config: FusionConfig,
         depths = np.ascontiguousarray(np.stack([n.depth for n in neighbors]))
         confidences = np.ascontiguousarray(np.stack([n.confidence for n in neighbors]))
         if config.refine:
-            splatted = backend.splat(depths, confidences, back, config.least_confidence, reference.size)
+            splatted = backend.splat(depths, confidences, back, config.min_neighbor_confidence, reference.size)
             fused = backend.fuse(
                 depth, confidence, depths, confidences, splatted, there, config.sigma, config.violation,
-                config.least_confidence,
+                config.min_neighbor_confidence,
             )  # fmt: skip
             depth = fused.depth
         consistent = backend.consistent_views(
@@ -156,7 +158,7 @@ def fuse(reference: DepthView, neighbors: list[DepthView], config: FusionConfig,
     sure = confidence >= config.confidence
     counts["rejected: confidence"] = float((keep & ~sure).sum())
     if config.check:
-        needed = config.least_views - 1
+        needed = config.min_views - 1
         if len(neighbors) < needed:
             needed = len(neighbors)
             problem = "too few neighbors for the consistency check" if needed else "no neighbor to check depth with"
@@ -164,10 +166,10 @@ def fuse(reference: DepthView, neighbors: list[DepthView], config: FusionConfig,
         counts["rejected: consistency"] = float((keep & ~agreed).sum())
         keep = keep & agreed
     keep = keep & sure
-    off_rim = not_on_rim(np.where(keep, depth, 0.0), config.rim)
-    counts["rejected: rim"] = float((keep & ~off_rim).sum())
-    in_patch = not_speckle(np.where(off_rim, depth, 0.0), config.speckle, config.relative)
-    counts["rejected: speckle"] = float((off_rim & ~in_patch).sum())
+    continuous = discontinuity_mask(np.where(keep, depth, 0.0), config.discontinuity_radius)
+    counts["rejected: discontinuity"] = float((keep & ~continuous).sum())
+    in_patch = not_speckle(np.where(continuous, depth, 0.0), config.speckle, config.relative)
+    counts["rejected: speckle"] = float((continuous & ~in_patch).sum())
     keep = in_patch
     counts["kept"] = float(keep.sum())
     filtered = np.where(keep, depth, 0.0).astype(np.float32)

@@ -39,7 +39,7 @@ class FusionBackend(Protocol):
         """
 
     def splat(
-        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, least_confidence: float,
+        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, min_neighbor_confidence: float,
         size: tuple[int, int],
     ) -> np.ndarray:  # fmt: skip
         """(N, H, W): the neighbors' pixels as depths in the reference, the nearest where several fall."""
@@ -54,6 +54,6 @@ class FusionBackend(Protocol):
         warps: np.ndarray,
         sigma: float,
         violation: float,
-        least_confidence: float,
+        min_neighbor_confidence: float,
     ) -> Fused:
         """The best of the reference's depth and the splatted ones by support - violation, refined by its supporters."""

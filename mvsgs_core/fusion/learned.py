@@ -9,7 +9,7 @@ import torch
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
-from mvsgs_core.fusion.views import DepthView
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.vfuse import FusionInput, VFuse, check_choices
 
@@ -49,13 +49,13 @@ class LearnedFusion(DepthFusion):
         self.learned = learned
         self._net = make_network(learned.file).to(learned.device)
 
-    def _prepared(self, reference: DepthView, neighbors: list[DepthView]) -> DepthView:
+    def _prepared(self, reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> KeyframeDepth:
         if not neighbors or not (reference.depth > 0).any():
             return reference
         return refine(self._net, reference, neighbors, self.learned)
 
 
-def refine(net: VFuse, reference: DepthView, neighbors: list[DepthView], learned: VFuseConfig) -> DepthView:
+def refine(net: VFuse, reference: KeyframeDepth, neighbors: list[KeyframeDepth], learned: VFuseConfig) -> KeyframeDepth:
     """The reference with V-FUSE's depth and confidence (what it means: networks.vfuse_confidence)."""
     views = [reference, *neighbors]
     depths = np.stack([v.depth for v in views]).astype(np.float32)

@@ -8,17 +8,17 @@ import numpy as np
 from mvsgs_core import camera
 
 
-def normals_of(depth: np.ndarray, intrinsics: np.ndarray, radius: int = 2, largest_jump: float = 0.05) -> np.ndarray:
+def normals_of(depth: np.ndarray, intrinsics: np.ndarray, radius: int = 2, max_jump: float = 0.05) -> np.ndarray:
     """(H, W, 3) float32 unit normals in the camera frame, toward the camera; 0 where depth (H, W) is 0.
 
     For n·X = d in front of the camera, 1 / z = a u + b v + c with (a, b, c) = K⁻ᵀ n / d. Differences across a relative
-    jump of depth above `largest_jump` are left out; the rest is averaged over (2 radius + 1)² pixels. A pixel without
+    jump of depth above `max_jump` are left out; the rest is averaged over (2 radius + 1)² pixels. A pixel without
     any usable difference faces the camera.
     """
     known = depth > 0
     inverse = np.where(known, 1.0 / np.where(known, depth, 1.0), 0.0).astype(np.float32)
-    slope_u = _mean_difference(inverse, known, 1, radius, largest_jump)
-    slope_v = _mean_difference(inverse, known, 0, radius, largest_jump)
+    slope_u = _mean_difference(inverse, known, 1, radius, max_jump)
+    slope_v = _mean_difference(inverse, known, 0, radius, max_jump)
     u, v = camera.pixel_grid(*depth.shape)
     fx, fy, cx, cy = (float(k) for k in intrinsics)
     offset = inverse - slope_u * u - slope_v * v
@@ -28,14 +28,14 @@ def normals_of(depth: np.ndarray, intrinsics: np.ndarray, radius: int = 2, large
     return np.where(known[..., None], unit, 0.0).astype(np.float32)
 
 
-def _mean_difference(inverse: np.ndarray, known: np.ndarray, axis: int, radius: int, largest_jump: float) -> np.ndarray:
+def _mean_difference(inverse: np.ndarray, known: np.ndarray, axis: int, radius: int, max_jump: float) -> np.ndarray:
     """(H, W) float64: mean, over the window, of the differences between neighboring pixels along `axis`."""
     here = (slice(None), slice(None, -1)) if axis == 1 else (slice(None, -1), slice(None))
     there = (slice(None), slice(1, None)) if axis == 1 else (slice(1, None), slice(None))
     difference = np.zeros(inverse.shape)
     usable = np.zeros(inverse.shape)
     step = inverse[there].astype(np.float64) - inverse[here]
-    good = known[there] & known[here] & (np.abs(step) < largest_jump * np.maximum(inverse[there], inverse[here]))
+    good = known[there] & known[here] & (np.abs(step) < max_jump * np.maximum(inverse[there], inverse[here]))
     difference[here] = np.where(good, step, 0.0)
     usable[here] = good
     window = (2 * radius + 1, 2 * radius + 1)

@@ -49,7 +49,7 @@ class TorchFusionBackend:
 
     @torch.no_grad()
     def splat(
-        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, least_confidence: float,
+        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, min_neighbor_confidence: float,
         size: tuple[int, int],
     ) -> np.ndarray:  # fmt: skip
         result = torch.full((len(depths), size[0] * size[1]), torch.inf, device=self.device)
@@ -57,7 +57,7 @@ class TorchFusionBackend:
             u, v = _pixels(z.shape, self.device)
             x, y, depth, front = _project(warp, u, v, z)
             at, inside = _nearest(x, y, size)
-            use = (z > 0) & (c >= least_confidence) & front & inside
+            use = (z > 0) & (c >= min_neighbor_confidence) & front & inside
             result[i].scatter_reduce_(0, at[use], depth[use], reduce="amin")
         result[torch.isinf(result)] = 0.0
         return result.reshape(len(depths), *size).cpu().numpy()
@@ -73,7 +73,7 @@ class TorchFusionBackend:
         warps: np.ndarray,
         sigma: float,
         violation: float,
-        least_confidence: float,
+        min_neighbor_confidence: float,
     ) -> Fused:
         own_depth = self._on(depth)
         known = own_depth > 0
@@ -96,7 +96,7 @@ class TorchFusionBackend:
                 x, y, expected, front = _project(warp, u, v, safe)
                 at, inside = _nearest(x, y, map_.shape)
                 found, c = map_.reshape(-1)[at], c_map.reshape(-1)[at]
-                use = valid & front & inside & (found > 0) & (c >= least_confidence)
+                use = valid & front & inside & (found > 0) & (c >= min_neighbor_confidence)
                 off = torch.where(use, (found - expected) / torch.where(use, expected, safe), zero)
                 weight = torch.where(use, c * torch.exp(-0.5 * (off / sigma) ** 2), zero)
                 support += weight

@@ -38,7 +38,7 @@ class NativeBackend:
     ) -> Choice:
         return Choice(
             *self._kernels.semi_global(
-                cost, reference, first, step, options.small_jump, options.large_jump, options.edge,
+                cost, reference, first, step, options.p1, options.p2, options.edge,
                 options.break_steps, options.temperature, options.paths, threads=self._threads,
             )
         )  # fmt: skip
@@ -58,7 +58,7 @@ class NativeBackend:
         self, cost: np.ndarray, surfaces: np.ndarray, reference: np.ndarray, options: ChooseOptions
     ) -> tuple[np.ndarray, np.ndarray]:
         best, gap = self._kernels.choose_surface(
-            cost, surfaces, reference, options.small_jump, options.large_jump, options.edge, options.apart,
+            cost, surfaces, reference, options.p1, options.p2, options.edge, options.apart,
             threads=self._threads,
         )  # fmt: skip
         return np.asarray(best), np.asarray(gap)

@@ -9,10 +9,10 @@ import numpy as np
 
 from mvsgs_core.mvs.backend import make_backend
 from mvsgs_core.mvs.explained import Explained
-from mvsgs_core.mvs.hypotheses import RangeChoice, SearchRange, search_range
-from mvsgs_core.mvs.neighbors import NeighborChoice, select_neighbors
+from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, search_range
+from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
+from mvsgs_core.mvs.neighbors import NeighborConfig, select_neighbors
 from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, empty_depth, estimate_depth
-from mvsgs_core.mvs.views import StereoView, prepare_view
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class CascadeConfig:
     window: int = 8  # keyframes before the reference that may be neighbors
     device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda": see make_backend
     threads: int | None = None  # of the C++ kernels; None: all
-    neighbors: NeighborChoice = field(default_factory=NeighborChoice)
-    ranges: RangeChoice = field(default_factory=RangeChoice)
+    neighbors: NeighborConfig = field(default_factory=NeighborConfig)
+    ranges: RangeConfig = field(default_factory=RangeConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
 
 
@@ -33,7 +33,7 @@ class CascadeConfig:
 class CascadeDepth:
     """One keyframe's stereo depth and where it came from."""
 
-    view: StereoView
+    view: StereoKeyframe
     result: StereoDepth
     neighbors: tuple[int, ...]  # indices of the keyframes that it was matched with
     search: SearchRange | None
@@ -46,7 +46,7 @@ class Cascade:
     def __init__(self, config: CascadeConfig | None = None) -> None:
         self.config = config or CascadeConfig()
         self._backend = make_backend(self.config.device, self.config.threads)
-        self._views: list[StereoView] = []  # a window of the stream, oldest first
+        self._views: list[StereoKeyframe] = []  # a window of the stream, oldest first
         self._waiting: list[int] = []  # indices without depth yet, oldest first
         self._previous_range: SearchRange | None = None
         self.explained: Explained | None = None  # if set, keyframes that the map explains get no depth
@@ -61,9 +61,9 @@ class Cascade:
         weight: np.ndarray,
         scale: float,
         segment: int,
-    ) -> StereoView:
+    ) -> StereoKeyframe:
         """A view for `add`: image (H, W, 3) uint8 with intrinsics (4,), the tracker's grid (h, w) and its weights."""
-        return prepare_view(
+        return prepare_keyframe(
             index,
             image,
             intrinsics,
@@ -76,7 +76,7 @@ class Cascade:
             segment=segment,
         )
 
-    def add(self, view: StereoView, wanted: bool = True) -> Iterator[CascadeDepth]:
+    def add(self, view: StereoKeyframe, wanted: bool = True) -> Iterator[CascadeDepth]:
         """Depth of the keyframe `lag` before this one; of all that wait if this one starts a new segment or size.
 
         wanted: whether this one is to get depth too; else it is a neighbor of others only.
@@ -121,6 +121,6 @@ class Cascade:
         result = self._estimate(reference, views, search)
         return CascadeDepth(reference, result, tuple(v.index for v in views), search)
 
-    def _estimate(self, reference: StereoView, neighbors: list[StereoView], search: SearchRange) -> StereoDepth:
+    def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
         """The source of depth: a subclass puts a network here and keeps views, neighbors and ranges."""
         return estimate_depth(reference, neighbors, search, self.config.stereo, self._backend)

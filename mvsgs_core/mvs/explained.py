@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core import camera
-from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.warp import apply_warp, relative_warp
 
 
@@ -58,12 +58,12 @@ class Explained:
         """Corrected poses (world_from_cam (4, 4), scale) by keyframe index."""
         self.sights = [s.moved(*poses[s.index]) if s.index in poses else s for s in self.sights]
 
-    def enough(self, reference: StereoView) -> bool:
+    def enough(self, reference: StereoKeyframe) -> bool:
         """Whether stereo can pass over this keyframe."""
         self._last = not self._last and self.share(reference) >= self.choice.share
         return self._last
 
-    def share(self, reference: StereoView) -> float:
+    def share(self, reference: StereoKeyframe) -> float:
         """Part of the reference's pixels onto which a sight's point falls, the nearest there, with the same color."""
         sights = [s for s in self.sights if s.segment == reference.segment]
         if not sights:
@@ -76,7 +76,7 @@ class Explained:
             explained |= self._explained_by(sight, reference, target)
         return float(explained.mean())
 
-    def _explained_by(self, sight: MapSight, reference: StereoView, target: np.ndarray) -> np.ndarray:
+    def _explained_by(self, sight: MapSight, reference: StereoKeyframe, target: np.ndarray) -> np.ndarray:
         size = (target.shape[0], target.shape[1])
         intrinsics = camera.scale_intrinsics(reference.intrinsics, reference.size, size)
         stride = max(1, round(sight.depth.shape[1] / (2 * size[1])))  # two points a pixel of the grid are enough

@@ -10,18 +10,18 @@ import numpy as np
 from mvsgs_core import camera
 from mvsgs_core.membrane import membrane
 from mvsgs_core.mvs.interface import Choice
-from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.warp import apply_warp, relative_warp
 
 
 @dataclass(frozen=True)
-class RangeChoice:
+class RangeConfig:
     """How the search range follows from sparse, partly wrong coarse depth."""
 
     percentile: float = 2.0  # of the valid inverse depths, at each end
     margin: float = 1.6  # factor beyond these percentiles
-    least_cells: int = 24  # fewer valid cells: ask the neighbors' grids
-    least_weight: float = 0.05  # a cell below is unknown
+    min_cells: int = 24  # fewer valid cells: ask the neighbors' grids
+    min_weight: float = 0.05  # a cell below is unknown
 
 
 @dataclass(frozen=True)
@@ -37,37 +37,37 @@ class SearchRange:
         return self.low + (self.high - self.low) * np.array([0.15, 0.4, 0.75])
 
 
-def valid_cells(view: StereoView, choice: RangeChoice) -> np.ndarray:
+def valid_cells(view: StereoKeyframe, choice: RangeConfig) -> np.ndarray:
     """(K,) float64 inverse depths that the tracker knows."""
-    good = np.isfinite(view.inverse_depth) & (view.inverse_depth > 0) & (view.weight >= choice.least_weight)
+    good = np.isfinite(view.inverse_depth) & (view.inverse_depth > 0) & (view.weight >= choice.min_weight)
     return view.inverse_depth[good].astype(np.float64)
 
 
-def range_of(inverse_depths: np.ndarray, choice: RangeChoice, source: str) -> SearchRange:
+def range_of(inverse_depths: np.ndarray, choice: RangeConfig, source: str) -> SearchRange:
     """Percentiles with a margin; robust to a few per cent of outliers."""
     low, high = np.percentile(inverse_depths, [choice.percentile, 100.0 - choice.percentile])
     return SearchRange(float(low / choice.margin), float(high * choice.margin), source)
 
 
 def search_range(
-    reference: StereoView, others: list[StereoView], previous: SearchRange | None, choice: RangeChoice
+    reference: StereoKeyframe, others: list[StereoKeyframe], previous: SearchRange | None, choice: RangeConfig
 ) -> SearchRange | None:
     """The reference's own range; else that of its neighbors' points seen from it; else the previous one; else None."""
     own = valid_cells(reference, choice)
-    if len(own) >= choice.least_cells:
+    if len(own) >= choice.min_cells:
         return range_of(own, choice, "own grid")
     gathered = [own, *(_seen_from(reference, other, choice) for other in others)]
     points = np.concatenate(gathered)
-    if len(points) >= choice.least_cells:
+    if len(points) >= choice.min_cells:
         return range_of(points, choice, "neighbors' grids")
     if previous is not None:
         return SearchRange(previous.low, previous.high, "previous keyframe")
     return None
 
 
-def _seen_from(reference: StereoView, other: StereoView, choice: RangeChoice) -> np.ndarray:
+def _seen_from(reference: StereoKeyframe, other: StereoKeyframe, choice: RangeConfig) -> np.ndarray:
     """(K,) inverse depths, in the reference, of the cells of another view that project into it."""
-    good = np.isfinite(other.inverse_depth) & (other.inverse_depth > 0) & (other.weight >= choice.least_weight)
+    good = np.isfinite(other.inverse_depth) & (other.inverse_depth > 0) & (other.weight >= choice.min_weight)
     if not good.any():
         return np.empty(0)
     size = other.inverse_depth.shape[:2]
@@ -85,8 +85,8 @@ def _seen_from(reference: StereoView, other: StereoView, choice: RangeChoice) ->
     return np.asarray(w[inside] / z[inside])
 
 
-def upsample_surface(inverse_depth: np.ndarray, size: tuple[int, int], largest_gap: float) -> np.ndarray:
-    """(H, W) float32 of a coarse map: linear on a surface, nearest across a jump larger than `largest_gap`.
+def upsample_surface(inverse_depth: np.ndarray, size: tuple[int, int], max_gap: float) -> np.ndarray:
+    """(H, W) float32 of a coarse map: linear on a surface, nearest across a jump larger than `max_gap`.
 
     A linear mix across a jump would center the next search between the two surfaces, on neither of them.
     """
@@ -96,7 +96,7 @@ def upsample_surface(inverse_depth: np.ndarray, size: tuple[int, int], largest_g
     linear = cv2.resize(smooth, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
     kernel = np.ones((3, 3), np.uint8)
     spread = cv2.dilate(smooth, kernel) - cv2.erode(smooth, kernel)
-    jump = cv2.resize(spread, (size[1], size[0]), interpolation=cv2.INTER_NEAREST) > largest_gap
+    jump = cv2.resize(spread, (size[1], size[0]), interpolation=cv2.INTER_NEAREST) > max_gap
     nearest = cv2.resize(smooth, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.ascontiguousarray(np.where(jump, nearest, linear), dtype=np.float32)
 

@@ -26,8 +26,8 @@ class CostOptions:
 class SmoothOptions:
     """Semi-global smoothing, and the softmax that gives the probability."""
 
-    small_jump: float = 0.3  # cost of a change by one hypothesis
-    large_jump: float = 2.0  # cost of a larger change
+    p1: float = 0.3  # cost of a change by one hypothesis
+    p2: float = 2.0  # cost of a larger change
     edge: float = 12.0  # gray levels that halve these
     break_steps: float = 4.0  # hypotheses: a larger jump of the surface ends the path
     temperature: float = 0.02  # of the softmax, in cost
@@ -38,8 +38,8 @@ class SmoothOptions:
 class ChooseOptions:
     """Semi-global smoothing over arbitrary surfaces."""
 
-    small_jump: float  # cost per inverse depth between neighboring pixels
-    large_jump: float  # the most that they pay
+    p1: float  # cost per inverse depth between neighboring pixels
+    p2: float  # the most that they pay
     edge: float  # gray levels that halve these
     apart: float  # inverse depth: a surface farther than this from another is not the same
 

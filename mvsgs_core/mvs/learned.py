@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from mvsgs_core import camera, geometry
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.hypotheses import SearchRange
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.mvs.stereo import StereoDepth
-from mvsgs_core.mvs.views import StereoView
 from mvsgs_core.networks import checkpoints, itermvs, mvsformer
 
 
@@ -94,7 +94,7 @@ class LearnedCascade(Cascade):
         weight: np.ndarray,
         scale: float,
         segment: int,
-    ) -> StereoView:
+    ) -> StereoKeyframe:
         self.remember(index, image)
         return super().prepare(index, image, intrinsics, world_from_cam, inverse_depth, weight, scale, segment)
 
@@ -107,7 +107,7 @@ class LearnedCascade(Cascade):
         for old in sorted(self._images)[: -(self.config.window + self.config.lag + 2)]:
             del self._images[old]
 
-    def _estimate(self, reference: StereoView, neighbors: list[StereoView], search: SearchRange) -> StereoDepth:
+    def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
         views = [reference, *neighbors]
         size = self._images[reference.index].shape[:2]
         images = np.stack([self._images[v.index] for v in views])

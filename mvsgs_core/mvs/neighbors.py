@@ -6,33 +6,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.warp import apply_warp, relative_warp
 
 
 @dataclass(frozen=True)
-class NeighborChoice:
+class NeighborConfig:
     """How neighbors are scored; angles are between the viewing rays at the scene's median depth."""
 
     count: int = 4  # views
     best_angle: float = 7.0  # degrees of parallax that score 1
     angle_below: float = 4.0  # degrees, width of the score below that
     angle_above: float = 12.0  # degrees, width above
-    least_angle: float = 0.4  # degrees: less gives no depth
-    least_overlap: float = 0.3  # part of the reference that the neighbor sees
+    min_angle: float = 0.4  # degrees: less gives no depth
+    min_overlap: float = 0.3  # part of the reference that the neighbor sees
     turn: float = 30.0  # degrees between the optical axes that halve the score
 
 
 @dataclass(frozen=True)
 class Neighbor:
-    view: StereoView
+    view: StereoKeyframe
     angle: float  # degrees of parallax
     overlap: float  # 0 to 1
     score: float
 
 
 def score_neighbor(
-    reference: StereoView, other: StereoView, inverse_depths: np.ndarray, choice: NeighborChoice
+    reference: StereoKeyframe, other: StereoKeyframe, inverse_depths: np.ndarray, choice: NeighborConfig
 ) -> Neighbor:
     """Baseline, overlap and turn of one candidate; score 0 if it fails a limit. `inverse_depths` (K,): typical ones."""
     warp = relative_warp(reference.intrinsics, reference.world_from_cam, other.intrinsics, other.world_from_cam)
@@ -51,7 +51,7 @@ def score_neighbor(
     turned = float(
         np.degrees(np.arccos(np.clip(reference.world_from_cam[:3, 2] @ other.world_from_cam[:3, 2], -1.0, 1.0)))
     )
-    if angle < choice.least_angle or overlap < choice.least_overlap:
+    if angle < choice.min_angle or overlap < choice.min_overlap:
         return Neighbor(other, angle, overlap, 0.0)
     width_of_score = choice.angle_below if angle < choice.best_angle else choice.angle_above
     by_angle = np.exp(-0.5 * ((angle - choice.best_angle) / width_of_score) ** 2)
@@ -60,7 +60,7 @@ def score_neighbor(
 
 
 def select_neighbors(
-    reference: StereoView, candidates: list[StereoView], inverse_depths: np.ndarray, choice: NeighborChoice
+    reference: StereoKeyframe, candidates: list[StereoKeyframe], inverse_depths: np.ndarray, choice: NeighborConfig
 ) -> list[Neighbor]:
     """Up to `choice.count` neighbors, best first. Half of them from each side in time where these score at all well,
 

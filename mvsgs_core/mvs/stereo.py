@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from mvsgs_core.mvs.confidence import Evidence, probability_of_inlier
+from mvsgs_core.mvs.depth_edges import DepthEdgeConfig, refine_depth_edges
 from mvsgs_core.mvs.hypotheses import SearchRange, certainty, fill_uncertain, upsample_surface
 from mvsgs_core.mvs.interface import Backend, Choice, CostOptions, SmoothOptions
-from mvsgs_core.mvs.rims import RimChoice, settle_rims
-from mvsgs_core.mvs.skipping import SkipChoice, keep_settled, settled_tiles, tiles_in_cells
-from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.keyframe import StereoKeyframe
+from mvsgs_core.mvs.pruning import PruningConfig, keep_settled, settled_tiles, tiles_in_cells
 from mvsgs_core.warp import parallax, relative_warp
 
 
@@ -24,8 +24,8 @@ class Stage:
     step: float  # pixels at this size that one hypothesis moves a point, in the neighbor with median parallax
     hypotheses: int  # first stage: at most; later ones: exactly, centered on the stage before
     radius: int  # pixels, of the matching window
-    small_jump: float  # smoothing penalties, see SmoothOptions
-    large_jump: float
+    p1: float  # smoothing penalties, see SmoothOptions
+    p2: float
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class StereoConfig:
     """The cascade of one view."""
 
     stages: tuple[Stage, ...] = (
-        Stage(scale=2, step=0.7, hypotheses=128, radius=2, small_jump=0.3, large_jump=2.0),
-        Stage(scale=1, step=0.35, hypotheses=11, radius=2, small_jump=0.05, large_jump=0.4),
+        Stage(scale=2, step=0.7, hypotheses=128, radius=2, p1=0.3, p2=2.0),
+        Stage(scale=1, step=0.35, hypotheses=11, radius=2, p1=0.05, p2=0.4),
     )
-    best_views: int = 3  # of the neighbors, per pixel and hypothesis: the others may be occluded
+    top_k: int = 3  # of the neighbors, per pixel and hypothesis: the others may be occluded
     noise: float = 1.5  # gray levels²
     contrast: float = 8.0  # gray levels: what differs so from a window's center counts 1 / e in it
     edge: float = 12.0  # gray levels
@@ -44,16 +44,14 @@ class StereoConfig:
     temperature: float = 0.02  # cost
     paths: int = 8  # 4 or 8
     fill: bool = True  # between stages, where matching says nothing, from the surroundings
-    rims: RimChoice | None = field(default_factory=RimChoice)
-    skips: SkipChoice = field(default_factory=SkipChoice)
+    depth_edges: DepthEdgeConfig | None = field(default_factory=DepthEdgeConfig)
+    skips: PruningConfig = field(default_factory=PruningConfig)
 
     def cost_options(self, stage: Stage) -> CostOptions:
-        return CostOptions(stage.radius, self.best_views, self.noise, self.contrast)
+        return CostOptions(stage.radius, self.top_k, self.noise, self.contrast)
 
     def smooth_options(self, stage: Stage) -> SmoothOptions:
-        return SmoothOptions(
-            stage.small_jump, stage.large_jump, self.edge, self.break_steps, self.temperature, self.paths
-        )
+        return SmoothOptions(stage.p1, stage.p2, self.edge, self.break_steps, self.temperature, self.paths)
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,11 @@ def empty_depth(size: tuple[int, int]) -> StereoDepth:
 
 
 def estimate_depth(
-    reference: StereoView, neighbors: list[StereoView], search: SearchRange, config: StereoConfig, backend: Backend
+    reference: StereoKeyframe,
+    neighbors: list[StereoKeyframe],
+    search: SearchRange,
+    config: StereoConfig,
+    backend: Backend,
 ) -> StereoDepth:
     """Depth (H, W) at the reference's finest stage. Raises ValueError without neighbors."""
     if not neighbors:
@@ -135,10 +137,10 @@ def estimate_depth(
     options = config.cost_options(last)
     moved = float(np.median([parallax(w, size, middle) for w in warps]))
     gap = np.zeros(size, dtype=np.float32)
-    if config.rims is not None:
+    if config.depth_edges is not None:
         pixel = 1.0 / max(moved, 1e-12)
-        surface, gap = settle_rims(
-            surface, gray, images, warps.astype(np.float32), pixel, options, config.rims, backend
+        surface, gap = refine_depth_edges(
+            surface, gray, images, warps.astype(np.float32), pixel, options, config.depth_edges, backend
         )
     correlation = backend.view_correlation(gray, images, warps.astype(np.float32), surface, options)
     evidence = Evidence.of(
@@ -158,14 +160,14 @@ def estimate_depth(
     return StereoDepth(depth, confidence, evidence, counts)
 
 
-def _warps(reference: StereoView, neighbors: list[StereoView], scale: int) -> np.ndarray:
+def _warps(reference: StereoKeyframe, neighbors: list[StereoKeyframe], scale: int) -> np.ndarray:
     here = reference.intrinsics_at(scale)
     return np.stack(
         [relative_warp(here, reference.world_from_cam, n.intrinsics_at(scale), n.world_from_cam) for n in neighbors]
     )
 
 
-def _stack(neighbors: list[StereoView], scale: int) -> np.ndarray:
+def _stack(neighbors: list[StereoKeyframe], scale: int) -> np.ndarray:
     """(N, h, w) images, all of one size (a change of size starts a new window in Cascade)."""
     return np.ascontiguousarray(np.stack([n.gray(scale) for n in neighbors]))
 

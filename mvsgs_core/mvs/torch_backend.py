@@ -199,9 +199,7 @@ def _path(
             base = torch.where(inside, lowest[source], torch.zeros_like(lowest))
             # Outside the image all is 0, as at a path's start, but there is no hypothesis beyond the first and last.
             below, above = torch.cat([high, same[:-1]]), torch.cat([same[1:], high])
-            moved = torch.minimum(
-                torch.minimum(below, above) + options.small_jump * relax, base + options.large_jump * relax
-            )
+            moved = torch.minimum(torch.minimum(below, above) + options.p1 * relax, base + options.p2 * relax)
             value = cost[y] + torch.minimum(same, moved) - base
         result[y] = value
         previous, lowest, before = value, value.min(dim=0).values, y
@@ -223,7 +221,7 @@ def _surface_path(
         if before is not None:
             relax = 1.0 / (1.0 + (gray[y] - gray[before][source]).abs() / options.edge)
             apart = (heights[y][:, None] - heights[before][:, source][None]).abs()
-            jump = (options.small_jump * apart).clamp(max=options.large_jump) * relax
+            jump = (options.p1 * apart).clamp(max=options.p2) * relax
             least = result[before].amin(dim=0)
             moved = (result[before][:, source][None] + jump).amin(dim=1) - least[source]
             result[y] += torch.where(inside, moved, torch.zeros_like(moved))

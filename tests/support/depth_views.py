@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvsgs_core.fusion.views import DepthView
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
 from tests.support.plane_scene import intrinsics_of, look, true_depth
 
 SIZE = (40, 56)
 
 
-def view(index: int, x: float, noise: float = 0.0, turn: float = 0.0) -> DepthView:
+def view(index: int, x: float, noise: float = 0.0, turn: float = 0.0) -> KeyframeDepth:
     pose = look(x, turn)
     depth = true_depth(pose, SIZE)
     rng = np.random.default_rng(index)
     depth = (depth * np.exp(noise * rng.normal(size=SIZE))).astype(np.float32)
     confidence = rng.uniform(0.3, 1.0, SIZE).astype(np.float32)
-    return DepthView(index, depth, confidence, intrinsics_of(SIZE), pose, 1.0)
+    return KeyframeDepth(index, depth, confidence, intrinsics_of(SIZE), pose, 1.0)

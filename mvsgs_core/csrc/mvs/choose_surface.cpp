@@ -1,6 +1,6 @@
 // One of several surfaces at each pixel: semi-global smoothing (Hirschmueller 2008, eq. 13) over arbitrary candidates.
 //
-// What two neighboring pixels pay is the distance of their inverse depths, at most `large_jump`, not the distance of
+// What two neighboring pixels pay is the distance of their inverse depths, at most `p2`, not the distance of
 // indices: candidates of a pixel are extrapolated from around it and have no order.
 #include <algorithm>
 #include <cmath>
@@ -40,8 +40,8 @@ void add_path(const Candidates& p, int dx, bool reverse, const ChooseOptions& o,
             const float* there = p.image + static_cast<std::size_t>(before) * w - dx;
             for (int x = from; x < to; ++x) {
                 const float relax = 1.0f / (1.0f + std::fabs(here[x] - there[x]) * inv_edge);
-                small[x] = o.small_jump * relax;
-                large[x] = o.large_jump * relax;
+                small[x] = o.p1 * relax;
+                large[x] = o.p2 * relax;
             }
             std::copy_n(path.data(), w, least.data());
             for (int k = 1; k < d; ++k)

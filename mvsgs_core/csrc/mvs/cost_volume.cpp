@@ -24,11 +24,11 @@ struct Columns {
 struct Scratch {
     int padded, stride;
     std::vector<float> sample, seen, correlation, mean, variance, best;
-    Scratch(const Windows& w, int best_views)
+    Scratch(const Windows& w, int top_k)
         : padded(w.blocks * Windows::kBlock), stride(padded + 2 * w.radius),
           sample(static_cast<std::size_t>(stride) * (kBand + 2 * w.radius), 0.0f),
           seen(static_cast<std::size_t>(padded) * (kBand + 2 * w.radius), 0.0f), correlation(padded), mean(padded),
-          variance(padded), best(static_cast<std::size_t>(padded) * kBand * best_views) {}
+          variance(padded), best(static_cast<std::size_t>(padded) * kBand * top_k) {}
 };
 
 // Where a row's pixels lie in the neighbor: the upper left of the four pixels around each, and the others' shares. The

@@ -67,12 +67,12 @@ void consistent_views(const float* depth, int height, int width, const float* ne
 }
 
 void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, int nh, int nw, const Warp& back,
-                 float least_confidence, int height, int width, float* splatted) {
+                 float min_neighbor_confidence, int height, int width, float* splatted) {
     std::fill_n(splatted, static_cast<std::size_t>(height) * width, 0.0f);
     for (int y = 0; y < nh; ++y) {
         for (int x = 0; x < nw; ++x) {
             const std::size_t i = static_cast<std::size_t>(y) * nw + x;
-            if (!(neighbor_depth[i] > 0.0f) || neighbor_confidence[i] < least_confidence) continue;
+            if (!(neighbor_depth[i] > 0.0f) || neighbor_confidence[i] < min_neighbor_confidence) continue;
             const Projected p = project(back, static_cast<float>(x), static_cast<float>(y), neighbor_depth[i]);
             const int at = p.front ? nearest(p.x, p.y, height, width) : -1;
             if (at < 0) continue;
@@ -110,7 +110,7 @@ void fuse_depth(const float* depth, const float* confidence, int height, int wid
                     const int at = p.front ? nearest(p.x, p.y, nh, nw) : -1;
                     if (at < 0) continue;
                     const float found = neighbor_depths[n * stride + at], c = neighbor_confidences[n * stride + at];
-                    if (!(found > 0.0f) || c < o.least_confidence) continue;
+                    if (!(found > 0.0f) || c < o.min_neighbor_confidence) continue;
                     const float difference = (found - p.depth) / p.depth;
                     const float weight = c * exponential(sharpness * difference * difference);
                     for_it += weight;

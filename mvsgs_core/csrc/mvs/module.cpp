@@ -95,7 +95,7 @@ nb::ndarray<nb::numpy, float> surface_costs(Image reference, Stack neighbors, Wa
     return cost;
 }
 
-nb::tuple choose_surface(Stack cost, Stack surfaces, Image reference, float small_jump, float large_jump, float edge,
+nb::tuple choose_surface(Stack cost, Stack surfaces, Image reference, float p1, float p2, float edge,
                          float apart, int threads) {
     const std::size_t h = reference.shape(0), w = reference.shape(1), d = surfaces.shape(0);
     require(surfaces.shape(1) == h && surfaces.shape(2) == w && d >= 1, "surfaces must be (D, H, W)");
@@ -103,7 +103,7 @@ nb::tuple choose_surface(Stack cost, Stack surfaces, Image reference, float smal
     require(edge > 0, "edge must be positive");
     auto best = allocate<std::int32_t>({h, w});
     auto gap = allocate<float>({h, w});
-    const stereo::ChooseOptions options{small_jump, large_jump, edge, apart, thread_count(threads)};
+    const stereo::ChooseOptions options{p1, p2, edge, apart, thread_count(threads)};
     {
         nb::gil_scoped_release release;
         stereo::choose_surface(cost.data(), surfaces.data(), static_cast<int>(d), static_cast<int>(h),
@@ -131,7 +131,7 @@ nb::ndarray<nb::numpy, float> view_correlation(Image reference, Stack neighbors,
     return correlation;
 }
 
-nb::tuple semi_global(Stack cost, Image reference, Image first, Image step, float small_jump, float large_jump,
+nb::tuple semi_global(Stack cost, Image reference, Image first, Image step, float p1, float p2,
                       float edge, float break_steps, float temperature, int paths, int threads) {
     same_size(reference, first);
     same_size(reference, step);
@@ -143,7 +143,7 @@ nb::tuple semi_global(Stack cost, Image reference, Image first, Image step, floa
     auto probability = allocate<float>({h, w});
     auto margin = allocate<float>({h, w});
     auto best = allocate<std::int32_t>({h, w});
-    const stereo::SmoothOptions options{small_jump, large_jump, edge, break_steps, temperature, paths,
+    const stereo::SmoothOptions options{p1, p2, edge, break_steps, temperature, paths,
                                         thread_count(threads)};
     {
         nb::gil_scoped_release release;
@@ -171,7 +171,7 @@ nb::ndarray<nb::numpy, std::uint8_t> consistent_views(Image depth, Stack neighbo
 }
 
 nb::ndarray<nb::numpy, float> splat_depths(Stack neighbor_depths, Stack neighbor_confidences, Warps back,
-                                           float least_confidence, int height, int width, int threads) {
+                                           float min_neighbor_confidence, int height, int width, int threads) {
     require(neighbor_depths.shape(0) == back.shape(0), "one warp per neighbor");
     require(neighbor_confidences.size() == neighbor_depths.size(), "one confidence per depth");
     require(height > 0 && width > 0, "the reference needs a size");
@@ -186,13 +186,13 @@ nb::ndarray<nb::numpy, float> splat_depths(Stack neighbor_depths, Stack neighbor
 #pragma omp parallel for schedule(static, 1) num_threads(team)
         for (int i = 0; i < views; ++i)
             stereo::splat_depth(neighbor_depths.data() + i * stride, neighbor_confidences.data() + i * stride, nh, nw,
-                                warps[i], least_confidence, height, width, splatted.data() + i * h * w);
+                                warps[i], min_neighbor_confidence, height, width, splatted.data() + i * h * w);
     }
     return splatted;
 }
 
 nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack neighbor_confidences, Stack splatted,
-                     Warps warps, float sigma, float violation_weight, float least_confidence, int threads) {
+                     Warps warps, float sigma, float violation_weight, float min_neighbor_confidence, int threads) {
     same_size(depth, confidence);
     require(neighbor_depths.shape(0) == warps.shape(0) && splatted.shape(0) == warps.shape(0), "one warp per neighbor");
     require(neighbor_confidences.size() == neighbor_depths.size(), "one confidence per depth");
@@ -202,7 +202,7 @@ nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack
     auto support = allocate<float>({h, w});
     auto violation = allocate<float>({h, w});
     auto own = allocate<float>({h, w});
-    const stereo::FuseOptions options{sigma, violation_weight, least_confidence, thread_count(threads)};
+    const stereo::FuseOptions options{sigma, violation_weight, min_neighbor_confidence, thread_count(threads)};
     {
         nb::gil_scoped_release release;
         stereo::fuse_depth(depth.data(), confidence.data(), static_cast<int>(h), static_cast<int>(w),
@@ -227,14 +227,14 @@ MVSGS_EXPAND(MVSGS_MODULE, m) {
     m.def("surface_costs", &surface_costs, "reference"_a, "neighbors"_a, "warps"_a, "surfaces"_a, "radius"_a, "best"_a,
           "noise"_a, "contrast"_a, "level"_a = 0.0f, "level_range"_a = 1.0f, "threads"_a = 0,
           "needed"_a = nb::none());
-    m.def("choose_surface", &choose_surface, "cost"_a, "surfaces"_a, "reference"_a, "small_jump"_a, "large_jump"_a,
+    m.def("choose_surface", &choose_surface, "cost"_a, "surfaces"_a, "reference"_a, "p1"_a, "p2"_a,
           "edge"_a, "apart"_a, "threads"_a = 0);
-    m.def("semi_global", &semi_global, "cost"_a, "reference"_a, "first"_a, "step"_a, "small_jump"_a, "large_jump"_a,
+    m.def("semi_global", &semi_global, "cost"_a, "reference"_a, "first"_a, "step"_a, "p1"_a, "p2"_a,
           "edge"_a, "break_steps"_a, "temperature"_a, "paths"_a, "threads"_a = 0);
     m.def("consistent_views", &consistent_views, "depth"_a, "neighbor_depths"_a, "warps"_a, "back"_a, "relative"_a,
           "pixels"_a, "round_trip"_a, "threads"_a = 0);
     m.def("splat_depths", &splat_depths, "neighbor_depths"_a, "neighbor_confidences"_a, "back"_a,
-          "least_confidence"_a, "height"_a, "width"_a, "threads"_a = 0);
+          "min_neighbor_confidence"_a, "height"_a, "width"_a, "threads"_a = 0);
     m.def("fuse_depth", &fuse_depth, "depth"_a, "confidence"_a, "neighbor_depths"_a, "neighbor_confidences"_a,
-          "splatted"_a, "warps"_a, "sigma"_a, "violation_weight"_a, "least_confidence"_a, "threads"_a = 0);
+          "splatted"_a, "warps"_a, "sigma"_a, "violation_weight"_a, "min_neighbor_confidence"_a, "threads"_a = 0);
 }

@@ -63,7 +63,7 @@ void add_path(const Plane& p, int dx, bool reverse, const SmoothOptions& o, floa
             float* out = current.data() + static_cast<std::size_t>(k + 1) * padded + 1;
             const float* c = p.cost + (static_cast<std::size_t>(y) * d + k) * w;
             float* total = sum + (static_cast<std::size_t>(y) * d + k) * w;
-            const float small = o.small_jump, large = o.large_jump;
+            const float small = o.p1, large = o.p2;
             const float* eased = relax.data();
 #pragma omp simd
             for (int x = 0; x < w; ++x) {

@@ -46,8 +46,8 @@ void view_correlation(const float* reference, int height, int width, const float
                       const CostOptions& options, float* correlation);
 
 struct SmoothOptions {
-    float small_jump;    // penalty for a change by one hypothesis
-    float large_jump;    // penalty for any larger change
+    float p1;    // penalty for a change by one hypothesis
+    float p2;    // penalty for any larger change
     float edge;          // gray levels: a step of this size in the image halves the penalties
     float break_steps;   // a jump of `first` by more hypotheses than this ends the smoothing
     float temperature;   // of the softmax over mean path costs
@@ -62,8 +62,8 @@ void semi_global(const float* cost, int height, int hypotheses, int width, const
                  std::int32_t* best);
 
 struct ChooseOptions {
-    float small_jump;  // penalty per inverse depth between neighboring pixels
-    float large_jump;  // the most that they pay
+    float p1;  // penalty per inverse depth between neighboring pixels
+    float p2;  // the most that they pay
     float edge;        // gray levels: a step of this size in the image halves the penalties
     float apart;       // inverse depth: a surface farther than this from another is not the same
     int threads;
@@ -89,12 +89,12 @@ void consistent_views(const float* depth, int height, int width, const float* ne
 
 // splatted (H, W): depth in the reference of a neighbor's pixels, the nearest one where several fall; 0 where none.
 void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, int neighbor_height,
-                 int neighbor_width, const Warp& back, float least_confidence, int height, int width, float* splatted);
+                 int neighbor_width, const Warp& back, float min_neighbor_confidence, int height, int width, float* splatted);
 
 struct FuseOptions {
     float sigma;       // relative depth: width of the support
     float violation;   // weight of free-space violations against support
-    float least_confidence;  // a neighbor's pixel below takes no part
+    float min_neighbor_confidence;  // a neighbor's pixel below takes no part
     int threads;
 };
 

@@ -8,9 +8,9 @@ import pytest
 from mvsgs_core import camera, geometry
 from mvsgs_core.fusion.backend import NativeFusionBackend
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig, fuse
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, warps_between
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.torch_backend import TorchFusionBackend
-from mvsgs_core.fusion.views import DepthView, warps_between
 from tests.support.depth_views import SIZE, view
 from tests.support.plane_scene import intrinsics_of, look, true_depth
 
@@ -18,7 +18,7 @@ CONFIG = FusionConfig(device="cpu", threads=1, relative=0.01)
 
 
 def brute_force(
-    reference: DepthView, neighbor: DepthView, relative: float, pixels: float, round_trip: bool
+    reference: KeyframeDepth, neighbor: KeyframeDepth, relative: float, pixels: float, round_trip: bool
 ) -> np.ndarray:
     """The paper's check, pixel by pixel, in float64 with 4x4 poses."""
     agree = np.zeros(SIZE, dtype=bool)
@@ -100,7 +100,7 @@ def test_a_point_that_others_see_through_is_rejected() -> None:
 def test_the_wrong_pose_of_one_neighbor_does_not_get_through() -> None:
     reference, good = view(0, 0.0), [view(1, 0.05), view(2, -0.05), view(3, 0.1)]
     wrong = view(4, 0.3)
-    shifted = DepthView(4, wrong.depth, wrong.confidence, wrong.intrinsics, look(0.5, 0.1), 1.0)
+    shifted = KeyframeDepth(4, wrong.depth, wrong.confidence, wrong.intrinsics, look(0.5, 0.1), 1.0)
     result = fuse(reference, [*good, shifted], CONFIG, NativeFusionBackend(1))
     truth = true_depth(look(0.0), SIZE)
     kept = result.depth > 0

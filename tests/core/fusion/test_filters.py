@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core.fusion.backend import NativeFusionBackend
-from mvsgs_core.fusion.filters import not_on_rim, not_speckle
+from mvsgs_core.fusion.filters import discontinuity_mask, not_speckle
 from mvsgs_core.fusion.fusion import FusionConfig, fuse
 from tests.support.depth_views import view
 
@@ -14,17 +14,17 @@ def test_the_rim_of_the_near_surface_goes_and_what_lies_behind_stays() -> None:
     depth = np.full((30, 40), 4.0, np.float32)
     depth[:, :20] = 2.0
     depth[:, 30:] = 0.0  # unknown: not farther
-    keep = not_on_rim(depth, 3)
+    keep = discontinuity_mask(depth, 3)
     assert keep[:, :17].all()
     assert not keep[:, 17:20].any()
     assert keep[:, 20:30].all()
     assert not keep[:, 30:].any()
-    np.testing.assert_array_equal(not_on_rim(depth, 0), depth > 0)
+    np.testing.assert_array_equal(discontinuity_mask(depth, 0), depth > 0)
 
 
 def test_a_slanted_surface_has_no_rim() -> None:
     depth = np.tile(np.linspace(2.0, 3.0, 100, dtype=np.float32), (20, 1))
-    assert not_on_rim(depth, 3).all()
+    assert discontinuity_mask(depth, 3).all()
 
 
 def test_small_patches_go_at_any_scale_and_large_ones_stay() -> None:
@@ -44,7 +44,7 @@ def test_small_patches_go_at_any_scale_and_large_ones_stay() -> None:
 def test_a_map_without_depth_stays_without() -> None:
     nothing = np.zeros((8, 8), np.float32)
     assert not not_speckle(nothing, 100, 0.02).any()
-    assert not not_on_rim(nothing, 3).any()
+    assert not discontinuity_mask(nothing, 3).any()
 
 
 def test_fusion_counts_what_each_filter_rejects() -> None:
@@ -53,13 +53,18 @@ def test_fusion_counts_what_each_filter_rejects() -> None:
     for neighbor in neighbors:
         neighbor.depth[:, 30:] = 0.0
     config = FusionConfig(device="cpu", threads=1)
-    plain = fuse(reference, neighbors, FusionConfig(device="cpu", threads=1, rim=0, speckle=0), NativeFusionBackend(1))
+    plain = fuse(
+        reference,
+        neighbors,
+        FusionConfig(device="cpu", threads=1, discontinuity_radius=0, speckle=0),
+        NativeFusionBackend(1),
+    )
     huge = fuse(reference, neighbors, FusionConfig(device="cpu", threads=1, speckle=10**6), NativeFusionBackend(1))
     default = fuse(reference, neighbors, config, NativeFusionBackend(1))
-    assert plain.counts["rejected: rim"] == plain.counts["rejected: speckle"] == 0
+    assert plain.counts["rejected: discontinuity"] == plain.counts["rejected: speckle"] == 0
     assert huge.counts["kept"] == 0
     assert huge.counts["rejected: speckle"] > 0
     for found in (plain, default):
-        rejected = sum(found.counts[f"rejected: {name}"] for name in ("rim", "speckle"))
+        rejected = sum(found.counts[f"rejected: {name}"] for name in ("discontinuity", "speckle"))
         sure = (found.unfiltered > 0) & (found.confidence >= config.confidence) & (found.consistent >= 1)
         assert found.counts["kept"] == sure.sum() - rejected

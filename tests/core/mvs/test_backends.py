@@ -81,7 +81,7 @@ def test_smoothing_of_both_backends_agrees(paths: int) -> None:
     p = problem()
     p["first"][:, 30:] += 0.5  # a jump that must end the paths
     cost = np.random.default_rng(1).random((SIZE[0], 7, SIZE[1]), dtype=np.float32)
-    options = replace(SMOOTH, paths=paths, small_jump=0.1, large_jump=0.4)
+    options = replace(SMOOTH, paths=paths, p1=0.1, p2=0.4)
     native = NativeBackend(1).semi_global(cost, p["reference"], p["first"], p["step"], options)
     twin = TorchBackend("cpu").semi_global(cost, p["reference"], p["first"], p["step"], options)
     same = native.best == twin.best
@@ -96,7 +96,7 @@ def test_smoothing_is_the_minimum_over_all_paths_of_a_line() -> None:
     width, count = 5, 3
     cost = rng.random((1, count, width), dtype=np.float32)
     flat, step = np.zeros((1, width), np.float32), np.ones((1, width), np.float32)
-    options = replace(SMOOTH, paths=4, small_jump=0.2, large_jump=0.5)
+    options = replace(SMOOTH, paths=4, p1=0.2, p2=0.5)
     jump = np.array([[0.0, 0.2, 0.5], [0.2, 0.0, 0.2], [0.5, 0.2, 0.0]])
     forward = np.zeros((count, width))
     forward[:, 0] = cost[0, :, 0]
@@ -160,7 +160,7 @@ def test_choices_of_both_backends_agree(count: int) -> None:
     rng = np.random.default_rng(4)
     cost = rng.random((SIZE[0], count, SIZE[1]), dtype=np.float32)
     surfaces = np.concatenate([surfaces_of(p, count)[:, :18], rng.permuted(surfaces_of(p, count)[:, 18:], axis=0)], 1)
-    options = ChooseOptions(small_jump=20.0, large_jump=0.6, edge=12.0, apart=0.03)
+    options = ChooseOptions(p1=20.0, p2=0.6, edge=12.0, apart=0.03)
     best, gap = NativeBackend(2).choose_surface(cost, surfaces, p["reference"], options)
     twin, twin_gap = TorchBackend("cpu").choose_surface(cost, surfaces, p["reference"], options)
     same = best == twin
@@ -184,7 +184,7 @@ def test_choosing_a_surface_is_the_minimum_over_all_paths_of_a_line() -> None:
             path[:, x] += (path[:, x - 1] + jumps[:, :, x - 1]).min(axis=1) - path[:, x - 1].min()
         lines.append(path)
     total = (lines[0] + lines[1][:, ::-1] + 6 * cost[0]) / 8  # up, down, aslant: a row alone
-    options = ChooseOptions(small_jump=0.8, large_jump=0.3, edge=12.0, apart=0.1)
+    options = ChooseOptions(p1=0.8, p2=0.3, edge=12.0, apart=0.1)
     best, gap = NativeBackend(1).choose_surface(cost, surfaces, np.zeros((1, width), np.float32), options)
     np.testing.assert_array_equal(best[0], total.argmin(axis=0))
     ahead = np.abs(surfaces[:, 0] - np.take_along_axis(surfaces[:, 0], best, axis=0)) > 0.1

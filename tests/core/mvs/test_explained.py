@@ -11,17 +11,17 @@ import numpy as np
 from mvsgs_core import camera
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.explained import ExplainChoice, Explained, MapSight
-from mvsgs_core.mvs.views import StereoView, prepare_view
+from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 from tests.support.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)
 
 
-def view(index: int, x: float) -> StereoView:
+def view(index: int, x: float) -> StereoKeyframe:
     pose = look(x)
     image, intrinsics = render(pose, SIZE)
     grid = (1.0 / true_depth(pose, SIZE)[4::8, 4::8]).astype(np.float32)
-    return prepare_view(index, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2), inverse_depth=grid)
+    return prepare_keyframe(index, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2), inverse_depth=grid)
 
 
 def sight(index: int, x: float) -> MapSight:

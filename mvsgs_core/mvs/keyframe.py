@@ -11,7 +11,7 @@ from mvsgs_core import camera
 
 
 @dataclass(frozen=True)
-class StereoView:
+class StereoKeyframe:
     """One keyframe at the size that stereo works at."""
 
     index: int
@@ -36,7 +36,7 @@ class StereoView:
     def intrinsics_at(self, scale: int) -> np.ndarray:
         return camera.scale_intrinsics(self.intrinsics, self.size, self.gray(scale).shape[:2])
 
-    def moved(self, world_from_cam: np.ndarray, scale: float) -> StereoView:
+    def moved(self, world_from_cam: np.ndarray, scale: float) -> StereoKeyframe:
         """The same view after the tracker corrected its pose and the map's scale."""
         factor = np.float32(scale / self.scale)
         return replace(
@@ -44,7 +44,7 @@ class StereoView:
         )
 
 
-def prepare_view(
+def prepare_keyframe(
     index: int,
     image: np.ndarray,
     intrinsics: np.ndarray,
@@ -56,7 +56,7 @@ def prepare_view(
     weight: np.ndarray | None = None,
     scale: float = 1.0,
     segment: int = 0,
-) -> StereoView:
+) -> StereoKeyframe:
     """A view of about `area` pixels, aspect kept, of an image (H, W, 3) uint8 with intrinsics (4,) at its own size.
 
     Without `inverse_depth` the caller must give a depth range. Raises ValueError for a pose or intrinsics with NaN.
@@ -72,7 +72,7 @@ def prepare_view(
     )
     unknown = np.zeros((1, 1), dtype=np.float32)
     grid = unknown if inverse_depth is None else np.asarray(inverse_depth, dtype=np.float32)
-    return StereoView(
+    return StereoKeyframe(
         index=index,
         pyramid=pyramid,
         scales=tuple(sorted(scales)),

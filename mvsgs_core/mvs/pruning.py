@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from mvsgs_core.mvs.interface import TILE, Choice
-from mvsgs_core.mvs.views import StereoView
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 
 
 @dataclass(frozen=True)
-class SkipChoice:
+class PruningConfig:
     """What is left out, tile by tile (mvsgs_core.mvs.interface.TILE)."""
 
     outside_range: bool = True  # first stage: no more hypotheses than the range needs at the stage's step
@@ -20,8 +20,8 @@ class SkipChoice:
     cell_radius: int = 3  # cells around a tile that speak for it
     cell_percentile: float = 5.0  # of their inverse depths, at each end
     cell_margin: float = 2.0  # factor beyond these percentiles
-    least_cells: int = 8  # with fewer known ones around it, a tile searches the whole range
-    least_weight: float = 0.3  # a cell below says nothing
+    min_cells: int = 8  # with fewer known ones around it, a tile searches the whole range
+    min_weight: float = 0.3  # a cell below says nothing
     certain: float = 1.0  # later stages: tiles whose mean certainty is above are left out; 1: none
 
 
@@ -30,12 +30,12 @@ def tile_counts(size: tuple[int, int]) -> tuple[int, int]:
     return -(-size[0] // TILE[0]), -(-size[1] // TILE[1])
 
 
-def cell_bounds(inverse_depth: np.ndarray, weight: np.ndarray, choice: SkipChoice) -> tuple[np.ndarray, np.ndarray]:
+def cell_bounds(inverse_depth: np.ndarray, weight: np.ndarray, choice: PruningConfig) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest inverse depth (h, w) that the known cells around each cell of a grid (h, w) leave open.
 
     0 and infinity where too few are known.
     """
-    known = np.isfinite(inverse_depth) & (inverse_depth > 0) & (weight >= choice.least_weight)
+    known = np.isfinite(inverse_depth) & (inverse_depth > 0) & (weight >= choice.min_weight)
     r = choice.cell_radius
     values = np.pad(np.where(known, inverse_depth, np.inf).astype(np.float32), r, constant_values=np.inf)
     side = 2 * r + 1
@@ -46,12 +46,12 @@ def cell_bounds(inverse_depth: np.ndarray, weight: np.ndarray, choice: SkipChoic
     low = np.take_along_axis(ordered, out[..., None], axis=-1)[..., 0] / choice.cell_margin
     last = np.maximum(count - 1 - out, 0)
     high = np.take_along_axis(ordered, last[..., None], axis=-1)[..., 0] * choice.cell_margin
-    enough = count >= choice.least_cells
+    enough = count >= choice.min_cells
     return np.where(enough, low, 0.0), np.where(enough, high, np.inf)
 
 
 def tiles_in_cells(
-    reference: StereoView, size: tuple[int, int], low: float, interval: float, count: int, choice: SkipChoice
+    reference: StereoKeyframe, size: tuple[int, int], low: float, interval: float, count: int, choice: PruningConfig
 ) -> np.ndarray:
     """(tile rows, D, tile columns) uint8: 1 where hypothesis low + k interval of a tile of (H, W) is open."""
     lowest, highest = cell_bounds(reference.inverse_depth, reference.weight, choice)
@@ -67,7 +67,7 @@ def tiles_in_cells(
     return is_open.astype(np.uint8)
 
 
-def settled_tiles(certainty: np.ndarray, size: tuple[int, int], count: int, choice: SkipChoice) -> np.ndarray:
+def settled_tiles(certainty: np.ndarray, size: tuple[int, int], count: int, choice: PruningConfig) -> np.ndarray:
     """(tile rows, D, tile columns) uint8 of a later stage of (H, W) pixels and `count` hypotheses.
 
     0 where the stage before was sure, (h, w), of all of the tile.

@@ -9,10 +9,10 @@ import pytest
 
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.coarse import enlarge_inverse_depth
-from mvsgs_core.mvs.hypotheses import RangeChoice, SearchRange, fill_uncertain, search_range, upsample_surface
-from mvsgs_core.mvs.neighbors import NeighborChoice, select_neighbors
+from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, fill_uncertain, search_range, upsample_surface
+from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
+from mvsgs_core.mvs.neighbors import NeighborConfig, select_neighbors
 from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
-from mvsgs_core.mvs.views import StereoView, prepare_view
 from mvsgs_core.warp import apply_warp, parallax, relative_warp
 from tests.support.plane_scene import look, render, true_depth
 
@@ -20,22 +20,22 @@ SIZE = (96, 128)
 TYPICAL = np.array([0.2, 0.3, 0.45])
 
 
-def view(index: int, x: float, turn: float = 0.0) -> StereoView:
+def view(index: int, x: float, turn: float = 0.0) -> StereoKeyframe:
     pose = look(x, turn)
     image, intrinsics = render(pose, SIZE)
     grid = (1.0 / true_depth(pose, SIZE)[4::8, 4::8]).astype(np.float32)
-    return prepare_view(
+    return prepare_keyframe(
         index, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2), inverse_depth=grid
     )  # fmt: skip
 
 
 def test_a_few_wrong_cells_do_not_widen_the_range() -> None:
     reference = view(0, 0.0)
-    clean = search_range(reference, [], None, RangeChoice())
+    clean = search_range(reference, [], None, RangeConfig())
     grid = reference.inverse_depth.copy()
     grid[0, :2] = 100.0
     grid[1, 0] = np.nan
-    dirty = search_range(replace(reference, inverse_depth=grid), [], None, RangeChoice())
+    dirty = search_range(replace(reference, inverse_depth=grid), [], None, RangeConfig())
     assert clean is not None
     assert dirty is not None
     assert dirty.high == pytest.approx(clean.high, rel=0.05)
@@ -47,20 +47,20 @@ def test_a_few_wrong_cells_do_not_widen_the_range() -> None:
 def test_the_range_comes_from_whoever_knows() -> None:
     reference, other = view(0, 0.0), view(1, 0.2)
     blind = replace(reference, inverse_depth=np.zeros_like(reference.inverse_depth))
-    own = search_range(reference, [other], None, RangeChoice())
-    theirs = search_range(blind, [other], None, RangeChoice())
-    before = search_range(blind, [], SearchRange(0.1, 0.5, "own grid"), RangeChoice())
+    own = search_range(reference, [other], None, RangeConfig())
+    theirs = search_range(blind, [other], None, RangeConfig())
+    before = search_range(blind, [], SearchRange(0.1, 0.5, "own grid"), RangeConfig())
     assert own is not None
     assert theirs is not None
     assert before is not None
     assert (own.source, theirs.source, before.source) == ("own grid", "neighbors' grids", "previous keyframe")
     assert theirs.high == pytest.approx(own.high, rel=0.3)
-    assert search_range(blind, [], None, RangeChoice()) is None
+    assert search_range(blind, [], None, RangeConfig()) is None
 
 
 def test_neighbors_come_from_both_sides_and_have_a_baseline() -> None:
     views = [view(i, 0.15 * (i - 4)) for i in range(9)]
-    chosen = select_neighbors(views[4], [v for v in views if v.index != 4], TYPICAL, NeighborChoice())
+    chosen = select_neighbors(views[4], [v for v in views if v.index != 4], TYPICAL, NeighborConfig())
     indices = {n.view.index for n in chosen}
     assert len(indices) == 4
     assert any(i < 4 for i in indices)
@@ -70,7 +70,7 @@ def test_neighbors_come_from_both_sides_and_have_a_baseline() -> None:
 
 def test_what_only_turned_or_looks_elsewhere_is_no_neighbor() -> None:
     reference = view(0, 0.0)
-    assert select_neighbors(reference, [view(1, 0.0, 0.2), view(2, 0.3, 2.5)], TYPICAL, NeighborChoice()) == []
+    assert select_neighbors(reference, [view(1, 0.0, 0.2), view(2, 0.3, 2.5)], TYPICAL, NeighborConfig()) == []
 
 
 def test_parallax_is_the_derivative_of_the_warp() -> None:
@@ -85,10 +85,10 @@ def test_parallax_is_the_derivative_of_the_warp() -> None:
 def test_upsampling_does_not_mix_the_two_sides_of_a_jump() -> None:
     coarse = np.full((12, 16), 0.2, np.float32)
     coarse[:, 8:] = 0.6
-    fine = upsample_surface(coarse, (24, 32), largest_gap=0.05)
+    fine = upsample_surface(coarse, (24, 32), max_gap=0.05)
     assert np.all((np.abs(fine - 0.2) < 1e-6) | (np.abs(fine - 0.6) < 1e-6))
     ramp = np.tile(np.linspace(0.2, 0.3, 16, dtype=np.float32), (12, 1))
-    assert np.ptp(np.diff(upsample_surface(ramp, (24, 32), largest_gap=0.05)[12, 4:-4])) < 1e-3
+    assert np.ptp(np.diff(upsample_surface(ramp, (24, 32), max_gap=0.05)[12, 4:-4])) < 1e-3
 
 
 def test_the_membrane_bridges_a_plane() -> None:

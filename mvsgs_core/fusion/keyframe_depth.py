@@ -10,7 +10,7 @@ from mvsgs_core.warp import relative_warp
 
 
 @dataclass(frozen=True)
-class DepthView:
+class KeyframeDepth:
     """One depth map with its camera."""
 
     index: int
@@ -26,13 +26,13 @@ class DepthView:
         height, width = self.depth.shape
         return height, width
 
-    def moved(self, world_from_cam: np.ndarray, scale: float) -> DepthView:
+    def moved(self, world_from_cam: np.ndarray, scale: float) -> KeyframeDepth:
         """The same map after the tracker corrected its pose and the map's scale."""
         factor = np.float32(scale / self.scale)
         return replace(self, world_from_cam=world_from_cam, scale=float(scale), depth=self.depth * factor)
 
 
-def warps_between(reference: DepthView, neighbors: list[DepthView]) -> tuple[np.ndarray, np.ndarray]:
+def warps_between(reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> tuple[np.ndarray, np.ndarray]:
     """(there (N, 12), back (N, 12)) float32: from the reference into each neighbor, and back."""
     there = [
         relative_warp(reference.intrinsics, reference.world_from_cam, n.intrinsics, n.world_from_cam) for n in neighbors

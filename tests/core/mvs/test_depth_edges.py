@@ -8,11 +8,17 @@ import cv2
 import numpy as np
 
 from mvsgs_core.mvs.backend import NativeBackend
+from mvsgs_core.mvs.depth_edges import (
+    DepthEdgeConfig,
+    at_level_of,
+    continued_surfaces,
+    differing_tiles,
+    refine_depth_edges,
+)
 from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.interface import TILE, CostOptions
-from mvsgs_core.mvs.rims import RimChoice, at_level_of, continued_surfaces, differing_tiles, settle_rims
+from mvsgs_core.mvs.keyframe import prepare_keyframe
 from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
-from mvsgs_core.mvs.views import prepare_view
 from tests.support.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)
@@ -51,11 +57,11 @@ def test_rims_of_a_box_come_out_sharper() -> None:
     views = []
     for k, pose in enumerate(poses):
         image, intrinsics = render(pose, SIZE)
-        views.append(prepare_view(k, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2)))
+        views.append(prepare_keyframe(k, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2)))
     truth = true_depth(poses[0], SIZE)
     rim = cv2.dilate(truth, np.ones((9, 9))) > 1.2 * cv2.erode(truth, np.ones((9, 9)))
     right = {}
-    for name, config in (("with", StereoConfig()), ("without", replace(StereoConfig(), rims=None))):
+    for name, config in (("with", StereoConfig()), ("without", replace(StereoConfig(), depth_edges=None))):
         found = estimate_depth(views[0], views[1:], SearchRange(0.12, 0.8, "given"), config, NativeBackend(1))
         right[name] = np.mean(np.abs(found.depth - truth)[rim] < 0.05 * truth[rim])
     assert right["with"] > right["without"] + 0.02
@@ -84,10 +90,10 @@ def test_each_round_frees_more_of_what_a_window_covered() -> None:
     warps = np.stack([[1, 0, 0, 0, 1, 0, 0, 0, 1, -focal * x, 0, 0] for x in places]).astype(np.float32)
     images = np.stack([seen(x) for x in places]).astype(np.float32)
     wrong = []
-    for rounds in ((), ((4, 8),), RimChoice().rounds):
-        surface, clear = settle_rims(
+    for rounds in ((), ((4, 8),), DepthEdgeConfig().rounds):
+        surface, clear = refine_depth_edges(
             closed, seen(0.0).astype(np.float32), images, warps, 1.0 / (focal * 0.075), CostOptions(radius=1),
-            RimChoice(rounds=rounds), NativeBackend(1),
+            DepthEdgeConfig(rounds=rounds), NativeBackend(1),
         )  # fmt: skip
         wrong.append(np.mean(np.abs(surface - truth)[:, 16:112] > 0.01))
         assert np.all((clear >= 0) & (clear <= 1))

@@ -8,27 +8,27 @@ import numpy as np
 import pytest
 
 from mvsgs_core.mvs.backend import NativeBackend
-from mvsgs_core.mvs.hypotheses import RangeChoice, range_of, valid_cells
+from mvsgs_core.mvs.hypotheses import RangeConfig, range_of, valid_cells
 from mvsgs_core.mvs.interface import TILE, Choice
-from mvsgs_core.mvs.skipping import SkipChoice, cell_bounds, keep_settled, settled_tiles, tiles_in_cells
+from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
+from mvsgs_core.mvs.pruning import PruningConfig, cell_bounds, keep_settled, settled_tiles, tiles_in_cells
 from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, estimate_depth
-from mvsgs_core.mvs.views import StereoView, prepare_view
 from tests.support.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)
-CHOICE = SkipChoice(cell_radius=1, cell_percentile=10.0, cell_margin=1.5, least_cells=3)
+CHOICE = PruningConfig(cell_radius=1, cell_percentile=10.0, cell_margin=1.5, min_cells=3)
 
 
-def view(index: int, x: float) -> StereoView:
+def view(index: int, x: float) -> StereoKeyframe:
     pose = look(x)
     image, intrinsics = render(pose, SIZE)
     grid = (1.0 / true_depth(pose, SIZE)[4::8, 4::8]).astype(np.float32)
-    return prepare_view(index, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2), inverse_depth=grid)
+    return prepare_keyframe(index, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2), inverse_depth=grid)
 
 
-def depth_of(skips: SkipChoice, **changes: object) -> StereoDepth:
+def depth_of(skips: PruningConfig, **changes: object) -> StereoDepth:
     reference = replace(view(0, 0.0), **changes)  # type: ignore[arg-type]
-    search = range_of(valid_cells(view(0, 0.0), RangeChoice()), RangeChoice(margin=3.0), "given")
+    search = range_of(valid_cells(view(0, 0.0), RangeConfig()), RangeConfig(margin=3.0), "given")
     neighbors = [view(i, x) for i, x in ((1, 0.4), (2, -0.4), (3, 0.8))]
     return estimate_depth(reference, neighbors, search, StereoConfig(skips=skips), NativeBackend(1))
 
@@ -42,7 +42,7 @@ def test_bounds_of_a_cell_are_those_of_the_known_cells_around() -> None:
         for x in range(8):
             rows, columns = slice(max(y - 1, 0), y + 2), slice(max(x - 1, 0), x + 2)
             known = np.sort(grid[rows, columns][weight[rows, columns] > 0])
-            if len(known) < CHOICE.least_cells:
+            if len(known) < CHOICE.min_cells:
                 assert (low[y, x], high[y, x]) == (0.0, np.inf)
                 continue
             out = int(len(known) * 0.1)
@@ -75,7 +75,7 @@ def test_cells_that_contradict_the_range_close_no_tile() -> None:
 
 
 def test_fewer_hypotheses_give_the_same_depth() -> None:
-    whole, less = depth_of(SkipChoice(outside_cells=False)), depth_of(SkipChoice())
+    whole, less = depth_of(PruningConfig(outside_cells=False)), depth_of(PruningConfig())
     truth = true_depth(look(0.0), SIZE)
     assert less.counts["outside the cells"] > 0.1 * less.counts["hypotheses"]
     assert whole.counts["outside the cells"] == 0
@@ -84,15 +84,15 @@ def test_fewer_hypotheses_give_the_same_depth() -> None:
 
 
 def test_without_the_limit_of_the_range_every_hypothesis_is_tried() -> None:
-    all_of_them = depth_of(SkipChoice(outside_range=False, outside_cells=False))
+    all_of_them = depth_of(PruningConfig(outside_range=False, outside_cells=False))
     assert all_of_them.counts["outside the range"] == 0
-    assert all_of_them.counts["hypotheses"] > depth_of(SkipChoice(outside_cells=False)).counts["hypotheses"]
+    assert all_of_them.counts["hypotheses"] > depth_of(PruningConfig(outside_cells=False)).counts["hypotheses"]
 
 
 def test_a_settled_tile_keeps_the_surface_of_the_stage_before() -> None:
     certainty = np.zeros((48, 64), np.float32)
     certainty[:24] = 1.0
-    needed = settled_tiles(certainty, SIZE, 5, SkipChoice(certain=0.9))
+    needed = settled_tiles(certainty, SIZE, 5, PruningConfig(certain=0.9))
     assert not needed[: SIZE[0] // 2 // TILE[0]].any()
     assert needed[SIZE[0] // 2 // TILE[0] :].all()
     flat = np.ones(SIZE, np.float32)
@@ -105,7 +105,7 @@ def test_a_settled_tile_keeps_the_surface_of_the_stage_before() -> None:
 
 
 def test_settled_tiles_are_counted() -> None:
-    found = depth_of(SkipChoice(certain=0.2))
+    found = depth_of(PruningConfig(certain=0.2))
     assert found.counts["settled before"] > 0
     truth = true_depth(look(0.0), SIZE)
     assert np.mean(np.abs(found.depth - truth) < 0.05 * truth) > 0.9

@@ -13,21 +13,21 @@ import numpy as np
 
 from mvsgs_core import camera
 from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, CostOptions
-from mvsgs_core.mvs.skipping import tile_counts
+from mvsgs_core.mvs.pruning import tile_counts
 from mvsgs_core.warp import apply_warp
 
 
 @dataclass(frozen=True)
-class RimChoice:
+class DepthEdgeConfig:
     """Candidates and their smoothing."""
 
     # Pixels, one tuple a round: the surfaces so far away, in eight directions, are candidates. The wide round frees
     # what a window covered whole, as between the slats of a chair; the narrow one finds the edge to the pixel.
     rounds: tuple[tuple[int, ...], ...] = ((4, 8, 12), (3, 6))
     radius: int = 1  # pixels, of the matching window: a wide one holds both surfaces
-    best_views: int = 2  # that count: right at a rim half of the views see something else
-    small_jump: float = 0.3  # cost of a change of inverse depth that moves the point by a pixel
-    large_jump: float = 1.0  # the most that a change costs
+    top_k: int = 2  # that count: right at a rim half of the views see something else
+    p1: float = 0.3  # cost of a change of inverse depth that moves the point by a pixel
+    p2: float = 1.0  # the most that a change costs
     contrast: float = 5.0  # gray levels: what differs so from a window's center counts 1 / e in it
     level: float = 0.3  # share of the cost that is the difference of gray level
     level_range: float = 10.0  # gray levels: that difference costs 1 from here on
@@ -66,14 +66,14 @@ def _beside(shift: int, length: int) -> tuple[np.ndarray, np.ndarray]:
     return there, (there - here).astype(np.float32)
 
 
-def settle_rims(
+def refine_depth_edges(
     inverse_depth: np.ndarray,
     reference: np.ndarray,
     neighbors: np.ndarray,
     warps: np.ndarray,
     pixel: float,
     cost_options: CostOptions,
-    choice: RimChoice,
+    choice: DepthEdgeConfig,
     backend: Backend,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) float32 inverse depth, and how clear the least clear choice was, 0 to 1, in cost.
@@ -84,12 +84,12 @@ def settle_rims(
     cost_options = replace(
         cost_options,
         radius=choice.radius,
-        best=min(choice.best_views, cost_options.best),
+        best=min(choice.top_k, cost_options.best),
         contrast=choice.contrast,
         level=choice.level,
         level_range=choice.level_range,
     )
-    options = ChooseOptions(choice.small_jump / pixel, choice.large_jump, choice.edge, pixel)
+    options = ChooseOptions(choice.p1 / pixel, choice.p2, choice.edge, pixel)
     clear = np.ones(inverse_depth.shape, dtype=np.float32)
     for rings in choice.rounds:
         surfaces = continued_surfaces(inverse_depth, rings)
