@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from msgs import Depth, View
+from msgs import Depth, FusedKeyframe
 from nodes.depth_fusion import DepthFusion
 
 
@@ -19,7 +19,7 @@ class SlowFusion(DepthFusion):
 
     config: Config
 
-    def on_depth(self, depth: Depth) -> Iterator[View]:
+    def on_depth(self, depth: Depth) -> Iterator[FusedKeyframe]:
         before = sum(self.stats.seconds.values())
         yield from super().on_depth(depth)
         taken = sum(self.stats.seconds.values()) - before
