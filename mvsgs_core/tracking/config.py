@@ -12,6 +12,7 @@ from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.places.loop_closure import LoopConfig
 from mvsgs_core.tracking.places.recovery import RecoveryConfig
+from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class TrackerConfig:
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     focal: FocalConfig = field(default_factory=FocalConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
+    relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     back_end: BackEndConfig = field(default_factory=BackEndConfig)
     covisibility: CovisibilityConfig = field(default_factory=CovisibilityConfig)

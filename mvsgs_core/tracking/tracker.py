@@ -36,6 +36,8 @@ from mvsgs_core.tracking.places.covisibility import CovisibleKeyframes
 from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
 from mvsgs_core.tracking.places.loop_closure import LoopCloser
 from mvsgs_core.tracking.places.recovery import Recovery
+from mvsgs_core.tracking.places.relocalization import Relocalizer
+from mvsgs_core.tracking.places.retrieval import Retrieval
 from mvsgs_core.tracking.publish import Publisher, Update
 
 
@@ -88,7 +90,7 @@ class Tracker:
             return Update(record.state)
         if self.front_end.is_lost(step):
             return self._lose(frame, record)
-        self.recovery.found_again()
+        self.relocalizer.found()
         return self._go_on(frame, step, record) if self.started else self._wait(frame, step, record)
 
     @property
@@ -170,8 +172,10 @@ class Tracker:
         self.diagnosis = Diagnosis(config.front_end, config.texture)
         self.initializer = Initializer(self.graph, self.matcher, config.initialization, config.threads, self.diagnosis)
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, config.threads)
-        self.loops = LoopCloser(self.graph, self.local_map, config.loop)
-        self.recovery = Recovery(self.graph, self.matcher, self.loops.retrieval, config.recovery, config.front_end)
+        retrieval = Retrieval()
+        self.loops = LoopCloser(self.graph, self.local_map, retrieval, config.loop)
+        self.relocalizer = Relocalizer(self.graph, self.matcher, retrieval, config.relocalization)
+        self.recovery = Recovery(self.graph, self.matcher, config.recovery, config.front_end)
         self.covisible_keyframes = CovisibleKeyframes(self.graph, self.local_map, config.covisibility, config.threads)
         self.back_end = BackEnd(self.graph, self.local_map, config.back_end, config.threads)
         self.publisher = Publisher(self.graph, config.tolerance, lambda index: self.keyframe(index).segment)
@@ -207,7 +211,7 @@ class Tracker:
             waiting = list(self.initializer.waiting)
             started = self.initializer.initialize(focal=self._unknown_focal())
         if not started:
-            place = self.recovery.relocalize(frame) if self.segment > 0 else None
+            place = self.relocalizer.relocalize(frame) if self.segment > 0 else None
             if place is None:
                 return Update(State.NOT_INITIALIZED)
             self.initializer.abandon()
@@ -349,7 +353,7 @@ class Tracker:
             return Update(record.state)
         self.recovery.keep(frame)
         with self.stats.time("relocalization"):
-            place = self.recovery.lost(frame)
+            place = self.relocalizer.lost(frame)
         if place is not None:
             if not self.started:
                 self.initializer.abandon()
@@ -358,7 +362,7 @@ class Tracker:
         if not self.started:
             self.initializer.abandon()
             return self._begin(frame, record)
-        if self.recovery.hopeless:
+        if self.relocalizer.hopeless:
             self.started = False
             self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self.graph.keyframes.values()))
             published = self._settle() if self.publisher.held else ()
@@ -372,7 +376,7 @@ class Tracker:
         self.started, self._tail = True, {}
         self.segment = keyframe.segment
         self.front_end.resume(keyframe.image, frame, place.matches, place.localization.cam_from_world)
-        self.recovery.found_again()
+        self.relocalizer.found()
         self.stats.count("relocalized")
         record.state = State.TRACKED
         record.follow(self.graph, place.index, place.matches, place.localization.cam_from_world)

@@ -1,4 +1,4 @@
-"""Known ground: where old keyframes already see what the camera sees, one of them is followed and none is added.
+"""Covisible keyframe reuse: where an old keyframe sees what the camera sees, it is followed and none is added.
 
 So a camera that stays in a room stops to grow the graph: keyframes fill the space of views once, then only gaps in it.
 Nothing is removed afterwards, so every keyframe that was ever told keeps its corrections.
@@ -14,28 +14,19 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.local_map import LocalMap
-from mvsgs_core.tracking.matching.flow import Matches
-from mvsgs_core.tracking.places.localization import Localization, localize
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
+from mvsgs_core.tracking.places.localization import localize
 
 
 @dataclass(frozen=True)
 class CovisibilityConfig:
     min_keyframes: int = 64  # of a map: smaller ones take every view, each makes them more accurate; 0: from the start
-    max_flow: float = 0.13  # of the width: a view nearer to an old keyframe than this is known; 0: none ever is
-    age: int = 12  # references since a keyframe was made, before it counts as old: the local window, and its baselines
-    candidates: int = 2  # old keyframes that are tried, the nearest first
-    fraction: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new
-    inliers: float = 0.8  # of its matches, within 2 pixels of one pose
-    agreement: float = 2.0  # pixels, median between where the map says its points are and where they are: more is drift
-
-
-@dataclass(frozen=True)
-class PlaceMatch:
-    """An old keyframe that sees what a frame sees."""
-
-    index: int
-    matches: Matches  # of its points, in the frame
-    localization: Localization  # of the frame
+    max_flow: float = 0.13  # of the width: old keyframes nearer to a view than this are covisible; 0: none ever is
+    min_age: int = 12  # references since a keyframe was made, before it is old: the local window, and its baselines
+    max_candidates: int = 2  # old keyframes that are tried, the nearest first
+    min_fraction: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new
+    min_inliers: float = 0.8  # fraction of its matches, within 2 pixels of one pose
+    max_error: float = 2.0  # pixels, median between where the map says its points are and where they are: more is drift
 
 
 class CovisibleKeyframes:
@@ -67,7 +58,7 @@ class CovisibleKeyframes:
             return None
         old = [index for index in sorted(self._tied_to(reference)) if self._is_old(index, segment)]
         near = self.local_map.from_pose(pose, old, self.config.max_flow * frame.size[1])
-        for index in near[: self.config.candidates]:
+        for index in near[: self.config.max_candidates]:
             found = self._verify(frame, pose, index)
             if found is not None:
                 self._refer(index)
@@ -80,22 +71,22 @@ class CovisibleKeyframes:
         keyframe = self.graph.keyframes[index]
         matches, fraction = self.local_map.matcher.match(keyframe.image, frame, expected, 0.0)
         seen = matches.alive & keyframe.triangulated
-        if fraction < self.config.fraction or not seen.any():
+        if fraction < self.config.min_fraction or not seen.any():
             return None
         apart = np.linalg.norm(expected + self.graph.readout_time * frame.shutter(expected) - matches.target, axis=1)[
             seen
         ]
-        if not np.median(apart) < self.config.agreement:
+        if not np.median(apart) < self.config.max_error:
             return None
         found = localize(self.graph, {index: matches}, pose, self.solver)
-        if found.failure or found.inliers < self.config.inliers:
+        if found.failure or found.inliers < self.config.min_inliers:
             return None
         return PlaceMatch(index, matches, found)
 
     def _is_old(self, index: int, segment: int) -> bool:
         return (
             self.graph.keyframes[index].segment == segment
-            and self._references - self._made.get(index, 0) >= self.config.age
+            and self._references - self._made.get(index, 0) >= self.config.min_age
         )
 
     def _tied_to(self, reference: int) -> set[int]:
@@ -117,4 +108,4 @@ class CovisibleKeyframes:
             self.graph.keyframes[index].image.release()
 
 
-__all__ = ["CovisibilityConfig", "CovisibleKeyframes", "PlaceMatch"]
+__all__ = ["CovisibilityConfig", "CovisibleKeyframes"]

@@ -1,4 +1,7 @@
-"""An old keyframe seen again, with no idea of the pose: features, then Lucas-Kanade, then a pose that must fit."""
+"""Geometric verification of a place: an old keyframe in an image, with no idea of the pose.
+
+Features, then Lucas-Kanade, then a pose that must meet the criteria.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,12 @@ from mvsgs_core.tracking.matching.features import match_features
 from mvsgs_core.tracking.matching.flow import Matches, spread
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.places.localization import Localization, localize
-from mvsgs_core.tracking.pose_criteria import PoseCriteria, verified
+from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 
 
 @dataclass(frozen=True)
 class PlaceMatch:
-    """Keyframe `index` was found in an image."""
+    """Keyframe `index` sees what an image sees."""
 
     index: int
     matches: Matches  # of its points
@@ -39,7 +42,7 @@ def verify_place(
     guess = spread(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * image.size[1])
     matches, fraction = matcher.match(keyframe.image, image, guess, 0.0)
     known = matches.alive & keyframe.triangulated
-    if fraction < criteria.fraction or known.sum() < criteria.count:
+    if fraction < criteria.min_fraction or known.sum() < criteria.min_matches:
         return None
     u, v = keyframe.points[known].T.astype(np.float64)
     fx, fy, cx, cy = graph.intrinsics
@@ -60,24 +63,24 @@ def verify_place(
     relative = np.eye(4)
     relative[:3, :3], relative[:3, 3] = geometry.so3_exp(rotation.ravel()), translation.ravel()
     localization = localize(graph, {index: matches}, relative @ keyframe.cam_from_world, Solver(steps=10))
-    if not verified(graph, index, matches, localization, criteria):
+    if not criteria.accept(graph, index, matches, localization):
         return None
     return PlaceMatch(index, matches, localization)
 
 
-def relative_scale(graph: KeyframeGraph, sighting: PlaceMatch, index: int) -> float | None:
-    """Unit of keyframe `index`'s own depths over the unit of the sighted keyframe's; None where too few compare."""
-    here, seen = graph.keyframes[index], graph.keyframes[sighting.index]
-    usable = sighting.matches.alive & seen.triangulated
+def relative_scale(graph: KeyframeGraph, place: PlaceMatch, index: int) -> float | None:
+    """Unit of keyframe `index`'s own depths over the unit of the place's keyframe; None where too few compare."""
+    here, seen = graph.keyframes[index], graph.keyframes[place.index]
+    usable = place.matches.alive & seen.triangulated
     own = np.flatnonzero(here.triangulated)
     if usable.sum() < 20 or len(own) < 20:
         return None
-    relative = sighting.localization.cam_from_world @ graph.world_from_cam(sighting.index)
+    relative = place.localization.cam_from_world @ graph.world_from_cam(place.index)
     fx, fy, cx, cy = graph.intrinsics
     u, v = seen.points[usable].T.astype(np.float64)
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)])
     z = relative[2, :3] @ rays / seen.inverse_depth[usable] + relative[2, 3]
-    at = sighting.matches.target[usable]
+    at = place.matches.target[usable]
     distance = np.linalg.norm(at[:, None] - here.points[own][None], axis=-1)
     nearest = np.argmin(distance, axis=1)
     near = (distance[np.arange(len(at)), nearest] < 8.0) & (z > 0)

@@ -12,15 +12,15 @@ from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of,
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, relative_scale, verify_place
+from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 from mvsgs_core.tracking.places.retrieval import Retrieval
-from mvsgs_core.tracking.pose_criteria import PoseCriteria
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    candidates: int = 2  # keyframes that are looked at, for each new one
-    apart: int = 10  # keyframes: nearer ones are no loop
-    agreement: float = 0.03  # of depth, radians, half of the scale: below, the map is right and only gains an edge
+    max_candidates: int = 2  # keyframes that are looked at, for each new one
+    min_gap: int = 10  # keyframes: nearer ones are no loop
+    max_disagreement: float = 0.03  # of depth, radians, half of the scale: below, the map only gains an edge
     criteria: PoseCriteria = field(default_factory=PoseCriteria)
 
 
@@ -36,11 +36,11 @@ class Closure:
 
 
 class LoopCloser:
-    def __init__(self, graph: KeyframeGraph, local_map: LocalMap, config: LoopConfig) -> None:
+    def __init__(self, graph: KeyframeGraph, local_map: LocalMap, retrieval: Retrieval, config: LoopConfig) -> None:
         self.graph = graph
         self.local_map = local_map
+        self.retrieval = retrieval
         self.config = config
-        self.retrieval = Retrieval()
 
     def add(self, index: int) -> None:
         """A keyframe that may be found again."""
@@ -51,12 +51,12 @@ class LoopCloser:
         keyframe = self.graph.keyframes[index]
         order = self.local_map.members(keyframe.segment)
         place = order.index(index)
-        near = set(order[max(0, place - self.config.apart) :]) | self.graph.neighbors(index) | {index}
+        near = set(order[max(0, place - self.config.min_gap) :]) | self.graph.neighbors(index) | {index}
         near |= {m for n in self.graph.neighbors(index) for m in self.graph.neighbors(n)}
         near = {n for n in near if n in self.graph.keyframes and self.graph.keyframes[n].segment == keyframe.segment}
         descriptors = keyframe.image.features()[1]
         usual = set(order[max(0, place - 2) : place])
-        for candidate in self.retrieval.query(descriptors, self.config.candidates, near, usual):
+        for candidate in self.retrieval.query(descriptors, self.config.max_candidates, near, usual):
             found = verify_place(self.graph, self.local_map.matcher, candidate, keyframe.image, self.config.criteria)
             if found is None:
                 continue
@@ -66,22 +66,22 @@ class LoopCloser:
         return None
 
     def close(self, found: PlaceMatch, index: int, scale: float) -> Closure:
-        """Moves the map so that the sighting holds. scale: unit of keyframe `index` over that of the sighted one."""
+        """Moves the map so that the place match holds.
+
+        scale: unit of keyframe `index` over that of the keyframe found.
+        """
         old, new = self.graph.keyframes[found.index], self.graph.keyframes[index]
         joined = new.segment if old.segment != new.segment else None
-        closure = Closure(found.index, index, True, joined)
+        moved = joined is not None or not self._disagreement(found, index, scale) < self.config.max_disagreement
         if joined is not None:
             self._join(found, index, scale)
-        else:
-            agrees = self._disagreement(found, index, scale) < self.config.agreement
-            if not agrees:
-                failure = self._pull(found, index, scale)
-                if failure:
-                    return Closure(found.index, index, False, None, failure)
-            closure = Closure(found.index, index, not agrees)
-        self.graph.connect(found.index, index, found.matches, self.config.criteria.fraction)
+        elif moved:
+            failure = self._spread_correction(found, index, scale)
+            if failure:
+                return Closure(found.index, index, False, failure=failure)
+        self.graph.connect(found.index, index, found.matches, self.config.criteria.min_fraction)
         self.local_map.match_edge(index, found.index)
-        return closure
+        return Closure(found.index, index, moved, joined)
 
     def _disagreement(self, found: PlaceMatch, index: int, scale: float) -> float:
         difference = found.localization.cam_from_world @ self.graph.world_from_cam(index)
@@ -90,14 +90,14 @@ class LoopCloser:
         return max(shift, turn, 0.5 * abs(float(np.log(scale))))
 
     def _measured(self, found: PlaceMatch, index: int, scale: float) -> np.ndarray:
-        """Similarity (4, 4): camera `index`, in its own unit, from the sighted camera."""
+        """Similarity (4, 4): camera `index`, in its own unit, from the camera of the keyframe found."""
         relative = found.localization.cam_from_world @ self.graph.world_from_cam(found.index)
         result = np.eye(4)
         result[:3, :3], result[:3, 3] = scale * relative[:3, :3], scale * relative[:3, 3]
         return result
 
-    def _pull(self, found: PlaceMatch, index: int, scale: float) -> str:
-        """Pose graph over the segment; returns why it failed, or nothing."""
+    def _spread_correction(self, found: PlaceMatch, index: int, scale: float) -> str:
+        """The loop's error is spread over its segment by a pose graph; returns why that failed, or nothing."""
         order = self.local_map.members(self.graph.keyframes[index].segment)
         number = {k: n for n, k in enumerate(order)}
         poses = np.stack([self.graph.keyframes[k].cam_from_world for k in order])
@@ -121,7 +121,7 @@ class LoopCloser:
         return ""
 
     def _join(self, found: PlaceMatch, index: int, scale: float) -> None:
-        """Brings the segment of `index` into the frame and unit of the sighted one."""
+        """Brings the segment of `index` into the frame and unit of the keyframe found."""
         target = self.graph.keyframes[found.index].segment
         wanted = self._measured(found, index, scale) @ self.graph.keyframes[found.index].cam_from_world
         other_from_target = self.graph.world_from_cam(index) @ wanted

@@ -36,8 +36,8 @@ class Retrieval:
             rarity = float(np.log(1.0 + self._keyframes / len(postings)))
             for index in postings:
                 scores[index] = scores.get(index, 0.0) + rarity
-        least = 0.5 * max((scores.get(index, 0.0) for index in usual or ()), default=0.0)
-        good = [index for index in scores if index not in exclude and scores[index] >= least]
+        min_score = 0.5 * max((scores.get(index, 0.0) for index in usual or ()), default=0.0)
+        good = [index for index in scores if index not in exclude and scores[index] >= min_score]
         return sorted(good, key=lambda index: (-scores[index], index))[:count]
 
     def _words(self, descriptors: np.ndarray) -> np.ndarray:

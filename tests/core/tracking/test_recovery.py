@@ -12,6 +12,7 @@ from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.frames import FrameRecord, State
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.places.recovery import RecoveryConfig
+from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
 from mvsgs_core.tracking.tracker import Tracker
 from tests.support.sequences import synthetic, track
 from tests.support.shared_data import shared
@@ -57,9 +58,11 @@ def test_each_lost_run_is_followed_from_its_own_keyframes() -> None:
 
 def test_only_the_newest_images_of_frames_without_a_pose_are_kept() -> None:
     items = covered(list(synthetic(frames=80)), range(40, 52), range(0))[:60]
-    tracker, _, _ = track(items, TrackerConfig(recovery=RecoveryConfig(max_images=5, patience=100)))
-    assert len(tracker.recovery._kept) == 5
-    assert min(tracker.recovery._kept) >= 40
+    tracker, _, _ = track(
+        items, TrackerConfig(recovery=RecoveryConfig(max_images=5), relocalization=RelocalizationConfig(patience=100))
+    )
+    assert len(tracker.recovery._images) == 5
+    assert min(tracker.recovery._images) >= 40
 
 
 def test_frames_before_the_start_are_verified_or_have_no_pose() -> None:
