@@ -80,7 +80,7 @@ class StereoNode(Node, ABC):
             self.stats.warn(f"some depth ranges come from the {found.search.source}: the tracker knew too little depth")
         self.stats.count("neighbors", len(found.neighbors))
         self.stats.count("hypotheses", found.result.counts.get("hypotheses", 0.0))
-        for what in ("outside the range", "outside the cells", "settled before"):
+        for what in ("outside the range", "outside the cells"):
             self.stats.skip(f"hypotheses {what}", found.result.counts.get(what, 0.0))
         kept = found.result.confidence
         self.stats.values["mean confidence"] = float(np.mean(kept))
@@ -112,7 +112,6 @@ class Mvs(StereoNode):
         range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
         min_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
         skip_cells: bool = True  # hypotheses that the tracker's depths around rule out
-        skip_certain: float = 1.0  # later stages where the one before was more certain than this; 1: nowhere
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
         threads: int | None = None  # of the C++ kernels; null: all
         resume_after: int | None = None  # keyframes up to this frame are in a resumed map: neighbors of others only
@@ -121,7 +120,7 @@ class Mvs(StereoNode):
 
     def _make_cascade(self) -> Cascade:
         c = self.config
-        skips = PruningConfig(outside_cells=c.skip_cells, certain=c.skip_certain)
+        skips = PruningConfig(outside_cells=c.skip_cells)
         stereo = StereoConfig(top_k=c.top_k, paths=c.paths, skips=skips)
         if c.stages:
             stereo = replace(stereo, stages=tuple(Stage(**stage) for stage in c.stages))

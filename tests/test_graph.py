@@ -143,12 +143,6 @@ def test_an_inline_run_that_fails_lets_its_nodes_save_what_they_have(
     assert saved == ["ArithmeticError: frame 2 cannot be relayed"]
 
 
-def test_what_the_map_shows_is_fed_back_to_stereo() -> None:
-    graph = compose(["mvs=skipping", "mapper.map_views=true"])
-    assert [(e.sender, e.reader) for e in graph.edges if e.feedback] == [("mapper", "mvs")]
-    assert list(graph.slots).index("mvs") < list(graph.slots).index("mapper")
-
-
 def test_another_target_starts_from_its_own_defaults() -> None:
     graph = fake(f"relay._target_={STAGES}.Uncorrected", "relay.every=3", "device=cpu")
     assert graph.slots["relay"].config == {"device": "cpu", "every": 3}  # and no `stride` of the old choice

@@ -30,7 +30,7 @@ from bench.depth.pose_refinement import refine_poses
 from bench.depth.run import Run, run, score, surest
 from bench.depth.sensor import sensor_offset, without_offset
 from bench.depth.tracked import load_tracked
-from bench.runs import Matrix, figure, folder
+from bench.runs import folder
 from bench.table import Row, at_least, at_most, main
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
@@ -197,26 +197,6 @@ def time_section(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def explained_section(options: argparse.Namespace) -> list[Row]:
-    """Whole runs with and without stereo for keyframes that the map explains, in one process: the same every time."""
-    if options.quick:
-        return []
-    frames = ["inline=true", "dataset.stop=70", "evaluator.lpips=off", "evaluator.max_frames=30"]
-    matrix = Matrix(["tum_fr1_xyz"], ["full", "skip_explained"], overrides=frames)
-    rows = []
-    for one in matrix.run(folder(options, "depth_explained")):
-        figures = {
-            "keyframes passed over": ("skipped.mvs.keyframes that the map explains", ""),
-            "keyframes": ("counts.mvs.keyframes", ""),
-            "stereo": ("time.stages.mvs.stereo", "s"),
-            "completeness of depth": ("depth.completeness", ""),
-            "held-out PSNR": ("rendering.held_out.psnr", "dB"),
-        }
-        name = f"skips, {one.scene}, 70 frames, {one.variant}"
-        rows += [Row(f"{name}: {what}", figure(one.report, path), unit) for what, (path, unit) in figures.items()]
-    return rows
-
-
 def map_section(options: argparse.Namespace) -> list[Row]:
     """The paper's A (tracker's depth), B (+ stereo), C (+ filter), from the recorded `python -m bench.ablation`."""
     file = Path(__file__).with_name("recorded") / "ablation.json"
@@ -243,7 +223,6 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "photos": photos_section,
     "parts": partial(variants_section, title="parts", variants=part_variants(SMALL)),
     "skips": partial(variants_section, title="skips", variants=skip_variants(SMALL)),
-    "explained": explained_section,
     "curves": curves_section,
     "failures": lambda options: failure_rows(SMALL, QUICK if options.quick else None),
     "time": time_section,

@@ -15,7 +15,7 @@ from mvsgs_core.mvs.cascade import CascadeConfig
 from mvsgs_core.mvs.stereo import StereoConfig
 
 Variant = tuple[CascadeConfig, FusionConfig]
-_COUNTED = ("outside the range", "outside the cells", "settled before")
+_COUNTED = ("outside the range", "outside the cells")
 
 
 def part_variants(area: int) -> dict[str, Variant]:
@@ -59,8 +59,6 @@ def skip_variants(area: int) -> dict[str, Variant]:
         "no skip": skips(outside_range=False, outside_cells=False),
         "all hypotheses, in the cells' range": skips(outside_range=False),
         "hypotheses outside the cells too": skips(outside_cells=False),
-        "later stage only where uncertain (0.95)": skips(certain=0.95),
-        "later stage only where uncertain (0.5)": skips(certain=0.5),
     }
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from mvsgs_core.mvs.backend import make_backend
-from mvsgs_core.mvs.explained import Explained
 from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, search_range
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 from mvsgs_core.mvs.neighbors import NeighborConfig, select_neighbors
@@ -49,7 +48,6 @@ class Cascade:
         self._views: list[StereoKeyframe] = []  # a window of the stream, oldest first
         self._waiting: list[int] = []  # indices without depth yet, oldest first
         self._previous_range: SearchRange | None = None
-        self.explained: Explained | None = None  # if set, keyframes that the map explains get no depth
 
     def prepare(
         self,
@@ -114,9 +112,6 @@ class Cascade:
         if not chosen:
             return CascadeDepth(reference, empty_depth(reference.size), (), search, "no neighbor with a baseline")
         self._previous_range = search
-        if self.explained is not None and self.explained.enough(reference):
-            nothing = replace(empty_depth(reference.size), counts={"explained": 1.0})
-            return CascadeDepth(reference, nothing, (), search)
         views = [n.view for n in chosen]
         result = self._estimate(reference, views, search)
         return CascadeDepth(reference, result, tuple(v.index for v in views), search)

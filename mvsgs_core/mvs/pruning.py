@@ -1,4 +1,4 @@
-"""Parts of the sweep that need not be computed: hypotheses that the tracker rules out, stages that cannot help."""
+"""Hypotheses of the sweep that need not be computed: those that the tracker's coarse depth rules out."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mvsgs_core.mvs.interface import TILE, Choice
+from mvsgs_core.mvs.interface import TILE
 from mvsgs_core.mvs.keyframe import StereoKeyframe
 
 
@@ -22,7 +22,6 @@ class PruningConfig:
     cell_margin: float = 2.0  # factor beyond these percentiles
     min_cells: int = 8  # with fewer known ones around it, a tile searches the whole range
     min_weight: float = 0.3  # a cell below says nothing
-    certain: float = 1.0  # later stages: tiles whose mean certainty is above are left out; 1: none
 
 
 def tile_counts(size: tuple[int, int]) -> tuple[int, int]:
@@ -65,27 +64,3 @@ def tiles_in_cells(
     is_open = (hypotheses >= begin[:, None] - interval) & (hypotheses <= end[:, None] + interval)
     is_open |= ~is_open.any(axis=1, keepdims=True)  # the cells contradict the range: all of it
     return is_open.astype(np.uint8)
-
-
-def settled_tiles(certainty: np.ndarray, size: tuple[int, int], count: int, choice: PruningConfig) -> np.ndarray:
-    """(tile rows, D, tile columns) uint8 of a later stage of (H, W) pixels and `count` hypotheses.
-
-    0 where the stage before was sure, (h, w), of all of the tile.
-    """
-    rows, columns = tile_counts(size)
-    mean = cv2.resize(certainty, (columns, rows), interpolation=cv2.INTER_AREA)
-    return np.repeat((mean <= choice.certain).astype(np.uint8)[:, None], count, axis=1)
-
-
-def keep_settled(now: Choice, before: Choice, needed: np.ndarray) -> Choice:
-    """A later stage's choice, with the stage before's in the tiles (tile rows, D, tile columns) that were left out."""
-    size = (now.index.shape[0], now.index.shape[1])
-    left_out = needed[:, 0].repeat(TILE[0], axis=0).repeat(TILE[1], axis=1)[: size[0], : size[1]] == 0
-    middle = needed.shape[1] // 2
-    order = (size[1], size[0])
-    return Choice(
-        index=np.where(left_out, np.float32((needed.shape[1] - 1) / 2), now.index),
-        probability=np.where(left_out, cv2.resize(before.probability, order), now.probability),
-        margin=np.where(left_out, cv2.resize(before.margin, order), now.margin),
-        best=np.where(left_out, np.int32(middle), now.best),
-    )

@@ -12,7 +12,7 @@ from mvsgs_core.mvs.depth_edges import DepthEdgeConfig, refine_depth_edges
 from mvsgs_core.mvs.hypotheses import SearchRange, certainty, fill_uncertain, upsample_surface
 from mvsgs_core.mvs.interface import Backend, Choice, CostOptions, SmoothOptions
 from mvsgs_core.mvs.keyframe import StereoKeyframe
-from mvsgs_core.mvs.pruning import PruningConfig, keep_settled, settled_tiles, tiles_in_cells
+from mvsgs_core.mvs.pruning import PruningConfig, tiles_in_cells
 from mvsgs_core.warp import parallax, relative_warp
 
 
@@ -81,7 +81,7 @@ def estimate_depth(
     if not neighbors:
         raise ValueError("stereo needs at least one neighbor with a baseline")
     middle = float(np.mean([search.low, search.high]))
-    counts = dict.fromkeys(("hypotheses", "outside the range", "outside the cells", "settled before"), 0.0)
+    counts = dict.fromkeys(("hypotheses", "outside the range", "outside the cells"), 0.0)
     skips = config.skips
     surface = np.empty((0, 0), dtype=np.float32)
     first_probability = surface
@@ -107,21 +107,17 @@ def estimate_depth(
             count = stage.hypotheses
             previous = interval
             assert choice is not None
-            before, sure = choice, certainty(choice)
             if config.fill:
-                surface = fill_uncertain(surface, sure, reference.gray(config.stages[number - 1].scale))
+                surface = fill_uncertain(surface, certainty(choice), reference.gray(config.stages[number - 1].scale))
             interval = min(wanted, previous)
             centers = upsample_surface(surface, size, 1.5 * previous)
             first = centers - np.float32(interval * (count - 1) / 2)
-            tiles = settled_tiles(sure, size, count, skips) if skips.certain < 1 else None
-            counts["settled before"] += 0.0 if tiles is None else float(1.0 - tiles.mean()) * count * gray.size
+            tiles = None
         step = np.full(size, interval, dtype=np.float32)
         cost = backend.cost_volume(
             gray, images, warps.astype(np.float32), first, step, count, config.cost_options(stage), tiles
         )
         choice = backend.semi_global(cost, gray, first, step, config.smooth_options(stage))
-        if number > 0 and tiles is not None:
-            choice = keep_settled(choice, before, tiles)
         surface = first + choice.index * np.float32(interval)
         counts["hypotheses"] += float(count) * gray.size
         if number == 0:

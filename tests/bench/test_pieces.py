@@ -85,7 +85,7 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
     switches = {f"mapper.{f.name}" for f in dataclasses.fields(Mapper.Config) if isinstance(f.default, bool)}
     switches -= {"mapper.keep_checkpoint", "mapper.save_images"}  # what is written beside the map
     switches |= {f"mvs.{f.name}" for f in dataclasses.fields(Mvs.Config) if f.name.startswith("skip_")}
-    assert {"mapper.skip_converged", "mvs.skip_cells", "mvs.skip_certain"} <= switches
+    assert {"mapper.skip_converged", "mvs.skip_cells"} <= switches
     assert switches <= switched
     others = ("voxel", "map_voxel", "map_voxel_error", "fill", "density_control", "kernel", "loss", "sh_degree")
     assert {f"mapper.{name}" for name in others} <= switched

@@ -9,9 +9,9 @@ import pytest
 
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.hypotheses import RangeConfig, range_of, valid_cells
-from mvsgs_core.mvs.interface import TILE, Choice
+from mvsgs_core.mvs.interface import TILE
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
-from mvsgs_core.mvs.pruning import PruningConfig, cell_bounds, keep_settled, settled_tiles, tiles_in_cells
+from mvsgs_core.mvs.pruning import PruningConfig, cell_bounds, tiles_in_cells
 from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, estimate_depth
 from tests.support.plane_scene import look, render, true_depth
 
@@ -87,25 +87,3 @@ def test_without_the_limit_of_the_range_every_hypothesis_is_tried() -> None:
     all_of_them = depth_of(PruningConfig(outside_range=False, outside_cells=False))
     assert all_of_them.counts["outside the range"] == 0
     assert all_of_them.counts["hypotheses"] > depth_of(PruningConfig(outside_cells=False)).counts["hypotheses"]
-
-
-def test_a_settled_tile_keeps_the_surface_of_the_stage_before() -> None:
-    certainty = np.zeros((48, 64), np.float32)
-    certainty[:24] = 1.0
-    needed = settled_tiles(certainty, SIZE, 5, PruningConfig(certain=0.9))
-    assert not needed[: SIZE[0] // 2 // TILE[0]].any()
-    assert needed[SIZE[0] // 2 // TILE[0] :].all()
-    flat = np.ones(SIZE, np.float32)
-    now = Choice(4 * flat, 0.9 * flat, 0.5 * flat, np.full(SIZE, 4, np.int32))
-    half = np.full((48, 64), 0.3, np.float32)
-    kept = keep_settled(now, Choice(half, half, half, np.zeros((48, 64), np.int32)), needed)
-    assert kept.index[0, 0] == 2.0  # the middle of five: the surface as it was
-    assert kept.probability[0, 0] == pytest.approx(0.3)
-    assert (kept.index[-1, 0], kept.best[-1, 0]) == (4.0, 4)
-
-
-def test_settled_tiles_are_counted() -> None:
-    found = depth_of(PruningConfig(certain=0.2))
-    assert found.counts["settled before"] > 0
-    truth = true_depth(look(0.0), SIZE)
-    assert np.mean(np.abs(found.depth - truth) < 0.05 * truth) > 0.9
