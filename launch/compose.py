@@ -19,8 +19,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from launch.graph import Graph, Replaced, build
-from launch.parameters import GraphError, did_you_mean
+from launch.graph import Graph, Replaced, build_graph
+from launch.refusal import GraphError
+from nodes.runtime.parameters import did_you_mean
 
 CONF = Path(__file__).resolve().parent / "conf"
 
@@ -51,7 +52,7 @@ def graph_of(config: DictConfig, overrides: Sequence[str], choices: Mapping[str,
     except OmegaConfBaseException as error:
         raise GraphError(str(error)) from error
     assert isinstance(resolved, dict)
-    return build({str(key): value for key, value in resolved.items()}, replaced)
+    return build_graph({str(key): value for key, value in resolved.items()}, replaced)
 
 
 def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: bool = True) -> list[str]:
@@ -78,8 +79,7 @@ def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str],
             f"other keys: {', '.join(settings)}"
         )
     if rest:
-        # a key inside a parameter that is itself a mapping (dataset.options.camera) is the choice file's: Hydra checks
-        return text if "." in rest and not rest.startswith("reads.") else f"++{text}"
+        return f"++{text}"
     chosen, choices = override.value(), slots[root]
     if chosen == "external" and chosen not in choices:
         return f"++{root}.external=true"

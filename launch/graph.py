@@ -6,7 +6,6 @@ choices and edges all come from `conf/`.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,8 +13,9 @@ from typing import Any, Literal
 
 import msgs
 import nodes
-from launch.parameters import GraphError, check_parameters, did_you_mean
+from launch.refusal import GraphError
 from mvsgs_core.named_modules import import_named
+from nodes.runtime.parameters import ParameterError, build, did_you_mean, parameter_names, plain_values
 
 # A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have. Where
 # some slot is their origin, an edge that misses them is an error all the same: corrections would be lost in silence.
@@ -45,6 +45,9 @@ class Settings:
     keys: str | None = None
     screen: Literal["auto", "live", "plain", "off"] = "auto"
     supervise: Supervise = field(default_factory=Supervise)
+
+
+FROM_SETTINGS = ("output", "seed")  # nodes that have such a parameter and are given none of their own get these
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,11 @@ class Slot:
     config: dict[str, Any]  # all of the node's parameters, plain JSON values
     reads: dict[type, str]  # message type -> sending slot, "?" after it for best effort
     placement: Placement
+
+    @property
+    def parameters(self) -> Any:
+        """The node's Config."""
+        return build(self.node.Config, self.config, self.name)
 
     @property
     def target(self) -> str:
@@ -125,15 +133,21 @@ class Replaced:
     interpolated: Collection[str]  # from a global key, such as ${output}: these hold where the new node has them
 
 
-def build(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | None = None) -> Graph:
+def build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | None = None) -> Graph:
     """The checked graph of a resolved configuration. Raises GraphError, with what would be valid."""
-    replaced = replaced or {}
+    try:
+        return _build_graph(config, replaced or {})
+    except ParameterError as error:
+        raise GraphError(str(error)) from error
+
+
+def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) -> Graph:
     settings, sections = _settings(config)
     device = _Device(settings.device)
     slots: dict[str, Slot] = {}
     for name, section in sections.items():
         if section.get("_target_") is not None:
-            slots[name] = _build_slot(name, section, replaced.get(name), device)
+            slots[name] = _build_slot(name, section, replaced.get(name), settings, device)
     edges, warnings = connect(slots, list(sections))
     names, edges = order(slots, edges)
     resolved = {key: value for key, value in config.items() if key not in sections}
@@ -147,17 +161,18 @@ def _settings(config: Mapping[str, Any]) -> tuple[Settings, dict[str, Mapping[st
     """The keys that belong to no slot, and the slots' sections."""
     own = Settings.__dataclass_fields__
     sections = {key: value for key, value in config.items() if isinstance(value, Mapping) and key not in own}
-    given = {key: value for key, value in config.items() if key not in sections}
-    checked = check_parameters("", "config.yaml", Settings, given)
-    supervise = Supervise(**checked["supervise"])
+    settings = build(Settings, {key: value for key, value in config.items() if key not in sections})
+    supervise = settings.supervise
     if not 0.0 < supervise.silent < supervise.dead:
         raise GraphError(f"supervise.silent={supervise.silent:g}: must be above 0 and below dead={supervise.dead:g}")
-    return Settings(**(checked | {"supervise": supervise})), sections
+    return settings, sections
 
 
-def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None, device: _Device) -> Slot:
+def _build_slot(
+    name: str, section: Mapping[str, Any], replaced: Replaced | None, settings: Settings, device: _Device
+) -> Slot:
     node = load_node(name, str(section["_target_"]))
-    inputs, accepted = _handlers(name, node), set(inspect.signature(node.Config).parameters)
+    inputs, accepted = _handlers(name, node), parameter_names(node.Config)
     reads = dict(section.get("reads") or {})
     given = {key: value for key, value in section.items() if key not in ("_target_", "reads")}
     placement = {key: given.pop(key) for key in Placement.__dataclass_fields__ if key in given and key not in accepted}
@@ -166,7 +181,8 @@ def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None
         kept = {*replaced.given, *(key for key in replaced.interpolated if key in accepted)}
         given = {key: value for key, value in given.items() if key in kept}
         reads = {key: value for key, value in reads.items() if key in {t.__name__ for t in inputs}}
-    parameters = check_parameters(name, f"{node.__module__}.{node.__qualname__}", node.Config, given)
+    given = {key: getattr(settings, key) for key in FROM_SETTINGS if key in accepted} | given
+    parameters = plain_values(build(node.Config, given, name))
     if parameters.get("device") == "auto":
         parameters["device"] = device.resolved
     typed: dict[type, str] = {}
@@ -176,8 +192,7 @@ def _build_slot(name: str, section: Mapping[str, Any], replaced: Replaced | None
         if not isinstance(sender, str):
             raise GraphError(f"{name}.reads.{message}={sender}: must be the name of the slot that sends it")
         typed[msgs.TYPES[message]] = sender
-    where = Placement(**check_parameters(name, "placement", Placement, placement))
-    return Slot(name, node, parameters, typed, where)
+    return Slot(name, node, parameters, typed, build(Placement, placement, name))
 
 
 def load_node(slot: str, target: str) -> type[nodes.Node]:

@@ -13,7 +13,6 @@ import numpy as np
 import nodes
 from launch.graph import Graph
 from msgs import End, Message
-from nodes.runtime.parameters import make_config
 from nodes.runtime.runner import Runner, end_of
 
 Observer = Callable[[str, nodes.Node, Any], None]
@@ -39,9 +38,7 @@ class _Inline:
     def __init__(self, graph: Graph, observe: Observer) -> None:
         self._graph = graph
         self._observe = observe
-        self._runners = {
-            name: Runner(name, slot.node(make_config(slot.node, slot.config))) for name, slot in graph.slots.items()
-        }
+        self._runners = {name: Runner(name, slot.node(slot.parameters)) for name, slot in graph.slots.items()}
 
     def run(self) -> dict[str, nodes.Node]:
         sources: dict[str, Iterator[Message]] = {name: self._runners[name].source() for name in self._graph.sources}

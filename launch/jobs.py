@@ -19,12 +19,11 @@ from launch.graph import Graph
 from launch.inline import run_inline
 from launch.outcome import FAILED, REFUSED, Outcome, finished
 from launch.output import Output
-from launch.parameters import GraphError
+from launch.refusal import GraphError
 from launch.screen import Screen, make_screen
 from launch.status import NodeStatus
 from launch.summary import summary
 from launch.supervise import Supervisor
-from nodes.runtime.parameters import make_config
 
 
 class RunFailed(RuntimeError):
@@ -118,7 +117,7 @@ def _check_nodes(graph: Graph) -> None:
             continue
         _check_device(name, slot.config.get("device"))
         try:
-            slot.node.check(make_config(slot.node, slot.config))
+            slot.node.check(slot.parameters)
         except (OSError, ValueError) as error:
             raise GraphError(f"{name}: {error}") from error
 

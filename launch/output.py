@@ -20,7 +20,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from launch.outcome import Outcome
-from launch.parameters import GraphError
+from launch.refusal import GraphError
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info
 

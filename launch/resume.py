@@ -6,7 +6,6 @@ Where they cannot (a live camera), the checkpoint's keyframes are the source, an
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,9 @@ import nodes
 from launch.compose import CONF, graph_of, parse, prepare, vocabulary
 from launch.graph import load_node
 from launch.output import REPORT, read_report
-from launch.parameters import GraphError
+from launch.refusal import GraphError
 from mvsgs_core.mapping.checkpoints.files import CheckpointInfo, checkpoint_info
-from nodes.runtime.parameters import make_config
+from nodes.runtime.parameters import parameter_names
 
 WORD = "resume="
 SOURCE = "dataset"  # the slot of the choice that gives a checkpoint's keyframes
@@ -44,7 +43,7 @@ def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) ->
     if not all(node.replayable for node in _classes(config).values() if nodes.is_source(node)):
         _without_stream(config, folder, conf)
     for slot, node in _classes(config).items():
-        known = inspect.signature(node.Config).parameters
+        known = parameter_names(node.Config)
         if "resume" in known:
             config[slot].resume = str(folder)
         if "resume_after" in known:
@@ -61,7 +60,7 @@ def leave_out_refused(config: DictConfig) -> list[str]:
         if slot.placement.external:
             continue
         try:
-            slot.node.check(make_config(slot.node, slot.config))
+            slot.node.check(slot.parameters)
         except (OSError, ValueError) as error:
             config[name] = {"_target_": None}
             notes.append(f"{name} is left out: {error}")
@@ -124,7 +123,7 @@ def _without_stream(config: DictConfig, folder: Path, conf: Path) -> None:
     kept = {SOURCE}
     for slot, node in classes.items():
         section = config[slot]
-        if "resume" in inspect.signature(node.Config).parameters or section.get("observer"):
+        if "resume" in parameter_names(node.Config) or section.get("observer"):
             kept.add(slot)
     for slot in classes.keys() - {SOURCE}:
         reads: dict[str, Any] = dict(config[slot].get("reads") or {})

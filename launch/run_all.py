@@ -31,7 +31,7 @@ from omegaconf import DictConfig
 from launch.children import python_environment
 from launch.compose import CONF, prepare
 from launch.jobs import Job, refused, run
-from launch.parameters import GraphError
+from launch.refusal import GraphError
 from launch.resume import WORD as RESUME
 from launch.resume import leave_out_refused, resumed_config
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from launch.graph import Graph
-from launch.parameters import GraphError
+from launch.refusal import GraphError
 from launch.specs import topic_of
 from nodes.runtime.spec import gone_file
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from launch.graph import Edge, Graph
-from launch.parameters import GraphError
+from launch.refusal import GraphError
 from nodes.runtime.addresses import TransportError, load_keys
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from launch.compose import CONF, compose, vocabulary
 from launch.graph import Edge, Graph
 from launch.inline import run_inline
-from launch.parameters import GraphError, convert
 from launch.placement import thread_plan
+from launch.refusal import GraphError
 from msgs import Frame, GroundTruth, Keyframe, Poses
+from nodes.runtime.parameters import ParameterError, convert
 from tests.support.fake_graph.stages import Relay, Sink
 
 FAKE = Path(__file__).parent / "support" / "fake_graph" / "conf"
@@ -81,8 +82,10 @@ REFUSED = [
     (["transport=udp"], "transport=udp", "'ipc' or 'tcp'"),
     (["device=tpu"], "device=tpu", "auto, cpu, cuda"),
     (["device=cuda:99", "source.device=auto"], "device=cuda:99", "CUDA devices"),
-    (["sink.tint=3"], "did you mean sink.labels.tint?", "labels: dict"),
-    (["sink.labels.color=3"], "sink.labels.color", ""),
+    (["sink.tint=3"], "did you mean sink.labels.tint?", "labels: {tint, shade}"),
+    (["sink.labels.color=3"], "sink.labels.color: ", "tint: int = 1"),
+    (["sink.labels.shad=3"], "did you mean shade", "shade: float = 0.5"),
+    (["sink.labels.tint=x"], "sink.labels.tint=x", "must be int"),
     (["relay._target_=nowhere.Node"], "no module 'nowhere'", "PYTHONPATH"),
     (["relay._target_=Node"], "relay._target_=Node", "module.Class"),
     ([f"relay._target_={STAGES}.Rely"], "did you mean Relay", "has: Source, Relay, Sink"),
@@ -202,7 +205,7 @@ def test_a_value_is_converted_to_its_type_or_refused(value: object) -> None:
         fits = isinstance(value, annotation) and (annotation is bool or not isinstance(value, bool))
         try:
             converted = convert(value, annotation, "x")
-        except GraphError:
+        except ParameterError:
             assert not fits
         else:
             assert isinstance(converted, annotation)

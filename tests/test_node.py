@@ -285,8 +285,12 @@ def test_a_node_that_yields_what_it_does_not_declare_fails() -> None:
     [
         ("tests.support.sample_nodes.Nothing", {}, "is no node"),
         ("tests.no_such_module.Left", {}, "ModuleNotFoundError"),
-        ("tests.support.sample_nodes.Left", {"dely": 1}, "has no parameter dely; its parameters are: delay"),
-        ("tests.support.sample_nodes.Left", {"delay": "long"}, "Left.delay='long': must be float"),
+        (
+            "tests.support.sample_nodes.Left",
+            {"dely": 1},
+            "left.dely: tests.support.sample_nodes.Left has no parameter 'dely' (did you mean delay?)",
+        ),
+        ("tests.support.sample_nodes.Left", {"delay": "long"}, "left.delay=long: must be float"),
     ],
 )
 def test_a_wrong_specification_is_refused(target: str, config: dict[str, object], error: str) -> None:
@@ -298,7 +302,11 @@ def test_a_wrong_specification_is_refused(target: str, config: dict[str, object]
 
 def test_a_file_that_is_no_specification_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "spec.json"
-    for text, error in (("{", "Expecting"), ('{"name": "a"}', "missing: target"), ("[1]", "must be a JSON object")):
+    for text, error in (
+        ("{", "Expecting"),
+        ('{"name": "a"}', "target must be given"),
+        ("[1]", "must be a JSON object"),
+    ):
         path.write_text(text)
         done = subprocess.run([sys.executable, "-m", "nodes", path], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode == 2

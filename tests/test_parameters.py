@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
@@ -14,7 +15,7 @@ import pytest
 from msgs import End, Frame, Keyframe
 from msgs.codec import decode, encode
 from nodes import Node
-from nodes.runtime.parameters import make_config
+from nodes.runtime.parameters import ParameterError, build, leaves, plain_values
 from nodes.runtime.plain import plain
 from nodes.runtime.runner import Runner, merge_stats, own_stats
 from tests.support.sample_nodes import Left, Wrong
@@ -43,6 +44,7 @@ class Sample(Node):
         mode: Literal["fast", "slow"] = "fast"
         color: Color = Color.RED
         inner: Inner = field(default_factory=Inner)
+        parts: tuple[Inner, ...] = ()
         options: dict[str, Any] = field(default_factory=dict)
         limits: dict[str, float] = field(default_factory=dict)
         number: int | float = 0
@@ -50,8 +52,8 @@ class Sample(Node):
 
 
 def test_plain_values_become_what_the_annotations_say() -> None:
-    config = make_config(
-        Sample,
+    config = build(
+        Sample.Config,
         {
             "required": 3,
             "ratio": 2,
@@ -63,6 +65,7 @@ def test_plain_values_become_what_the_annotations_say() -> None:
             "mode": "slow",
             "color": "BLUE",
             "inner": {"weight": 1},
+            "parts": [{"weight": 2}, {}],
             "options": {"any": [1, None]},
             "limits": {"a": 1},
             "number": 3,
@@ -70,9 +73,10 @@ def test_plain_values_become_what_the_annotations_say() -> None:
         },
     )
     assert config == Sample.Config(
-        3, 2.0, None, Path("a/b"), (4, 5), ["u"], (1.0, 2.5), "slow", Color.BLUE, Inner(1.0), {"any": [1, None]},
-        {"a": 1.0}, 3, True,
+        3, 2.0, None, Path("a/b"), (4, 5), ["u"], (1.0, 2.5), "slow", Color.BLUE, Inner(1.0), (Inner(2.0), Inner()),
+        {"any": [1, None]}, {"a": 1.0}, 3, True,
     )  # fmt: skip
+    assert build(Sample.Config, json.loads(json.dumps(plain_values(config)))) == config  # and back
     assert isinstance(config.number, int)
     assert isinstance(config.limits["a"], float)
 
@@ -80,25 +84,37 @@ def test_plain_values_become_what_the_annotations_say() -> None:
 @pytest.mark.parametrize(
     ("given", "error"),
     [
-        ({}, "Sample needs required; its parameters are: required, ratio"),
-        ({"required": 1, "requird": 1}, "has no parameter requird"),
-        ({"required": 1.5}, "Sample.required=1.5: must be int"),
-        ({"required": True}, "Sample.required=True: must be int"),
-        ({"required": 1, "flag": 1}, "Sample.flag=1: must be bool"),
-        ({"required": 1, "size": [1, 2, 3]}, "Sample.size"),
-        ({"required": 1, "size": [1, "a"]}, "Sample.size"),
-        ({"required": 1, "names": "abc"}, "Sample.names"),
-        ({"required": 1, "mode": "medium"}, "Sample.mode='medium': must be"),
-        ({"required": 1, "color": "GREEN"}, "Sample.color"),
-        ({"required": 1, "inner": {"wait": 1}}, "Sample.inner has no parameter wait"),
-        ({"required": 1, "inner": 3}, "Sample.inner=3"),
-        ({"required": 1, "limits": {"a": "b"}}, "Sample.limits.a='b': must be float"),
+        ({}, "sample.required must be given: tests.test_parameters.Sample has no default for it (int)"),
+        ({"required": 1, "requird": 1}, "sample.requird: tests.test_parameters.Sample has no parameter 'requird'"),
+        ({"required": 1, "requird": 1}, "(did you mean required?); it has:\n  required: int  (must be given)\n"),
+        ({"required": 1.5}, "sample.required=1.5: must be int"),
+        ({"required": True}, "sample.required=True: must be int"),
+        ({"required": 1, "flag": 1}, "sample.flag=1: must be bool"),
+        ({"required": 1, "size": [1, 2, 3]}, "sample.size=[1, 2, 3]: must be [int, int] or null"),
+        ({"required": 1, "size": [1, "a"]}, "sample.size"),
+        ({"required": 1, "names": "abc"}, "sample.names=abc: must be [str]"),
+        ({"required": 1, "mode": "medium"}, "sample.mode=medium: must be 'fast' or 'slow'"),
+        ({"required": 1, "color": "GREEN"}, "sample.color=GREEN: must be RED or BLUE"),
+        ({"required": 1, "inner": {"wait": 1}}, "sample.inner.wait: tests.test_parameters.Inner has no parameter"),
+        ({"required": 1, "inner": {"wait": 1}}, "(did you mean weight?)"),
+        ({"required": 1, "weight": 1}, "(did you mean sample.inner.weight?)"),
+        ({"required": 1, "inner": 3}, "sample.inner=3: must be {weight}"),
+        ({"required": 1, "inner": {"weight": "x"}}, "sample.inner.weight=x: must be float"),
+        ({"required": 1, "parts": [{"weight": "x"}]}, "sample.parts[0].weight=x: must be float"),
+        ({"required": 1, "limits": {"a": "b"}}, "sample.limits.a=b: must be float"),
     ],
 )
 def test_what_does_not_fit_is_named(given: dict[str, Any], error: str) -> None:
-    with pytest.raises(TypeError) as caught:
-        make_config(Sample, given)
+    with pytest.raises(ParameterError) as caught:
+        build(Sample.Config, given, "sample")
     assert error in str(caught.value)
+
+
+def test_every_parameter_has_a_path_down_to_the_innermost() -> None:
+    paths = [path for path, *_ in leaves(Sample.Config, "sample")]
+    assert paths[0] == "sample.required"
+    assert "sample.inner.weight" in paths
+    assert "sample.inner" not in paths
 
 
 def frame() -> Frame:

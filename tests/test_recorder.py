@@ -21,7 +21,6 @@ from mvsgs_core.datasets.mcap_file import MAGIC
 from nodes import handlers, is_source, outputs
 from nodes.player import Player
 from nodes.recorder import GraphRecorder, Recorder
-from nodes.runtime.parameters import make_config
 from tests.support.example_messages import MESSAGES, assert_equal, example
 
 
@@ -244,4 +243,4 @@ def test_a_recording_without_anything_to_play_is_refused_before_the_run(tmp_path
 def compose_and_check(overrides: list[str]) -> None:
     graph = compose([*overrides, "output=/tmp/x"])
     slot = graph.slots["dataset"]
-    slot.node.check(make_config(slot.node, slot.config))
+    slot.node.check(slot.parameters)

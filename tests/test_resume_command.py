@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from launch.compose import compose, graph_of
 from launch.graph import Graph
-from launch.parameters import GraphError
+from launch.refusal import GraphError
 from launch.resume import leave_out_refused, resumed_config
 from mvsgs_core.mapping.checkpoints.files import state_file, write_state
 from tests.support.shared_data import ROOT

@@ -1,88 +1,205 @@
-"""Plain values, as they come from a launch file or JSON, into a node's `Config`."""
+"""Plain values, as a launch file or JSON has them, into a dataclass and back.
+
+A node's `Config` is the one place that says which parameters there are, of which type and with which default. The
+launcher and the node's process both build it here, so what one takes the other takes too.
+"""
 
 from __future__ import annotations
 
+import difflib
 import types
 import typing
-from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
-from nodes import Node
+T = TypeVar("T")
 
 
-def make_config(node: type[Node], given: Mapping[str, Any]) -> Any:
-    """`node.Config` with these parameters, defaults for the others.
+class ParameterError(ValueError):
+    """A parameter that is unknown, missing or of the wrong type; the message says which, and what would be valid."""
 
-    Raises TypeError, naming the parameter and what is valid, for an unknown or missing one or a wrong type.
+
+def build(config: type[T], given: Mapping[str, Any], where: str = "") -> T:
+    """The dataclass `config` with the values given, its defaults for the others.
+
+    `where`: the path of these parameters, as a user writes it (`mapper.insertion`). Raises ParameterError.
     """
-    return _build(node.Config, given, node.__qualname__)
-
-
-def _build(config: type, given: Mapping[str, Any], where: str) -> Any:
     hints = typing.get_type_hints(config)
-    declared = {field.name: field for field in fields(config) if field.init}
-    unknown = [name for name in given if name not in declared]
-    missing = [
-        name
-        for name, field in declared.items()
-        if name not in given and field.default is MISSING and field.default_factory is MISSING
-    ]
-    if unknown or missing:
-        problem = f"has no parameter {', '.join(unknown)}" if unknown else f"needs {', '.join(missing)}"
-        raise TypeError(f"{where} {problem}; its parameters are: {', '.join(declared) or 'none'}")
-    return config(**{name: _convert(value, hints[name], f"{where}.{name}") for name, value in given.items()})
+    declared = {field.name: field for field in fields(config) if field.init}  # type: ignore[arg-type]
+    for name in given:
+        if name not in declared:
+            raise ParameterError(
+                f"{_path(where, name)}: {_owner(config)} has no parameter {name!r}"
+                f"{_meant(config, where, name, given)}; it has:\n{describe(config)}"
+            )
+    for name, field in declared.items():
+        if name not in given and not _has_default(field):
+            raise ParameterError(
+                f"{_path(where, name)} must be given: {_owner(config)} has no default for it ({type_name(hints[name])})"
+            )
+    return config(**{name: convert(value, hints[name], _path(where, name)) for name, value in given.items()})
 
 
-def _convert(value: Any, annotation: Any, where: str) -> Any:
-    """The value as an instance of the annotated type: nested dataclasses, enums, paths and tuples are built."""
+def plain_values(value: Any) -> Any:
+    """A parameter, or a whole dataclass of them, as the JSON value that `build` makes it from."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain_values(getattr(value, field.name)) for field in fields(value) if field.init}
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain_values(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_values(item) for item in value]
+    return value
+
+
+def parameter_names(config: type) -> list[str]:
+    """Of a dataclass, without those of the dataclasses in it."""
+    return [field.name for field in fields(config) if field.init]
+
+
+def leaves(config: type, where: str = "") -> Iterator[tuple[str, type, Field[Any], Any]]:
+    """Every parameter that is no dataclass itself, in order: path, dataclass that declares it, field, annotation."""
+    hints = typing.get_type_hints(config)
+    for field in fields(config):
+        path, annotation = _path(where, field.name), hints[field.name]
+        if isinstance(annotation, type) and is_dataclass(annotation):
+            yield from leaves(annotation, path)
+        elif field.init:
+            yield path, config, field, annotation
+
+
+def default_of(field: Field[Any]) -> Any:
+    """The JSON value of a field's default. Raises ParameterError where it must be given."""
+    if not _has_default(field):
+        raise ParameterError(f"{field.name} must be given")
+    return plain_values(field.default if field.default_factory is MISSING else field.default_factory())
+
+
+def describe(config: type) -> str:
+    """One line a parameter: name, type, default; of nested ones the names."""
+    hints = typing.get_type_hints(config)
+    lines = []
+    for field in fields(config):
+        if is_dataclass(hints[field.name]):
+            default = ""
+        else:
+            default = f" = {default_of(field)}" if _has_default(field) else "  (must be given)"
+        lines.append(f"  {field.name}: {type_name(hints[field.name])}{default}")
+    return "\n".join(lines) or "  (no parameters)"
+
+
+def did_you_mean(word: str, valid: Iterable[str]) -> str:
+    """' (did you mean X?)' for the closest valid word, or nothing."""
+    close = difflib.get_close_matches(word, list(valid), n=1)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def convert(value: Any, annotation: Any, where: str) -> Any:
+    """`value` as an instance of the annotated type. Raises ParameterError, naming `where`, where it is none."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if annotation is Any or (annotation is type(None) and value is None):
-        return value
+    kind = origin or annotation
     if origin is typing.Annotated:
-        return _convert(value, arguments[0], where)
+        return convert(value, arguments[0], where)
+    if annotation is Any or annotation is object or (annotation is type(None) and value is None):
+        return value
     if origin in (typing.Union, types.UnionType):
-        exact = sorted(arguments, key=lambda member: type(value) is not member)  # int | float keeps 3 an int
-        for member in exact:
+        # the member that the value already is comes first, so that int | str keeps 3 a number
+        for member in sorted(arguments, key=lambda member: type(value) is not member):
             try:
-                return _convert(value, member, where)
-            except TypeError:
+                return convert(value, member, where)
+            except ParameterError:
                 continue
-    elif origin is typing.Literal:
-        if value in arguments:
+    elif origin is Literal:
+        if any(value == argument and type(value) is type(argument) for argument in arguments):
             return value
-    elif is_dataclass(annotation):
+    elif isinstance(kind, type) and is_dataclass(kind):
         if isinstance(value, Mapping):
-            return _build(typing.cast(type, annotation), value, where)
-    elif (origin or annotation) in (tuple, list) and isinstance(value, list | tuple):
-        return _sequence(value, origin or annotation, arguments, where)
-    elif isinstance(origin or annotation, type) and issubclass(origin or annotation, Mapping):
+            return build(kind, value, where)
+    elif kind in (tuple, list, Sequence):
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            return _sequence(value, annotation, where)
+    elif kind in (dict, Mapping):
         if isinstance(value, Mapping):
             of = arguments[1] if arguments else Any
-            return {key: _convert(item, of, f"{where}.{key}") for key, item in value.items()}
-    elif isinstance(annotation, type):
-        return _scalar(value, annotation, where)
-    raise TypeError(f"{where}={value!r}: must be {annotation}")
+            return {str(key): convert(item, of, f"{where}.{key}") for key, item in value.items()}
+    elif isinstance(kind, type):
+        scalar = _scalar(value, kind)
+        if scalar is not None:
+            return scalar
+    raise _wrong_type(value, annotation, where)
 
 
-def _sequence(value: Any, kind: type, arguments: tuple[Any, ...], where: str) -> Any:
+def _sequence(value: Sequence[Any], annotation: Any, where: str) -> Any:
+    kind, arguments = typing.get_origin(annotation) or annotation, typing.get_args(annotation)
     if kind is tuple and arguments and arguments[-1] is not Ellipsis:
         if len(value) != len(arguments):
-            raise TypeError(f"{where}={value!r}: must have {len(arguments)} entries")
-        return tuple(_convert(item, of, f"{where}[{i}]") for i, (item, of) in enumerate(zip(value, arguments)))
-    of = arguments[0] if arguments else Any
-    return kind(_convert(item, of, f"{where}[{i}]") for i, item in enumerate(value))
+            raise _wrong_type(value, annotation, where)
+        types_of = arguments
+    else:
+        types_of = (arguments[0] if arguments else Any,) * len(value)
+    items = [convert(item, of, f"{where}[{i}]") for i, (item, of) in enumerate(zip(value, types_of, strict=True))]
+    return tuple(items) if kind is tuple else items
 
 
-def _scalar(value: Any, kind: type, where: str) -> Any:
-    if issubclass(kind, Enum) and value in kind.__members__:
-        return kind[value]
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if kind is Path and isinstance(value, str):
-        return Path(value)
-    if isinstance(value, kind) and not (isinstance(value, bool) and kind is not bool):
-        return value
-    raise TypeError(f"{where}={value!r}: must be {kind.__name__}")
+def _scalar(value: Any, kind: type) -> Any:
+    """A bool, int, float, str, path or member of an enumeration; None where `value` is no such thing."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if issubclass(kind, Enum):
+        return kind[value] if isinstance(value, str) and value in kind.__members__ else None
+    if kind is float:
+        return float(value) if is_number else None
+    if kind in (str, Path):
+        return kind(str(value)) if is_number or isinstance(value, str | Path) else None
+    return value if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)) else None
+
+
+def type_name(annotation: Any) -> str:
+    """The annotation as a user reads it: `int`, `[int, int] or null`, `'a' or 'b'`, `{name, name}` of a dataclass."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return type_name(arguments[0])
+    if annotation is type(None):
+        return "null"
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(type_name(member) for member in arguments)
+    if origin is Literal:
+        return " or ".join(repr(argument) for argument in arguments)
+    if isinstance(annotation, type) and issubclass(annotation, Enum):
+        return " or ".join(annotation.__members__)
+    if isinstance(annotation, type) and is_dataclass(annotation):
+        return f"{{{', '.join(parameter_names(annotation))}}}"
+    if origin in (tuple, list, Sequence):
+        return f"[{', '.join('...' if argument is Ellipsis else type_name(argument) for argument in arguments)}]"
+    return getattr(annotation, "__name__", str(annotation))
+
+
+def _wrong_type(value: Any, annotation: Any, where: str) -> ParameterError:
+    return ParameterError(f"{where}={value}: must be {type_name(annotation)}")
+
+
+def _meant(config: type, where: str, name: str, given: Mapping[str, Any]) -> str:
+    """The parameter that a wrong name is close to: the one of that name in a nested dataclass or a mapping first."""
+    paths = [path for path, *_ in leaves(config)]
+    paths += [f"{key}.{inner}" for key, value in given.items() if isinstance(value, Mapping) for inner in value]
+    same = [path for path in paths if "." in path and path.rpartition(".")[2] == name]
+    if same:
+        return f" (did you mean {_path(where, same[0])}?)"
+    return did_you_mean(name, parameter_names(config)) or did_you_mean(name, paths)
+
+
+def _has_default(field: Field[Any]) -> bool:
+    return field.default is not MISSING or field.default_factory is not MISSING
+
+
+def _owner(config: type) -> str:
+    return f"{config.__module__}.{config.__qualname__}".removesuffix(".Config")
+
+
+def _path(where: str, name: str) -> str:
+    return f"{where}.{name}" if where else name

@@ -31,7 +31,7 @@ from nodes import Node, is_source, outputs
 from nodes.runtime.addresses import PeerLost, load_keys
 from nodes.runtime.freed_memory import FreedMemory
 from nodes.runtime.inbox import Inbox, Reader
-from nodes.runtime.parameters import make_config
+from nodes.runtime.parameters import build
 from nodes.runtime.runner import Runner, end_of, stats_of
 from nodes.runtime.signals import ABORT_SECONDS, Signals, Stopped, end_within
 from nodes.runtime.spec import Spec
@@ -102,7 +102,8 @@ class _Process:
         self.status.set("starting")
         node_type = load_node(self._spec.target)
         self._seed()
-        runner = self._runner = Runner(self._spec.name, node_type(make_config(node_type, self._spec.config)))
+        config = build(node_type.Config, self._spec.config, self._spec.name)
+        runner = self._runner = Runner(self._spec.name, node_type(config))
         runner.node.rest = self._rest
         read = {given.type for given in self._spec.outputs}
         runner.node.unread = frozenset(sent for sent in outputs(node_type) if sent.__name__ not in read)

@@ -16,11 +16,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import msgs
+from nodes.runtime.parameters import ParameterError, build
 
 
 @dataclass(frozen=True)
@@ -65,14 +66,16 @@ class Spec:
     def read(path: Path) -> Spec:
         """Raises ValueError, OSError for a file that is no specification."""
         content = json.loads(path.read_text())
-        spec = _build(Spec, content, str(path))
-        inputs = tuple(_build(Input, item, f"{path}: inputs") for item in spec.inputs)
-        outputs = tuple(_build(Output, item, f"{path}: outputs") for item in spec.outputs)
-        for item in (*inputs, *outputs):
-            if item.type not in msgs.TYPES:
-                raise ValueError(f"{path}: {item.type} is no message; the types are {', '.join(msgs.TYPES)}")
-        cpu = None if spec.cpu is None else tuple(spec.cpu)
-        return Spec(**(vars(spec) | {"inputs": inputs, "outputs": outputs, "cpu": cpu, "folder": path.parent}))
+        if not isinstance(content, dict):
+            raise ValueError(f"{path}: must be a JSON object")
+        try:
+            spec = build(Spec, content)
+        except ParameterError as error:
+            raise ValueError(f"{path}: {error}") from error
+        for kind in [given.type for given in spec.inputs] + [given.type for given in spec.outputs]:
+            if kind not in msgs.TYPES:
+                raise ValueError(f"{path}: {kind} is no message; the types are {', '.join(msgs.TYPES)}")
+        return replace(spec, folder=path.parent)
 
     def awaited_observers(self, output: Output) -> list[str]:
         """The observers of an output that are not known to be gone."""
@@ -81,17 +84,3 @@ class Spec:
 
 def gone_file(folder: Path, name: str) -> Path:
     return folder / f"{name}.gone"
-
-
-def _build(kind: Any, content: Any, where: str) -> Any:
-    names = [field.name for field in fields(kind)]
-    missing = [
-        f.name
-        for f in fields(kind)
-        if f.default is MISSING and (not isinstance(content, dict) or f.name not in content)
-    ]
-    if not isinstance(content, dict) or missing or not set(content) <= set(names):
-        raise ValueError(
-            f"{where}: must be a JSON object of {', '.join(names)}; missing: {', '.join(missing) or 'none'}"
-        )
-    return kind(**content)

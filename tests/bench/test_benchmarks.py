@@ -20,7 +20,7 @@ from bench.runs import CONF, Matrix, Run, Setting, choices, figure, said
 from bench.stress import __main__ as stress
 from bench.table import Row, at_least, at_most
 from launch.compose import compose
-from launch.parameters import GraphError
+from launch.refusal import GraphError
 from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.mapping.training import TrainingConfig

@@ -116,13 +116,19 @@ def take(seconds: float, how: str) -> None:
             time.sleep(seconds)
 
 
+@dataclass
+class Labels:
+    tint: int = 1  # of nothing
+    shade: float = 0.5
+
+
 class Sink(Node):
     """Writes what arrived to `output`/sink.json."""
 
     @dataclass
     class Config:
         output: str
-        labels: dict[str, Any] = field(default_factory=dict)
+        labels: Labels = field(default_factory=Labels)
         refuse: bool = False  # fails before the run starts
         long: float = 0.0  # seconds for each keyframe
 
