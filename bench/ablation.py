@@ -24,7 +24,7 @@ from bench.table import Row, main
 SCENES = ("room", "tum_fr1_xyz", "redkitchen")
 TABLE_III = ("A", "B", "C", "D")
 SKIPS = (  # what is left out, switched off or over; keyframe reuse needs more keyframes than these scenes have
-    "no_skips", "all_skips", "no_skip_converged", "skip_tiles", "coarse_to_fine", "no_selective", "no_unexplored",
+    "no_skips", "all_skips", "no_skip_converged", "coarse_to_fine", "no_selective", "no_unexplored",
     "no_voxel", "no_map_voxel", "map_voxel_strict", "no_fill", "realtime", "no_skip_cells", "every_frame",
 )  # fmt: skip
 OTHERS = (

@@ -148,13 +148,13 @@ def run(scene: Scene, config: MapperConfig, checkpoints: int = 10, period: float
 
 def all_skips_off(config: MapperConfig) -> MapperConfig:
     """Every keyframe's every pixel inserted (through the voxel filter), every iteration whole."""
-    nothing = SkipConfig(converged=False, tiles=False, coarse_to_fine=False, selective=False)
+    nothing = SkipConfig(converged=False, coarse_to_fine=False, selective=False)
     return replace(config, skipping=nothing, insertion=replace(config.insertion, unexplored=False, map_voxel=0.0))
 
 
 def all_skips_on(config: MapperConfig) -> MapperConfig:
     """Those too that the default leaves off because they cost more quality than they save time."""
-    return replace(config, skipping=SkipConfig(converged=True, tiles=True, coarse_to_fine=True, selective=True))
+    return replace(config, skipping=SkipConfig(converged=True, coarse_to_fine=True, selective=True))
 
 
 def variants(config: MapperConfig) -> dict[str, MapperConfig]:
@@ -172,7 +172,6 @@ def variants(config: MapperConfig) -> dict[str, MapperConfig]:
         "density control none": replace(config, density_control=replace(density, mode="none")),
         "density control relocate": replace(config, density_control=replace(density, mode="relocate")),
         "no skip of converged keyframes": replace(config, skipping=replace(skipping, converged=False)),
-        "low-error tiles left out": replace(config, skipping=replace(skipping, tiles=True)),
         "coarse-to-fine": replace(config, skipping=replace(skipping, coarse_to_fine=True)),
         "every splat stepped": replace(config, skipping=replace(skipping, selective=False)),
         "shapes trained (exact)": replace(config, training=replace(training, kernel="exact", betas=True)),

@@ -67,7 +67,6 @@ class Mapper(Node):
         density_control: str = "adaptive"  # adaptive, relocate or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls
-        skip_tiles: bool = False  # leave out tiles of low error
         coarse_to_fine: bool = False  # a keyframe's first visits at half resolution
         selective: bool = True  # step only the splats that were seen
         preview_period: float = 1.0  # seconds between previews; 0: none
@@ -349,7 +348,7 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
             poses=config.refine_poses, loss=_loss(config.loss),
         ),
         skipping=SkipConfig(
-            converged=config.skip_converged, tiles=config.skip_tiles, coarse_to_fine=config.coarse_to_fine,
+            converged=config.skip_converged, coarse_to_fine=config.coarse_to_fine,
             selective=config.selective,
         ),
         rates=OptimizerConfig(),

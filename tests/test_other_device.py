@@ -94,7 +94,7 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
             backend="reference", exposure=True, poses=True, pose_visits=0, betas=True, kernel="exact",
             loss=LossConfig(),
         ),
-        skipping=SkipConfig(tiles=True, tiles_every=2, coarse_to_fine=True, coarse_visits=1),
+        skipping=SkipConfig(coarse_to_fine=True, coarse_visits=1),
         density_control=DensityControlConfig(every=3, mode=mode),
     )  # fmt: skip
     views = [rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(3)]
@@ -119,7 +119,7 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
 
 def test_a_checkpoint_of_a_mapper_elsewhere_gives_it_back(tmp_path: Path) -> None:
     training = TrainingConfig(backend="reference", exposure=True, poses=True, pose_visits=0)
-    config = MapperConfig(iterations=3, device=DEVICE, training=training, skipping=SkipConfig(tiles=True))
+    config = MapperConfig(iterations=3, device=DEVICE, training=training)
     views = [rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(2)]
     images = tmp_path / FOLDER / KEYFRAMES
     images.mkdir(parents=True)

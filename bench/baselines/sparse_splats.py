@@ -62,7 +62,7 @@ class SparseMap:
         self.log = Stats()
         self.iterations = 0
         self.seconds = 0.0
-        self._skip = SkipConfig(converged=False, tiles=False, coarse_to_fine=False, levels=1)
+        self._skip = SkipConfig(converged=False, coarse_to_fine=False, levels=1)
         self._random = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
         self._views = [self._training(view) for view in views]

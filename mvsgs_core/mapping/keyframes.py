@@ -52,7 +52,6 @@ class TrainingView:
     visits_full: int = 0  # of these at full resolution
     loss_fast: float = field(default=float("nan"))  # running means of the full-resolution loss
     loss_slow: float = field(default=float("nan"))
-    tile_error: Tensor | None = None  # (rows, columns) mean absolute error of each tile at full resolution
 
     @property
     def refined_from_cam(self) -> np.ndarray:
@@ -69,7 +68,7 @@ class TrainingView:
 
     def drop_images(self) -> None:
         """Frees what only the training needs; pose, scale and exposure stay."""
-        self.levels, self.valid, self.tile_error = [], None, None
+        self.levels, self.valid = [], None
 
     def rescale(self, factor: float) -> None:
         """Lengths in a unit of 1 / `factor` of what it was; the moments follow, a gradient is divided by `factor`."""

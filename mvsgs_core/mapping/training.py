@@ -6,14 +6,13 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
-from torch import Tensor
 
 from mvsgs_core.mapping import optimizer
 from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import LossConfig, frequency_of, photometric_loss
 from mvsgs_core.mapping.map_state import MapState
-from mvsgs_core.rasterizer.rasterize import TILE, rasterize
+from mvsgs_core.rasterizer.rasterize import rasterize
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,6 @@ class SkipConfig:
     converged_visits: int = 30  # full-resolution visits before a keyframe can count as converged
     converged_improvement: float = 0.02  # share by which the loss must still fall
     converged_keep: float = 0.5  # share of the visits that a converged keyframe still gets
-    tiles: bool = False  # tiles of low error are left out
-    tiles_error: float = 0.5  # low: below this share of the view's mean error
-    tiles_every: int = 4  # every so many visits all tiles are rendered, and their errors measured
     coarse_to_fine: bool = False  # the first visits of a keyframe are at lower resolution
     coarse_visits: int = 2  # of these, for each level
     levels: int = 2  # of the image pyramid, full resolution included
@@ -69,13 +65,6 @@ def level_of_visit(view: TrainingView, skipping: SkipConfig) -> int:
     return max(0, len(view.levels) - 1 - view.visits // skipping.coarse_visits)
 
 
-def busy_tiles(view: TrainingView, skipping: SkipConfig) -> Tensor | None:
-    """Tiles (rows, columns) bool worth training on; None: all, because their errors are unknown or due again."""
-    if view.tile_error is None or view.visits % skipping.tiles_every == 0:
-        return None
-    return view.tile_error > skipping.tiles_error * view.tile_error.mean()
-
-
 def train_once(
     state: MapState,
     view: TrainingView,
@@ -90,24 +79,19 @@ def train_once(
 ) -> None:
     """One iteration on `view`. What is not finite is refused, counted in `log`, and never reaches the map."""
     level = 0 if refining else level_of_visit(view, skipping)
-    tiles = busy_tiles(view, skipping) if skipping.tiles and level == 0 and not refining else None
     exposure = view.exposure.requires_grad_(True) if training.exposure else None
     moving = training.poses and not view.fixed and view.visits >= training.pose_visits
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
     render = rasterize(
         state.splats, view.refined_from_cam, view.intrinsics[level], view.size(level), kernel=training.kernel,
-        backend=training.backend, exposure=exposure, pose_delta=twist, tile_mask=tiles,
-        near=training.near * median_depth, antialiased=training.antialiased, threads=training.threads,
+        backend=training.backend, exposure=exposure, pose_delta=twist, near=training.near * median_depth,
+        antialiased=training.antialiased, threads=training.threads,
     )  # fmt: skip
     target = view.target(level)
-    masked = target
     if view.valid is not None:
-        masked = torch.where(view.valid[level][..., None], target, render.color.detach())
-    if tiles is not None:  # equal to the render where nothing was rendered: no loss, no gradient
-        masked = torch.where(pixels_of_tiles(tiles, view.size(level))[..., None], masked, render.color.detach())
-        log.skip("tiles_low_error", int((~tiles).sum()))
+        target = torch.where(view.valid[level][..., None], target, render.color.detach())
     frequency = frequency_of(view.visits, training.frequency_horizon)
-    loss = photometric_loss(render.color, masked, frequency, training.loss, training.threads)
+    loss = photometric_loss(render.color, target, frequency, training.loss, training.threads)
     view.visits += 1
     value = float(loss.detach())
     if not value < float("inf"):
@@ -133,19 +117,5 @@ def train_once(
         rate = training.pose_rate * global_rate
         if not step_pose(view, twist.grad.numpy(), rate, rate * median_depth):
             log.refuse("pose_steps", 1, "a step of a keyframe's pose that was not finite was refused")
-    if level == 0 and tiles is None:
+    if level == 0:
         view.record(value)
-        if skipping.tiles:
-            view.tile_error = tile_means((render.color.detach() - target).abs().mean(dim=-1))
-
-
-def tile_means(values: Tensor) -> Tensor:
-    """Mean of an image (H, W) over each tile (rows, columns); tiles at the border are smaller."""
-    pooled = torch.nn.functional.avg_pool2d(values[None, None], TILE, ceil_mode=True, count_include_pad=False)
-    return pooled[0, 0]
-
-
-def pixels_of_tiles(tiles: Tensor, size: tuple[int, int]) -> Tensor:
-    """(H, W) bool: each pixel has its tile's value."""
-    rows = tiles.repeat_interleave(TILE, dim=0)[: size[0]]
-    return rows.repeat_interleave(TILE, dim=1)[:, : size[1]]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvsgs_core.mapping.atlas import Session
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import TrainingConfig
@@ -27,9 +27,9 @@ def view(index: int) -> RGBDKeyframe:
     return replace(found, image=image, timestamp=0.1)
 
 
-def begun(config: MapperConfig) -> Session:
+def begun(config: MapperConfig) -> Atlas:
     """Two segments, corrections, and iterations that are still owed."""
-    session = Session(OnlineMapper(config))
+    session = Atlas(OnlineMapper(config))
     for index in range(6):
         session.enter(int(index == 3))
         session.current.add_keyframe(view(index))

@@ -88,11 +88,6 @@ def pack(mapper: OnlineMapper, prefix: str, names: list[list[str]]) -> tuple[dic
         arrays[f"{prefix}/views/{name}"] = np.array(rows, dtype=dtype).reshape(len(views), *shape)
     levels = mapper.config.skipping.levels
     arrays[f"{prefix}/views/intrinsics"] = np.array([view.intrinsics for view in views]).reshape(len(views), levels, 4)
-    errors = [view.tile_error for view in views]
-    shapes = [(-1, -1) if error is None else tuple(error.shape) for error in errors]
-    flat = [np.zeros(0, np.float32), *(error.cpu().numpy().ravel() for error in errors if error is not None)]
-    arrays[f"{prefix}/views/tile_shape"] = np.array(shapes, dtype=np.int64).reshape(len(views), 2)
-    arrays[f"{prefix}/views/tile_error"] = np.concatenate(flat)
     arrays[f"{prefix}/origin"] = np.zeros(0) if mapper.origin is None else mapper.origin
     arrays[f"{prefix}/generator"] = mapper.generator.get_state().numpy()
     meta = {
@@ -163,15 +158,10 @@ def _views(arrays: Arrays, images: Any, config: MapperConfig, folder: Path) -> l
     sensible = all((columns[n] >= 0).all() for n in ("pose_steps", "visits", "visits_full", "median_depth"))
     if not (sensible and (columns["image_size"] > 0).all() and (columns["scale"] > 0).all()):
         raise ValueError("keyframes have sizes, scales or counts that none has")
-    shapes = arrays.take("tile_shape", np.int64, (count, 2))
-    cells = np.where((shapes >= 0).all(axis=1), np.abs(shapes).prod(axis=1), 0)
-    flat = arrays.take("tile_error", np.float32, (None,))
-    if cells.sum() != len(flat) or (cells > len(flat)).any():
-        raise ValueError("tile_error has another size than tile_shape says")
     if not (isinstance(images, list) and len(images) == count and all(_is_names(names, levels) for names in images)):
         raise ValueError("not every keyframe's images are named")
     device, views = torch.device(config.device), []
-    for k, tiles in enumerate(np.split(flat, np.cumsum(cells)[:-1]) if count else []):
+    for k in range(count):
         row = {name: value[k] for name, value in columns.items()}
         pyramid, valid = read_images(folder, images[k], device)
         moments = torch.from_numpy(row["exposure_moments"].copy()).to(device)
@@ -187,7 +177,6 @@ def _views(arrays: Arrays, images: Any, config: MapperConfig, folder: Path) -> l
                 median_depth=float(row["median_depth"]), valid=valid, visits=int(row["visits"]),
                 visits_full=int(row["visits_full"]), loss_fast=float(row["loss_fast"]),
                 loss_slow=float(row["loss_slow"]),
-                tile_error=torch.from_numpy(tiles.reshape(shapes[k]).copy()).to(device) if shapes[k, 0] >= 0 else None,
             )
         )  # fmt: skip
     return views
@@ -195,13 +184,12 @@ def _views(arrays: Arrays, images: Any, config: MapperConfig, folder: Path) -> l
 
 def _copied(view: TrainingView) -> TrainingView:
     """On the CPU; images are shared, as they never change."""
-    cpu, error = torch.device("cpu"), view.tile_error
+    cpu = torch.device("cpu")
     first, second = (moment.to(cpu, copy=True) for moment in view.exposure_moments)
     return replace(
         view, levels=list(view.levels), valid=None if view.valid is None else list(view.valid),
         exposure=view.exposure.detach().to(cpu, copy=True), exposure_moments=(first, second),
         pose_delta=view.pose_delta.copy(), pose_moments=view.pose_moments.copy(),
-        tile_error=None if error is None else error.to(cpu, copy=True),
     )  # fmt: skip
 
 

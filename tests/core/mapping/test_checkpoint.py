@@ -37,7 +37,7 @@ EVERYTHING = replace(
     max_pixels=500,
     max_keyframes=4,
     training=TrainingConfig(threads=1, kernel="exact", betas=True, exposure=True, poses=True, pose_visits=1),
-    skipping=SkipConfig(tiles=True, coarse_to_fine=True, converged_visits=3),
+    skipping=SkipConfig(coarse_to_fine=True, converged_visits=3),
     density_control=DensityControlConfig(mode="relocate", every=7, prune_opacity=0.3),
 )
 
@@ -283,10 +283,10 @@ def test_no_mutated_value_raises_anything_but_a_value_error(tmp_path: Path) -> N
 
 
 def test_another_version_is_refused_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.VERSION", 2)
+    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.VERSION", 3)
     written(begun(PLAIN), tmp_path)
     monkeypatch.undo()
-    with pytest.raises(ValueError, match="version 2 of the format: this program reads 1"):
+    with pytest.raises(ValueError, match="version 3 of the format: this program reads 2"):
         load(tmp_path, PLAIN, Stats())
 
 

@@ -168,7 +168,7 @@ def test_the_map_never_grows_beyond_its_limit_and_says_so() -> None:
 
 
 def test_every_skip_can_be_switched_off() -> None:
-    nothing = SkipConfig(converged=False, tiles=False, coarse_to_fine=False, selective=False)
+    nothing = SkipConfig(converged=False, coarse_to_fine=False, selective=False)
     config = replace(CONFIG, skipping=nothing, insertion=InsertionConfig(unexplored=False, voxel=0.0, map_voxel=0.0))
     mapper = mapped(tiny_views(), config)
     assert mapper.iterations == 4 * 16 + 20
