@@ -16,19 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import IntEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 
-
-class TrackingState(IntEnum):
-    """What the tracker knows of a frame's pose."""
-
-    TRACKED = 0
-    LOST = 1  # no pose: the frame could not be matched with the map
-    NOT_INITIALIZED = 2  # no pose: before the start-up succeeded
-    DEGENERATE = 3  # a pose, but the motion gives no depth (pure rotation) or the image no texture
+from mvsgs_core.trajectory import TrackingState as TrackingState
 
 
 @dataclass(frozen=True)
@@ -195,7 +187,4 @@ class End:
 Message = (
     Frame | GroundTruth | Keyframe | Depth | FusedKeyframe | Poses | Trajectory | SplatMap | Preview | MapView | End
 )
-TYPES: dict[str, type] = {
-    t.__name__: t
-    for t in (Frame, GroundTruth, Keyframe, Depth, FusedKeyframe, Poses, Trajectory, SplatMap, Preview, MapView, End)
-}
+TYPES: dict[str, type] = {t.__name__: t for t in get_args(Message)}

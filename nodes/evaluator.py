@@ -16,12 +16,11 @@ import numpy as np
 import torch
 
 from msgs import FusedKeyframe, GroundTruth, SplatMap, Trajectory
-from mvsgs_core import weights
+from mvsgs_core import trajectory, weights
 from mvsgs_core.atomic_file import replace_text, replacing
 from mvsgs_core.evaluation import html, pictures, statistics
 from mvsgs_core.evaluation.evaluation import Evaluation, FinishedMap
 from mvsgs_core.evaluation.lpips import Lpips
-from mvsgs_core.evaluation.track import Track
 from mvsgs_core.held_out import HELD_OUT_EVERY
 from mvsgs_core.mapping.exposure import IDENTITY
 from mvsgs_core.rasterizer.splats import Splats
@@ -74,17 +73,8 @@ class Evaluator(Node):
         self.evaluation.add_keyframe(view.index, view.image, view.intrinsics, view.depth, view.scale)
         yield from ()
 
-    def on_trajectory(self, track: Trajectory) -> Iterator[None]:
-        self.evaluation.track = Track(
-            track.index,
-            track.timestamp,
-            track.world_from_cam,
-            track.keyframe,
-            track.state,
-            track.segment,
-            track.focal_factor,
-            track.readout_time,
-        )
+    def on_trajectory(self, message: Trajectory) -> Iterator[None]:
+        self.evaluation.trajectory = trajectory.Trajectory(**vars(message))
         yield from ()
 
     def on_splat_map(self, splat_map: SplatMap) -> Iterator[None]:
@@ -133,7 +123,7 @@ class Evaluator(Node):
             f"Keyframes are training views; held-out: every {HELD_OUT_EVERY}th frame that is no keyframe. Covered: "
             "pixels at which the render is more than half opaque. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self.evaluation.lpips else 'not computed'}. "
-            f"{_shutter(self.evaluation.track)}{_exposure(self.evaluation.maps)}"
+            f"{_shutter(self.evaluation.trajectory)}{_exposure(self.evaluation.maps)}"
             "ATE: RMSE of keyframe positions after Sim(3) alignment."
         )
 
@@ -149,10 +139,10 @@ class Evaluator(Node):
         )
         self.evaluation.close()
         replace_text(folder / "report.json", json.dumps(_plain(self.report), indent=1, allow_nan=False))
-        track = self.evaluation.track
-        if track is not None:
+        found = self.evaluation.trajectory
+        if found is not None:
             with replacing(folder / "trajectory.txt") as aside:
-                write_trajectory(aside, track.timestamp[track.posed], track.world_from_cam[track.posed])
+                write_trajectory(aside, found.timestamp[found.posed], found.world_from_cam[found.posed])
         if comparisons:
             with replacing(folder / "comparison.png") as aside:
                 pictures.write_sheet(aside, comparisons)
@@ -174,10 +164,10 @@ def _finished(message: SplatMap) -> FinishedMap:
     )
 
 
-def _shutter(track: Track | None) -> str:
-    if track is None or track.readout_time == 0.0:
+def _shutter(found: trajectory.Trajectory | None) -> str:
+    if found is None or found.readout_time == 0.0:
         return ""
-    taken_out = f"{1e3 * track.readout_time:.1f} ms a frame"
+    taken_out = f"{1e3 * found.readout_time:.1f} ms a frame"
     return f"The rolling shutter that the tracker took out of the keyframes is applied to renders ({taken_out}). "
 
 

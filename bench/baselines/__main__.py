@@ -29,7 +29,7 @@ from launch.placement import available_cores
 from msgs import GroundTruth
 from mvsgs_core import image_metrics
 from mvsgs_core.datasets import Item
-from mvsgs_core.evaluation import trajectory
+from mvsgs_core.evaluation import trajectory_metrics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.mapping.training import TrainingConfig
 from nodes.reader import Reader
@@ -122,8 +122,8 @@ def ate_percent(poses: dict[int, np.ndarray], ours: Ours, frames: list[int]) -> 
         return None
     estimate = np.array([poses[i] for i in known])
     truth = np.array([truths[i] for i in known], dtype=np.float64)
-    errors = trajectory.absolute_errors(estimate, truth, trajectory.align(estimate, truth))
-    return 100 * trajectory.rmse(errors) / trajectory.path_length(truth)
+    errors = trajectory_metrics.absolute_errors(estimate, truth, trajectory_metrics.align(estimate, truth))
+    return 100 * trajectory_metrics.rmse(errors) / trajectory_metrics.path_length(truth)
 
 
 def train(model: Model, ours: Ours, config: SparseConfig) -> Trained:

@@ -56,7 +56,7 @@ class DroidSlam:
         self.frames: list[StoredFrame] = []
         self._states: list[State] = []
         self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
-        self._trajectory = _empty_trajectory()
+        self._trajectory = Trajectory.empty()
 
     def add(self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> Update:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow."""
@@ -206,18 +206,6 @@ class DroidSlam:
             state=states,
             segment=np.where(np.isfinite(poses).all(axis=(1, 2)), 0, -1).astype(np.int32),
         )
-
-
-def _empty_trajectory() -> Trajectory:
-    none = np.zeros(0)
-    return Trajectory(
-        none.astype(np.int64),
-        none,
-        np.zeros((0, 4, 4)),
-        none.astype(bool),
-        none.astype(np.uint8),
-        none.astype(np.int32),
-    )
 
 
 __all__ = ["DroidConfig", "DroidSlam"]

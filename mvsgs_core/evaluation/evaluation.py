@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from mvsgs_core.evaluation import scoring, track, trajectory
+from mvsgs_core.evaluation import scoring, trajectory_metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.exposure import between_keyframes
 from mvsgs_core.evaluation.frames import Frames
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
-from mvsgs_core.evaluation.track import Track
 from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.trajectory import Trajectory
 
 NEAR = 0.01  # of the typical depth: splats nearer to a camera are not drawn
 ENOUGH = 3  # held-out frames whose mean and worst say something
@@ -55,7 +55,7 @@ class Evaluation:
     max_bytes: float = 2e9  # there
     started: float | None = None
     mapped: float | None = None
-    track: Track | None = None
+    trajectory: Trajectory | None = None
     maps: dict[bool, FinishedMap] = field(default_factory=dict)  # by `refined`
     scores: dict[bool, list[scoring.Score]] = field(default_factory=dict)
 
@@ -118,7 +118,7 @@ class Evaluation:
 
     def views(self, refined: bool = True) -> list[scoring.ScoredFrame]:
         """All frames with a pose in the main part of the map whose image is there, in the order of the stream."""
-        finished, tracked = self.maps[refined], self.track
+        finished, tracked = self.maps[refined], self.trajectory
         assert tracked is not None
         views = []
         main = tracked.main()
@@ -149,10 +149,10 @@ class Evaluation:
 
     def _exposures(self, finished: FinishedMap, main: np.ndarray) -> np.ndarray | None:
         """Color affines (N, 3, 4) of the track's frames, from the map's keyframes; None where the mapper had none."""
-        assert self.track is not None
-        known = np.flatnonzero(main & np.isin(self.track.index, list(finished.exposures)))
-        affines = np.array([finished.exposures[int(i)] for i in self.track.index[known]], dtype=np.float32)
-        return between_keyframes(self.track.timestamp, self.track.timestamp[known], affines)
+        assert self.trajectory is not None
+        known = np.flatnonzero(main & np.isin(self.trajectory.index, list(finished.exposures)))
+        affines = np.array([finished.exposures[int(i)] for i in self.trajectory.index[known]], dtype=np.float32)
+        return between_keyframes(self.trajectory.timestamp, self.trajectory.timestamp[known], affines)
 
     def photograph(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8. Raises KeyError for a frame that was not kept."""
@@ -169,7 +169,7 @@ class Evaluation:
         finished = self.maps.get(refined)
         if not self.max_frames:
             return scoring.summarize([])
-        if finished is None or self.track is None or not len(finished.splats.means):
+        if finished is None or self.trajectory is None or not len(finished.splats.means):
             which = "after" if refined else "before"
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
@@ -182,28 +182,32 @@ class Evaluation:
             notes.append(few)
         return scoring.summarize(scores)
 
-    def _score_trajectory(self, notes: list[str]) -> tuple[trajectory.Alignment | None, dict[str, Any]]:
-        if self.track is None:
+    def _score_trajectory(self, notes: list[str]) -> tuple[trajectory_metrics.Alignment | None, dict[str, Any]]:
+        if self.trajectory is None:
             notes.append("no trajectory was received")
-            return None, {**track.NO_SCORE, **track.NO_TRACK, "frames": self._received}
-        alignment, errors = track.score(self.track, self._truth, notes)
-        return alignment, {**errors, **self.track.counts()}
+            return None, {
+                **trajectory_metrics.NO_ERRORS,
+                **trajectory_metrics.counts(Trajectory.empty()),
+                "frames": self._received,
+            }
+        alignment, errors = trajectory_metrics.score(self.trajectory, self._truth, notes)
+        return alignment, {**errors, **trajectory_metrics.counts(self.trajectory)}
 
     def aligned_paths(self) -> dict[str, np.ndarray]:
         """Camera positions (N, 3) for a plot: "estimate" in the frame of the "truth" where there is one."""
-        if self.track is None:
+        if self.trajectory is None:
             return {}
-        main = self.track.main()
+        main = self.trajectory.main()
         alignment, _ = self._score_trajectory([])
         if alignment is None:
-            return {"estimate": self.track.world_from_cam[main][:, :3, 3]}
-        known = main & np.isin(self.track.index, list(self._truth))
+            return {"estimate": self.trajectory.world_from_cam[main][:, :3, 3]}
+        known = main & np.isin(self.trajectory.index, list(self._truth))
         return {
-            "truth": track.poses_of(self._truth, self.track.index[known])[:, :3, 3],
-            "estimate": alignment.positions(self.track.world_from_cam[main]),
+            "truth": trajectory_metrics.poses_of(self._truth, self.trajectory.index[known])[:, :3, 3],
+            "estimate": alignment.positions(self.trajectory.world_from_cam[main]),
         }
 
-    def _score_depths(self, alignment: trajectory.Alignment | None, notes: list[str]) -> dict[str, Any]:
+    def _score_depths(self, alignment: trajectory_metrics.Alignment | None, notes: list[str]) -> dict[str, Any]:
         """After one scale for the whole run, the median ratio of true to estimated depth, as is usual for monocular
         depth; `scale_ratio` is that over the trajectory's scale, 1 where poses and depth maps of the truth agree."""
         finished = self.maps.get(True) or self.maps.get(False)

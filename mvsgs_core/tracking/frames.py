@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 
@@ -13,17 +12,11 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.places.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
+from mvsgs_core.trajectory import TrackingState, Trajectory
+
+State = TrackingState
 
 AGREEMENT = 0.7  # of a frame's points, all of which agreed once: fewer after the map's corrections, and it is lost
-
-
-class State(IntEnum):
-    """What is known of a frame's pose; the same values as msgs.TrackingState."""
-
-    TRACKED = 0
-    LOST = 1
-    NOT_INITIALIZED = 2
-    DEGENERATE = 3
 
 
 @dataclass(slots=True)
@@ -48,18 +41,6 @@ class FrameRecord:
     def forget(self) -> None:
         """The frame has no pose."""
         self.reference, self.same_as, self.points, self.cam_from_reference = None, None, b"", b""
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """All frames, N, in order."""
-
-    index: np.ndarray  # (N,) int64
-    timestamp: np.ndarray  # (N,) float64 seconds
-    world_from_cam: np.ndarray  # (N, 4, 4) float64, NaN where there is no pose
-    keyframe: np.ndarray  # (N,) bool
-    state: np.ndarray  # (N,) uint8
-    segment: np.ndarray  # (N,) int32
 
 
 def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver) -> Trajectory:

@@ -9,7 +9,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 
 from mvsgs_core import geometry, trajectory_file
-from mvsgs_core.evaluation import trajectory
+from mvsgs_core.evaluation import trajectory_metrics
 
 
 def _trajectories(n: int = 60, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -33,15 +33,15 @@ def _evo(poses: np.ndarray) -> PoseTrajectory3D:
 
 def test_agrees_with_evo() -> None:
     estimate, truth = _trajectories()
-    alignment = trajectory.align(estimate, truth)
-    ours = trajectory.rmse(trajectory.absolute_errors(estimate, truth, alignment))
+    alignment = trajectory_metrics.align(estimate, truth)
+    ours = trajectory_metrics.rmse(trajectory_metrics.absolute_errors(estimate, truth, alignment))
     reference, aligned = _evo(truth), _evo(estimate)
     _, _, scale = aligned.align(reference, correct_scale=True)
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data((reference, aligned))
     assert ours == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), rel=1e-9)
     assert alignment.scale == pytest.approx(scale, rel=1e-9)
-    move, turn = trajectory.relative_errors(estimate, truth, alignment.scale)
+    move, turn = trajectory_metrics.relative_errors(estimate, truth, alignment.scale)
     for relation, value in (
         (metrics.PoseRelation.translation_part, move),
         (metrics.PoseRelation.rotation_angle_deg, turn),
@@ -55,7 +55,11 @@ def test_far_origin_changes_nothing() -> None:
     errors = []
     for offset in (0.0, 1e6):
         estimate, truth = _trajectories(offset=offset)
-        errors.append(trajectory.rmse(trajectory.absolute_errors(estimate, truth, trajectory.align(estimate, truth))))
+        errors.append(
+            trajectory_metrics.rmse(
+                trajectory_metrics.absolute_errors(estimate, truth, trajectory_metrics.align(estimate, truth))
+            )
+        )
     assert errors[1] == pytest.approx(errors[0], rel=1e-4)
 
 
@@ -63,17 +67,17 @@ def test_a_mirrored_estimate_is_not_aligned_by_a_reflection() -> None:
     estimate, truth = _trajectories()
     mirrored = estimate.copy()
     mirrored[:, 0, 3] *= -1
-    alignment = trajectory.align(mirrored, truth)
+    alignment = trajectory_metrics.align(mirrored, truth)
     assert np.linalg.det(alignment.rotation) == pytest.approx(1.0)
 
 
 def test_no_alignment_is_an_error() -> None:
     estimate, truth = _trajectories()
     with pytest.raises(ValueError, match="at least 3"):
-        trajectory.align(estimate[:2], truth[:2])
+        trajectory_metrics.align(estimate[:2], truth[:2])
     estimate[:, :3, 3] = 1.0
     with pytest.raises(ValueError, match="coincide"):
-        trajectory.align(estimate, truth)
+        trajectory_metrics.align(estimate, truth)
 
 
 def test_tum_files_round_trip_and_evo_reads_them(tmp_path: Path) -> None:

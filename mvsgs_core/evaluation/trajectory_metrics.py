@@ -1,0 +1,125 @@
+"""Trajectory metrics after similarity alignment (Sturm et al. 2012; Umeyama 1991), and which frames have a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.held_out import is_held_out
+from mvsgs_core.trajectory import TrackingState, Trajectory
+
+NO_ERRORS: dict[str, Any] = {
+    "ate_rmse": None, "ate_rmse_frames": None, "ate_percent": None, "rpe_translation": None, "rpe_rotation": None,
+    "path_length": None, "scale": None, "ate_keyframes": 0, "ate_frames": 0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """truth = scale * rotation @ estimate + translation."""
+
+    scale: float
+    rotation: np.ndarray  # (3, 3)
+    translation: np.ndarray  # (3,)
+
+    def positions(self, world_from_cam: np.ndarray) -> np.ndarray:
+        """Camera positions (N, 3) of estimated poses (N, 4, 4) in the frame of the truth."""
+        return self.scale * world_from_cam[:, :3, 3] @ self.rotation.T + self.translation
+
+
+def align(estimate: np.ndarray, truth: np.ndarray) -> Alignment:
+    """Least-squares Sim(3) from estimated to true camera positions; both (N, 4, 4) world_from_cam.
+
+    Raises ValueError where no alignment exists: fewer than 3 poses, or positions that coincide.
+    """
+    # the truth's own origin may be far away: solved around its mean inside umeyama, in float64
+    return Alignment(*geometry.umeyama(estimate[:, :3, 3], truth[:, :3, 3]))
+
+
+def absolute_errors(estimate: np.ndarray, truth: np.ndarray, alignment: Alignment) -> np.ndarray:
+    """(N,) distances of aligned to true camera positions, in the unit of the truth."""
+    return np.linalg.norm(alignment.positions(estimate) - truth[:, :3, 3], axis=1)
+
+
+def rmse(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def relative_errors(estimate: np.ndarray, truth: np.ndarray, scale: float, step: int = 1) -> tuple[float, float]:
+    """Relative pose error over `step` poses: RMSE of translation (truth's unit) and of rotation (degrees)."""
+    if len(estimate) <= step:
+        raise ValueError(f"relative errors over {step} poses need more than {step} poses")
+    scaled = estimate.copy()
+    scaled[:, :3, 3] *= scale
+    move_e = geometry.inverse(scaled[:-step]) @ scaled[step:]
+    move_t = geometry.inverse(truth[:-step]) @ truth[step:]
+    error = geometry.inverse(move_t) @ move_e
+    angles = np.linalg.norm(geometry.so3_log(error[:, :3, :3]), axis=1)
+    return rmse(np.linalg.norm(error[:, :3, 3], axis=1)), float(np.degrees(rmse(angles)))
+
+
+def path_length(world_from_cam: np.ndarray) -> float:
+    """Length of the way through camera positions (N, 4, 4)."""
+    return float(np.linalg.norm(np.diff(world_from_cam[:, :3, 3], axis=0), axis=1).sum())
+
+
+def score(
+    trajectory: Trajectory, truth: Mapping[int, np.ndarray], notes: list[str]
+) -> tuple[Alignment | None, dict[str, Any]]:
+    """Errors of the poses of the main part against the true ones by index, and the Sim(3) that brings them together.
+
+    None, with the reason in `notes`, where there is none.
+    """
+    known = trajectory.main() & np.isin(trajectory.index, list(truth))
+    estimate, true = trajectory.world_from_cam[known], poses_of(truth, trajectory.index[known])
+    is_keyframe = trajectory.keyframe[known]
+    report = {**NO_ERRORS, "ate_keyframes": int(is_keyframe.sum()), "ate_frames": len(estimate)}
+    try:
+        alignment = align(estimate[is_keyframe], true[is_keyframe])
+    except ValueError as error:
+        notes.append(f"no trajectory error: {error}" if len(truth) else "no trajectory error: no true poses")
+        return None, report
+    errors = absolute_errors(estimate, true, alignment)
+    length = path_length(true)
+    report |= {
+        "ate_rmse": rmse(errors[is_keyframe]),
+        "ate_rmse_frames": rmse(errors),
+        "ate_percent": 100 * rmse(errors[is_keyframe]) / length if length else None,
+        "path_length": length,
+        "scale": alignment.scale,
+    }
+    if len(estimate) > 1:
+        report["rpe_translation"], report["rpe_rotation"] = relative_errors(estimate, true, alignment.scale)
+    return alignment, report
+
+
+def poses_of(truth: Mapping[int, np.ndarray], indices: np.ndarray) -> np.ndarray:
+    """(N, 4, 4) float64 true poses of these frames. Raises KeyError for one that has none."""
+    return np.array([truth[int(i)] for i in indices], dtype=np.float64).reshape(-1, 4, 4)
+
+
+def counts(trajectory: Trajectory) -> dict[str, Any]:
+    """How many frames have which state and a pose; held-out frames that became keyframes all the same."""
+    posed = trajectory.posed
+    tracked = trajectory.index[posed & (trajectory.state == TrackingState.TRACKED)]
+    without = trajectory.state[~posed]
+    return {
+        "frames": len(trajectory.index),
+        "frames_tracked": len(tracked),
+        "frames_without_pose": {_name(int(state)): int((without == state).sum()) for state in np.unique(without)},
+        "frames_degenerate": int((posed & (trajectory.state == TrackingState.DEGENERATE)).sum()),
+        "first_tracked": int(tracked.min()) if len(tracked) else None,
+        "last_tracked": int(tracked.max()) if len(tracked) else None,
+        "keyframes": int(trajectory.keyframe.sum()),
+        "held_out_keyframes": [int(i) for i in trajectory.index[trajectory.keyframe] if is_held_out(int(i))],
+        "segments": len(np.unique(trajectory.segment[posed])),
+    }
+
+
+def _name(state: int) -> str:
+    names = {s.value: s.name.lower() for s in TrackingState}
+    return names.get(state, f"state {state}")

@@ -1,0 +1,53 @@
+"""A camera's trajectory: what is known of the pose of each frame of a stream."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+
+class TrackingState(IntEnum):
+    """What the tracker knows of a frame's pose."""
+
+    TRACKED = 0
+    LOST = 1  # no pose: the frame could not be matched with the map
+    NOT_INITIALIZED = 2  # no pose: before the map began
+    DEGENERATE = 3  # a pose, but the motion gives no depth (pure rotation) or the image no texture
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """All frames that the tracker saw, N, in order."""
+
+    index: np.ndarray  # (N,) int64
+    timestamp: np.ndarray  # (N,) float64 seconds
+    world_from_cam: np.ndarray  # (N, 4, 4) float64, NaN where there is no pose
+    keyframe: np.ndarray  # (N,) bool
+    state: np.ndarray  # (N,) uint8 TrackingState
+    segment: np.ndarray  # (N,) int32: poses of two segments share no frame of reference
+    focal_factor: float = 1.0  # on the focal lengths of the frames, where they were guessed
+    readout_time: float = 0.0  # seconds of the rolling shutter that was taken out of the keyframes
+
+    @classmethod
+    def empty(cls) -> Trajectory:
+        """That of a stream without frames."""
+        index, poses = np.zeros(0, np.int64), np.zeros((0, 4, 4))
+        return cls(index, np.zeros(0), poses, np.zeros(0, bool), np.zeros(0, np.uint8), np.zeros(0, np.int32))
+
+    @property
+    def posed(self) -> np.ndarray:
+        """(N,) bool: frames with a pose, verified or not."""
+        return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
+
+    def main(self) -> np.ndarray:
+        """(N,) bool: frames with a pose in the part of the map that has most frames."""
+        posed = self.posed
+        if not posed.any():
+            return posed
+        segments, counts = np.unique(self.segment[posed], return_counts=True)
+        return np.asarray(posed & (self.segment == segments[np.argmax(counts)]))
+
+
+__all__ = ["TrackingState", "Trajectory"]
