@@ -10,9 +10,9 @@ import numpy as np
 
 from msgs import Frame, Keyframe, Poses, Trajectory
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking import frames
 from mvsgs_core.tracking.publish import Correction
 from mvsgs_core.tracking.tracker import Update
+from mvsgs_core.trajectory import Trajectory as CameraTrajectory
 from nodes import Node
 
 
@@ -30,7 +30,7 @@ class CoreTracker(Protocol):
 
     def finish(self) -> Iterator[Update]: ...
 
-    def trajectory(self) -> frames.Trajectory: ...
+    def trajectory(self) -> CameraTrajectory: ...
 
 
 class TrackerNode(Node, ABC):

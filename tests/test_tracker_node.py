@@ -12,7 +12,6 @@ import msgs
 from msgs import Frame, GroundTruth, Keyframe, Poses, TrackingState, Trajectory
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
 from mvsgs_core.image_metrics import psnr
-from mvsgs_core.tracking.frames import State
 from nodes import Node, handlers, outputs
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker, spread
@@ -28,10 +27,6 @@ def messages(count: int = 45) -> tuple[list[Frame], list[GroundTruth]]:
 
 def of_type(sent: list[msgs.Message], kind: type) -> list:  # type: ignore[type-arg]
     return [message for message in sent if isinstance(message, kind)]
-
-
-def test_states_are_the_messages_states() -> None:
-    assert {s.name: s.value for s in State} == {s.name: s.value for s in TrackingState}
 
 
 def test_contracts() -> None:

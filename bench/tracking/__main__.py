@@ -26,8 +26,8 @@ from bench.tracking.baselines import Baseline, aligned_error
 from bench.tracking.cases import CASES, Case
 from bench.tracking.parts import global_adjustment_seconds
 from mvsgs_core.datasets import Item
-from mvsgs_core.tracking.frames import State, Trajectory
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
+from mvsgs_core.trajectory import TrackingState, Trajectory
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def rows_of(name: str, case: Case, results: list[Result]) -> list[Row]:
         rows.append(at_most(f"{name}: the same run again, largest difference", _difference(results), "", 0.0))
     rows.append(Row(f"{name}: ATE all frames", 100.0 * max(first.frame_errors, default=float("nan")), "cm"))
     rows.append(Row(f"{name}: keyframes", first.keyframes, f"of {len(first.path.index)}"))
-    states = {s.name.lower(): int(np.sum(first.path.state == s)) for s in State if s != State.TRACKED}
+    states = {s.name.lower(): int(np.sum(first.path.state == s)) for s in TrackingState if s != TrackingState.TRACKED}
     if case.hard:
         told = first.unposed == 0 or any("lost" in w or "start" in w for w in first.warnings)
         segments = len(first.keyframe_errors)

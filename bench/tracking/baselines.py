@@ -15,7 +15,7 @@ from bench.tracking.cases import CASES
 from mvsgs_core import geometry
 from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
 from mvsgs_core.datasets import Item
-from mvsgs_core.tracking.frames import Trajectory
+from mvsgs_core.trajectory import Trajectory
 
 AREA = 512 * 384  # pixels of COLMAP's images: 2.6 times those of the tracker
 SUCCESS = 0.5  # fraction of the frames that COLMAP must register for its error to be a mark

@@ -25,9 +25,9 @@ from mvsgs_core.droid.video import Video, VideoFrame
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.networks.droid import DroidNet
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.frames import State, Trajectory
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT
 from mvsgs_core.tracking.publish import Publisher, Update
+from mvsgs_core.trajectory import TrackingState, Trajectory
 
 _DEGENERATE = 0.05  # share of cells that agree with a neighbor, below which a keyframe's depth is none
 
@@ -54,7 +54,7 @@ class DroidSlam:
             self.stats.warn("DROID-SLAM runs on random weights: its poses and depths are noise")
         self.framing: Framing | None = None
         self.frames: list[StoredFrame] = []
-        self._states: list[State] = []
+        self._states: list[TrackingState] = []
         self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
         self._trajectory = Trajectory.empty()
 
@@ -67,7 +67,7 @@ class DroidSlam:
             small = self.framing.image(image)
             self.frames.append(StoredFrame.of(index, timestamp, small))
         self.stats.count("frames")
-        self._states.append(State.TRACKED if self.frontend.started else State.NOT_INITIALIZED)
+        self._states.append(TrackingState.TRACKED if self.frontend.started else TrackingState.NOT_INITIALIZED)
         if (len(self.frames) - 1) % self.config.preset.stride:
             self.stats.skip("frames between strides")
             return Update(self._states[-1])
@@ -112,7 +112,7 @@ class DroidSlam:
             )
             self.stats.warn(self.nothing)
             self._trajectory = self._collect(None)
-            yield Update(State.NOT_INITIALIZED)
+            yield Update(TrackingState.NOT_INITIALIZED)
             return
         self.nothing = ""
         yield self._publish(len(self.video))
@@ -121,7 +121,7 @@ class DroidSlam:
         self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.video.keyframes))
         if self.networks.not_finite:
             self.stats.warn(f"{self.networks.not_finite} network outputs were not finite and were ignored")
-        yield Update(State.TRACKED, (), self.publisher.corrections(True))
+        yield Update(TrackingState.TRACKED, (), self.publisher.corrections(True))
 
     def trajectory(self) -> Trajectory:
         """Every frame's pose, after `finish`."""
@@ -161,7 +161,7 @@ class DroidSlam:
         if self.frontend.started:
             position = max(0, len(self.video) - 2)
             flat = consistent_share(self.video, position) < _DEGENERATE
-            self._states[-1] = State.DEGENERATE if flat else State.TRACKED
+            self._states[-1] = TrackingState.DEGENERATE if flat else TrackingState.TRACKED
             if flat:
                 self.stats.warn("keyframes whose depth agrees with no other: their poses mean little")
         return Update(self._states[-1], tuple(frame.index for frame in new), correction)
@@ -194,9 +194,9 @@ class DroidSlam:
         states = np.array(self._states, np.uint8).reshape(count)
         if cam_from_world is not None:
             poses = geometry.inverse(np.stack([cam_from_world[frame.index] for frame in self.frames]))
-            states[states == State.NOT_INITIALIZED] = State.TRACKED
+            states[states == TrackingState.NOT_INITIALIZED] = TrackingState.TRACKED
             unknown = ~np.isfinite(poses).all(axis=(1, 2))
-            poses[unknown], states[unknown] = np.nan, State.LOST
+            poses[unknown], states[unknown] = np.nan, TrackingState.LOST
         keyframes = self.video.keyframes if cam_from_world is not None else {}
         return Trajectory(
             index=np.array([frame.index for frame in self.frames], np.int64),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.frames import State, Trajectory
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.trajectory import TrackingState, Trajectory
 
 
 def warn_of_gaps(stats: Stats, trajectory: Trajectory) -> None:
@@ -15,8 +15,8 @@ def warn_of_gaps(stats: Stats, trajectory: Trajectory) -> None:
     if segments > 1:
         stats.warn(f"the map is in {segments} segments: no verified loop joins them")
     lost, unstarted = (
-        int(np.sum(trajectory.state == State.LOST)),
-        int(np.sum(trajectory.state == State.NOT_INITIALIZED)),
+        int(np.sum(trajectory.state == TrackingState.LOST)),
+        int(np.sum(trajectory.state == TrackingState.NOT_INITIALIZED)),
     )
     if lost:
         stats.warn(f"{lost} of {len(trajectory.state)} frames were lost")

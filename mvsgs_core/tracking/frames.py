@@ -14,8 +14,6 @@ from mvsgs_core.tracking.places.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
-State = TrackingState
-
 AGREEMENT = 0.7  # of a frame's points, all of which agreed once: fewer after the map's corrections, and it is lost
 
 
@@ -25,7 +23,7 @@ class FrameRecord:
 
     index: int
     timestamp: float  # seconds
-    state: State
+    state: TrackingState
     reference: int | None = None  # keyframe that the frame's pose was found against; None: no pose, or as `same_as`
     points: bytes = b""  # of its matches, see sample.py
     cam_from_reference: bytes = b""  # (4, 4) float32: where the search for the pose begins
@@ -54,26 +52,28 @@ def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: S
         own = graph.keyframes.get(record.index)
         if own is not None:
             poses[k], keyframe[k], segment[k] = graph.world_from_cam(record.index), True, own.segment
-            if state[k] in (State.LOST, State.NOT_INITIALIZED):
-                state[k] = State.TRACKED
+            if state[k] in (TrackingState.LOST, TrackingState.NOT_INITIALIZED):
+                state[k] = TrackingState.TRACKED
             continue
         if record.same_as is not None:
             other = place[record.same_as]
             poses[k], segment[k], state[k] = poses[other], segment[other], state[other]
             continue
         if record.reference is None or record.reference not in graph.keyframes:
-            state[k] = State.NOT_INITIALIZED if state[k] == State.NOT_INITIALIZED else State.LOST
+            state[k] = (
+                TrackingState.NOT_INITIALIZED if state[k] == TrackingState.NOT_INITIALIZED else TrackingState.LOST
+            )
             continue
         reference = graph.keyframes[record.reference]
         relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
         matches = restored(record.points, len(reference.inverse_depth))
         found = localize(graph, {record.reference: matches}, relative @ reference.cam_from_world, solver)
         if found.failure or found.inliers < AGREEMENT:
-            state[k] = State.LOST
+            state[k] = TrackingState.LOST
             continue
         poses[k], segment[k] = geometry.inverse(found.cam_from_world), reference.segment
-        if state[k] != State.DEGENERATE:
-            state[k] = State.TRACKED
+        if state[k] != TrackingState.DEGENERATE:
+            state[k] = TrackingState.TRACKED
     return Trajectory(
         index=np.array([r.index for r in records], np.int64).reshape(n),
         timestamp=np.array([r.timestamp for r in records], np.float64).reshape(n),
@@ -84,4 +84,4 @@ def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: S
     )
 
 
-__all__ = ["FrameRecord", "State", "Trajectory", "solve_trajectory"]
+__all__ = ["FrameRecord", "solve_trajectory"]

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mvsgs_core.tracking.frames import State
+from mvsgs_core.trajectory import TrackingState
 
 
 class Tracked(Protocol):
@@ -47,7 +47,7 @@ class Correction:
 class Update:
     """What one frame changed."""
 
-    state: State
+    state: TrackingState
     keyframes: tuple[int, ...] = ()  # indices of frames that became keyframes, in order
     correction: Correction | None = None  # of keyframes published before
 

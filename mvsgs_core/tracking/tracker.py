@@ -23,7 +23,7 @@ from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.estimation.calibration import REESTIMATED_AT, Calibration
 from mvsgs_core.tracking.estimation.focal import FocalConfig
-from mvsgs_core.tracking.frames import FrameRecord, State, Trajectory, solve_trajectory
+from mvsgs_core.tracking.frames import FrameRecord, solve_trajectory
 from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
@@ -39,6 +39,7 @@ from mvsgs_core.tracking.places.recovery import Recovery
 from mvsgs_core.tracking.places.relocalization import Relocalizer
 from mvsgs_core.tracking.places.retrieval import Retrieval
 from mvsgs_core.tracking.publish import Publisher, Update
+from mvsgs_core.trajectory import TrackingState, Trajectory
 
 
 class Tracker:
@@ -74,7 +75,7 @@ class Tracker:
         with self.stats.time("image"):
             frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color)
         self.stats.count("frames")
-        record = FrameRecord(index, timestamp, State.NOT_INITIALIZED)
+        record = FrameRecord(index, timestamp, TrackingState.NOT_INITIALIZED)
         self.records.append(record)
         self._since += 1
         if self.front_end.reference is None:
@@ -125,7 +126,7 @@ class Tracker:
         if self.started:
             self.calibration.estimate_readout_time(self.local_map.members(self.segment)[-40:])
         if self.publisher.held:
-            yield Update(State.TRACKED, self._settle())
+            yield Update(TrackingState.TRACKED, self._settle())
         with self.stats.time("global bundle adjustment"):
             for segment in sorted({k.segment for k in self.graph.keyframes.values()}):
                 if set(self.local_map.members(segment)) <= self.publisher.published:
@@ -145,7 +146,11 @@ class Tracker:
             self.stats.warn(self.nothing)
         warn_of_gaps(self.stats, self._trajectory)
         warn_of_few_matches(self.stats, self.graph, self.config.matches)
-        yield Update(State.TRACKED if self.started else State.NOT_INITIALIZED, (), self.publisher.corrections(True))
+        yield Update(
+            TrackingState.TRACKED if self.started else TrackingState.NOT_INITIALIZED,
+            (),
+            self.publisher.corrections(True),
+        )
 
     def trajectory(self) -> Trajectory:
         """Every frame's pose, after `finish`."""
@@ -182,7 +187,7 @@ class Tracker:
 
     def _begin(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """First keyframe of a segment that has not started yet."""
-        record.state = State.NOT_INITIALIZED
+        record.state = TrackingState.NOT_INITIALIZED
         if frame.cells.textured.mean() < self.config.texture:
             self.stats.count("frames without texture")
             self.diagnosis.no_texture(frame)
@@ -203,7 +208,7 @@ class Tracker:
             if self.initializer.waiting == [reference] and is_held_out(reference) and not is_held_out(frame.index):
                 self.initializer.abandon()
                 return self._begin(frame, record)
-            return Update(State.NOT_INITIALIZED)
+            return Update(TrackingState.NOT_INITIALIZED)
         with self.stats.time("start"):
             self.initializer.add(frame, self.segment, step.matches)
             self._refer_to(frame)
@@ -213,7 +218,7 @@ class Tracker:
         if not started:
             place = self.relocalizer.relocalize(frame) if self.segment > 0 else None
             if place is None:
-                return Update(State.NOT_INITIALIZED)
+                return Update(TrackingState.NOT_INITIALIZED)
             self.initializer.abandon()
             self.segment -= 1
             return self._resume(frame, record, place)
@@ -230,15 +235,15 @@ class Tracker:
             for index in waiting:
                 self.loops.add(index)
         self.stats.count("keyframes", len(waiting))
-        record.state = State.TRACKED
-        return Update(State.TRACKED, self._publish(waiting))
+        record.state = TrackingState.TRACKED
+        return Update(TrackingState.TRACKED, self._publish(waiting))
 
     def _go_on(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """A tracked frame; perhaps a keyframe."""
         assert self.graph is not None
         assert self.front_end.reference is not None
         assert step.localization is not None
-        record.state = State.TRACKED
+        record.state = TrackingState.TRACKED
         pose = step.localization.cam_from_world
         reference = self.front_end.reference.index
         record.follow(self.graph, reference, step.matches, pose)
@@ -246,10 +251,10 @@ class Tracker:
         moved = self.front_end.wants_keyframe(step, limit)
         wanted = self.choice.wants(frame.index, reference, step, frame.size[1], limit)
         if moved and self._reuse_keyframe(frame, pose, reference):
-            return Update(State.TRACKED)
+            return Update(TrackingState.TRACKED)
         if not wanted:
             self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
-            return Update(State.TRACKED)
+            return Update(TrackingState.TRACKED)
         return self._keyframe_of(frame, step, record) or self._lose(frame, record)
 
     def _keyframe_of(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update | None:
@@ -269,7 +274,7 @@ class Tracker:
             self.stats.count("keyframes taken back")
             return None
         if self.graph.keyframes[frame.index].triangulated.mean() < 0.3 * frame.cells.textured.mean():
-            record.state = State.DEGENERATE
+            record.state = TrackingState.DEGENERATE
             self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
         self.stats.count("keyframes")
         self.covisible_keyframes.made(frame.index)
@@ -346,7 +351,7 @@ class Tracker:
     def _lose(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The frame could not be matched: look for it in the map, else begin anew."""
         assert self.graph is not None
-        record.state = State.LOST if self.started else State.NOT_INITIALIZED
+        record.state = TrackingState.LOST if self.started else TrackingState.NOT_INITIALIZED
         record.forget()
         if frame.cells.textured.mean() < self.config.texture:
             self.stats.count("frames without texture")
@@ -378,9 +383,9 @@ class Tracker:
         self.front_end.resume(keyframe.image, frame, place.matches, place.localization.cam_from_world)
         self.relocalizer.found()
         self.stats.count("relocalized")
-        record.state = State.TRACKED
+        record.state = TrackingState.TRACKED
         record.follow(self.graph, place.index, place.matches, place.localization.cam_from_world)
-        return Update(State.TRACKED)
+        return Update(TrackingState.TRACKED)
 
     def _force_start(self) -> Iterator[Update]:
         """The stream ended before the start: what was collected, with weaker criteria."""

@@ -11,8 +11,8 @@ import pytest
 from mvsgs_core import geometry
 from mvsgs_core.droid.presets import Preset
 from mvsgs_core.droid.system import DroidConfig, DroidSlam
-from mvsgs_core.tracking.frames import State, Trajectory
 from mvsgs_core.tracking.tracker import Update
+from mvsgs_core.trajectory import TrackingState, Trajectory
 from tests.support import droid_oracle as oracle
 
 HEIGHT, WIDTH, COUNT = 96, 128, 44
@@ -60,7 +60,7 @@ def test_all_poses_are_found(tracked: tuple[DroidSlam, list[Update]]) -> None:
     assert distance[inside].max() < 0.008
     # beyond the last keyframe poses start at its own; the published damping slows their solution on so small a map
     assert distance.max() < 0.05
-    assert set(trajectory.state.tolist()) == {State.TRACKED}
+    assert set(trajectory.state.tolist()) == {TrackingState.TRACKED}
     assert not system.stats.warnings
 
 
@@ -122,10 +122,10 @@ def test_a_camera_at_rest_never_starts() -> None:
     system = DroidSlam(CONFIG, net=oracle.Oracle(oracle.path(1), INTRINSICS / 8))
     for n in range(6):
         system.add(n, n / 30, oracle.image(0, HEIGHT, WIDTH), INTRINSICS)
-    assert [update.state for update in system.finish()] == [State.NOT_INITIALIZED]
+    assert [update.state for update in system.finish()] == [TrackingState.NOT_INITIALIZED]
     trajectory = system.trajectory()
     assert np.isnan(trajectory.world_from_cam).all()
-    assert trajectory.state.tolist() == [State.NOT_INITIALIZED] * 6
+    assert trajectory.state.tolist() == [TrackingState.NOT_INITIALIZED] * 6
     assert any("never started" in warning for warning in system.stats.warnings)
 
 

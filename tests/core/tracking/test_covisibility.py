@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvsgs_core.tracking.frames import State
 from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.tracker import TrackerConfig
+from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import ate, synthetic, track
 
 ROUND = 80  # frames of a round: every third of 240 of the room's loop
@@ -23,7 +23,7 @@ def test_a_second_round_makes_few_keyframes_and_is_as_accurate() -> None:
     assert second <= 0.2 * first
     assert tracker.stats.skipped["keyframes spared by covisible ones"] >= 5
     assert np.isfinite(trajectory.world_from_cam).all(), "frames that see what old keyframes see have poses"
-    assert (trajectory.state == State.TRACKED).all()
+    assert (trajectory.state == TrackingState.TRACKED).all()
     assert tracker.publisher.published == set(trajectory.index[trajectory.keyframe].tolist()), (
         "no keyframe that was published is taken back"
     )

@@ -10,8 +10,8 @@ import pytest
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.datasets.synthetic import Synthetic
-from mvsgs_core.tracking.frames import Trajectory
 from mvsgs_core.tracking.tracker import Tracker, Update
+from mvsgs_core.trajectory import Trajectory
 from tests.support.sequences import ate
 
 SIZE = (240, 320)

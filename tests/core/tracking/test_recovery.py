@@ -9,11 +9,12 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.tracking.config import TrackerConfig
-from mvsgs_core.tracking.frames import FrameRecord, State
+from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.places.recovery import RecoveryConfig
 from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
 from mvsgs_core.tracking.tracker import Tracker
+from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import synthetic, track
 from tests.support.shared_data import shared
 
@@ -37,7 +38,7 @@ def test_a_lost_run_that_begins_with_black_frames_does_not_end_the_tracker() -> 
     assert known[:44].all()
     assert not known[44:50].any()
     assert known[51:].all()
-    assert (trajectory.state[44:50] == State.LOST).all()
+    assert (trajectory.state[44:50] == TrackingState.LOST).all()
 
 
 def test_each_lost_run_is_followed_from_its_own_keyframes() -> None:
@@ -72,14 +73,14 @@ def test_frames_before_the_start_are_verified_or_have_no_pose() -> None:
     tracker = Tracker()
     tracker.set_up(items[0].image.shape[0], items[0].image.shape[1], items[0].intrinsics, False)
     for item in items[:before]:  # as a start leaves them that was given up
-        tracker.records.append(FrameRecord(item.index, item.timestamp, State.NOT_INITIALIZED))
+        tracker.records.append(FrameRecord(item.index, item.timestamp, TrackingState.NOT_INITIALIZED))
         tracker.recovery.keep(TrackingImage.of(item.index, item.timestamp, item.image, tracker.size, False))
     for item in items[before:]:
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
     list(tracker.finish())
     trajectory = tracker.trajectory()
     known = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))
-    np.testing.assert_array_equal(known, np.isin(trajectory.state, (State.TRACKED, State.DEGENERATE)))
+    np.testing.assert_array_equal(known, np.isin(trajectory.state, (TrackingState.TRACKED, TrackingState.DEGENERATE)))
     assert known[8:].all(), "what is verified is posed"
     truth = np.stack([np.asarray(i.world_from_cam) for i in items])
     scale, rotation, shift = geometry.umeyama(

@@ -11,12 +11,13 @@ from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
-from mvsgs_core.tracking.frames import FrameRecord, State
+from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.places.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.tracking.tracker import Tracker
+from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import tracked_room
 
 
@@ -81,7 +82,7 @@ def test_a_frame_needs_a_kilobyte() -> None:
     try:
         records = []
         for n in range(1000, 1200):
-            record = FrameRecord(n, n / 30.0, State.TRACKED)
+            record = FrameRecord(n, n / 30.0, TrackingState.TRACKED)
             record.follow(graph, reference, matches, pose)
             records.append(record)
         size, _ = tracemalloc.get_traced_memory()

@@ -8,8 +8,8 @@ import numpy as np
 
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.synthetic import Synthetic
-from mvsgs_core.tracking.frames import State
 from mvsgs_core.tracking.tracker import Tracker
+from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import ate
 
 BEFORE, COVERED = 30, 3
@@ -44,7 +44,7 @@ def test_a_lost_segment_is_joined_by_a_loop() -> None:
             moved = set(update.correction.index.tolist())
     list(tracker.finish())
     trajectory = tracker.trajectory()
-    assert all(state == State.LOST for state in states[BEFORE : BEFORE + COVERED])
+    assert all(state == TrackingState.LOST for state in states[BEFORE : BEFORE + COVERED])
     second = {index for index, segment in published.items() if segment == 1}
     assert len(second) >= 6, "there was no segment of its own"
     assert min(second) > BEFORE + COVERED

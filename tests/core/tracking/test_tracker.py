@@ -7,9 +7,9 @@ import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.tracking.frames import State
 from mvsgs_core.tracking.matching.flow import FLOWS
 from mvsgs_core.tracking.tracker import TrackerConfig
+from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import ate, synthetic, track, tracked_room
 from tests.support.shared_data import shared
 
@@ -19,7 +19,7 @@ def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:
     tracker, trajectory, updates = tracked_room()
     error, length = ate(trajectory, items)
     assert error < 0.003 * length
-    assert (trajectory.state == State.TRACKED).all()
+    assert (trajectory.state == TrackingState.TRACKED).all()
     assert np.isfinite(trajectory.world_from_cam).all()
     published = [index for update in updates for index in update.keyframes]
     assert sorted(published) == sorted(set(published)) == trajectory.index[trajectory.keyframe].tolist()
@@ -33,7 +33,7 @@ def test_every_choice_of_flow_without_weights_starts_and_tracks(flow: str) -> No
     tracker, trajectory, updates = track(items, TrackerConfig(flow=flow))
     assert any(update.keyframes for update in updates[: len(items)]), tracker.initializer.reason
     assert tracker.stats.warnings == []
-    assert (trajectory.state == State.TRACKED).all()
+    assert (trajectory.state == TrackingState.TRACKED).all()
     error, length = ate(trajectory, items)
     assert error < 0.003 * length
 
@@ -79,15 +79,15 @@ def test_a_turning_start_waits_for_parallax_and_is_filled_in_later() -> None:
     assert first >= 20, "a start was made of nothing but rotation"
     error, length = ate(trajectory, items)
     assert error < 0.01 * length
-    assert np.mean(trajectory.state == State.TRACKED) > 0.9
+    assert np.mean(trajectory.state == TrackingState.TRACKED) > 0.9
 
 
 def test_a_covered_lens_is_lost_and_found_again() -> None:
     items = synthetic(frames=90, covered=12, covered_start=50)
     tracker, trajectory, updates = track(items)
-    assert (trajectory.state[50:62] == State.LOST).all()
+    assert (trajectory.state[50:62] == TrackingState.LOST).all()
     assert not np.isfinite(trajectory.world_from_cam[50:62]).any()
-    assert (trajectory.state[64:] == State.TRACKED).all()
+    assert (trajectory.state[64:] == TrackingState.TRACKED).all()
     assert len({int(s) for s in trajectory.segment[trajectory.segment >= 0]}) == 1
     assert not any(update.keyframes for update in updates[50:62])
     assert any("lost" in warning for warning in tracker.stats.warnings)
@@ -117,7 +117,7 @@ def test_a_room_without_texture_is_not_tracked_and_says_so() -> None:
         for item in synthetic(frames=80)[:10]
     ]
     tracker, trajectory, updates = track(items)
-    assert (trajectory.state == State.NOT_INITIALIZED).all()
+    assert (trajectory.state == TrackingState.NOT_INITIALIZED).all()
     assert not any(update.keyframes for update in updates)
     assert any("never started" in warning for warning in tracker.stats.warnings)
 
@@ -139,4 +139,4 @@ def test_a_real_hand_held_sequence() -> None:
     known = np.isin(trajectory.index, [i.index for i in items if i.world_from_cam is not None])
     error, _ = ate(trajectory, items, known)
     assert error < 0.015, "meters"
-    assert (trajectory.state == State.TRACKED).all()
+    assert (trajectory.state == TrackingState.TRACKED).all()
