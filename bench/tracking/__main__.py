@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path as File
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -133,7 +133,7 @@ def _ate_row(name: str, centimeters: float, goal: str, length: float) -> Row:
     return at_most(name, centimeters, "cm", limit)
 
 
-def curve(name: str, items: Sequence[Item], folder: File) -> list[Row]:
+def curve(name: str, items: Sequence[Item], folder: Path) -> list[Row]:
     """Run time against error over the main settings; the plot goes to `folder`."""
 
     def one(config: TrackerConfig) -> tuple[float, float, int]:
@@ -198,7 +198,7 @@ def arguments(parser: argparse.ArgumentParser) -> Any:
     parser.add_argument("--colmap", action=flag, default=True, help="pycolmap on the same frames (one core, minutes)")
     parser.add_argument("--curve", action=flag, default=True, help="run time against error over the main settings")
     parser.add_argument("--frames", type=int, default=2000, help="of the run whose memory is measured, more than 500")
-    parser.add_argument("--output", type=File, help="folder for plots and COLMAP's models; default: in runs")
+    parser.add_argument("--output", type=Path, help="folder for plots and COLMAP's models; default: in runs")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path as File
+from pathlib import Path
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Baseline:
     size: tuple[int, int]
 
 
-def solve(items: Sequence[Item], folder: File, threads: int) -> Baseline:
+def solve(items: Sequence[Item], folder: Path, threads: int) -> Baseline:
     """COLMAP's model of the frames. One that an earlier call left in `folder` for the same images is taken again."""
     size = items[0].image.shape[0], items[0].image.shape[1]
     small = fit_size(*size, AREA) if size[0] * size[1] > AREA else size
@@ -49,7 +49,7 @@ def solve(items: Sequence[Item], folder: File, threads: int) -> Baseline:
     return Baseline(model, why, small)
 
 
-def solve_case(name: str, folder: File) -> Baseline:
+def solve_case(name: str, folder: Path) -> Baseline:
     """`solve` for a sequence of the benchmark, by one thread: for a process of its own, beside which ours is timed."""
     case = CASES[name]
     place = folder / "".join(c if c.isalnum() else "_" for c in name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path as File
+from pathlib import Path
 
 import numpy as np
 
@@ -85,7 +85,7 @@ def beats(point: Point, other: Point) -> bool:
     return point.milliseconds * TIME_NOISE < other.milliseconds and point.error * ERROR_NOISE < other.error
 
 
-def draw(file: File, points: Sequence[Point]) -> None:
+def draw(file: Path, points: Sequence[Point]) -> None:
     """The curves, error upside down so that better is up; settings that are off by a multiple are left out."""
     default = points[0]
     limit = 6.0 * default.error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path as File
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +13,10 @@ from bench.tracking.baselines import Baseline
 from bench.tracking.curves import Point
 from bench.tracking.memory import Sample
 from mvsgs_core.datasets import Item
-from mvsgs_core.tracking.frames import Path
+from mvsgs_core.trajectory import Trajectory
 
 
-def test_the_default_is_on_the_front_unless_something_is_faster_and_better_by_more_than_noise(tmp_path: File) -> None:
+def test_the_default_is_on_the_front_unless_something_is_faster_and_better_by_more_than_noise(tmp_path: Path) -> None:
     points = [
         Point("default", "", 20.0, 1.0, 50), Point("size", "small", 10.0, 1.5, 50),
         Point("size", "odd", 19.9, 0.99, 50), Point("size", "bad", 30.0, 2.0, 50),
@@ -68,7 +68,10 @@ def test_colmap_is_a_mark_only_where_it_registers_most_frames(registered: int, g
     ours[0, :3, 3] += 0.05
     ours[3] = np.nan
     model = Model(np.arange(registered), 2.0 * theirs, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), {}, 30.0)
-    path = Path(np.arange(20), np.zeros(20), ours, np.ones(20, bool), np.zeros(20, np.uint8), np.zeros(20, np.int32))
+    nothing = np.zeros(20)
+    path = Trajectory(
+        np.arange(20), nothing, ours, np.ones(20, bool), nothing.astype(np.uint8), nothing.astype(np.int32)
+    )
     rows = baselines.rows("room", Baseline(model, "", (240, 320)), path, items, 3.0)
     assert f"{registered} of 20 frames" in rows[0].unit
     assert rows[1].goal == goal
@@ -78,10 +81,10 @@ def test_colmap_is_a_mark_only_where_it_registers_most_frames(registered: int, g
     assert [r.value for r in none] == ["no model"]
 
 
-def test_colmaps_model_is_kept_for_the_same_images_only(tmp_path: File, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colmaps_model_is_kept_for_the_same_images_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
-    def fake(frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: File, threads: int) -> tuple[Model, str]:
+    def fake(frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: Path, threads: int) -> tuple[Model, str]:
         calls.append(len(frames))
         np.savez(folder / "model.npz", index=np.arange(2), world_from_cam=np.zeros((2, 4, 4)), points=0, colors=0)
         (folder / "seconds.json").write_text('{"wall": {"matching": 1.0}, "processor": 2.0}')
