@@ -22,7 +22,7 @@ from nodes.stream_times import LATEST, StreamTimes
 
 POLL = 0.5  # s at most between two looks at the clock
 FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye and a telescope nothing can be tracked
-SMALLEST, LARGEST = 16, 16384  # pixels of a side
+MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
 
 
 class Robot(Node):
@@ -136,8 +136,8 @@ class Robot(Node):
         native = frame.image.shape[0], frame.image.shape[1]
         side = max(native)
         focal, center = frame.intrinsics[:2], frame.intrinsics[2:]
-        if not SMALLEST <= min(native) <= side <= LARGEST:
-            return f"frames with sides outside of {SMALLEST} to {LARGEST} pixels were left out, such as {native}"
+        if not MIN_SIDE <= min(native) <= side <= MAX_SIDE:
+            return f"frames with sides outside of {MIN_SIDE} to {MAX_SIDE} pixels were left out, such as {native}"
         if self._native not in (None, native):
             return f"frames of another size than the first, {self._native}, were left out, such as {native}"
         in_view = np.all((FOCAL_RANGE[0] * side <= focal) & (focal <= FOCAL_RANGE[1] * side))

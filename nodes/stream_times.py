@@ -8,7 +8,7 @@ from collections.abc import Callable
 LATEST = 1e11  # s: the year 5138; what is beyond it is in other units than seconds, and loses fractions of them
 LEAP = 3600.0  # s that a stream may jump ahead by itself: a recording with gaps is no broken clock
 FASTEST_PLAYBACK = 1000.0  # times the recorded rate
-LEAST_STEP = 1e-4  # s between two frames where they came at once
+MIN_STEP = 1e-4  # s between two frames where they came at once
 
 
 class StreamTimes:
@@ -32,7 +32,7 @@ class StreamTimes:
             passed = now - self._came
             if not 0 < shown - self._last <= LEAP + FASTEST_PLAYBACK * passed:
                 self.repaired += 1
-                shown = self._last + max(passed, LEAST_STEP)
+                shown = self._last + max(passed, MIN_STEP)
                 self._shift = shown - timestamp
         self._last, self._came = shown, now
         return shown

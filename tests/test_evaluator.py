@@ -150,7 +150,7 @@ def test_frames_are_rendered_with_the_focal_length_that_the_tracker_found(evalua
     evaluator.evaluation.close()
 
 
-def test_renders_are_rolled_with_the_shutter_that_the_tracker_took_out(evaluator: Evaluator) -> None:
+def test_the_rolling_shutter_that_the_tracker_took_out_is_applied_to_renders(evaluator: Evaluator) -> None:
     poses, index, none = _poses(), np.arange(N), np.zeros(N, np.int32)
     poses[:, :3, 3] += ORIGIN
     track = Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, readout_time=0.02)

@@ -1,4 +1,4 @@
-"""How good depth maps are: absolute relative error, share of inliers, completeness."""
+"""How good depth maps are: absolute relative error, fraction of inliers, completeness."""
 
 from __future__ import annotations
 

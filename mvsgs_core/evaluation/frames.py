@@ -18,7 +18,7 @@ from mvsgs_core.evaluation.thinning import Thinned
 from mvsgs_core.held_out import is_held_out
 
 ENDING = 5  # last frames of the stream, all of them there
-LEAST = 400  # frames of each kind that are kept at least, so that short streams are whole
+MIN_KEPT = 400  # frames of each kind that are kept at least, so that short streams are whole
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Frames:
 
     def __init__(self, folder: Path | None, max_frames: int, max_bytes: float) -> None:
         """folder: where they wait; max_frames: that will be scored; max_bytes: on disk, for all of them."""
-        most = max(2 * max_frames, LEAST)
+        kept = max(2 * max_frames, MIN_KEPT)
         self._none = max_frames == 0
         self._max_bytes = max_bytes
         self._streamed: dict[bool, Thinned[np.ndarray]] = {
-            held_out: Thinned(folder, most, max_bytes / 3) for held_out in (True, False)
+            held_out: Thinned(folder, kept, max_bytes / 3) for held_out in (True, False)
         }
-        self._mapped: Thinned[_Mapped] = Thinned(folder, most, max_bytes / 3)
+        self._mapped: Thinned[_Mapped] = Thinned(folder, kept, max_bytes / 3)
         self._ending: dict[int, _Frame] = {}  # by index, in the order in which they came
 
     def add(self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray | None) -> None:

@@ -86,10 +86,10 @@ def _listed(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
 
 
-def _some(indices: Sequence[int], most: int = 8) -> str:
+def _some(indices: Sequence[int], limit: int = 8) -> str:
     if not indices:
         return "none"
-    return f"{len(indices)}: {', '.join(map(str, indices[:most]))}{', …' if len(indices) > most else ''}"
+    return f"{len(indices)}: {', '.join(map(str, indices[:limit]))}{', …' if len(indices) > limit else ''}"
 
 
 def page(

@@ -41,7 +41,7 @@ class Score:
     psnr: float
     ssim: float
     lpips: float | None
-    coverage: float  # share of the pixels at which the render is more opaque than not
+    coverage: float  # fraction of the pixels at which the render is more opaque than not
 
     @property
     def held_out(self) -> bool:
@@ -107,8 +107,8 @@ def choose(views: list[ScoredFrame], limit: int) -> list[ScoredFrame]:
         [v for v in rest if not v.keyframe and not is_held_out(v.index)],
     ]
     for k, group in enumerate(groups):
-        share = (limit - len(chosen)) // (len(groups) - k)
-        places = np.linspace(0, max(len(group) - 1, 0), min(share, len(group)))
+        wanted = (limit - len(chosen)) // (len(groups) - k)
+        places = np.linspace(0, max(len(group) - 1, 0), min(wanted, len(group)))
         chosen += [group[i] for i in np.unique(places.round().astype(int))]
     return sorted(chosen, key=lambda v: v.index)
 

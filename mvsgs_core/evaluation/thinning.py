@@ -1,8 +1,8 @@
 """Frames of a stream of unknown length, thinned out evenly while it goes on: bounded in number and in bytes on disk.
 
-Each frame has a place in [0, 1), the fraction of its number times the golden ratio: the multiples of no other number
-lie as evenly, whatever their step. Kept are those whose place is below a share, which is halved where they become too
-many. So which frames stay depends on the stream alone, and what two kinds of frames keep is nested.
+Each frame has a place in [0, 1), the fractional part of its number times the golden ratio: the multiples of no other
+number lie as evenly, whatever their step. Kept are those whose place is below a fraction, which is halved where they
+become too many. So which frames stay depends on the stream alone, and what two kinds of frames keep is nested.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _GOLDEN = 0x9E3779B97F4A7C15  # of 2^64
 class Thinned(Generic[T]):
     """What is kept of one kind of frames: arrays on disk, a note of each in memory."""
 
-    def __init__(self, folder: Path | None, most: int, most_bytes: float) -> None:
-        """most: frames; most_bytes: on disk. Both may be exceeded by the frame that is being added."""
+    def __init__(self, folder: Path | None, max_frames: int, max_bytes: float) -> None:
+        """max_frames: kept; max_bytes: on disk. Both may be exceeded by the frame that is being added."""
         self._store = FrameStore(folder)
-        self._most, self._most_bytes = most, most_bytes
-        self._share = 1.0
+        self._max_frames, self._max_bytes = max_frames, max_bytes
+        self._fraction = 1.0
         self.notes: dict[int, T] = {}  # by index
         self.seen = 0
         self.too_large = False  # the bound on bytes has bitten
@@ -37,13 +37,13 @@ class Thinned(Generic[T]):
     def add(self, index: int, note: T, arrays: Mapping[str, np.ndarray]) -> None:
         """Takes a frame, in the place of the one of this index if there is one; it may be dropped now or later."""
         self.seen += index not in self.notes
-        if _place(index) >= self._share:
+        if _place(index) >= self._fraction:
             return
         try:
             self._store.put(index, arrays)
             self.notes[index] = note
-            while self.notes and (len(self.notes) > self._most or self._store.size > self._most_bytes):
-                self.too_large = self.too_large or len(self.notes) <= self._most
+            while self.notes and (len(self.notes) > self._max_frames or self._store.size > self._max_bytes):
+                self.too_large = self.too_large or len(self.notes) <= self._max_frames
                 self._halve()
         except OSError as error:
             self.lost += 1
@@ -62,8 +62,8 @@ class Thinned(Generic[T]):
         self._store.close()
 
     def _halve(self) -> None:
-        self._share /= 2
-        self.notes = {index: note for index, note in self.notes.items() if _place(index) < self._share}
+        self._fraction /= 2
+        self.notes = {index: note for index, note in self.notes.items() if _place(index) < self._fraction}
         self._store.keep(self.notes.keys())
 
 

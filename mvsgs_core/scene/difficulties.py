@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from .. import geometry
-from .path import Path
+from .path import CameraPath
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Difficulties:
     covered_start: int = 60  # first of them
     jump: int = 0  # frames of the path that are missing at once: the view jumps
     jump_start: int = 60  # first frame after the jump
-    drop: float = 0.0  # share of frames lost at random, 0 to 1; their time stamps are missing
-    motion_blur: float = 0.0  # exposure time as a share of the time between two frames, 0 to 1
-    rolling_shutter: float = 0.0  # readout time, first row to last, as a share of the time between two frames, 0 to 1
+    drop: float = 0.0  # fraction of frames lost at random, 0 to 1; their time stamps are missing
+    motion_blur: float = 0.0  # exposure time as a fraction of the time between two frames, 0 to 1
+    rolling_shutter: float = 0.0  # readout time as a fraction of the time between two frames, 0 to 1
     exposure: float = 0.0  # brightness drifts by up to so many stops up and down
     noise: float = 0.0  # standard deviation of the sensor's noise at mid gray, 8-bit levels
     gloss: float = 0.0  # strength of highlights, 1 is plausible: surfaces that change with the view
@@ -52,7 +52,7 @@ class DifficultPath:
 
     SWEEP = np.radians(30.0)  # the camera turns so far to either side and back while it only turns
 
-    def __init__(self, path: Path, difficulties: Difficulties) -> None:
+    def __init__(self, path: CameraPath, difficulties: Difficulties) -> None:
         self.path = path
         self.difficulties = difficulties
 

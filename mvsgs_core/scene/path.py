@@ -9,7 +9,7 @@ import numpy as np
 from .. import geometry
 
 
-class Path(Protocol):
+class CameraPath(Protocol):
     """A camera's pose over time."""
 
     def pose(self, s: float) -> np.ndarray:

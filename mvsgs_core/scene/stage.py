@@ -13,7 +13,7 @@ from . import aerial, room
 from .lighting import Lighting
 from .materials import marbled
 from .patches import blob
-from .path import FlightPath, Path, RoomPath
+from .path import CameraPath, FlightPath, RoomPath
 from .renderer import SceneRenderer
 
 SCENES = ("room", "aerial")
@@ -26,7 +26,7 @@ class Stage:
     REACH: ClassVar[dict[str, float]] = {"room": 0.12, "aerial": 4.0}  # scene units of one unit of the ball's swing
     name: str
     renderer: SceneRenderer
-    path: Path
+    path: CameraPath
     ball: SceneRenderer  # stands at its own origin
     focus: np.ndarray  # (3,) the middle of where it moves, scene units; relative to the camera in the landscape
 
@@ -68,6 +68,6 @@ def stage(scene: str, seed: int, textureless: int, loop_frames: int | None, movi
     size = max(moving_object, 0.01)
     renderer = renderer_of(scene, seed, textureless)
     if scene == "aerial":
-        path: Path = FlightPath(seed, loop_frames)
+        path: CameraPath = FlightPath(seed, loop_frames)
         return Stage(scene, renderer, path, ball_of(5.0 * size, seed), np.array([0.0, 30.0, 15.0]))
     return Stage(scene, renderer, RoomPath(seed, loop_frames), ball_of(0.13 * size, seed), np.array([2.6, 2.2, 1.1]))

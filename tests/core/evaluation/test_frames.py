@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mvsgs_core.evaluation.frames import ENDING, LEAST, Frames
+from mvsgs_core.evaluation.frames import ENDING, MIN_KEPT, Frames
 from mvsgs_core.evaluation.thinning import Thinned
 from mvsgs_core.held_out import is_held_out
 from tests.support.full_disk import full_after
@@ -44,12 +44,12 @@ def test_a_hundred_thousand_frames_cost_bounded_disk_and_are_kept_evenly(tmp_pat
     for index in range(count):
         frames.add(index, image(index % 7), INTRINSICS, None)
         largest = max(largest, frames.size)
-    assert largest < 2.5 * LEAST * 200  # bytes of a frame
+    assert largest < 2.5 * MIN_KEPT * 200  # bytes of a frame
     kept = np.array(sorted(frames.photographs()))
     assert kept[-ENDING:].tolist() == list(range(count - ENDING, count))
     for held_out in (True, False):
         same = np.array([index for index in kept[:-ENDING] if is_held_out(int(index)) == held_out])
-        assert LEAST / 2 - 20 < len(same) <= LEAST
+        assert MIN_KEPT / 2 - 20 < len(same) <= MIN_KEPT
         gaps = np.diff([0, *same, count])
         assert gaps.max() < 4 * np.median(gaps)
         per_tenth = np.histogram(same, bins=10, range=(0, count))[0]
@@ -63,7 +63,7 @@ def test_a_stream_with_gaps_is_kept_evenly_too(tmp_path: Path, step: int) -> Non
     kept = np.array(sorted(frames.photographs()))
     per_fifth = np.histogram(kept[:-ENDING], bins=5, range=(0, 3000 * step))[0]
     assert per_fifth.min() > 0.75 * per_fifth.mean()
-    assert len(kept) > LEAST / 2 - 20
+    assert len(kept) > MIN_KEPT / 2 - 20
     frames.close()
 
 
