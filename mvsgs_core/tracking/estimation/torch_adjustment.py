@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver
+from mvsgs_core.tracking.estimation.problem import Graph, Solution, Solver
 
 _DENSE = 2**25  # elements of the coupling that are dense at a time: 256 MB
 
