@@ -1,4 +1,4 @@
-"""Synthetic sequences of the tracking tests, and how far a path is from the truth."""
+"""Synthetic sequences of the tracking tests, and how far a trajectory is from the truth."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import Item, open_dataset
-from mvsgs_core.tracking.frames import Path
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig, Update
+from mvsgs_core.trajectory import Trajectory
 
 
 @functools.cache
@@ -24,26 +24,26 @@ def synthetic(**options: Any) -> tuple[Item, ...]:
     return _rendered(tuple(sorted(options.items())))
 
 
-def track(items: Sequence[Item], config: TrackerConfig | None = None) -> tuple[Tracker, Path, list[Update]]:
+def track(items: Sequence[Item], config: TrackerConfig | None = None) -> tuple[Tracker, Trajectory, list[Update]]:
     """A tracker that has seen all of them."""
     tracker = Tracker(config)
     updates = [tracker.add(i.index, i.timestamp, i.image, i.intrinsics) for i in items]
     updates += tracker.finish()
-    return tracker, tracker.path(), updates
+    return tracker, tracker.trajectory(), updates
 
 
 @functools.cache
-def tracked_room() -> tuple[Tracker, Path, list[Update]]:
+def tracked_room() -> tuple[Tracker, Trajectory, list[Update]]:
     """The easy case, tracked once: 80 frames of the room."""
     return track(synthetic(frames=80))
 
 
-def ate(path: Path, items: Sequence[Item], chosen: np.ndarray | None = None) -> tuple[float, float]:
-    """RMS position error after Sim(3) alignment over all frames with a pose, and the length of the true path."""
+def ate(trajectory: Trajectory, items: Sequence[Item], chosen: np.ndarray | None = None) -> tuple[float, float]:
+    """RMS position error after Sim(3) alignment over all frames with a pose, and the length of the true trajectory."""
     truth = {i.index: i.world_from_cam for i in items}
-    use = np.isfinite(path.world_from_cam).all(axis=(1, 2)) & (True if chosen is None else chosen)
-    found = path.world_from_cam[use, :3, 3]
-    wanted = np.stack([np.asarray(truth[int(n)])[:3, 3] for n in path.index[use]])
+    use = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2)) & (True if chosen is None else chosen)
+    found = trajectory.world_from_cam[use, :3, 3]
+    wanted = np.stack([np.asarray(truth[int(n)])[:3, 3] for n in trajectory.index[use]])
     s, r, t = geometry.umeyama(found, wanted)
     length = float(np.linalg.norm(np.diff(wanted, axis=0), axis=1).sum())
     return float(np.sqrt(np.mean(np.sum(np.square(s * found @ r.T + t - wanted), axis=1)))), length
