@@ -2,8 +2,8 @@
 
 A, B, C and D are the paper's Table III (the tracker's coarse depth, + multi-view stereo, + filtering, + the mask of
 unexplored pixels, at the paper's 40 dB); the others switch one thing off or over. A figure is the variant's minus the
-full system's: mean over the seeds, plus or minus half the range. The difference is called real where it is larger than
-the spreads of both.
+full system's: mean over the seeds, plus or minus half the range; "~" stands before one that is not larger than the
+spreads of both.
 
 The runs are kept by scene and variant: with --resume the same command, or one with other --variants, runs only what is
 missing, so that the whole can be made in pieces (--minutes, --variants) and then stands in one table.
@@ -86,44 +86,15 @@ def rows_of(runs: list[Run], scenes: Sequence[str], variants: Sequence[str]) -> 
         for name, (path, unit, _) in FIGURES.items():
             base = [v for v in (figure(run.report, path) for run in full) if v is not None]
             if base:
-                rows.append(Row(f"{scene}: full: {name}", float(np.mean(base)), unit))
+                spread = float(np.ptp(base) / 2) if len(base) > 1 else None
+                rows.append(Row(f"{scene}: full: {name}", float(np.mean(base)), unit, spread=spread))
         for variant in variants:
             for name, (path, unit, digits) in FIGURES.items():
                 found = difference(select(runs, scene, variant), full, path)
                 if found is not None:
-                    real = "" if found.real else " (within the spread)" if found.runs > 1 else " (one run)"
-                    rows.append(Row(f"{scene}: {variant}: {name}, change", found.text(digits) + real, unit))
+                    real = "" if found.real else "~ " if found.runs > 1 else "once: "
+                    rows.append(Row(f"{scene}: {variant}: {name}, change", real + found.text(digits), unit))
     return rows
-
-
-def table(runs: list[Run], scenes: Sequence[str], variants: Sequence[str]) -> str:
-    names = list(FIGURES)
-    lines = ["| scene | variant | " + " | ".join(names) + " |", "|---|---|" + "---:|" * len(names)]
-    for scene in scenes:
-        full = select(runs, scene, "full")
-        cells = []
-        for path, _, digits in FIGURES.values():
-            base = [v for v in (figure(run.report, path) for run in full) if v is not None]
-            cells.append(
-                f"{np.mean(base):.{digits}f} ± {np.ptp(base) / 2:.{digits}f}"
-                if len(base) > 1
-                else f"{base[0]:.{digits}f}"
-                if base
-                else "–"
-            )
-        lines.append(f"| {scene} | **full** | " + " | ".join(cells) + " |")
-        for variant in variants:
-            if not select(runs, scene, variant):
-                continue
-            found = [(difference(select(runs, scene, variant), full, p), digits) for p, _, digits in FIGURES.values()]
-            shown = ["–" if d is None else f"**{d.text(n)}**" if d.real else d.text(n) for d, n in found]
-            lines.append(f"| {scene} | {variant} | " + " | ".join(shown) + " |")
-    return (
-        "\n".join(
-            [*lines, "", "Changes against the full system; bold: larger than the spreads of both, of two runs or more."]
-        )
-        + "\n"
-    )
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
@@ -139,13 +110,10 @@ def measure(options: argparse.Namespace) -> list[Row]:
         for scene in scenes
     }
     runs = made.runs(matrices)
-    (made.output / "table.md").write_text("\n".join([table(runs, scenes, variants), made.note]).strip() + "\n")
-    if made.note:
-        print(made.note)
     failed = [
         Row(f"{r.scene}/{r.variant}/seed {r.seed}", "failed", "", "finished", False) for r in runs if not r.report
     ]
-    return rows_of(runs, scenes, variants) + failed
+    return rows_of(runs, scenes, variants) + failed + made.rows()
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,6 @@ wide tolerances, and only warn where the machine is another than the recorded on
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import re
 import sys
@@ -145,7 +144,7 @@ def run(arguments: list[str]) -> int:
         if not known.exists():
             print(f"{file.stem}: nothing recorded to compare with")
             continue
-        recorded = Record(**json.loads(known.read_text()))
+        recorded = Record.load(file.stem, options.recorded)
         rows = read_rows([file])[0]
         compared += len(rows)
         changes = compare(file.stem, rows, recorded)

@@ -86,20 +86,6 @@ def points_of(runs: list[Run], curves: dict[str, dict[str, tuple[str, ...]]]) ->
     return point("default", "default", "default") if "default" in by_setting else None, others
 
 
-def judgement(default: Point, others: list[Point]) -> str:
-    """By what the default is beaten, in words."""
-    noise = f"± {default.noise[0]:.1f} s and ± {default.noise[1]:.2f} dB over the default's runs"
-    found = [
-        f"{point.name} ({point.seconds - default.seconds:+.1f} s, {point.psnr - default.psnr:+.2f} dB)"
-        for point in others
-        if point.beats(default)
-    ]
-    if not any(default.noise):
-        return "The default ran once: what beats it by more than the noise is unknown."
-    by = ", ".join(found) if found else "nothing here"
-    return f"The default is beaten by more than the noise ({noise}) by {by}."
-
-
 def rows_of(scene: str, default: Point, others: list[Point]) -> list[Row]:
     everything = [default, *others]
     front = plots.pareto([p.seconds for p in everything], [p.psnr for p in everything])
@@ -113,35 +99,13 @@ def rows_of(scene: str, default: Point, others: list[Point]) -> list[Row]:
         rows.append(Row(f"{name}: held-out PSNR", point.psnr, "dB"))
         rows += [Row(f"{name}: {e}", figure(point.run.report, path), unit) for e, (path, unit) in ERRORS.items()]
         rows += [Row(f"{name}: {n}", stage_seconds(point.run.report, n), "s") for n in ("tracker", "mvs", "mapper")]
+        rows.append(Row(f"{name}: splats", figure(point.run.report, "map.splats")))
         rows.append(Row(f"{name}: on the front", "yes" if k in front else "no"))
     rows.append(Row(f"{scene}: default: half the range of its wall times", default.noise[0], "s"))
     rows.append(Row(f"{scene}: default: half the range of its held-out PSNR", default.noise[1], "dB"))
     beating = [point.name for point in others if point.beats(default)] if any(default.noise) else ["unknown"]
     rows.append(Row(f"{scene}: default: beaten by", ", ".join(beating) or "none"))
     return rows
-
-
-def table(scene: str, default: Point, others: list[Point]) -> str:
-    everything = [default, *others]
-    front = plots.pareto([p.seconds for p in everything], [p.psnr for p in everything])
-    lines = [
-        f"**{scene}**", "",
-        "| setting | wall s | held-out dB | ATE % | depth inliers | tracker s | MVS s | mapper s | splats | front |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---|",
-    ]  # fmt: skip
-    for k, point in enumerate(everything):
-        report = point.run.report
-        times = [stage_seconds(report, node) for node in ("tracker", "mvs", "mapper")]
-        values = [
-            (point.seconds, 1), (point.psnr, 2), (figure(report, "trajectory.ate_percent"), 2),
-            (figure(report, "depth.inlier_ratio"), 3), *((t, 1) for t in times), (figure(report, "map.splats"), 0),
-        ]  # fmt: skip
-        cells = ["–" if v is None or not np.isfinite(v) else f"{v:.{digits}f}" for v, digits in values]
-        name = "**default**" if point is default else point.name
-        marks = ["yes"] if k in front else []
-        marks += ["beats the default"] if any(default.noise) and point.beats(default) else []
-        lines.append("| " + " | ".join([name, *cells, ", ".join(marks)]) + " |")
-    return "\n".join([*lines, "", judgement(default, others)])
 
 
 def picture(default: Point, others: list[Point]) -> str:
@@ -185,17 +149,14 @@ def measure(options: argparse.Namespace) -> list[Row]:
         for curve, points in settings(curves).items()
     }  # fmt: skip
     runs = made.runs(matrices)
-    rows, tables = [], []
+    rows = []
     for scene in scenes:
         default, others = points_of([run for run in runs if run.scene == scene], curves)
         if default is None:
             continue
         rows += rows_of(scene, default, others)
-        tables.append(table(scene, default, others))
         plots.write(made.output / f"{scene}.svg", picture(default, others))
-    (made.output / "table.md").write_text("\n\n".join([*tables, made.note]).strip() + "\n")
-    print("\n\n".join([*tables, made.note]))
-    return rows
+    return rows + made.rows()
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -82,10 +82,10 @@ def flat_rows(name: str, output: Path) -> list[Row]:
         if len(streaming) < 10:
             continue
         times, memory = np.array(taken).T
-        rows.append(Row(f"{name}: {node}, peak memory", float(memory.max()), "MB"))
+        rows.append(Row(f"{name}: {node}: peak memory", float(memory.max()), "MB"))
         rows.append(
             at_most(
-                f"{name}: {node}, memory at the stream's end over that after a quarter", growth(streaming), "x", GROWTH
+                f"{name}: {node}: memory at the stream's end over that after a quarter", growth(streaming), "x", GROWTH
             )
         )
         series.append(svg.Series(node, times, memory))

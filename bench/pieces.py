@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.runs import Matrix, Run, commit
+from bench.table import Row
 
 
 @dataclass
@@ -59,15 +60,14 @@ class Pieces:
         """As the command line, with `arguments`, says."""
         return Pieces(output, options.resume, options.collect, options.minutes)
 
-    @property
-    def note(self) -> str:
-        """What a table must say of how its runs were made; empty where all are of one commit."""
-        parts = []
+    def rows(self) -> list[Row]:
+        """What must be said of how the runs were made; nothing where all are there and of one commit."""
+        rows = []
         if len(self.commits) > 1:
-            parts.append(f"Runs of the commits {', '.join(self.commits)}.")
+            rows.append(Row("runs of the commits", ", ".join(self.commits)))
         if self.missing:
-            parts.append(f"Not run yet: {', '.join(self.missing)}; --resume goes on with them.")
-        return " ".join(parts)
+            rows.append(Row("not run yet (--resume goes on with them)", ", ".join(self.missing)))
+        return rows
 
     @property
     def _may_start(self) -> bool:

@@ -1,12 +1,12 @@
-"""Records a benchmark's rows and puts them into BENCHMARKS.md.
+"""Records a benchmark's rows, and writes what is read of them: docs/benchmarks/ and the figures of BENCHMARKS.md.
 
-    python -m bench.record NAME FILE.json [FILE.json ...] [--from FOLDER] [--command TEXT]
-    python -m bench.record                    only writes BENCHMARKS.md anew from what is recorded
+    python -m bench.record NAME FILE.json [FILE.json ...] [--from FOLDER] [--command TEXT] [--note TEXT]
+    python -m bench.record                    only writes the documents anew from what is recorded
 
 Several files of the same rows are repeated runs: a figure becomes their mean, with half their range as its spread. The
-record, bench/recorded/NAME.json, keeps command, commit, machine and date. `--from`: the folder of a benchmark that also
-writes a table of its own form, table.md, and plots, *.svg: they take the place of the plain table. In BENCHMARKS.md the
-text between `<!-- bench:NAME -->` and `<!-- /bench:NAME -->` is replaced by all this; everything else stays.
+record, bench/recorded/NAME.json, has a row a line, and keeps command, commit, machine and date. `--from`: the folder of
+the run, of which plots, *.svg, go to docs/benchmarks/. In docs/benchmarks/NAME.md what is between `<!-- bench:NAME -->`
+and `<!-- /bench:NAME -->` is replaced by tables and plots; the words around it are written by hand.
 """
 
 from __future__ import annotations
@@ -17,17 +17,20 @@ import operator
 import re
 import shutil
 import sys
+import textwrap
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench import pivot
+from bench import figures, pivot, plots
 from bench.runs import ROOT, commit, machine
 
 RECORDED = ROOT / "bench" / "recorded"
+PAGES = ROOT / "docs" / "benchmarks"
 DOCUMENT = ROOT / "BENCHMARKS.md"
+_UNSET = {"unit": "", "goal": "", "met": None, "spread": None}  # of a row; not written
 _BLOCK = re.compile(r"(<!-- bench:([\w/.-]+) -->\n).*?(<!-- /bench:\2 -->)", re.DOTALL)
 
 
@@ -41,28 +44,41 @@ class Record:
     machine: str
     date: str
     runs: int
+    note: str = ""  # how it was made, where the command does not say
     rows: list[dict[str, Any]] = field(default_factory=list)
-    table: str = ""  # Markdown, in place of the plain table of the rows
-    plots: list[str] = field(default_factory=list)  # files beside the record
+    plots: list[str] = field(default_factory=list)  # files in docs/benchmarks
 
     @staticmethod
     def load(name: str, folder: Path = RECORDED) -> Record:
         """Raises FileNotFoundError where nothing of that name is recorded."""
-        return Record(**json.loads((folder / f"{name}.json").read_text()))
+        found = json.loads((folder / f"{name}.json").read_text())
+        return Record(**{**found, "rows": [{**_UNSET, **row} for row in found["rows"]]})
 
     def save(self, folder: Path = RECORDED) -> Path:
+        """With a row a line, so that a difference of figures can be read."""
         file = folder / f"{self.name}.json"
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n")
+        head = {key: value for key, value in asdict(self).items() if key != "rows"}
+        keys = ("name", "value", *_UNSET)
+        rows = [{k: row[k] for k in keys if k not in _UNSET or row.get(k, _UNSET[k]) != _UNSET[k]} for row in self.rows]
+        lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in rows)
+        text = json.dumps(head, indent=0, ensure_ascii=False)[:-2]
+        file.write_text(f'{text},\n"rows": [\n{lines}\n]\n}}\n')
         return file
 
     def markdown(self) -> str:
-        """Where it comes from, the table, the plots."""
-        repeated = f", {self.runs} runs" if self.runs > 1 else ""
-        origin = f"`{self.command}`{repeated}; commit {self.commit}; {self.machine}; {self.date}"
-        folder = RECORDED.relative_to(ROOT)
-        plots = [f"![{plot}]({folder}/{plot})" for plot in self.plots]
-        return "\n\n".join([origin, self.table.strip() or pivot.markdown(self.rows), *plots])
+        """Where it comes from, the tables, the plots."""
+        repeated = f" {self.runs} runs." if self.runs > 1 else ""
+        note = f" Made so: {self.note}." if self.note else ""
+        origin = f"Recorded {self.date} at commit {self.commit} on {self.machine}.{repeated}{note} Command:"
+        pictures = [f"![{Path(plot).stem.replace('_', ' ')}]({plot})" for plot in self.plots]
+        command = textwrap.wrap(self.command, pivot.WIDTH - 2, break_long_words=False, break_on_hyphens=False)
+        return "\n\n".join([
+            textwrap.fill(origin, pivot.WIDTH, break_long_words=False, break_on_hyphens=False),
+            "\n".join(["```", " \\\n  ".join(command), "```"]),
+            pivot.markdown(self.rows),
+            *pictures,
+        ])  # fmt: skip
 
 
 def merge(runs: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -87,17 +103,23 @@ def merge(runs: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
 
 
 def render(text: str, folder: Path = RECORDED) -> str:
-    """BENCHMARKS.md with the tables of everything that is recorded; a table of what is not says so."""
+    """A document with what is recorded in its blocks; a block of what is not says so."""
 
     def block(match: re.Match[str]) -> str:
         name = match[2]
-        if (folder / f"{name}.json").exists():
+        if name == "figures":
+            body = figures.markdown(lambda of: Record.load(of, folder).rows)
+        elif (folder / f"{name}.json").exists():
             body = Record.load(name, folder).markdown()
         else:
             body = "*Not recorded yet.*"
         return f"{match[1]}\n{body}\n\n{match[3]}"
 
     return _BLOCK.sub(block, text)
+
+
+def documents() -> list[Path]:
+    return [DOCUMENT, *sorted(PAGES.glob("*.md"))]
 
 
 def read_rows(files: Iterable[Path]) -> list[list[dict[str, Any]]]:
@@ -107,22 +129,24 @@ def read_rows(files: Iterable[Path]) -> list[list[dict[str, Any]]]:
         rows = json.loads(file.read_text())
         if not isinstance(rows, list) or not all(isinstance(r, dict) and {"name", "value"} <= set(r) for r in rows):
             raise ValueError(f"{file}: no rows of a benchmark; they are written with --json FILE")
-        runs.append([{"unit": "", "goal": "", "met": None, **row} for row in rows])
+        runs.append([{**_UNSET, **row} for row in rows])
     return runs
 
 
-def record(name: str, files: list[Path], command: str, made_in: Path | None = None, folder: Path = RECORDED) -> Record:
-    """Merges the runs in `files`, takes table.md and *.svg from `made_in`, saves and returns the record."""
+def record(
+    name: str, files: list[Path], command: str, made_in: Path | None = None, note: str = "", folder: Path = RECORDED,
+    pages: Path = PAGES,
+) -> Record:  # fmt: skip
+    """Merges the runs in `files`, copies *.svg from `made_in` to `pages`, saves and returns the record."""
+    copied = []
+    for plot in sorted(made_in.glob("*.svg")) if made_in else []:
+        copied.append(f"{name}_{plot.name}")
+        pages.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(plot, pages / copied[-1])
     rows = merge(read_rows(files))
-    table, plots = "", []
-    if made_in is not None:
-        own = made_in / "table.md"
-        table = own.read_text() if own.exists() else ""
-        for plot in sorted(made_in.glob("*.svg")):
-            plots.append(f"{name}_{plot.name}")
-            (folder / plots[-1]).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(plot, folder / plots[-1])
-    entry = Record(name, command, commit(), machine(), time.strftime("%Y-%m-%d"), len(files), rows, table, plots)
+    entry = Record(
+        name, command, commit(), machine(), time.strftime("%Y-%m-%d"), len(files), note, rows, copied
+    )  # fmt: skip
     entry.save(folder)
     return entry
 
@@ -132,7 +156,8 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("name", nargs="?", help="such as transport, or quick/transport")
     parser.add_argument("files", nargs="*", type=Path, help="rows, from --json")
     parser.add_argument("--command", help="how they were made; default: python -m bench.NAME")
-    parser.add_argument("--from", type=Path, dest="made_in", help="folder of the run, for table.md and *.svg")
+    parser.add_argument("--note", default="", help="what the reader must know besides: other work on the machine")
+    parser.add_argument("--from", type=Path, dest="made_in", help="folder of the run, for *.svg")
     options = parser.parse_args(arguments)
     if options.name:
         if not options.files:
@@ -142,9 +167,11 @@ def run(arguments: list[str]) -> int:
             print(f"{options.name} measured nothing here: its record stays as it is")
             return 0
         command = options.command or f"python -m bench.{stem}" + (" --quick" if quick else "")
-        record(options.name, options.files, command.strip(), options.made_in)
-    if DOCUMENT.exists():
-        DOCUMENT.write_text(render(DOCUMENT.read_text()))
+        record(options.name, options.files, command.strip(), options.made_in, options.note)
+    for document in documents():
+        document.write_text(render(document.read_text()))
+    for name, svg in figures.plots_of(lambda of: Record.load(of).rows).items():
+        plots.write(PAGES / f"{name}.svg", svg)
     return 0
 
 

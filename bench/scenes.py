@@ -13,29 +13,29 @@ from pathlib import Path
 import numpy as np
 
 from bench import plots
-from bench.runs import ROOT, Matrix, Run, available_scenes, choices, commit, figure, folder, machine, said
+from bench.runs import Matrix, Run, available_scenes, choices, figure, folder, said
 from bench.table import Row, main
 from mvsgs_core.evaluation import svg
 
-# column: path in the report, digits, unit of the rows
+# column: path in the report, unit
 COLUMNS = {
-    "KF PSNR": ("rendering.keyframes.psnr", 2, "dB"),
-    "held-out PSNR": ("rendering.held_out.psnr", 2, "dB"),
-    "all PSNR": ("rendering.all.psnr", 2, "dB"),
-    "held-out, unrefined": ("rendering_before_refinement.held_out.psnr", 2, "dB"),
-    "SSIM": ("rendering.held_out.ssim", 3, ""),
-    "LPIPS": ("rendering.held_out.lpips", 3, ""),
-    "ATE": ("trajectory.ate_rmse", 4, ""),
-    "ATE %": ("trajectory.ate_percent", 2, "% of the path"),
-    "abs rel": ("depth.abs_rel", 3, ""),
-    "inliers": ("depth.inlier_ratio", 3, ""),
-    "complete": ("depth.completeness", 3, ""),
-    "KFs": ("trajectory.keyframes", 0, ""),
-    "KF/s": ("time.keyframes_per_second", 2, "1/s"),
-    "wall s": ("time.wall", 1, "s"),
-    "splats": ("map.splats", 0, ""),
-    "MB": ("map.bytes", 1, "MB"),
-    "peak MB": ("memory", 0, "MB"),
+    "KF PSNR": ("rendering.keyframes.psnr", "dB"),
+    "held-out PSNR": ("rendering.held_out.psnr", "dB"),
+    "all PSNR": ("rendering.all.psnr", "dB"),
+    "held-out, unrefined": ("rendering_before_refinement.held_out.psnr", "dB"),
+    "SSIM": ("rendering.held_out.ssim", ""),
+    "LPIPS": ("rendering.held_out.lpips", ""),
+    "ATE": ("trajectory.ate_rmse", ""),
+    "ATE %": ("trajectory.ate_percent", "% of the path"),
+    "abs rel": ("depth.abs_rel", ""),
+    "inliers": ("depth.inlier_ratio", ""),
+    "complete": ("depth.completeness", ""),
+    "KFs": ("trajectory.keyframes", ""),
+    "KF/s": ("time.keyframes_per_second", "1/s"),
+    "wall s": ("time.wall", "s"),
+    "splats": ("map.splats", ""),
+    "MB": ("map.bytes", "MB"),
+    "peak MB": ("memory", "MB"),
 }
 _FACTORS = {"MB": 1e-6, "peak MB": 1e-6}
 
@@ -65,30 +65,6 @@ def value(run: Run, column: str) -> float | None:
     return None if found is None else found * _FACTORS.get(column, 1.0)
 
 
-def markdown(runs: list[Run]) -> str:
-    """One row for each scene and variant: the mean over seeds, with half the spread where there are several."""
-    names = ["scene", "variant", "runs", *COLUMNS]
-    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
-    for scene, variant in dict.fromkeys((r.scene, r.variant) for r in runs):
-        group = [r for r in runs if (r.scene, r.variant) == (scene, variant)]
-        good = [r for r in group if r.report is not None]
-        cells = [scene, variant, f"{len(good)}" if len(good) == len(group) else f"{len(good)} of {len(group)}"]
-        lines.append("| " + " | ".join(cells + [_cell(good, column) for column in COLUMNS]) + " |")
-        if scene in PAPER:
-            psnr, ssim, lpips = PAPER[scene]
-            lines.append(f"| {scene} | *the paper* | | *{psnr}* | | | | *{ssim}* | *{lpips}* |" + " |" * 11)
-    return "\n".join(lines)
-
-
-def _cell(runs: list[Run], column: str) -> str:
-    values = [v for v in (value(r, column) for r in runs) if v is not None]
-    if not values:
-        return "–"
-    digits = COLUMNS[column][1]
-    spread = f" ±{(max(values) - min(values)) / 2:.{digits}f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.{digits}f}{spread}"
-
-
 def time_against_error(runs: list[Run]) -> str:
     """Held-out PSNR over wall time, one color a variant."""
     series = []
@@ -100,16 +76,23 @@ def time_against_error(runs: list[Run]) -> str:
 
 
 def rows(runs: list[Run]) -> list[Row]:
+    """Of each scene and variant the mean over the seeds, with half their range; the paper's figures; failures."""
     found = []
-    for run in runs:
-        name = f"{run.scene}/{run.variant}/seed {run.seed}"
-        if run.report is None:
-            found.append(Row(f"{name}: finished", said(run), "", "a report", False))
-            continue
-        for column in COLUMNS:
-            measured = value(run, column)
-            if measured is not None:
-                found.append(Row(f"{name}: {column}", measured, COLUMNS[column][2]))
+    for scene, variant in dict.fromkeys((run.scene, run.variant) for run in runs):
+        group = [run for run in runs if (run.scene, run.variant) == (scene, variant)]
+        for column, (_, unit) in COLUMNS.items():
+            values = [v for v in (value(run, column) for run in group) if v is not None]
+            if values:
+                spread = (max(values) - min(values)) / 2 if len(values) > 1 else None
+                found.append(Row(f"{scene}/{variant}: {column}", float(np.mean(values)), unit, spread=spread))
+        found += [
+            Row(f"{scene}/{variant}/seed {run.seed}: finished", said(run), "", "a report", False)
+            for run in group
+            if run.report is None
+        ]
+    for scene in dict.fromkeys(run.scene for run in runs if run.scene in PAPER):
+        published = zip(("all PSNR", "SSIM", "LPIPS"), PAPER[scene], ("dB", "", ""))
+        found += [Row(f"{scene}/the paper: {column}", measured, unit) for column, measured, unit in published]
     return found
 
 
@@ -138,11 +121,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     output = folder(options, "scenes")
     gather: Callable[[Path], list[Run]] = matrix.collect if options.collect else matrix.run
     runs = gather(output)
-    command = " ".join(["python", *matrix.command(output)[1:]]).replace(str(ROOT), "$PWD")
-    text = f"{markdown(runs)}\n\n{machine()}; commit {commit()}; `{command}`\n"
-    (output / "table.md").write_text(text)
     plots.write(output / "time_against_error.svg", time_against_error(runs))
-    print(text)
     return rows(runs)
 
 

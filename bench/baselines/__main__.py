@@ -246,29 +246,6 @@ def compare(scene: str, options: argparse.Namespace, overrides: list[str], made:
     return rows + map_rows(scene, ours, baseline.model, trained)
 
 
-def markdown(rows: list[Row]) -> str:
-    """A table of poses and one of maps, a line each scene and method, from rows named "scene: kind, method: figure"."""
-    tables: dict[str, dict[tuple[str, str], dict[str, str]]] = {"poses": {}, "map": {}}
-    others = []
-    for row in rows:
-        scene, method, *figure_name = row.name.split(": ", 2)
-        kind, _, method = method.partition(", ")
-        shown = "–" if row.value is None else f"{row.value:.4g}" if isinstance(row.value, float) else str(row.value)
-        if kind in tables and figure_name:
-            tables[kind].setdefault((scene, method), {})[figure_name[0]] = f"{shown} {row.unit}".strip()
-        else:
-            verdict = f" ({row.goal}{'' if row.met else ': no'})" if row.goal else ""
-            others.append(f"{row.name}: {shown} {row.unit}".rstrip() + verdict)
-    text = []
-    for kind, lines in tables.items():
-        names = list(dict.fromkeys(name for figures in lines.values() for name in figures))
-        text += [f"| scene | {kind} | " + " | ".join(names) + " |", "|---|---|" + "---:|" * len(names)]
-        for (scene, method), figures in lines.items():
-            text.append(f"| {scene} | {method} | " + " | ".join(figures.get(name, "") for name in names) + " |")
-        text.append("")
-    return "\n".join([*text, "\n\n".join(others)]) + "\n"
-
-
 def measure(options: argparse.Namespace) -> list[Row]:
     scenes = options.scenes.split(",")
     overrides = list(options.overrides)
@@ -277,8 +254,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
         overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
     made = pieces.Pieces.of(options, folder(options, "baselines"))
     rows = [row for scene in scenes for row in compare(scene, options, overrides, made)]
-    (made.output / "table.md").write_text((markdown(rows) + made.note).strip() + "\n")
-    return rows
+    return rows + made.rows()
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

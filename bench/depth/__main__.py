@@ -4,17 +4,15 @@ Inliers: kept pixels within 2 % (synthetic) or 5 % (real) of the true depth. Com
 true depth. Kinect depth is a noisy sensor's, without values at edges and on shiny or far surfaces: these pixels are not
 scored; nor are those of icl_nuim's files that are wrong along edges (30 % off their surroundings) and in the far.
 "tracked": poses, scale and range are the tracker's, and each map is scaled by its median ratio to the truth. With true
-poses the range comes from coarse depth made from the truth with holes, noise and outliers (depth_data.py).
+poses the range comes from coarse depth made from the truth with holes, noise and outliers (data.py).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 from bench.depth.baselines import baseline_rows
 from bench.depth.calibration import calibration_rows
@@ -197,19 +195,6 @@ def time_section(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def map_section(options: argparse.Namespace) -> list[Row]:
-    """The paper's A (tracker's depth), B (+ stereo), C (+ filter), from the recorded `python -m bench.ablation`."""
-    file = Path(__file__).with_name("recorded") / "ablation.json"
-    recorded: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"rows": [], "commit": ""}
-    wanted = tuple(f"{variant}: held-out PSNR, change" for variant in "ABC")
-    rows = [
-        Row(f"map, {row['name']} (recorded by bench.ablation at {recorded['commit']})", row["value"], row["unit"])
-        for row in recorded["rows"]
-        if row["name"].endswith((*wanted, "full: held-out PSNR"))
-    ]
-    return rows or [Row("map: run python -m bench.ablation and record it first", None)]
-
-
 SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "quality": partial(quality_section, area=SMALL, tracked=False),
     "tracked": partial(quality_section, area=SMALL, tracked=True),
@@ -227,7 +212,6 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "failures": lambda options: failure_rows(SMALL, QUICK if options.quick else None),
     "time": time_section,
     "kernel": lambda options: kernel_rows(options.quick),
-    "map": map_section,
 }
 
 

@@ -93,7 +93,7 @@ def curve_rows(load: Loader, area: int, align: bool, quick: bool, output: Path) 
     ordered = {curve: sorted(entries, key=lambda entry: entry[1]) for curve, entries in series.items()}
     axes = ("processor seconds a keyframe", "kept and right, part of the true depth")
     plot = plots.front_plot(ordered, (default.seconds, default.right), *axes)
-    plots.write(output / f"depth_{name.replace(', ', '_')}.svg", plot)
+    plots.write(output / f"{name.replace(', ', '_')}.svg", plot)
     return rows
 
 

@@ -65,11 +65,13 @@ def skip_variants(area: int) -> dict[str, Variant]:
 def variant_rows(title: str, scene: Scene, default: Run, variants: Mapping[str, Variant], align: bool) -> list[Row]:
     """Each variant's figures, and its changes against the default."""
     base = _figures(scene, default, align)
-    rows = [Row(f"{title}, {scene.name}, default: {name}", value, unit) for name, (value, unit) in base.items()]
+    rows = [Row(f"{title}, {scene.name}: default: {name}", value, unit) for name, (value, unit) in base.items()]
     for variant, (cascade, fusion) in variants.items():
         found = _figures(scene, run(scene.views, cascade, fusion), align)
-        text = ", ".join(f"{name} {found[name][0] - value:+.3g}" for name, (value, _) in base.items())
-        rows.append(Row(f"{title}, {scene.name}, {variant}: change", text))
+        rows += [
+            Row(f"{title}, {scene.name}: {variant}: {name}, change", f"{found[name][0] - value:+.3g}", unit)
+            for name, (value, unit) in base.items()
+        ]
     return rows
 
 
@@ -82,6 +84,6 @@ def _figures(scene: Scene, found: Run, align: bool) -> dict[str, tuple[float, st
         "unfiltered error": (raw.relative_error, ""),
         "inliers": (kept.inliers, ""),
         "completeness": (kept.completeness, ""),
-        "processor ms": (1000 * found.processor_seconds, "ms"),
+        "processor time": (1000 * found.processor_seconds, "ms"),
         "fraction skipped": (float(np.sum(totals) / everything) if everything else 0.0, ""),
     }

@@ -126,7 +126,7 @@ def _rows(
         peak = max(megabytes for _, megabytes in taken)
         rows.append(
             at_most(
-                f"{name}: {node}, memory at the end over that after {settled}",
+                f"{name}: {node}: memory at the end over that after {settled}",
                 after / before,
                 f"x ({after:.0f} MB; peak of the run {peak:.0f} MB)",
                 GROWTH,

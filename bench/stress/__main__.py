@@ -108,8 +108,8 @@ def rows_of(
     broken = outcome.broken(easy, known_poses)
     verdict = ("broken, " if broken else "holds, ") + ("map kept" if outcome.kept_a_map else "no map")
     passed = outcome.finished and (not broken or outcome.reported)
-    rows.append(Row(f"{name}: outcome", f"{verdict}; it said: {outcome.said}", "", "holds, or says that not", passed))
-    return rows
+    rows.append(Row(f"{name}: outcome", verdict, "", "holds, or says that not", passed))
+    return rows if outcome.said == "nothing" else [*rows, Row(f"{name}: it said", outcome.said)]
 
 
 def setting(difficulty: str, strength: float) -> Setting:
@@ -119,26 +119,23 @@ def setting(difficulty: str, strength: float) -> Setting:
     return Setting(f"{difficulty}_{strength:g}".replace("+", ""), tuple(given))
 
 
-def difficulties(options: argparse.Namespace, overrides: list[str], easy: Outcome, lines: list[str]) -> list[Row]:
+def difficulties(options: argparse.Namespace, overrides: list[str], easy: Outcome) -> list[Row]:
     chosen = {"covered": (20,), "noise": (12,)} if options.quick else DIFFICULTIES
     rows = []
     for name, strengths in chosen.items():
         settings = [setting(name, strength) for strength in strengths]
         matrix = Matrix(["room"], overrides=overrides, jobs=options.jobs, settings=settings)
         for strength, run in zip(strengths, _go(matrix, options, f"difficulties/{name}")):  # none where it is missing
-            outcome = Outcome.of(run)
-            rows += rows_of(f"{name} {strength:g}", outcome, easy, same=name in SAME)
-            lines.append(_line(f"{name} {strength:g}", outcome, rows[-1]))
+            rows += rows_of(f"{name} {strength:g}", Outcome.of(run), easy, same=name in SAME)
     return rows
 
 
-def real(options: argparse.Namespace, lines: list[str]) -> list[Row]:
+def real(options: argparse.Namespace) -> list[Row]:
     matrix = Matrix(REAL, overrides=SMALL[4:], jobs=options.jobs)
     rows = []
     for run in _go(matrix, options, "real"):
-        outcome = Outcome.of(run)
-        rows += rows_of(run.scene, outcome, None, known_poses=figure(run.report, "trajectory.path_length") is not None)
-        lines.append(_line(run.scene, outcome, rows[-1]))
+        known_poses = figure(run.report, "trajectory.path_length") is not None
+        rows += rows_of(run.scene, Outcome.of(run), None, known_poses=known_poses)
     return rows
 
 
@@ -195,19 +192,6 @@ def _go(matrix: Matrix, options: argparse.Namespace, name: str) -> list[Run]:
     return found
 
 
-def _line(name: str, outcome: Outcome, verdict: Row) -> str:
-    def cell(value: float | None, digits: int) -> str:
-        return "–" if value is None else f"{value:.{digits}f}"
-
-    of = "" if outcome.scored == "held-out" else f" of {outcome.scored}"
-    cells = [
-        name, cell(outcome.ate, 2), cell(outcome.inliers, 2), cell(outcome.completeness, 2), cell(outcome.psnr, 1) + of,
-        cell(100 * outcome.tracked, 0), "yes" if outcome.kept_a_map else "**no**", "yes" if verdict.met else "**no**",
-        outcome.said.replace("|", "/"),
-    ]  # fmt: skip
-    return "| " + " | ".join(cells) + " |"
-
-
 def measure(options: argparse.Namespace) -> list[Row]:
     groups = ["difficulties"] if options.quick else options.only.split(",")
     unknown = sorted(set(groups) - set(GROUPS))
@@ -216,38 +200,27 @@ def measure(options: argparse.Namespace) -> list[Row]:
     overrides = [*SMALL, *options.overrides]
     if options.quick:
         overrides += ["dataset.stop=70", "mapper.iterations=10", "mapper.refinement=30"]
-    lines = ["| | ATE % | depth inliers | complete | held-out PSNR | tracked % | map | pass | it said |",
-             "|---|---:|---:|---:|---:|---:|---|---|---|"]  # fmt: skip
     options.made = pieces.Pieces.of(options, folder(options, "stress"))
     runs = _go(Matrix(["room"], overrides=overrides), options, "easy")
     if not runs:
         raise SystemExit(f"the easy run, which the others are compared with, is not in {options.made.output}")
     easy = Outcome.of(runs[0])
     rows = rows_of("nothing hard", easy, None)
-    lines.append(_line("nothing hard", easy, rows[-1]))
     if "difficulties" in groups:
-        rows += difficulties(options, overrides, easy, lines)
+        rows += difficulties(options, overrides, easy)
     if "real" in groups:
-        rows += real(options, lines)
-    others: list[Row] = []
+        rows += real(options)
     if "repeats" in groups:
-        others += repeats(options, overrides)
+        rows += repeats(options, overrides)
     if "one_core" in groups:
         pinned = Matrix(["room"], overrides=overrides, prefix=("taskset", "-c", "0"))
-        others += one_run("one core", pinned, options, easy)
+        rows += one_run("one core", pinned, options, easy)
     if "slow_node" in groups:
         slow = "depth_fusion._target_=bench.stress.slow_fusion.SlowFusion"
-        others += one_run(
-            "depth fusion 10 times as slow", Matrix(["room"], overrides=[*overrides, slow]), options, easy
-        )
+        rows += one_run("depth fusion 10 times as slow", Matrix(["room"], overrides=[*overrides, slow]), options, easy)
     if "long" in groups:
-        others += long_run(options)
-    lines += ["", "| | value | goal | met |", "|---|---:|---|---|"]
-    for row in others:
-        value = f"{row.value:.3g}" if isinstance(row.value, float) else str(row.value)
-        lines.append(f"| {row.name} | {value} {row.unit} | {row.goal} | {row.met if row.met is not None else ''} |")
-    (options.made.output / "table.md").write_text("\n".join([*lines, "", options.made.note]).strip() + "\n")
-    return rows + others
+        rows += long_run(options)
+    return rows + options.made.rows()
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench import ablation, curves, memory, plots, record, scenes
+from bench import ablation, curves, memory, plots, scenes
 from bench.baselines import __main__ as baselines
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.runs import CONF, Matrix, Run, Setting, choices, figure, said
@@ -24,15 +23,10 @@ from launch.refusal import GraphError
 from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.mapping.training import TrainingConfig
+from tests.support.benchmarks import BENCHMARKS
 from tests.support.shared_data import ROOT
 
 SEARCH = f"hydra.searchpath=[file://{CONF}]"
-FILES = [*(ROOT / "bench").glob("*.py"), *(ROOT / "bench").glob("*/__main__.py")]
-MAINS = sorted(
-    file.parent.name if file.stem == "__main__" else file.stem
-    for file in FILES
-    if re.search(r"^ +main\(measure", file.read_text(), re.M)
-)
 
 
 def report(psnr: float = 25.0, wall: float = 10.0, **more: Any) -> dict[str, Any]:
@@ -158,14 +152,13 @@ def test_what_a_run_said(tmp_path: Path) -> None:
     assert said(Run("room", "full", 0, tmp_path / "0", None)) == "tracker failed: ValueError: no image"
 
 
-def test_scene_table_has_means_spreads_the_paper_and_failures() -> None:
+def test_scene_rows_are_means_with_spreads_the_papers_and_failures() -> None:
     runs = [a_run(seed=0, psnr=24.0), a_run(seed=1, psnr=26.0), a_run("tum_desk"), Run("fox", "A", 0, Path("x"), None)]
-    lines = scenes.markdown(runs).splitlines()
-    assert len({line.count("|") for line in lines}) == 1
-    assert "25.00 ±1.00" in lines[2]
-    assert "*20.67*" in lines[4]
-    assert "0 of 1" in lines[5]
-    assert any(r.name.startswith("fox/A") and r.met is False for r in scenes.rows(runs))
+    found = {row.name: row for row in scenes.rows(runs)}
+    assert found["room/full: held-out PSNR"] == Row("room/full: held-out PSNR", 25.0, "dB", spread=1.0)
+    assert found["tum_desk/full: held-out PSNR"].spread is None
+    assert found["tum_desk/the paper: all PSNR"].value == 20.67
+    assert found["fox/A/seed 0: finished"].met is False
     assert scenes.time_against_error(runs[:3]).startswith("<svg")
 
 
@@ -177,9 +170,10 @@ def test_ablation_says_sign_size_and_what_is_within_the_spread() -> None:
     assert found.real
     assert found.mean == pytest.approx(-3.0)
     assert found.spread == pytest.approx(0.1)
-    text = ablation.table(runs, ["room"], ["A", "B"])
-    assert "**-3.00 ± 0.10**" in text
-    assert "| +0.05 ± 0.10 |" in text
+    rows = {row.name: row for row in ablation.rows_of(runs, ["room"], ["A", "B"])}
+    assert rows["room: full: held-out PSNR"].spread == pytest.approx(0.1)
+    assert rows["room: A: held-out PSNR, change"].value == "-3.00 ± 0.10"
+    assert rows["room: B: held-out PSNR, change"].value == "~ +0.05 ± 0.10"
 
 
 def test_an_ablation_of_one_run_calls_nothing_real() -> None:
@@ -187,23 +181,9 @@ def test_an_ablation_of_one_run_calls_nothing_real() -> None:
     found = ablation.difference(runs[1:], runs[:1], "rendering.held_out.psnr")
     assert found is not None
     assert not found.real
-    text = ablation.table(runs, ["room"], ["A"])
-    assert "| -3.00 |" in text
-    assert "±" not in text
-
-
-def test_baselines_stand_in_one_table_of_poses_and_one_of_maps() -> None:
-    rows = [
-        Row("room: poses, ours: ATE", 0.5, "%"), Row("room: poses, COLMAP: ATE", None, "%"),
-        Row("room: map, ours: held-out PSNR", 30.0, "dB"),
-        Row("room: map, COLMAP, equal time: held-out PSNR", 20.0, "dB"),
-        Row("room: map, ours: splats", 9), Row("fox: COLMAP", "no model"),
-    ]  # fmt: skip
-    text = baselines.markdown(rows)
-    assert "| room | poses, ours |" not in text
-    assert "| room | COLMAP | – % |" in text
-    assert "| room | ours | 30 dB | 9 |\n| room | COLMAP, equal time | 20 dB |  |" in text
-    assert text.endswith("fox: COLMAP: no model\n")
+    rows = {row.name: row for row in ablation.rows_of(runs, ["room"], ["A"])}
+    assert rows["room: full: held-out PSNR"].spread is None
+    assert rows["room: A: held-out PSNR, change"].value == "once: -3.00"
 
 
 def test_the_error_of_other_poses_is_taken_over_common_frames_after_alignment() -> None:
@@ -248,8 +228,6 @@ def test_the_offline_map_is_trained_until_twice_the_time_brings_little(
     assert rows["room: COLMAP + splatting, gain by the last doubling of its time"].met
     short = {row.name: row for row in baselines.map_rows("room", ours, model, cut_short)}
     assert not short["room: COLMAP + splatting, gain by the last doubling of its time"].met
-    text = baselines.markdown(list(rows.values()))
-    assert text.endswith("gain by the last doubling of its time: 0.05 dB (< 0.1: converged)\n")
     other = baselines.Ours(report(time={"wall": 9.0, "stages": {"mapper": {"insertion": 6.0}}}), ours.track, {})
     baselines.train_longer(model, other, 1.0, 1, kept)
     assert asked[-1] == 6.0  # results of another time are no start
@@ -280,7 +258,6 @@ def test_curves_average_seeds_and_mark_the_front() -> None:
     assert default is not None
     front = {r.name: r.value for r in curves.rows_of("room", default, others) if "front" in r.name}
     assert list(front.values()) == ["yes", "yes", "no"]
-    assert "**default**" in curves.table("room", default, others)
     assert curves.picture(default, others).startswith("<svg")
 
 
@@ -298,26 +275,30 @@ def test_what_beats_the_default_by_more_than_the_noise_is_named() -> None:
     assert default is not None
     assert default.noise == pytest.approx((0.2, 0.1))
     assert [point.label for point in points if point.beats(default)] == ["fast", "better"]
-    text = curves.table("room", default, points)
-    assert "beaten by more than the noise (± 0.2 s and ± 0.10 dB over the default's runs) by a = fast (-1.2 s" in text
-    assert text.count("beats the default") == 2
-    assert {r.name: r.value for r in curves.rows_of("room", default, points)}["room: default: beaten by"] == (
-        "a = fast, a = better"
-    )
+    rows = {r.name: r.value for r in curves.rows_of("room", default, points)}
+    assert rows["room: default: beaten by"] == "a = fast, a = better"
+    assert rows["room: default: half the range of its wall times"] == pytest.approx(0.2)
+    assert rows["room: default: half the range of its held-out PSNR"] == pytest.approx(0.1)
+    assert rows["room: a fast: splats"] == 1000
     assert "noise (box)" in curves.picture(default, points)
     once, _ = curves.points_of(runs[1:], chosen)
     assert once is not None
-    assert "unknown" in curves.judgement(once, points)
+    assert curves.rows_of("room", once, points)[-1].value == "unknown"
     assert curves.points_of(runs[2:], chosen)[0] is None
 
 
 def test_stress_passes_what_holds_or_says_that_it_does_not() -> None:
     easy = stress.Outcome.of(a_run())
-    assert stress.rows_of("x", easy, None)[-1].met
+
+    def outcome(found: stress.Outcome, beside: stress.Outcome | None = easy) -> Row:
+        return next(row for row in stress.rows_of("x", found, beside) if row.name == "x: outcome")
 
     def verdict(**trajectory: Any) -> Row:
         path = {**report()["trajectory"], **trajectory}
-        return stress.rows_of("x", stress.Outcome.of(a_run(trajectory=path)), easy)[-1]
+        return outcome(stress.Outcome.of(a_run(trajectory=path)))
+
+    assert outcome(easy, None).met
+    assert not any(row.name == "x: it said" for row in stress.rows_of("x", easy, None))
 
     assert not verdict(ate_percent=30.0).met  # broken, and not a word
     assert verdict(ate_percent=30.0, frames_tracked=50).met
@@ -326,8 +307,9 @@ def test_stress_passes_what_holds_or_says_that_it_does_not() -> None:
     assert mapped.kept_a_map
     assert any(row.name == "fox: keyframes PSNR" and row.value == 22.0 for row in stress.rows_of("fox", mapped, None))
     nothing = stress.Outcome.of(Run("room", "full", 0, Path("x"), None))
-    assert not stress.rows_of("x", nothing, easy)[-1].met  # not even a report
-    assert "no map" in str(stress.rows_of("x", nothing, easy)[-1].value)
+    assert not outcome(nothing).met  # not even a report
+    assert "no map" in str(outcome(nothing).value)
+    assert stress.rows_of("x", nothing, easy)[-1].name == "x: it said"
 
 
 def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
@@ -377,16 +359,8 @@ def test_each_benchmark_explains_itself() -> None:
         "    try: runpy.run_module('bench.' + name, run_name='__main__')\n"
         "    except SystemExit as ended: assert ended.code == 0, name\n"
     )
-    names = [*MAINS, "record", "compare", "baselines.colmap_poses"]
+    names = [*BENCHMARKS, "record", "compare", "baselines.colmap_poses"]
     assert {"scenes", "baselines", "stress", "curves", "ablation"} <= set(names)
     done = subprocess.run([sys.executable, "-c", code, *names], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.count("usage:") == len(names)
-    assert done.stdout.count("--quick") >= len(MAINS)
-
-
-def test_the_document_has_a_place_for_every_benchmark() -> None:
-    text = (ROOT / "BENCHMARKS.md").read_text()
-    for name in MAINS:
-        assert f"<!-- bench:{name} -->" in text, name
-        assert f"<!-- /bench:{name} -->" in text, name
-    assert record.render(text) == text, "tables differ from what is recorded: python -m bench.record"
+    assert done.stdout.count("--quick") >= len(BENCHMARKS)

@@ -31,11 +31,11 @@ def rows(tracker: float, unnamed: float = 1.0) -> dict[str, Row]:
 
 def test_what_grows_with_the_stream_misses_the_goal() -> None:
     found = rows(tracker=20.0)
-    assert found["tracker, memory at the end over that after 200"].met is False
-    assert found["mapper, memory at the end over that after 200"].met is True
-    assert found["mapper, memory at the end over that after 200"].value == 1.0
-    assert "peak of the run 400 MB" in found["mapper, memory at the end over that after 200"].unit
-    assert rows(tracker=5.0)["tracker, memory at the end over that after 200"].met is True
+    assert found["tracker: memory at the end over that after 200"].met is False
+    assert found["mapper: memory at the end over that after 200"].met is True
+    assert found["mapper: memory at the end over that after 200"].value == 1.0
+    assert "peak of the run 400 MB" in found["mapper: memory at the end over that after 200"].unit
+    assert rows(tracker=5.0)["tracker: memory at the end over that after 200"].met is True
 
 
 def test_frames_on_disk_have_a_bound() -> None:

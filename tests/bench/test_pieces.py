@@ -43,7 +43,7 @@ def test_a_resumed_benchmark_runs_only_what_is_missing(tmp_path: Path, ran: list
     assert ran == ["room", "fox"]
     assert [(r.scene, r.seed) for r in both] == [("room", 0), ("room", 1), ("fox", 0), ("fox", 1)]
     assert [r.report for r in both[:2]] == [r.report for r in first]
-    assert resumed.note == ""
+    assert resumed.rows() == []
     Pieces(tmp_path).runs(matrices("room"))
     assert ran == ["room", "fox", "room"]  # a new measurement is one
 
@@ -68,8 +68,9 @@ def test_what_did_not_run_and_other_commits_are_said(tmp_path: Path, ran: list[s
     found = late.runs(matrices("room", "fox", "fountain"))
     assert {r.scene for r in found} == {"room", "fox"}
     assert late.missing == ["fountain"]
-    assert "Runs of the commits abc1234, " in late.note
-    assert "Not run yet: fountain" in late.note
+    said = {row.name: str(row.value) for row in late.rows()}
+    assert said["runs of the commits"].startswith("abc1234, ")
+    assert said["not run yet (--resume goes on with them)"] == "fountain"
     assert Pieces(tmp_path, collect=True).runs(matrices("fountain")) == []
     assert "fountain" not in ran
 
@@ -95,7 +96,5 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
 def test_a_partial_ablation_shows_the_variants_it_has(tmp_path: Path) -> None:
     runs = [Run("room", variant, seed, tmp_path, {"rendering": {"held_out": {"psnr": 20.0 + seed}}})
             for variant in ("full", "A") for seed in (0, 1)]  # fmt: skip
-    text = ablation.table(runs, ["room", "fox"], ["A", "B"])
-    assert "| room | A |" in text
-    assert "| room | B |" not in text
-    assert "| fox | A |" not in text
+    rows = ablation.rows_of(runs, ["room", "fox"], ["A", "B"])
+    assert [row.name for row in rows] == ["room: full: held-out PSNR", "room: A: held-out PSNR, change"]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bench import compare, pivot, record
+from bench import compare, figures, pivot, record
 from bench.table import Row, timed
 
 
@@ -54,7 +54,8 @@ def test_records_are_rendered_between_their_markers_only(tmp_path: Path) -> None
     block = "<!-- bench:{0} -->\n{1}<!-- /bench:{0} -->\n"
     text = "before\n" + block.format("quick/transport", "old\n") + "after\n" + block.format("x", "")
     once = record.render(text, tmp_path)
-    assert once.startswith("before\n<!-- bench:quick/transport -->\n\n`python -m bench.transport`, 2 runs; commit ")
+    assert once.startswith("before\n<!-- bench:quick/transport -->\n\nRecorded 2")
+    assert ". 2 runs. Command:\n\n```\npython -m bench.transport\n```\n" in once.replace(",\n", ", ")
     assert "| latency \\| 99 % | 1.5 ± 0.5 ms | &lt;= 3 |" in once
     assert "old" not in once
     assert "\nafter\n" in once
@@ -86,16 +87,52 @@ def test_a_table_has_fewer_columns_than_lines_and_every_row_once() -> None:
     assert text.count("|") == 5 * 7 + 4 * 5
 
 
-def test_a_benchmarks_own_table_and_plots_are_kept(tmp_path: Path) -> None:
-    run = tmp_path / "run"
+def test_groups_have_tables_of_their_own_and_wide_ones_are_cut() -> None:
+    rows = [row(f"{g}: {s}: f{k}", k) for g in ("one", "two") for s in "abcdefghij" for k in range(9)]
+    text = pivot.markdown(rows)
+    assert text.count("**one**") == text.count("**two**") == 1
+    assert text.count("|  | f0 | f1 | f2 | f3 | f4 |") == text.count("|  | f5 | f6 | f7 | f8 |") == 2
+    sparse = pivot.markdown([*(r for r in rows[:90] if r["name"] < "one: j: f5")])
+    assert sparse.count("| j |") == 1  # not in the second, where it has nothing
+
+
+def test_what_has_no_room_in_a_cell_is_told_below() -> None:
+    text = pivot.markdown([row("room: error", 1.0), row("room: it said", "word " * 60)])
+    assert text.startswith("|  | value |")
+    below = text.partition("\n- room: it said: ")[2].splitlines()
+    assert len(below) > 2
+    assert max(map(len, below)) <= pivot.WIDTH
+    assert "said" not in text.partition("\n- ")[0]
+
+
+def test_a_record_has_a_row_a_line_and_comes_back_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "rows.json").write_text(json.dumps([row("a", 1.0), row("b", "word", "x", "<= 2", True)]))
+    made = record.record("curves", [tmp_path / "rows.json"], "c", note="on a Sunday", folder=tmp_path)
+    lines = (tmp_path / "curves.json").read_text().splitlines()
+    assert '{"name": "a", "value": 1.0},' in lines
+    assert '{"name": "b", "value": "word", "unit": "x", "goal": "<= 2", "met": true}' in lines
+    assert record.Record.load("curves", tmp_path) == made
+    assert "Made so: on a Sunday." in made.markdown()
+
+
+def test_plots_of_a_run_go_beside_the_page(tmp_path: Path) -> None:
+    run, pages = tmp_path / "run", tmp_path / "pages"
     run.mkdir()
-    (run / "table.md").write_text("| own |\n")
     (run / "room.svg").write_text("<svg/>")
     (tmp_path / "rows.json").write_text(json.dumps([row("a", 1.0)]))
-    made = record.record("curves", [tmp_path / "rows.json"], "c", run, tmp_path / "kept")
-    assert "| own |" in made.markdown()
-    assert "curves_room.svg" in made.markdown()
-    assert (tmp_path / "kept" / "curves_room.svg").read_text() == "<svg/>"
+    made = record.record("curves", [tmp_path / "rows.json"], "c", run, folder=tmp_path / "kept", pages=pages)
+    assert "![curves room](curves_room.svg)" in made.markdown()
+    assert (pages / "curves_room.svg").read_text() == "<svg/>"
+
+
+def test_the_figures_name_rows_that_are_recorded_and_benchmarks_that_print_them() -> None:
+    text = figures.markdown(lambda name: record.Record.load(name).rows)
+    assert len(text.splitlines()) == 2 + len(figures.FIGURES) == 12
+    with pytest.raises(KeyError, match="ATE"):
+        figures.markdown(lambda name: [row("other", 1.0)])
+    drawn = figures.plots_of(lambda name: record.Record.load(name).rows)
+    assert drawn["poses"].count("<rect") >= 10
+    assert drawn["maps"].count("<circle") >= 6
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,98 @@
+"""The ten figures and the two plots of BENCHMARKS.md: each of ours beside its baseline, from what is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench import pivot
+from mvsgs_core.evaluation import svg
+
+Rows = Callable[[str], list[dict[str, Any]]]  # those recorded of a benchmark, by its name; FileNotFoundError
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Two rows of one record, side by side."""
+
+    what: str
+    benchmark: str
+    ours: str  # name of the row
+    baseline: str  # what it is
+    theirs: str  # name of its row
+
+
+_REDKITCHEN, _FR1 = "RedKitchen, 100 frames at 240x180", "freiburg1_xyz, 100 frames at 240x180"
+_COLMAP, _OFFLINE = "COLMAP, same frames", "COLMAP + offline splatting, equal optimization time"
+FIGURES = (
+    Figure(f"Position error, {_REDKITCHEN}, of the path", "baselines",
+           "redkitchen: poses, ours: ATE, frames that COLMAP has", _COLMAP,
+           "redkitchen: poses, COLMAP: ATE, frames that COLMAP has"),
+    Figure(f"Position error, {_FR1}, of the path", "baselines",
+           "tum_fr1_xyz: poses, ours: ATE, frames that COLMAP has", _COLMAP,
+           "tum_fr1_xyz: poses, COLMAP: ATE, frames that COLMAP has"),
+    Figure(f"Time to poses, {_REDKITCHEN}", "baselines",
+           "redkitchen: poses, ours: seconds", _COLMAP, "redkitchen: poses, COLMAP: seconds"),
+    Figure("Depth of the room, true poses: kept pixels within 2 %, at 0.81 of completeness", "depth",
+           "room, 320x240: inliers", "plane sweep of OpenCV's parts", "room: plane sweep inliers at completeness 0.81"),
+    Figure("Depth of RedKitchen, tracked poses: kept pixels within 5 %, at 0.56 of completeness", "depth",
+           "redkitchen, tracked, 320x240: inliers", "plane sweep of OpenCV's parts",
+           "redkitchen, tracked: plane sweep inliers at completeness 0.56"),
+    Figure(f"Time from frames to map, {_REDKITCHEN}", "baselines",
+           "redkitchen: map, ours: seconds, frames to map", _OFFLINE,
+           "redkitchen: map, COLMAP + splatting, equal time: seconds, frames to map"),
+    Figure(f"Held-out PSNR, {_REDKITCHEN}", "baselines",
+           "redkitchen: map, ours: held-out PSNR", _OFFLINE,
+           "redkitchen: map, COLMAP + splatting, equal time: held-out PSNR"),
+    Figure(f"Held-out PSNR, {_FR1}", "baselines",
+           "tum_fr1_xyz: map, ours: held-out PSNR", _OFFLINE,
+           "tum_fr1_xyz: map, COLMAP + splatting, equal time: held-out PSNR"),
+    Figure("Rasterizer, 640x480, 50,000 Gaussians, both ways", "rasterizer",
+           "640x480 50k gaussian: both", "roofline of the machine", "640x480 50k gaussian: roofline"),
+    Figure("Transport of a 640x480 image, median", "transport",
+           "ipc, VGA RGB (0.9 MB): latency, median", "plain pyzmq",
+           "ipc, VGA RGB (0.9 MB): latency, median, plain pyzmq"),
+)  # fmt: skip
+
+
+def markdown(rows: Rows) -> str:
+    """Raises FileNotFoundError where a benchmark is not recorded, KeyError where its record lacks a row."""
+    lines = []
+    for figure in FIGURES:
+        found = {row["name"]: row for row in rows(figure.benchmark)}
+        ours, theirs = (pivot.value(found[name], found[name]["unit"]) for name in (figure.ours, figure.theirs))
+        page = f"[`python -m bench.{figure.benchmark}`](docs/benchmarks/{figure.benchmark}.md)"
+        lines.append([figure.what, f"**{ours}**", theirs, figure.baseline, page])
+    return pivot.table(["", "ours", "baseline", "which is", "printed by"], lines, numbers=2)
+
+
+def plots_of(rows: Rows) -> dict[str, str]:
+    """SVG by name: position errors over COLMAP's, and held-out PSNR over the time to the map."""
+    ratio = ": ATE / pycolmap's, same frames"
+    errors = {
+        row["name"].removesuffix(ratio): float(row["value"])
+        for row in rows("tracking")
+        if row["name"].endswith(ratio) and isinstance(row["value"], float)
+    }
+    found: dict[str, dict[str, dict[str, float]]] = {}  # way: method: figure
+    for row in rows("baselines"):
+        scene, kind, *rest = row["name"].split(": ")
+        if kind.startswith("map, ") and rest:
+            way = f"{scene}, {'ours' if kind == 'map, ours' else 'COLMAP'}"
+            found.setdefault(way, {}).setdefault(kind, {})[rest[0]] = row["value"]
+    series = [
+        svg.Series(
+            way,
+            np.array([figures["seconds, frames to map"] for figures in methods.values()]),
+            np.array([figures["held-out PSNR"] for figures in methods.values()]),
+            points=True,
+        )
+        for way, methods in found.items()
+    ]
+    return {
+        "poses": svg.bars(dict(sorted(errors.items(), key=lambda entry: entry[1])), "x"),
+        "maps": svg.plot(series, "seconds from frames to map", "held-out PSNR, dB", width=640),
+    }
