@@ -10,7 +10,7 @@ import numpy as np
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import CELL, TrackingImage
-from mvsgs_core.tracking.matching.flow import DenseInverseSearch, Matches, sample_field, spread
+from mvsgs_core.tracking.matching.flow import DenseInverseSearch, Matches, propagate, sample_field
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.places.localization import Localization, localize
 
@@ -47,24 +47,24 @@ class FrontEnd:
         self.solver = Solver(steps=8, robust_scale=1.0, threads=threads)
         self.reference: TrackingImage | None = None
         self.last: TrackingImage | None = None
-        self.carried = np.zeros((0, 2))  # (M, 2) where the reference's points were, or should have been, last
+        self.propagated = np.zeros((0, 2))  # (M, 2) where the reference's points were, or should have been, last
         self.pose: np.ndarray | None = None  # (4, 4) cam_from_world of the last frame
         self.step: Step | None = None
 
     def refer_to(self, image: TrackingImage) -> None:
         """Starts over from a new reference keyframe, which is also the last frame."""
         self.reference = self.last = image
-        self.carried = image.cells.points.astype(np.float64)
+        self.propagated = image.cells.points.astype(np.float64)
         self.step = None
 
     def resume(self, reference: TrackingImage, image: TrackingImage, matches: Matches, pose: np.ndarray | None) -> None:
         """Goes on from a frame whose matches with another keyframe, and pose (4, 4), are known."""
         self.refer_to(reference)
         alive = matches.alive
-        near = spread(
+        near = propagate(
             reference.cells.points[alive], (matches.target - reference.cells.points)[alive], reference.cells.points
         )
-        self.carried = np.where(alive[:, None], matches.target, near)
+        self.propagated = np.where(alive[:, None], matches.target, near)
         self.last, self.pose = image, pose
 
     def follow(self, image: TrackingImage, started: bool) -> Step:
@@ -78,7 +78,7 @@ class FrontEnd:
                 self.step.matches, self.step.fraction, self.step.flow, True, self.step.localization if started else None
             )
         self._set_velocity(image, field)
-        guess = self.carried + sample_field(field, self.carried)
+        guess = self.propagated + sample_field(field, self.propagated)
         matches, fraction = self.matcher.match(self.reference, image, guess, self.config.feature_fraction)
         alive = matches.alive
         flow = np.inf
@@ -93,7 +93,7 @@ class FrontEnd:
         if self.is_lost(step):
             image.velocity = None
         else:
-            self.carried = np.where(alive[:, None], matches.target, np.nan_to_num(guess, nan=-1e3))
+            self.propagated = np.where(alive[:, None], matches.target, np.nan_to_num(guess, nan=-1e3))
             self.last = image
             self.pose = found.cam_from_world if found else None
             self.step = step

@@ -11,7 +11,7 @@ from mvsgs_core.tracking.estimation.focal import FocalConfig, reconstruct_with_u
 from mvsgs_core.tracking.estimation.structure_from_motion import ReconstructionCriteria, reconstruct
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.matching.flow import Matches, spread
+from mvsgs_core.tracking.matching.flow import Matches, propagate
 from mvsgs_core.tracking.matching.matcher import Matcher
 
 
@@ -110,14 +110,14 @@ class Initializer:
                     continue
                 start, seen = old.cells.points.astype(np.float64), link.weight > 0
                 hop = link.target.T[seen].astype(np.float64)
-                there = spread(near[matches.alive], (matches.target - near)[matches.alive], hop)
-                guess = spread(start[seen], there - start[seen], start)
+                there = propagate(near[matches.alive], (matches.target - near)[matches.alive], hop)
+                guess = propagate(start[seen], there - start[seen], start)
                 forward, _ = self.matcher.match(old, image, guess, fraction)
             self.graph.connect(index, image.index, forward, fraction)
             if forward.alive.sum() < 30:
                 continue
             at = forward.target[forward.alive]
-            guess = spread(at, old.cells.points[forward.alive] - at, points)
+            guess = propagate(at, old.cells.points[forward.alive] - at, points)
             self.graph.connect(image.index, index, self.matcher.match(image, old, guess, fraction)[0], fraction)
 
 

@@ -41,7 +41,7 @@ class LocalMap:
         self, image: TrackingImage, cam_from_world: np.ndarray, segment: int, matches: dict[int, Matches]
     ) -> Keyframe:
         """Adds a keyframe with its pose; `matches`: points of older keyframes, by index, found in it."""
-        inverse_depth = self._carry_depth(image, cam_from_world, matches)
+        inverse_depth = self._propagate_depth(image, cam_from_world, matches)
         keyframe = Keyframe(image, cam_from_world, inverse_depth, np.zeros(len(inverse_depth)), segment)
         earlier = self.members(segment)
         self.graph.add(keyframe)
@@ -157,7 +157,7 @@ class LocalMap:
             self.graph.rescale(window, float(np.median(ratios)) if ratios else 1.0)
         return solution
 
-    def _carry_depth(self, image: TrackingImage, pose: np.ndarray, matches: dict[int, Matches]) -> np.ndarray:
+    def _propagate_depth(self, image: TrackingImage, pose: np.ndarray, matches: dict[int, Matches]) -> np.ndarray:
         """Inverse depths (M,): the median of the five nearest points of other keyframes found or expected here."""
         at, depths = [], []
         for index, found in matches.items():

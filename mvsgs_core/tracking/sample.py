@@ -26,7 +26,7 @@ def sample(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: n
     use = located(graph, index, matches, cam_from_world)
     if (use & keyframe.triangulated).sum() >= 20:  # as in `localize`: what is not triangulated says nothing then
         use &= keyframe.triangulated
-    chosen = _spread(matches.target, np.flatnonzero(use), keyframe.image.size)
+    chosen = _thinned(matches.target, np.flatnonzero(use), keyframe.image.size)
     few = np.zeros(len(use))
     few[chosen] = 1.0
     alone = localize(graph, {index: Matches(matches.target, few, matches.shift)}, cam_from_world, Solver(steps=4))
@@ -51,7 +51,7 @@ def restored(points: bytes, cells: int) -> Matches:
     return Matches(target, weight, shift)
 
 
-def _spread(target: np.ndarray, candidates: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def _thinned(target: np.ndarray, candidates: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """The candidate nearest to the middle of each box of the grid, where there is one."""
     at = target[candidates] / [size[1], size[0]] * [GRID[1], GRID[0]]
     box = np.clip(at.astype(int), 0, [GRID[1] - 1, GRID[0] - 1])

@@ -109,7 +109,7 @@ class DenseInverseSearch:
 
 @dataclass
 class FeatureFlow:
-    """ORB features that agree with one epipolar geometry (MAGSAC), spread to the points; for large motion."""
+    """ORB features that agree with one epipolar geometry (MAGSAC), propagated to the points; for large motion."""
 
     neighbors: int = 3
     needs_color: bool = False
@@ -118,7 +118,7 @@ class FeatureFlow:
         from_a, in_b = match_features(a, b)
         if len(from_a) < 15:
             return Matches(np.full(points.shape, np.nan), np.zeros(len(points)))
-        target = spread(from_a, in_b - from_a, points, self.neighbors, radius=0.15 * a.size[1])
+        target = propagate(from_a, in_b - from_a, points, self.neighbors, radius=0.15 * a.size[1])
         return Matches(target, np.isfinite(target[:, 0]).astype(np.float64))
 
 
@@ -147,7 +147,7 @@ def refined_features(neighbors: int = 3) -> RefinedFlow:
     return RefinedFlow(FeatureFlow(neighbors), LucasKanade(start_level=2))
 
 
-def spread(
+def propagate(
     points: np.ndarray, displacement: np.ndarray, queries: np.ndarray, neighbors: int = 5, radius: float = 1e6
 ) -> np.ndarray:
     """Queries (M, 2) moved by the median displacement of their nearest points (N, 2); NaN where none is near."""
@@ -196,8 +196,8 @@ __all__ = [
     "Matches",
     "RefinedFlow",
     "make_flow",
+    "propagate",
     "refined_features",
     "refined_inverse_search",
     "sample_field",
-    "spread",
 ]

@@ -27,9 +27,9 @@ class Matcher:
         matches, fraction = self._flow(a, b, guess)
         if fraction < enough:
             self.feature_calls += 1
-            spread = self.features.match(a, b, a.cells.points, guess)
-            if spread.alive.sum() > 0:
-                other, other_fraction = self._flow(a, b, spread.target)
+            propagated = self.features.match(a, b, a.cells.points, guess)
+            if propagated.alive.sum() > 0:
+                other, other_fraction = self._flow(a, b, propagated.target)
                 if other_fraction > fraction:
                     return other, other_fraction
         return matches, fraction

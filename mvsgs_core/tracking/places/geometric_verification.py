@@ -16,7 +16,7 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.features import match_features
-from mvsgs_core.tracking.matching.flow import Matches, spread
+from mvsgs_core.tracking.matching.flow import Matches, propagate
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.places.localization import Localization, localize
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
@@ -39,7 +39,7 @@ def verify_place(
     from_keyframe, in_image = match_features(keyframe.image, image, threshold=1.5)
     if len(from_keyframe) < 15:
         return None
-    guess = spread(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * image.size[1])
+    guess = propagate(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * image.size[1])
     matches, fraction = matcher.match(keyframe.image, image, guess, 0.0)
     known = matches.alive & keyframe.triangulated
     if fraction < criteria.min_fraction or known.sum() < criteria.min_matches:

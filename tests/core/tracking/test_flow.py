@@ -12,8 +12,8 @@ from mvsgs_core.tracking.matching.flow import (
     FeatureFlow,
     LucasKanade,
     make_flow,
+    propagate,
     sample_field,
-    spread,
 )
 
 SIZE = (240, 320)
@@ -107,11 +107,11 @@ def test_coarse_flows_come_near(flow: DenseInverseSearch | FeatureFlow, shift: t
     assert np.median(error) < 1.0
 
 
-def test_spread_takes_the_median_of_the_nearest() -> None:
+def test_propagate_takes_the_median_of_the_nearest() -> None:
     points = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [100.0, 0.0]])
     displacement = np.array([[1.0, 0.0], [1.0, 0.0], [50.0, 0.0], [7.0, 7.0]])
     queries = np.array([[0.5, 0.5], [99.0, 0.0], [500.0, 0.0]])
-    moved = spread(points, displacement, queries, neighbors=3, radius=10.0)
+    moved = propagate(points, displacement, queries, neighbors=3, radius=10.0)
     np.testing.assert_allclose(moved[:2], [[1.5, 0.5], [106.0, 7.0]])
     assert np.isnan(moved[2]).all()
 
