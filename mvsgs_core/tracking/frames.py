@@ -67,7 +67,7 @@ def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: S
         reference = graph.keyframes[record.reference]
         relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
         matches = restored(record.points, len(reference.inverse_depth))
-        found = localize(graph, {record.reference: matches}, relative @ reference.cam_from_world, solver)
+        found = localize(graph, record.reference, matches, relative @ reference.cam_from_world, solver)
         if found.failure or found.inliers < AGREEMENT:
             state[k] = TrackingState.LOST
             continue

@@ -87,7 +87,7 @@ class FrontEnd:
         found: Localization | None = None
         if started:
             start = self.pose if self.pose is not None else self.graph.keyframes[self.reference.index].cam_from_world
-            found = localize(self.graph, {self.reference.index: matches}, start, self.solver)
+            found = localize(self.graph, self.reference.index, matches, start, self.solver)
             guess, _ = self.graph.predict_pose(self.reference.index, found.cam_from_world)
         step = Step(matches, fraction, flow, False, found)
         if self.is_lost(step):

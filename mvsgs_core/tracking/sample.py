@@ -29,7 +29,7 @@ def sample(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: n
     chosen = _thinned(matches.target, np.flatnonzero(use), keyframe.image.size)
     few = np.zeros(len(use))
     few[chosen] = 1.0
-    alone = localize(graph, {index: Matches(matches.target, few, matches.shift)}, cam_from_world, Solver(steps=4))
+    alone = localize(graph, index, Matches(matches.target, few, matches.shift), cam_from_world, Solver(steps=4))
     points = np.zeros(len(chosen), _POINT)
     points["cell"] = chosen
     points["target"] = matches.target[chosen]

@@ -78,7 +78,7 @@ class CovisibleKeyframes:
         ]
         if not np.median(apart) < self.config.max_error:
             return None
-        found = localize(self.graph, {index: matches}, pose, self.solver)
+        found = localize(self.graph, index, matches, pose, self.solver)
         if found.failure or found.inliers < self.config.min_inliers:
             return None
         return PlaceMatch(index, matches, found)

@@ -62,7 +62,7 @@ def verify_place(
         return None
     relative = np.eye(4)
     relative[:3, :3], relative[:3, 3] = geometry.so3_exp(rotation.ravel()), translation.ravel()
-    localization = localize(graph, {index: matches}, relative @ keyframe.cam_from_world, Solver(steps=10))
+    localization = localize(graph, index, matches, relative @ keyframe.cam_from_world, Solver(steps=10))
     if not criteria.accept(graph, index, matches, localization):
         return None
     return PlaceMatch(index, matches, localization)

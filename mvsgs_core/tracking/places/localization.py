@@ -1,4 +1,4 @@
-"""The pose of one frame against keyframes whose depths are known: motion-only bundle adjustment."""
+"""The pose of one frame against a keyframe whose depths are known: motion-only bundle adjustment."""
 
 from __future__ import annotations
 
@@ -17,55 +17,43 @@ class Localization:
 
     cam_from_world: np.ndarray  # (4, 4)
     inliers: float  # fraction of the matches with known depth that agree with the pose
-    count: int  # matches with known depth
-    error: float  # pixels, median over those matches
     failure: str = ""
 
 
 INLIER = 2.0  # pixels: a match that is further from where the pose puts it does not agree with it
 
 
-def localize(
-    graph: KeyframeGraph,
-    matches: dict[int, Matches],
-    start: np.ndarray,
-    solver: Solver,
-) -> Localization:
-    """The pose (4, 4) that explains where the points of keyframes (by index) were found, from a start near it.
+def localize(graph: KeyframeGraph, index: int, matches: Matches, start: np.ndarray, solver: Solver) -> Localization:
+    """The pose (4, 4) that explains where the points of keyframe `index` were found, from a start near it.
 
     Points that were never triangulated are left out: in a pure rotation their depths would invent a translation.
     """
-    order = sorted(matches)
-    frames = [graph.keyframes[index] for index in order]
-    k = len(order)
-    cells = len(frames[0].inverse_depth)
-    weights = np.stack([np.where(f.triangulated, matches[i].weight, 0.0) for i, f in zip(order, frames)])
-    if (weights > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
-        weights = np.stack([matches[i].weight for i in order])
-    target = np.stack([np.nan_to_num(_rectified(matches[i], graph.readout_time).T) for i in order])
-    information = np.stack([f.image.cells.information.T for f in frames]) * weights[:, None]
+    keyframe = graph.keyframes[index]
+    weight = np.where(keyframe.triangulated, matches.weight, 0.0)
+    if (weight > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
+        weight = matches.weight
+    target = np.nan_to_num(_rectified(matches, graph.readout_time).T)
+    cells = len(keyframe.inverse_depth)
     problem = Graph(
-        cam_from_world=np.stack([*(f.cam_from_world for f in frames), start]),
-        inverse_depth=np.stack([*(f.inverse_depth for f in frames), np.ones(cells)]),
-        pixels=np.stack([*(graph.pixels(i) for i in order), np.zeros((2, cells))]),
+        cam_from_world=np.stack([keyframe.cam_from_world, start]),
+        inverse_depth=np.stack([keyframe.inverse_depth, np.ones(cells)]),
+        pixels=np.stack([graph.pixels(index), np.zeros((2, cells))]),
         intrinsics=graph.intrinsics,
-        source=np.arange(k, dtype=np.int32),
-        to=np.full(k, k, np.int32),
-        target=target,
-        information=information,
-        free_pose=np.arange(k + 1) == k,
-        free_depth=np.zeros(k + 1, bool),
+        source=np.array([0], np.int32),
+        to=np.array([1], np.int32),
+        target=target[None],
+        information=(keyframe.image.cells.information.T * weight)[None],
+        free_pose=np.array([False, True]),
+        free_depth=np.zeros(2, bool),
     )
     solution = adjust(problem, solver)
-    pose = solution.cam_from_world[k]
     pixels, z = reproject(
         solution.cam_from_world, problem.inverse_depth, problem.pixels, graph.intrinsics, problem.source, problem.to
     )
-    used = weights > 0
-    error = np.where(z > 0, np.linalg.norm(pixels - target, axis=1), np.inf)[used]
+    error = np.where(z[0] > 0, np.linalg.norm(pixels[0] - target, axis=0), np.inf)[weight > 0]
     if len(error) == 0:
-        return Localization(start, 0.0, 0, np.inf, "no match has a known depth")
-    return Localization(pose, float(np.mean(error < INLIER)), len(error), float(np.median(error)), solution.failure)
+        return Localization(start, 0.0, "no match has a known depth")
+    return Localization(solution.cam_from_world[1], float(np.mean(error < INLIER)), solution.failure)
 
 
 def located(

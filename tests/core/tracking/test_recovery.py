@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.tracking.config import TrackerConfig
-from mvsgs_core.tracking.frames import FrameRecord
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
+from mvsgs_core.tracking.frames import FrameRecord, TrackingState, solve_trajectory
+from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.places.recovery import RecoveryConfig
+from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
+from mvsgs_core.tracking.places.recovery import Recovery, RecoveryConfig
 from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
 from mvsgs_core.tracking.tracker import Tracker
-from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import synthetic, track
 from tests.support.shared_data import shared
+from tests.support.true_maps import image, matcher, pose_error, true_graph, true_pose
 
 
 def covered(items: list[Item], noisy: range, black: range) -> list[Item]:
@@ -91,3 +96,60 @@ def test_frames_before_the_start_are_verified_or_have_no_pose() -> None:
     )
     assert errors.max() < 0.2, "meters: frames that nothing verified were up to 0.32 off"
     assert any("have no pose" in warning for warning in tracker.stats.warnings)
+
+
+def recovery(*keyframes: int, max_images: int = 400) -> Recovery:
+    return Recovery(true_graph(*keyframes), matcher(), RecoveryConfig(max_images), FrontEndConfig())
+
+
+def records(numbers: Sequence[int], keyframes: Sequence[int]) -> list[FrameRecord]:
+    return [FrameRecord(n, n / 20.0, TrackingState.TRACKED if n in keyframes else TrackingState.LOST) for n in numbers]
+
+
+@pytest.mark.parametrize(("keyframes", "reference"), [((100,), 100), ((108,), 108), ((100, 108), 108)])
+def test_frames_between_true_keyframes_get_their_true_poses(keyframes: tuple[int, ...], reference: int) -> None:
+    """Forward from the keyframe before, backward from the one after; from the one after where there are both."""
+    lost = recovery(*keyframes)
+    numbers = range(100, 109)
+    seen = records(numbers, keyframes)
+    for record in seen:
+        if record.index not in keyframes:
+            lost.keep(image(record.index))
+    assert lost.fill_in(seen) == len(numbers) - len(keyframes)
+    assert {r.reference for r in seen if r.index not in keyframes} == {reference}
+    trajectory = solve_trajectory(seen, lost.graph, Solver(steps=8))
+    assert (trajectory.state == TrackingState.TRACKED).all()
+    for number, pose in zip(numbers, trajectory.world_from_cam):
+        shift, turn = pose_error(geometry.inverse(pose), true_pose(number))
+        assert shift < 0.005, "meters"
+        assert turn < 0.003
+
+
+def test_what_no_keyframe_sees_stays_without_a_pose() -> None:
+    lost = recovery(100)
+    seen = records([100, 101, 102, 103, 104], [100])
+    images = {101: image(101), 102: image(220, 102), 103: image(103), 104: image(104)}
+    for number in (101, 102, 103):
+        lost.keep(images[number])  # nothing was kept of 104
+    seen[4].same_as = 103
+    assert lost.fill_in(seen) == 2
+    assert [r.reference for r in seen] == [None, 100, None, 100, None]
+    assert lost.fill_in(seen) == 0, "what has a pose keeps it"
+
+
+def test_poses_that_do_not_meet_the_criteria_are_none() -> None:
+    strict = RecoveryConfig(criteria=PoseCriteria(min_matches=10_000))
+    lost = Recovery(true_graph(100), matcher(), strict, FrontEndConfig())
+    seen = records([100, 101], [100])
+    lost.keep(image(101))
+    assert lost.fill_in(seen) == 0
+    assert seen[1].reference is None
+
+
+def test_the_oldest_images_go_first() -> None:
+    lost = recovery(100, max_images=2)
+    seen = records([100, 101, 102, 103], [100])
+    for number in (101, 102, 103):
+        lost.keep(image(number))
+    assert lost.fill_in(seen) == 2
+    assert [r.reference for r in seen] == [None, None, 100, 100]

@@ -30,7 +30,7 @@ def matches_of(reference: int, frame: int) -> tuple[Matches, np.ndarray]:
     noise = np.random.default_rng(1).normal(0, 0.5, expected.shape)
     weight = np.where(inside & graph.keyframes[reference].image.cells.textured, 1.0, 0.0)
     matches = Matches(np.where(weight[:, None] > 0, expected + noise, np.nan), weight)
-    found = localize(graph, {reference: matches}, graph.keyframes[frame].cam_from_world, Solver(steps=8))
+    found = localize(graph, reference, matches, graph.keyframes[frame].cam_from_world, Solver(steps=8))
     return matches, found.cam_from_world
 
 
@@ -42,9 +42,9 @@ def test_a_few_points_give_the_pose_of_all() -> None:
     matches, pose = matches_of(reference, frame)
     few = restored(sample(graph, reference, matches, pose), len(matches.weight))
     assert 20 <= few.alive.sum() <= 48
-    again = localize(graph, {reference: few}, pose, Solver(steps=8)).cam_from_world
+    again = localize(graph, reference, few, pose, Solver(steps=8)).cam_from_world
     plain = localize(
-        graph, {reference: Matches(matches.target, matches.weight * few.alive)}, pose, Solver(steps=8)
+        graph, reference, Matches(matches.target, matches.weight * few.alive), pose, Solver(steps=8)
     ).cam_from_world
     off = np.linalg.norm(geometry.se3_log(again @ geometry.inverse(pose)))
     assert off < 0.1 * np.linalg.norm(geometry.se3_log(plain @ geometry.inverse(pose)))
