@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mvsgs_core.evaluation import metrics
+
 FILES = ("report.html", "report.json", "map.ply", "cameras.json", "keyframes", "trajectory.txt", "config.yaml", "logs")
 
 
@@ -32,38 +34,30 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
     lines += _worst(report, "rendering") or _worst(report, "rendering_before_refinement")
     trajectory = _get(report, "trajectory") or {}
     if trajectory:
-        tracked = f"{trajectory.get('frames_tracked')} of {trajectory.get('frames')} frames"
-        ate = (
-            f", ATE {_number(trajectory.get('ate_rmse'))} (RMSE of {trajectory.get('ate_keyframes')} keyframes, in the "
-            "true poses' unit)"
-        )
+        ate = metrics.listed(metrics.TRAJECTORY[:1], trajectory)
+        behind = f"(RMSE of {trajectory.get('ate_keyframes')} keyframes, in the true poses' unit)"
         lines.append(
-            f"trajectory  {tracked}, {trajectory.get('keyframes')} keyframes"
-            + (ate if trajectory.get("ate_rmse") is not None else "")
+            f"trajectory  {trajectory.get('frames_tracked')} of {trajectory.get('frames')} frames, "
+            f"{trajectory.get('keyframes')} keyframes" + (f", {ate} {behind}" if ate else "")
         )
-    depth = _get(report, "depth")
-    if depth and depth.get("abs_rel") is not None:
-        lines.append(
-            f"depth       relative error {_number(depth['abs_rel'])}, within 5 %: "
-            f"{_percent(depth.get('inlier_ratio'))}, complete: {_percent(depth.get('completeness'))}, "
-            f"{depth.get('count')} keyframes"
-        )
-    splats, size = _get(report, "map", "splats"), _get(report, "map", "bytes")
-    if splats is not None:
-        lines.append(f"map         {splats} splats" + (f", {size / 1e6:.1f} MB" if size else ""))
-    wall = _get(report, "time", "wall")
-    if wall is not None:
-        lines.append(f"time        {wall:.1f} s, {_number(_get(report, 'time', 'keyframes_per_second'))} keyframes/s")
+    depth = _get(report, "depth") or {}
+    if errors := metrics.listed(metrics.DEPTH, depth):
+        lines.append(f"depth       {errors}, {depth.get('count')} keyframes")
+    splats = _get(report, "map") or {}
+    if splats.get("splats") is not None:
+        size = metrics.at("map.bytes").text(splats.get("bytes"))
+        lines.append(f"map         {splats['splats']} splats, {size}")
+    times = _get(report, "time") or {}
+    if times.get("wall") is not None:
+        wall, pace = metrics.at("time.wall"), metrics.at("time.keyframes_per_second")
+        rate = pace.text(times.get(pace.key), unit=False)
+        lines.append(f"time        {wall.text(times['wall'])}, {rate} keyframes/s")
     return lines
 
 
 def _image(scores: Mapping[str, Any] | None) -> str:
-    if not scores or scores.get("psnr") is None:
-        return ""
-    text = f"PSNR {scores['psnr']:.2f} dB, SSIM {_number(scores.get('ssim'))}"
-    if scores.get("lpips") is not None:
-        text += f", LPIPS {scores['lpips']:.3f}"
-    return f"{text}, {scores.get('count')} frames"
+    figures = metrics.listed(metrics.IMAGE, scores or {})
+    return f"{figures}, {scores.get('count')} frames" if scores and figures else ""
 
 
 def _worst(report: Mapping[str, Any], part: str) -> list[str]:
@@ -71,9 +65,9 @@ def _worst(report: Mapping[str, Any], part: str) -> list[str]:
     worst, coverage = _get(report, part, "worst", "all"), _get(report, part, "coverage")
     if not worst or not coverage or coverage.get("min") is None:
         return []
-    psnr = "" if worst.get("psnr") is None else f": {worst['psnr']:.2f} dB"
+    figure = metrics.listed(metrics.IMAGE[:1], worst)
     return [
-        f"worst       frame {worst.get('index')} ({worst.get('kind')}){psnr}; least covered: "
+        f"worst       frame {worst.get('index')} ({worst.get('kind')}){figure and f': {figure}'}; least covered: "
         f"frame {coverage.get('min_index')}, {100 * coverage['min']:.1f} % (of {coverage.get('count')} frames)"
     ]
 
@@ -83,11 +77,3 @@ def _get(report: Mapping[str, Any], *path: str) -> Any:
     for key in path:
         found = found.get(key) if isinstance(found, Mapping) else None
     return found
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.0f} %"

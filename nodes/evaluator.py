@@ -49,8 +49,9 @@ class Evaluator(Node):
         if folder:
             folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        lpips = self._load_lpips()
-        self.evaluation = Evaluation(self.config.max_frames, lpips, folder, self.config.max_bytes)
+        self._lpips = self._load_lpips()
+        given = {"lpips": self._lpips.compare} if self._lpips else {}
+        self.evaluation = Evaluation(self.config.max_frames, given, folder, self.config.max_bytes)
         self.report: dict[str, Any] = {}
 
     @classmethod
@@ -122,7 +123,7 @@ class Evaluator(Node):
             "Scored at native resolution; nothing is fitted to a scored frame, exposure neither. "
             f"Keyframes are training views; held-out: every {HELD_OUT_EVERY}th frame that is no keyframe. Covered: "
             "pixels at which the render is more than half opaque. "
-            f"LPIPS: {'v0.1, SqueezeNet trunk' if self.evaluation.lpips else 'not computed'}. "
+            f"LPIPS: {'v0.1, SqueezeNet trunk' if self._lpips else 'not computed'}. "
             f"{_shutter(self.evaluation.trajectory)}{_exposure(self.evaluation.maps)}"
             "ATE: RMSE of keyframe positions after Sim(3) alignment."
         )

@@ -18,18 +18,18 @@ def report(after: list[Score], before: list[Score]) -> dict[str, Any]:
 
 
 SCORES = [
-    Score(0, False, 33.0, 0.9, None, 1.0),
-    Score(3, True, 35.0, 0.9, None, 0.995),
-    Score(8, False, 20.3, 0.8, None, 0.87),
+    Score(0, False, {"psnr": 33.0, "ssim": 0.9, "lpips": None}, 1.0),
+    Score(3, True, {"psnr": 35.0, "ssim": 0.9, "lpips": None}, 0.995),
+    Score(8, False, {"psnr": 20.3, "ssim": 0.8, "lpips": None}, 0.87),
 ]
 
 
 def test_the_worst_frame_the_least_covered_and_the_counts_are_shown() -> None:
     lines = _figures(report(SCORES, []))
     assert lines[:3] == [
-        "keyframes   PSNR 35.00 dB, SSIM 0.9, 1 frames",
-        "held-out    PSNR 33.00 dB, SSIM 0.9, 1 frames",
-        "worst       frame 8 (between keyframes): 20.30 dB; least covered: frame 8, 87.0 % (of 3 frames)",
+        "keyframes   PSNR 35.00 dB, SSIM 0.900, 1 frames",
+        "held-out    PSNR 33.00 dB, SSIM 0.900, 1 frames",
+        "worst       frame 8 (between keyframes): PSNR 20.30 dB; least covered: frame 8, 87.0 % (of 3 frames)",
     ]
     assert any("RMSE of 3 keyframes" in line for line in lines)
     assert any(line.startswith("depth") and line.endswith("2 keyframes") for line in lines)

@@ -27,12 +27,15 @@ class DepthScore:
             self.known + other.known,
         )
 
-    def summary(self) -> dict[str, float | None]:
-        return {
-            "abs_rel": self.relative_error / self.estimated if self.estimated else None,
-            "inlier_ratio": self.inliers / self.estimated if self.estimated else None,
-            "completeness": self.estimated / self.known if self.known else None,
-        }
+    def abs_rel(self) -> float | None:
+        """Mean relative error; None where nothing was estimated."""
+        return self.relative_error / self.estimated if self.estimated else None
+
+    def inlier_ratio(self) -> float | None:
+        return self.inliers / self.estimated if self.estimated else None
+
+    def completeness(self) -> float | None:
+        return self.estimated / self.known if self.known else None
 
 
 NO_DEPTH = DepthScore(0.0, 0, 0, 0)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvsgs_core.evaluation import scoring, trajectory_metrics
+from mvsgs_core.evaluation import metrics, scoring, trajectory_metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.exposure import between_keyframes
 from mvsgs_core.evaluation.frames import Frames
-from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
+from mvsgs_core.evaluation.trajectory_metrics import known_poses
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.trajectory import Trajectory
 
@@ -50,7 +50,7 @@ class Evaluation:
     """Feed it with `add_*` in any order; `report()` needs at least a track."""
 
     max_frames: int = 200  # frames scored at most, of each kind as many; 0: none, and no depth maps
-    lpips: Lpips | None = None
+    given: Mapping[str, scoring.Compare] = field(default_factory=dict)  # image metrics made at run time, by key
     folder: Path | None = None  # where frames wait on disk
     max_bytes: float = 2e9  # there
     started: float | None = None
@@ -174,7 +174,7 @@ class Evaluation:
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
         views = scoring.choose(self.views(refined), self.max_frames)
-        scores = [scoring.score_frame(finished.splats, finished.kernel, v, self.lpips) for v in views]
+        scores = [scoring.score_frame(finished.splats, finished.kernel, v, self.given) for v in views]
         self.scores[refined] = scores
         held_out = sum(score.held_out for score in scores)
         few = f"{held_out} of the {len(scores)} frames scored are held out: their mean and their worst say little"
@@ -183,15 +183,22 @@ class Evaluation:
         return scoring.summarize(scores)
 
     def _score_trajectory(self, notes: list[str]) -> tuple[trajectory_metrics.Alignment | None, dict[str, Any]]:
-        if self.trajectory is None:
-            notes.append("no trajectory was received")
-            return None, {
-                **trajectory_metrics.NO_ERRORS,
-                **trajectory_metrics.counts(Trajectory.empty()),
-                "frames": self._received,
-            }
-        alignment, errors = trajectory_metrics.score(self.trajectory, self._truth, notes)
-        return alignment, {**errors, **trajectory_metrics.counts(self.trajectory)}
+        trajectory = self.trajectory or Trajectory.empty()
+        poses = known_poses(trajectory, self._truth)
+        counts = {**trajectory_metrics.counts(trajectory), "ate_keyframes": int(poses.keyframe.sum())}
+        counts["ate_frames"] = len(poses.keyframe)
+        try:
+            found = poses.alignment
+        except ValueError as error:
+            if self.trajectory is None:
+                counts["frames"] = self._received
+                notes.append("no trajectory was received")
+            else:
+                notes.append(f"no trajectory error: {error if self._truth else 'no true poses'}")
+            unknown = {"path_length": None, "scale": None}
+            return None, {**metrics.of_all(metrics.TRAJECTORY, None), **unknown, **counts}
+        length = {"path_length": poses.path_length, "scale": found.scale}
+        return found, {**metrics.of_all(metrics.TRAJECTORY, poses), **length, **counts}
 
     def aligned_paths(self) -> dict[str, np.ndarray]:
         """Camera positions (N, 3) for a plot: "estimate" in the frame of the "truth" where there is one."""
@@ -224,10 +231,11 @@ class Evaluation:
         if not len(known):
             if self.max_frames:
                 notes.append("no depth error: no keyframe has both filtered and true depth")
-            return {**NO_DEPTH.summary(), "scale_ratio": None, "count": 0}
+            return {**metrics.of_all(metrics.DEPTH, NO_DEPTH), "scale_ratio": None, "count": 0}
         scale = float(np.median(known))
         total = sum((score_depth(depth, truth, scale) for depth, truth in maps()), NO_DEPTH)
-        return {**total.summary(), "scale_ratio": scale / alignment.scale if alignment else None, "count": count}
+        ratio = scale / alignment.scale if alignment else None
+        return {**metrics.of_all(metrics.DEPTH, total), "scale_ratio": ratio, "count": count}
 
     def close(self) -> None:
         self._frames.close()

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mvsgs_core.evaluation import svg
+from mvsgs_core.evaluation import metrics, svg
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8882; }
@@ -41,25 +41,27 @@ def image_tag(picture: np.ndarray, caption: str) -> str:
 
 
 def rendering_table(report: Mapping[str, Any]) -> str:
-    rows = ["<tr><th>frames</th><th>refinement</th><th>PSNR dB</th><th>SSIM</th><th>LPIPS</th><th>count</th></tr>"]
+    titles = ("frames", "refinement", *(f"{m.label} {m.unit}".strip() for m in metrics.IMAGE), "count")
+    rows = ["<tr>" + "".join(f"<th>{title}</th>" for title in titles) + "</tr>"]
     for kind in ("keyframes", "held_out", "all"):
         for when, key in (("before", "rendering_before_refinement"), ("after", "rendering")):
-            s = report[key][kind]
-            cells = (kind.replace("_", "-"), when, number(s["psnr"], 2), number(s["ssim"], 4), number(s["lpips"], 4))
-            rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in (*cells, s["count"])) + "</tr>")
+            means = report[key][kind]
+            values = (m.text(means[m.key], unit=False) for m in metrics.IMAGE)
+            cells = (kind.replace("_", "-"), when, *values, means["count"])
+            rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>")
     return f"<table>{''.join(rows)}</table>"
 
 
 def worst_figures(rendering: Mapping[str, Any]) -> dict[str, str]:
     """The worst frames and how much of the frames the map covers, from `report["rendering"]`."""
-    coverage = rendering["coverage"]
+    coverage, first = rendering["coverage"], metrics.IMAGE[0]
     figures = {}
     for name, worst, count in (
         ("worst held-out frame", rendering["worst"]["held_out"], rendering["held_out"]["count"]),
         ("worst of all frames scored", rendering["worst"]["all"], rendering["all"]["count"]),
     ):
         if worst:
-            figures[f"{name} ({count})"] = f"{worst['index']} ({worst['kind']}): {number(worst['psnr'], 2)} dB"
+            figures[f"{name} ({count})"] = f"{worst['index']} ({worst['kind']}): {first.text(worst[first.key])}"
     if coverage["count"]:
         mean, least = (f"{100 * coverage[key]:.1f} %" for key in ("mean", "min"))
         figures[f"pixels covered by the map, of {coverage['count']} frames"] = (
@@ -73,8 +75,8 @@ def figures_table(figures: Mapping[str, Any]) -> str:
     return f"<table>{''.join(rows)}</table>"
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+def _metrics(prefix: str, entries: Sequence[metrics.Metric], values: Mapping[str, Any]) -> dict[str, str]:
+    return {prefix + metric.name: metric.text(values[metric.key]) for metric in entries}
 
 
 def _span(trajectory: Mapping[str, Any]) -> str:
@@ -100,26 +102,18 @@ def page(
     plots: Mapping[str, str],
 ) -> str:
     """The whole document. comparisons and depth_maps: (caption, pictures by name) a row."""
-    trajectory, depth, splats, times = report["trajectory"], report["depth"], report["map"], report["time"]
+    trajectory, depth = report["trajectory"], report["depth"]
     figures = {
-        "ATE RMSE of keyframes (after Sim(3), unit of the true poses)": number(trajectory["ate_rmse"], 4),
-        "… in % of the path": number(trajectory["ate_percent"], 2),
-        "… of so many keyframes with a true pose": trajectory["ate_keyframes"],
+        **_metrics("", metrics.TRAJECTORY, trajectory),
+        "keyframes with a true pose": trajectory["ate_keyframes"],
         "frames tracked": f"{trajectory['frames_tracked']} of {trajectory['frames']}{_span(trajectory)}",
         "frames without a pose": _listed(trajectory["frames_without_pose"]) or "none",
         "frames with a pose of too little motion or texture": trajectory["frames_degenerate"],
         "keyframes": trajectory["keyframes"],
         "keyframes that were to be held out": _some(trajectory["held_out_keyframes"]),
         "filtered depth: keyframes with true depth": depth["count"],
-        "filtered depth: absolute relative error": number(depth["abs_rel"], 4),
-        "filtered depth: inliers within 5 %": number(depth["inlier_ratio"]),
-        "filtered depth: completeness": number(depth["completeness"]),
-        "scale of the depth maps over that of the trajectory": number(depth["scale_ratio"]),
-        "splats": f"{splats['splats']:,}",
-        "map size": f"{splats['bytes'] / 1e6:.1f} MB",
-        "optimization steps": f"{splats['iterations']:,}",
-        "wall time, first frame to finished map": f"{number(times['wall'], 1)} s",
-        "keyframes per second": number(times["keyframes_per_second"], 2),
+        **_metrics("filtered depth: ", metrics.DEPTH, depth),
+        **{m.name: m.text(report[place.partition(".")[0]][m.key]) for place, m in metrics.RUN.items() if m.name},
     }
     memory = {node: f"{size / 1e6:.0f} MB" for node, size in report.get("memory", {}).get("peak_bytes", {}).items()}
     skipped = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -61,6 +62,10 @@ class Lpips(nn.Module):
         _load(self.features, trunk, "features.", ignored=("classifier.",))
         _load(self.heads, heads, "lin", renamed=(".model.1.", "."))
         self.requires_grad_(False).eval()
+
+    def compare(self, render: np.ndarray, photograph: np.ndarray) -> float:
+        """The distance of two images (H, W, 3) float32 in 0..1."""
+        return float(self(*(torch.from_numpy(i).permute(2, 0, 1)[None].contiguous() for i in (render, photograph))))
 
     @torch.inference_mode()
     def forward(self, image: Tensor, reference: Tensor) -> Tensor:

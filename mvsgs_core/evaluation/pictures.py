@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core.camera import resize_image
-from mvsgs_core.evaluation import html, scoring, svg
+from mvsgs_core.evaluation import html, metrics, scoring, svg
 from mvsgs_core.evaluation.evaluation import Evaluation
 
 Row = tuple[str, dict[str, np.ndarray]]
@@ -26,7 +26,7 @@ def comparisons(evaluation: Evaluation) -> list[Row]:
     views = {v.index: v for v in evaluation.views(refined)}
     rows = []
     for name, score in _picks(scores):
-        figures = f"{score.psnr:.2f} dB, SSIM {score.ssim:.3f}, {100 * score.coverage:.1f} % covered"
+        figures = f"{metrics.listed(metrics.IMAGE, score.figures)}, {100 * score.coverage:.1f} % covered"
         caption = f"{name}: {score.index} ({score.kind}), {figures}"
         rows.append((caption, scoring.comparison(finished.splats, finished.kernel, views[score.index])))
     return rows
@@ -36,14 +36,14 @@ def _picks(scores: Sequence[scoring.Score]) -> list[tuple[str, scoring.Score]]:
     """No frame twice."""
     held_out = [s for s in scores if s.held_out]
     among = "held-out frame" if held_out else "frame"
-    ranked = sorted(held_out or scores, key=lambda s: s.psnr)
+    ranked = sorted(held_out or scores, key=lambda s: s.rank)
     places = {"worst": 0, "median": len(ranked) // 2, "best": len(ranked) - 1}
     picks: dict[int, tuple[str, scoring.Score]] = {}
     for name, place in places.items():
         picks.setdefault(ranked[place].index, (f"{name} {among}", ranked[place]))
     if len(ranked) == 1:
         picks = {ranked[0].index: (f"only {among}", ranked[0])}
-    worst = min(scores, key=lambda s: s.psnr)
+    worst = scoring.worst_of(scores)
     picks.setdefault(worst.index, (f"worst of all {len(scores)} frames scored", worst))
     return list(picks.values())
 
@@ -82,15 +82,15 @@ def plots(evaluation: Evaluation, stages: Mapping[str, Mapping[str, float]]) -> 
         center = next(iter(paths.values())).mean(axis=0)
         series = [svg.Series(name, *((p - center) @ axes.T).T) for name, p in paths.items()]
         result["Trajectory"] = svg.plot(series, "widest direction", "second", equal=True)
-    series, covered = [], []
+    series, covered, first = [], [], metrics.IMAGE[0]
     for refined, name in ((False, "before refinement"), (True, "after")):
         scores = evaluation.scores.get(refined, [])
         if scores:
             index = np.array([s.index for s in scores], dtype=float)
-            series.append(svg.Series(name, index, np.array([s.psnr for s in scores])))
+            series.append(svg.Series(name, index, np.array([s.figures[first.key] for s in scores], dtype=float)))
             covered.append(svg.Series(name, index, np.array([100 * s.coverage for s in scores])))
     if series:
-        result["PSNR by frame"] = svg.plot(series, "frame", "dB")
+        result[f"{first.label} by frame"] = svg.plot(series, "frame", first.unit)
         result["Coverage by frame"] = svg.plot(covered, "frame", "% of the pixels more than half opaque")
     if stages:
         result["Time by stage"] = html.timing_bars(stages)

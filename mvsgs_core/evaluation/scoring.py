@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -10,14 +10,15 @@ import cv2
 import numpy as np
 import torch
 
-from mvsgs_core import image_metrics
 from mvsgs_core.camera import resize_image
+from mvsgs_core.evaluation import metrics
 from mvsgs_core.evaluation.frames import ENDING
-from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.rolling_shutter import Shutter, apply_rolling_shutter
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
+
+Compare = Callable[[np.ndarray, np.ndarray], float]  # of a render and the photograph, (H, W, 3) float32 in 0..1
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,7 @@ class ScoredFrame:
 class Score:
     index: int
     keyframe: bool
-    psnr: float
-    ssim: float
-    lpips: float | None
+    figures: dict[str, float | None]  # by key of metrics.IMAGE
     coverage: float  # fraction of the pixels at which the render is more opaque than not
 
     @property
@@ -54,7 +53,16 @@ class Score:
 
     def entry(self) -> dict[str, Any]:
         """As it stands in report.json."""
-        return {**vars(self), "held_out": self.held_out, "kind": self.kind}
+        own = {"index": self.index, "keyframe": self.keyframe, "coverage": self.coverage}
+        return {**own, **self.figures, "held_out": self.held_out, "kind": self.kind}
+
+    @property
+    def rank(self) -> float:
+        """The higher, the better the frame, by the first of the image metrics."""
+        first = metrics.IMAGE[0]
+        value = self.figures[first.key]
+        assert value is not None
+        return value if first.better == "higher" else -value
 
 
 class Rendered(NamedTuple):
@@ -76,22 +84,14 @@ def render_frame(splats: Splats, kernel: str, view: ScoredFrame, size: tuple[int
     return Rendered(color, depth, render.opacity.cpu().numpy())
 
 
-def score_frame(splats: Splats, kernel: str, view: ScoredFrame, lpips: Lpips | None) -> Score:
-    """Scores one view. Nothing is fitted to its photograph, exposure neither."""
+def score_frame(splats: Splats, kernel: str, view: ScoredFrame, given: Mapping[str, Compare] | None = None) -> Score:
+    """Scores one frame by metrics.IMAGE; given: those of them that are made at run time, by key. Nothing is fitted to
+    its photograph, exposure neither."""
     photograph = view.photograph().astype(np.float32) / 255.0
     color, _, opacity = render_frame(splats, kernel, view, photograph.shape[:2])
-    distance = None
-    if lpips is not None:
-        images = [torch.from_numpy(i).permute(2, 0, 1)[None].contiguous() for i in (color, photograph)]
-        distance = float(lpips(*images))
-    return Score(
-        view.index,
-        view.keyframe,
-        image_metrics.psnr(color, photograph),
-        image_metrics.ssim(color, photograph),
-        distance,
-        float((opacity > 0.5).mean()),
-    )
+    compare = {m.key: (given or {}).get(m.key, m.of) for m in metrics.IMAGE}
+    figures = {key: None if of is None else of(color, photograph) for key, of in compare.items()}
+    return Score(view.index, view.keyframe, figures, float((opacity > 0.5).mean()))
 
 
 def choose(views: list[ScoredFrame], limit: int) -> list[ScoredFrame]:
@@ -122,14 +122,17 @@ def summarize(scores: Iterable[Score]) -> dict[str, Any]:
         "keyframes": _mean([s for s in scores if s.keyframe]),
         "held_out": _mean(held_out),
         "all": _mean(scores),
-        "worst": {"held_out": _worst(held_out), "all": _worst(scores)},
+        "worst": {
+            "held_out": worst_of(held_out).entry() if held_out else None,
+            "all": worst_of(scores).entry() if scores else None,
+        },
         "coverage": _coverage(scores),
         "frames": [s.entry() for s in scores],
     }
 
 
-def _worst(scores: Sequence[Score]) -> dict[str, Any] | None:
-    return min(scores, key=lambda s: s.psnr).entry() if scores else None
+def worst_of(scores: Sequence[Score]) -> Score:
+    return min(scores, key=lambda s: s.rank)
 
 
 def _coverage(scores: Sequence[Score]) -> dict[str, Any]:
@@ -141,15 +144,11 @@ def _coverage(scores: Sequence[Score]) -> dict[str, Any]:
 
 
 def _mean(scores: Sequence[Score]) -> dict[str, float | int | None]:
-    def mean(values: list[float]) -> float | None:
-        return float(np.mean(values)) if values else None
-
-    return {
-        "psnr": mean([s.psnr for s in scores]),
-        "ssim": mean([s.ssim for s in scores]),
-        "lpips": mean([s.lpips for s in scores if s.lpips is not None]),
-        "count": len(scores),
-    }
+    means: dict[str, float | int | None] = {}
+    for metric in metrics.IMAGE:
+        values = [value for s in scores if (value := s.figures[metric.key]) is not None]
+        means[metric.key] = float(np.mean(values)) if values else None
+    return means | {"count": len(scores)}
 
 
 def comparison(splats: Splats, kernel: str, view: ScoredFrame, width: int = 400) -> dict[str, np.ndarray]:

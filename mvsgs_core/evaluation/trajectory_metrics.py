@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,6 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.trajectory import TrackingState, Trajectory
-
-NO_ERRORS: dict[str, Any] = {
-    "ate_rmse": None, "ate_rmse_frames": None, "ate_percent": None, "rpe_translation": None, "rpe_rotation": None,
-    "path_length": None, "scale": None, "ate_keyframes": 0, "ate_frames": 0,
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -67,34 +63,41 @@ def path_length(world_from_cam: np.ndarray) -> float:
     return float(np.linalg.norm(np.diff(world_from_cam[:, :3, 3], axis=0), axis=1).sum())
 
 
-def score(
-    trajectory: Trajectory, truth: Mapping[int, np.ndarray], notes: list[str]
-) -> tuple[Alignment | None, dict[str, Any]]:
-    """Errors of the poses of the main part against the true ones by index, and the Sim(3) that brings them together.
+@dataclass(frozen=True)
+class KnownPoses:
+    """Estimated poses whose true ones are known, and how they compare after alignment of the keyframes."""
 
-    None, with the reason in `notes`, where there is none.
-    """
+    estimate: np.ndarray  # (N, 4, 4) world_from_cam
+    truth: np.ndarray  # (N, 4, 4)
+    keyframe: np.ndarray  # (N,) bool
+
+    @cached_property
+    def alignment(self) -> Alignment:
+        """Raises ValueError where there is none, as `align` does; so do `errors` and `relative`."""
+        return align(self.estimate[self.keyframe], self.truth[self.keyframe])
+
+    @cached_property
+    def errors(self) -> np.ndarray:
+        """(N,) in the unit of the truth."""
+        return absolute_errors(self.estimate, self.truth, self.alignment)
+
+    @cached_property
+    def relative(self) -> tuple[float, float] | tuple[None, None]:
+        """As `relative_errors`; None of a single pose."""
+        if len(self.estimate) < 2:
+            return None, None
+        return relative_errors(self.estimate, self.truth, self.alignment.scale)
+
+    @cached_property
+    def path_length(self) -> float:
+        return path_length(self.truth)
+
+
+def known_poses(trajectory: Trajectory, truth: Mapping[int, np.ndarray]) -> KnownPoses:
+    """Those of the main part of the map; truth: poses (4, 4) by frame index."""
     known = trajectory.main() & np.isin(trajectory.index, list(truth))
-    estimate, true = trajectory.world_from_cam[known], poses_of(truth, trajectory.index[known])
-    is_keyframe = trajectory.keyframe[known]
-    report = {**NO_ERRORS, "ate_keyframes": int(is_keyframe.sum()), "ate_frames": len(estimate)}
-    try:
-        alignment = align(estimate[is_keyframe], true[is_keyframe])
-    except ValueError as error:
-        notes.append(f"no trajectory error: {error}" if len(truth) else "no trajectory error: no true poses")
-        return None, report
-    errors = absolute_errors(estimate, true, alignment)
-    length = path_length(true)
-    report |= {
-        "ate_rmse": rmse(errors[is_keyframe]),
-        "ate_rmse_frames": rmse(errors),
-        "ate_percent": 100 * rmse(errors[is_keyframe]) / length if length else None,
-        "path_length": length,
-        "scale": alignment.scale,
-    }
-    if len(estimate) > 1:
-        report["rpe_translation"], report["rpe_rotation"] = relative_errors(estimate, true, alignment.scale)
-    return alignment, report
+    true = poses_of(truth, trajectory.index[known])
+    return KnownPoses(trajectory.world_from_cam[known], true, trajectory.keyframe[known])
 
 
 def poses_of(truth: Mapping[int, np.ndarray], indices: np.ndarray) -> np.ndarray:

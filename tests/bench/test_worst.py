@@ -7,8 +7,11 @@ from mvsgs_core.evaluation.scoring import Score, summarize
 
 
 def test_one_bad_last_frame_misses_both_goals() -> None:
-    good = [Score(k, k % 5 == 1, 33.0 + 0.1 * k, 0.95, None, 1.0) for k in range(9)]
-    found = rows("room", summarize([*good, Score(9, False, 20.3, 0.8, None, 0.94)]))
+    def score(index: int, psnr: float, coverage: float = 1.0) -> Score:
+        return Score(index, index % 5 == 1, {"psnr": psnr, "ssim": 0.95, "lpips": None}, coverage)
+
+    good = [score(k, 33.0 + 0.1 * k) for k in range(9)]
+    found = rows("room", summarize([*good, score(9, 20.3, 0.94)]))
     assert [row.met for row in found] == [None, False, False]
     assert "frame 9" in found[0].unit
     assert [row.met for row in rows("room", summarize(good))] == [None, True, True]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
+from mvsgs_core.evaluation.metrics import DEPTH, of_all
 
 
 def test_counts_only_what_both_know() -> None:
@@ -12,7 +13,7 @@ def test_counts_only_what_both_know() -> None:
     depth = np.full((4, 6), 1.0, np.float32)  # at half the scale
     depth[:, 0] = 0  # filtered out
     depth[1, 1] = 1.2  # 20 % off
-    summary = score_depth(depth, truth, scale=2.0).summary()
+    summary = of_all(DEPTH, score_depth(depth, truth, scale=2.0))
     assert summary["completeness"] == pytest.approx(15 / 18)
     assert summary["inlier_ratio"] == pytest.approx(14 / 15)
     assert summary["abs_rel"] == pytest.approx(0.2 / 15, rel=1e-5)
@@ -22,10 +23,10 @@ def test_scores_add_up() -> None:
     truth = np.full((8, 8), 3.0, np.float32)
     good = score_depth(truth, truth, 1.0)
     bad = score_depth(truth * 1.5, truth, 1.0)
-    both = (NO_DEPTH + good + bad).summary()
+    both = of_all(DEPTH, NO_DEPTH + good + bad)
     assert both["abs_rel"] == pytest.approx(0.25)
     assert both["inlier_ratio"] == pytest.approx(0.5)
-    assert NO_DEPTH.summary() == {"abs_rel": None, "inlier_ratio": None, "completeness": None}
+    assert of_all(DEPTH, NO_DEPTH) == {"abs_rel": None, "inlier_ratio": None, "completeness": None}
 
 
 def test_truth_is_read_at_pixel_centers_without_mixing_edges() -> None:
@@ -33,7 +34,7 @@ def test_truth_is_read_at_pixel_centers_without_mixing_edges() -> None:
     truth[:, 20:] = 10.0
     depth = np.ones((20, 20), np.float32)
     depth[:, 10:] = 10.0
-    assert score_depth(depth, truth, 1.0).summary()["abs_rel"] == 0.0
+    assert score_depth(depth, truth, 1.0).abs_rel() == 0.0
 
 
 def test_values_that_are_not_finite_are_no_estimate() -> None:

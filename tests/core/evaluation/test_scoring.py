@@ -17,7 +17,7 @@ def view(index: int, keyframe: bool = False) -> ScoredFrame:
 
 
 def score(index: int, psnr: float, keyframe: bool = False, coverage: float = 1.0) -> Score:
-    return Score(index, keyframe, psnr, 0.9, None, coverage)
+    return Score(index, keyframe, {"psnr": psnr, "ssim": 0.9, "lpips": None}, coverage)
 
 
 @pytest.mark.parametrize("limit", [6, 30, 200])
@@ -76,5 +76,5 @@ def test_coverage_is_the_share_of_pixels_that_the_map_shows() -> None:
     quaternions = torch.zeros(count, 4)
     quaternions[:, 0] = 1.0
     splats = Splats(means, log_scales, quaternions, logits, torch.zeros(count, 1, 3), torch.full((count,), 2.0))
-    found = score_frame(splats, "gaussian", view(3), None)
+    found = score_frame(splats, "gaussian", view(3))
     assert found.coverage == pytest.approx(0.5, abs=0.06)

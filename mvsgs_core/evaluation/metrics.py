@@ -1,0 +1,98 @@
+"""The metrics of a run. Each is one entry here: report, summary and benchmarks take what they say of it from that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, Literal
+
+from mvsgs_core import image_metrics
+from mvsgs_core.evaluation.depth_metrics import DepthScore
+from mvsgs_core.evaluation.trajectory_metrics import rmse
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One figure of report.json."""
+
+    key: str  # in its part of the report
+    label: str  # short: a table's heading
+    unit: str
+    digits: int  # after the point
+    better: Literal["higher", "lower", ""]  # "": neither
+    name: str = ""  # in full, where the report lists it; none: it is not listed
+    # What it is of: an image metric of a render and the photograph (H, W, 3) float32 in 0..1, one of depth of a
+    # DepthScore, one of poses of KnownPoses; None: given at run time, or counted
+    of: Callable[..., float | None] | None = None
+    factor: float = 1.0  # from the report's value to the unit
+
+    def text(self, value: float | None, unit: bool = True) -> str:
+        """The report's value as a table shows it."""
+        if value is None:
+            return "–"
+        shown = f"{self.factor * value:,.{self.digits}f}"
+        return f"{shown} {self.unit}" if unit and self.unit else shown
+
+
+# The first of them ranks the frames: what is called the worst frame is the worst by it.
+IMAGE = (
+    Metric("psnr", "PSNR", "dB", 2, "higher", of=image_metrics.psnr),
+    Metric("ssim", "SSIM", "", 3, "higher", of=image_metrics.ssim),
+    Metric("lpips", "LPIPS", "", 3, "lower"),  # its network is loaded where its weights are found
+)
+DEPTH = (
+    Metric("abs_rel", "abs rel", "", 4, "lower", "absolute relative error", DepthScore.abs_rel),
+    Metric("inlier_ratio", "inliers", "", 3, "higher", "inliers within 5 %", DepthScore.inlier_ratio),
+    Metric("completeness", "complete", "", 3, "higher", "completeness", DepthScore.completeness),
+)
+TRAJECTORY = (
+    Metric(
+        "ate_rmse", "ATE", "", 4, "lower", "ATE RMSE of keyframes (after Sim(3), unit of the true poses)",
+        lambda poses: rmse(poses.errors[poses.keyframe]),
+    ),
+    Metric(
+        "ate_percent", "ATE %", "% of the path", 2, "lower", "ATE RMSE of keyframes, of the path",
+        lambda poses: 100 * rmse(poses.errors[poses.keyframe]) / poses.path_length if poses.path_length else None,
+    ),
+    Metric("ate_rmse_frames", "ATE of all", "", 4, "lower", "ATE RMSE of all frames", lambda poses: rmse(poses.errors)),
+    Metric("rpe_translation", "RPE", "", 4, "lower", "RPE of translation by frame", lambda poses: poses.relative[0]),
+    Metric("rpe_rotation", "RPE, turn", "°", 3, "lower", "RPE of rotation by frame", lambda poses: poses.relative[1]),
+)  # fmt: skip
+RUN = {  # by their place in the report
+    "trajectory.keyframes": Metric("keyframes", "KFs", "", 0, ""),
+    "map.splats": Metric("splats", "splats", "", 0, "", "splats"),
+    "map.bytes": Metric("bytes", "MB", "MB", 1, "lower", "map size", factor=1e-6),
+    "map.iterations": Metric("iterations", "steps", "", 0, "", "optimization steps"),
+    "time.wall": Metric("wall", "wall s", "s", 1, "lower", "wall time, first frame to finished map"),
+    "time.keyframes_per_second": Metric("keyframes_per_second", "KF/s", "1/s", 2, "higher", "keyframes per second"),
+    "time.cpu.*": Metric("cpu", "CPU s", "s", 1, "lower"),
+}
+METRICS = {
+    **{f"rendering*.{metric.key}": metric for metric in IMAGE},
+    **{f"depth.{metric.key}": metric for metric in DEPTH},
+    **{f"trajectory.{metric.key}": metric for metric in TRAJECTORY},
+    **RUN,
+}
+
+
+def at(path: str) -> Metric:
+    """The metric at a path of the report, such as "rendering.held_out.psnr". Raises KeyError where there is none."""
+    for pattern, metric in METRICS.items():
+        if fnmatchcase(path, pattern):
+            return metric
+    raise KeyError(f"no metric at {path!r} of the report; there are: {', '.join(METRICS)}")
+
+
+def of_all(metrics: tuple[Metric, ...], measured: Any) -> dict[str, float | None]:
+    """The value of each metric, by key; None for all where nothing was `measured`."""
+    return {m.key: None if measured is None or m.of is None else m.of(measured) for m in metrics}
+
+
+def listed(metrics: tuple[Metric, ...], values: Mapping[str, Any]) -> str:
+    """Those that have a value, in a line: "PSNR 31.20 dB, SSIM 0.912"."""
+    known = [(m, values[m.key]) for m in metrics if values.get(m.key) is not None]
+    return ", ".join(f"{metric.label} {metric.text(value)}" for metric, value in known)
+
+
+__all__ = ["DEPTH", "IMAGE", "METRICS", "RUN", "TRAJECTORY", "Metric", "at", "listed", "of_all"]
