@@ -29,7 +29,7 @@ SKIPS = (  # what is left out, switched off or over; keyframe reuse needs more k
 )  # fmt: skip
 OTHERS = (
     "no_density_control", "relocate", "exact", "ges_scale", "ges_loss", "harmonics", "exposure", "refine_poses",
-    "global_shutter", "no_unroll", "true_poses",
+    "global_shutter", "no_rectification", "true_poses",
 )  # fmt: skip
 FIGURES = {  # path in the report, unit, digits
     "held-out PSNR": ("rendering.held_out.psnr", "dB", 2),

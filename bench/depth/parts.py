@@ -30,7 +30,7 @@ def part_variants(area: int) -> dict[str, Variant]:
         "no adaptive windows": changed(contrast=1e6),
         "4 paths": changed(paths=4),
         "no membrane": changed(fill=False),
-        "no choice at rims": changed(depth_edges=None),
+        "no choice at depth edges": changed(depth_edges=None),
         "best 2 views": changed(top_k=2),
         "all 4 views": changed(top_k=4),
         "2 neighbors": (replace(base, neighbors=replace(base.neighbors, count=2)), fusion),
@@ -41,7 +41,7 @@ def part_variants(area: int) -> dict[str, Variant]:
         "4 maps to check with": (base, replace(fusion, neighbors=4)),
         "round trip": (base, replace(fusion, round_trip=True)),
         "no confidence threshold": (base, replace(fusion, confidence=0.0)),
-        "rims kept": (base, replace(fusion, discontinuity_radius=0)),
+        "depth edges kept": (base, replace(fusion, discontinuity_radius=0)),
         "speckles kept": (base, replace(fusion, speckle=0)),
         "no filter": (base, replace(fusion, confidence=0.0, check=False, discontinuity_radius=0, speckle=0)),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.depth.__main__ import SECTIONS, SMALL, map_section
+from bench.depth.__main__ import SECTIONS, SMALL
 from bench.depth.calibration import reliability
 from bench.depth.curves import Point, settings
 from bench.depth.data import Scene, coarse_grid, without_ragged_edges
@@ -86,7 +86,7 @@ def test_reliability_of_honest_and_of_boastful_confidences() -> None:
     boastful, _ = reliability(probability, rng.random(20000) < 0.5 * probability)
     assert honest < 0.03
     assert boastful > 0.2
-    assert sum(share for *_, share in curve) == pytest.approx(1.0)
+    assert sum(fraction for *_, fraction in curve) == pytest.approx(1.0)
 
 
 def test_the_simulated_grid_is_sparse_noisy_and_partly_wrong() -> None:
@@ -98,10 +98,6 @@ def test_the_simulated_grid_is_sparse_noisy_and_partly_wrong() -> None:
     assert 0.0 < np.mean(np.abs(known - 0.5) > 0.25) < 0.06
 
 
-def test_sections_have_names_and_the_map_says_where_its_figures_come_from() -> None:
-    assert {"quality", "tracked", "oracle", "baselines", "photos", "skips", "curves", "failures", "calibration"} <= set(
-        SECTIONS
-    )
-    rows = map_section(None)  # type: ignore[arg-type]
-    assert rows
-    assert all("bench.ablation" in row.name for row in rows)
+def test_sections_have_names() -> None:
+    known = {"quality", "tracked", "oracle", "baselines", "photos", "skips", "curves", "failures", "calibration"}
+    assert known <= set(SECTIONS)
