@@ -1,7 +1,7 @@
 """Command-line overrides -> configuration (Hydra) -> checked graph.
 
-Hydra refuses a parameter that the choice's file does not have; here the node's `Config` decides that (another
-`_target_` has other parameters), so overrides of a slot's parameters are handed to Hydra as `++slot.parameter=value`.
+A choice's file holds only what differs from the defaults of the node's `Config`, which decides what parameters there
+are. Hydra would refuse one that the file does not have, so it is given `++slot.parameter=value`.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from launch.graph import Graph, Replaced, build_graph
+from launch.graph import Graph, Replaced, Settings, build_graph
 from launch.refusal import GraphError
-from nodes.runtime.parameters import did_you_mean
+from nodes.runtime.parameters import did_you_mean, parameter_names, plain_values
 
 CONF = Path(__file__).resolve().parent / "conf"
+DEFAULTS = plain_values(Settings())  # so that a choice's file can name any of the keys of no slot: ${output}
 
 
 def compose(overrides: Sequence[str] = (), conf: Path = CONF) -> Graph:
@@ -42,9 +43,10 @@ def compose(overrides: Sequence[str] = (), conf: Path = CONF) -> Graph:
 
 def graph_of(config: DictConfig, overrides: Sequence[str], choices: Mapping[str, Any]) -> Graph:
     """The graph of a composed configuration. `overrides` are those it was composed with."""
-    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    if own.get("output") is None:
-        own.output = f"runs/{time.strftime('%Y-%m-%d_%H-%M-%S')}-{choices.get('dataset', 'run')}"
+    slots = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    own = OmegaConf.merge(DEFAULTS, slots)
+    assert isinstance(own, DictConfig)
+    own.output = own.output or f"runs/{time.strftime('%Y-%m-%d_%H-%M-%S')}-{choices.get('dataset', 'run')}"
     own.output = str(Path(own.output).expanduser().absolute())
     replaced = _replaced(own, overrides)
     try:
@@ -60,9 +62,8 @@ def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: b
 
     `all_choices_known` is False where choices can come from other directories: Hydra refuses them then.
     """
-    slots, settings = vocabulary(conf)
-    choices = {slot: sorted(path.stem for path in (conf / slot).glob("*.yaml")) for slot in slots}
-    return [_prepare(text, choices, settings, all_choices_known) for text in overrides]
+    choices = {slot: sorted(path.stem for path in (conf / slot).glob("*.yaml")) for slot in slots_of(conf)}
+    return [_prepare(text, choices, parameter_names(Settings), all_choices_known) for text in overrides]
 
 
 def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str], all_choices_known: bool) -> str:
@@ -72,7 +73,7 @@ def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str],
     if root == "hydra" or root.startswith("hydra/") or override.type is not OverrideType.CHANGE:
         return text
     if root in settings:
-        return text
+        return f"++{text}"
     if root not in slots:
         raise GraphError(
             f"{text}: no slot or key {root!r}{did_you_mean(root, [*slots, *settings])}; slots: {', '.join(slots)}; "
@@ -91,13 +92,12 @@ def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str],
     return text
 
 
-def vocabulary(conf: Path) -> tuple[list[str], list[str]]:
-    """Slots and global keys, from config.yaml."""
+def slots_of(conf: Path) -> list[str]:
+    """The slots that config.yaml names."""
     config = OmegaConf.load(conf / "config.yaml")
     assert isinstance(config, DictConfig)
     groups = [str(next(iter(entry))) for entry in config.defaults if isinstance(entry, DictConfig)]
-    slots = [group for group in groups if not group.startswith("override ")]
-    return slots, [str(key) for key in config if key not in ("defaults", "hydra")]
+    return [group for group in groups if not group.startswith("override ")]
 
 
 def _replaced(config: DictConfig, overrides: Sequence[str]) -> dict[str, Replaced]:

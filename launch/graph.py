@@ -14,6 +14,7 @@ from typing import Any, Literal
 import msgs
 import nodes
 from launch.refusal import GraphError
+from launch.renamed_parameters import refuse_old_names
 from mvsgs_core.named_modules import import_named
 from nodes.runtime.parameters import ParameterError, build, did_you_mean, parameter_names, plain_values
 
@@ -32,17 +33,17 @@ class Supervise:
 
 @dataclass(frozen=True)
 class Settings:
-    """The keys of config.yaml that belong to no slot; see the comments there."""
+    """The keys that belong to no slot."""
 
-    output: str
-    device: str = "auto"
-    seed: int = 0
-    inline: bool = False
-    buffer: int = 4
+    output: str = ""  # directory of everything a run writes; none given: runs/<time>-<dataset>
+    device: str = "auto"  # auto, cpu, cuda or cuda:1: for every node that has a `device` and leaves it at auto
+    seed: int = 0  # of every random choice
+    inline: bool = False  # true (or --inline): all nodes in this process, one message at a time, for a debugger
+    buffer: int = 4  # messages that a reliable edge holds before it stops its sender
     transport: Literal["ipc", "tcp"] = "ipc"
-    host: str = "127.0.0.1"
-    port: int | None = None
-    keys: str | None = None
+    host: str = "127.0.0.1"  # tcp: where the nodes' publishers are reached; a slot may have its own `host`
+    port: int | None = None  # tcp: the first of the ports, one a topic; null: free ones, known to nodes started here
+    keys: str | None = None  # directory of CURVE keys: without them nothing listens beyond loopback
     screen: Literal["auto", "live", "plain", "off"] = "auto"
     supervise: Supervise = field(default_factory=Supervise)
 
@@ -58,9 +59,8 @@ class Placement:
     threads: int | None = None  # None: a share of the cores, see launch/placement.py
     external: bool = False  # started by hand
     host: str | None = None  # tcp: where this slot's publishers are reached, if not at the global `host`
-    best_effort: list[str] = field(
-        default_factory=list
-    )  # types that this slot sends newest-only, as a live camera does
+    # types that this slot sends newest-only, as a live camera does
+    best_effort: list[str] = field(default_factory=list)
     observer: bool = False  # watches only: the run goes on without it
 
 
@@ -150,7 +150,7 @@ def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) ->
             slots[name] = _build_slot(name, section, replaced.get(name), settings, device)
     edges, warnings = connect(slots, list(sections))
     names, edges = order(slots, edges)
-    resolved = {key: value for key, value in config.items() if key not in sections}
+    resolved: dict[str, Any] = plain_values(settings)
     resolved |= {name: _section(slots[name]) if name in slots else {"_target_": None} for name in sections}
     graph = Graph({name: slots[name] for name in names}, edges, settings, resolved, warnings)
     _check_observers(graph)
@@ -181,6 +181,7 @@ def _build_slot(
         kept = {*replaced.given, *(key for key in replaced.interpolated if key in accepted)}
         given = {key: value for key, value in given.items() if key in kept}
         reads = {key: value for key, value in reads.items() if key in {t.__name__ for t in inputs}}
+    refuse_old_names(name, node.Config, given)
     given = {key: getattr(settings, key) for key in FROM_SETTINGS if key in accepted} | given
     parameters = plain_values(build(node.Config, given, name))
     if parameters.get("device") == "auto":

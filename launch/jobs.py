@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import msgs
 import nodes
@@ -44,7 +44,7 @@ class Job:
     def of(config: DictConfig, hydra: Any) -> Job:
         sweep = hydra.mode == RunMode.MULTIRUN
         if sweep:
-            config.output = hydra.runtime.output_dir
+            OmegaConf.update(config, "output", hydra.runtime.output_dir, force_add=True)
         return Job(config, list(hydra.overrides.task), dict(hydra.runtime.choices), hydra.job.num if sweep else None)
 
 

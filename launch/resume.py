@@ -16,10 +16,11 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 import nodes
-from launch.compose import CONF, graph_of, parse, prepare, vocabulary
+from launch.compose import CONF, graph_of, parse, prepare, slots_of
 from launch.graph import load_node
 from launch.output import REPORT, read_report
 from launch.refusal import GraphError
+from launch.renamed_parameters import refuse_old_names
 from mvsgs_core.mapping.checkpoints.files import CheckpointInfo, checkpoint_info
 from nodes.runtime.parameters import parameter_names
 
@@ -35,8 +36,9 @@ def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) ->
     """
     folder = folder.expanduser().absolute()
     config = _interrupted(folder)
+    _refuse_older(config, folder)
     info = _checkpoint(folder)
-    slots, _ = vocabulary(conf)
+    slots = slots_of(conf)
     for text in prepare(overrides, conf):
         _apply(config, text, slots, conf)
     config.output = str(folder)
@@ -83,6 +85,14 @@ def _interrupted(folder: Path) -> DictConfig:
     if read_report(folder).get("finished"):
         raise GraphError(f"{WORD}{folder}: that run has reached its end (see {folder / REPORT}): nothing is left to do")
     return config
+
+
+def _refuse_older(config: DictConfig, folder: Path) -> None:
+    for slot, node in _classes(config).items():
+        try:
+            refuse_old_names(slot, node.Config, config[slot])
+        except GraphError as error:
+            raise GraphError(f"{WORD}{folder}: that run was one of an older version: {error}") from None
 
 
 def _checkpoint(folder: Path) -> CheckpointInfo:

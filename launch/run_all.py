@@ -1,7 +1,7 @@
 """Starts the whole graph: `python launch/run_all.py dataset=tum dataset.path=... mapper.iterations=300 viewer=off`.
 
-From any directory. `--help` lists slots, choices and parameters; `-m` sweeps; `--inline` runs all in this process;
-`resume=DIR` goes on with an interrupted run in its own directory.
+From any directory. `--help` lists slots, choices and parameters, `--graph` shows what is composed; `-m` sweeps;
+`--inline` runs all in this process; `resume=DIR` goes on with an interrupted run in its own directory.
 """
 
 from __future__ import annotations
@@ -29,11 +29,16 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from launch.children import python_environment
-from launch.compose import CONF, prepare
+from launch.compose import CONF, graph_of, prepare
+from launch.graph_text import graph_text
+from launch.help_text import help_text
 from launch.jobs import Job, refused, run
 from launch.refusal import GraphError
 from launch.resume import WORD as RESUME
 from launch.resume import leave_out_refused, resumed_config
+
+GRAPH = "--graph"
+SHOWN = (GRAPH, "--help", "-h")  # --cfg, --info and --hydra-help are Hydra's own
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -41,7 +46,8 @@ def main(arguments: Sequence[str]) -> int:
     try:
         if any(word.startswith(RESUME) for word in arguments):
             return run(resumed_job(arguments))
-        sys.argv[1:] = hydra_arguments(arguments)
+        shown = next((word for word in arguments if word in SHOWN), None)
+        sys.argv[1:] = hydra_arguments([word for word in arguments if word not in SHOWN])
     except GraphError as error:
         return refused(error)
     os.environ |= python_environment()  # Hydra's launchers start workers that need the workspace too
@@ -49,10 +55,25 @@ def main(arguments: Sequence[str]) -> int:
 
     @hydra.main(version_base="1.3", config_path="conf", config_name="config")
     def job(config: DictConfig) -> None:
-        codes.append(run(Job.of(config, HydraConfig.get())))
+        one = Job.of(config, HydraConfig.get())
+        codes.append(run(one) if shown is None else show(one, shown))
 
     job()
     return codes[-1] if codes else 0
+
+
+def show(job: Job, shown: str) -> int:
+    """Prints what a command line composes, and runs nothing."""
+    try:
+        graph = graph_of(job.config, job.overrides, job.choices)
+    except GraphError as error:
+        return refused(error)
+    if shown == GRAPH:
+        print(graph_text(graph, job.choices))
+    else:
+        sources = HydraConfig.get().runtime.config_sources
+        print(help_text(graph, job.choices, [Path(source.path) for source in sources if source.schema == "file"]))
+    return 0
 
 
 def resumed_job(arguments: Sequence[str]) -> Job:

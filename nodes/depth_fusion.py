@@ -115,9 +115,9 @@ class DepthFusion(FusionNode):
         relative: float = 0.02  # relative depth difference that still agrees
         round_trip: bool = False  # check by projecting back, instead of the paper's one way
         min_views: int = 2  # views that must agree, the reference counted
-        confidence: float = 0.77  # least confidence of a kept pixel
-        discontinuity_radius: int = 2  # pixels: nothing is kept that close to something farther; 0: off
-        speckle: int = 200  # pixels: patches up to this size are not kept; 0: off
+        confidence: float = 0.795  # least confidence of a kept pixel: lower fills more, with more outliers
+        discontinuity_radius: int = 3  # pixels: nothing is kept that close to something farther; 0: off
+        speckle: int = 100  # pixels: patches up to this size are not kept; 0: off
         device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
         threads: int | None = None  # of the C++ kernels; null: all
 

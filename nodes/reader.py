@@ -19,15 +19,17 @@ class Reader(Node):
 
     @dataclass
     class Config:
-        name: str = "tum"  # format, one of mvsgs_core.datasets.READERS
+        name: str  # format, one of mvsgs_core.datasets.READERS
         path: str | None = None  # folder or file
         start: int = 0  # first frame of the original sequence
         stop: int | None = None  # frame to stop before; null: the end
         stride: int = 1  # every which frame
         size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as it is
-        intrinsics: list[float] | str | None = None  # [fx, fy, cx, cy] in original pixels; auto; null: the set's own
+        # [fx, fy, cx, cy] in pixels of the original image; auto: the tracker estimates them; null: the data set's own
+        intrinsics: list[float] | str | None = None
         distortion: list[float] = field(default_factory=list)  # with intrinsics: [k1, k2, p1, p2(, k3)] as in OpenCV
-        realtime: bool = False  # play at the recorded rate instead of as fast as it is read
+        # play at the recorded rate, not as fast as it is read; with best_effort=[Frame] it is as a live camera
+        realtime: bool = False
         options: dict[str, Any] = field(default_factory=dict)  # of that format: see its class in mvsgs_core.datasets
 
     config: Config

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch.compose import CONF, compose, vocabulary
+from launch.compose import CONF, compose, slots_of
 from launch.graph import Edge, Graph
 from launch.inline import run_inline
 from launch.placement import thread_plan
@@ -214,13 +214,12 @@ def test_a_value_is_converted_to_its_type_or_refused(value: object) -> None:
 
 def test_every_choice_file_of_the_project_composes() -> None:
     """One at a time, with the default choices elsewhere: its node exists, its parameters and reads hold."""
-    slots, _ = vocabulary(CONF)
     stands_for_the_stages = [
         *(f"{slot}._target_=null" for slot in ("tracker", "mvs", "depth_fusion")),
         "mapper.reads={FusedKeyframe: dataset, Poses: dataset}",
         "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, FusedKeyframe: dataset, SplatMap: mapper}",
     ]
-    for slot in slots:
+    for slot in slots_of(CONF):
         for path in sorted((CONF / slot).glob("*.yaml")):
             others = stands_for_the_stages if (slot, path.stem) == ("dataset", "resumed") else []
             compose([f"{slot}={path.stem}", "device=cpu", *others])

@@ -6,7 +6,6 @@ import json
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import pytest
 import yaml
 
 from nodes.runtime.transport import create_keys
-from tests.support.launches import DOWN, ROOT, Launch, launch
+from tests.support.launches import DOWN, Launch, launch
 
 __all__ = ["launch"]  # the fixture
 
@@ -217,10 +216,3 @@ def test_a_sweep_goes_on_after_a_failure_and_says_so_at_the_end(launch: type[Lau
     run = launch("-m", "relay.fail_at=1,null", "source.count=4")
     assert run.finish()[0] == 1
     assert sink(run.output / "1")["keyframes"] == [0, 1, 2, 3]
-
-
-def test_help_names_slots_and_choices() -> None:
-    shown = subprocess.run([sys.executable, ROOT / "launch/run_all.py", "--help"], capture_output=True, text=True)
-    assert shown.returncode == 0, shown.stderr
-    for word in ("dataset: ", "tum", "mapper", "--inline", "tracker=external", "_target_=my_tracker"):
-        assert word in shown.stdout

@@ -15,7 +15,7 @@ import pytest
 from msgs import End, Frame, Keyframe
 from msgs.codec import decode, encode
 from nodes import Node
-from nodes.runtime.parameters import ParameterError, build, leaves, plain_values
+from nodes.runtime.parameters import ParameterError, build, parameters, plain_values
 from nodes.runtime.plain import plain
 from nodes.runtime.runner import Runner, merge_stats, own_stats
 from tests.support.sample_nodes import Left, Wrong
@@ -29,6 +29,7 @@ class Color(Enum):
 @dataclass
 class Inner:
     weight: float = 0.5
+    count: int = 1
 
 
 class Sample(Node):
@@ -98,7 +99,7 @@ def test_plain_values_become_what_the_annotations_say() -> None:
         ({"required": 1, "inner": {"wait": 1}}, "sample.inner.wait: tests.test_parameters.Inner has no parameter"),
         ({"required": 1, "inner": {"wait": 1}}, "(did you mean weight?)"),
         ({"required": 1, "weight": 1}, "(did you mean sample.inner.weight?)"),
-        ({"required": 1, "inner": 3}, "sample.inner=3: must be {weight}"),
+        ({"required": 1, "inner": 3}, "sample.inner=3: must be {weight, count}"),
         ({"required": 1, "inner": {"weight": "x"}}, "sample.inner.weight=x: must be float"),
         ({"required": 1, "parts": [{"weight": "x"}]}, "sample.parts[0].weight=x: must be float"),
         ({"required": 1, "limits": {"a": "b"}}, "sample.limits.a=b: must be float"),
@@ -110,8 +111,27 @@ def test_what_does_not_fit_is_named(given: dict[str, Any], error: str) -> None:
     assert error in str(caught.value)
 
 
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = field(default_factory=lambda: Inner(0.25, 3))
+
+    def __post_init__(self) -> None:
+        if self.inner.weight < 0:
+            raise ValueError("the weight is negative")
+
+
+def test_what_is_given_in_part_keeps_its_parent_s_default_for_the_rest() -> None:
+    assert build(Outer, {"inner": {"count": 5}}) == Outer(Inner(0.25, 5))
+    assert [parameter.default for parameter in parameters(Outer)] == [0.25, 3]
+
+
+def test_what_a_dataclass_refuses_itself_is_refused_with_its_path() -> None:
+    with pytest.raises(ParameterError, match=r"^outer: the weight is negative$"):
+        build(Outer, {"inner": {"weight": -1.0}}, "outer")
+
+
 def test_every_parameter_has_a_path_down_to_the_innermost() -> None:
-    paths = [path for path, *_ in leaves(Sample.Config, "sample")]
+    paths = [parameter.path for parameter in parameters(Sample.Config, "sample")]
     assert paths[0] == "sample.required"
     assert "sample.inner.weight" in paths
     assert "sample.inner" not in paths

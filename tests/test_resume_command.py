@@ -110,6 +110,14 @@ def test_what_cannot_be_resumed_is_refused_with_the_reason(tmp_path: Path) -> No
         assert "config" in refusal(folder) or "no module 'nowhere'" in refusal(folder)
 
 
+def test_a_run_of_an_older_version_is_refused_with_the_new_names(tmp_path: Path) -> None:
+    config = OmegaConf.load(interrupted(tmp_path) / "config.yaml")
+    config.tracker.readout, config.mapper.density = config.tracker.pop("readout_time"), config.mapper.pop("kernel")
+    OmegaConf.save(config, tmp_path / "config.yaml")
+    with pytest.raises(GraphError, match=r"an older version: tracker.readout is tracker.readout_time now"):
+        resumed_config(tmp_path, ())
+
+
 def test_a_refused_resume_touches_nothing(tmp_path: Path) -> None:
     folder = interrupted(tmp_path, report=json.dumps({"finished": True}))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}

@@ -33,6 +33,7 @@ from mvsgs_core.evaluation import trajectory_metrics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.mapping.training import TrainingConfig
 from nodes.reader import Reader
+from nodes.runtime.parameters import parameter_names
 
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end
 QUICK = "room"  # scene of a quick run: in 30 frames of the real ones COLMAP puts no two images together
@@ -91,7 +92,7 @@ def run_ours(scene: str, overrides: list[str], output: Path, made: pieces.Pieces
         return None
     config = OmegaConf.to_container(OmegaConf.load(runs[0].folder / "config.yaml"))
     assert isinstance(config, dict)
-    known = set(vars(Reader.Config()))
+    known = parameter_names(Reader.Config)
     settings = {str(k): v for k, v in config["dataset"].items() if k in known}
     track = json.loads((runs[0].folder / "track.json").read_text())
     return Ours(runs[0].report, track, frames_of(settings), settings)

@@ -10,7 +10,7 @@ import difflib
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -22,8 +22,19 @@ class ParameterError(ValueError):
     """A parameter that is unknown, missing or of the wrong type; the message says which, and what would be valid."""
 
 
-def build(config: type[T], given: Mapping[str, Any], where: str = "") -> T:
-    """The dataclass `config` with the values given, its defaults for the others.
+@dataclass(frozen=True)
+class Parameter:
+    """One that is no dataclass itself."""
+
+    path: str  # as a user writes it: mapper.insertion.fill
+    owner: type  # the dataclass that declares it
+    name: str
+    annotation: Any
+    default: Any  # the JSON value; MISSING where it must be given
+
+
+def build(config: type[T], given: Mapping[str, Any], where: str = "", base: T | None = None) -> T:
+    """The dataclass `config` with the values given, and for the others those of `base`, or its own defaults.
 
     `where`: the path of these parameters, as a user writes it (`mapper.insertion`). Raises ParameterError.
     """
@@ -35,12 +46,23 @@ def build(config: type[T], given: Mapping[str, Any], where: str = "") -> T:
                 f"{_path(where, name)}: {_owner(config)} has no parameter {name!r}"
                 f"{_meant(config, where, name, given)}; it has:\n{describe(config)}"
             )
+    values = {}
     for name, field in declared.items():
-        if name not in given and not _has_default(field):
-            raise ParameterError(
-                f"{_path(where, name)} must be given: {_owner(config)} has no default for it ({type_name(hints[name])})"
-            )
-    return config(**{name: convert(value, hints[name], _path(where, name)) for name, value in given.items()})
+        default, path = _default(field, base), _path(where, name)
+        if name not in given:
+            if default is MISSING:
+                wanted = type_name(hints[name])
+                raise ParameterError(f"{path} must be given: {_owner(config)} has no default for it ({wanted})")
+            values[name] = default
+        elif is_dataclass(hints[name]) and is_dataclass(default) and isinstance(given[name], Mapping):
+            values[name] = build(hints[name], given[name], path, default)  # the rest as it is here, not as in general
+        else:
+            values[name] = convert(given[name], hints[name], path)
+    try:
+        return config(**values)
+    except ValueError as error:
+        named = not where or str(error).startswith(where)
+        raise ParameterError(str(error) if named else f"{where}: {error}") from error
 
 
 def plain_values(value: Any) -> Any:
@@ -63,22 +85,15 @@ def parameter_names(config: type) -> list[str]:
     return [field.name for field in fields(config) if field.init]
 
 
-def leaves(config: type, where: str = "") -> Iterator[tuple[str, type, Field[Any], Any]]:
-    """Every parameter that is no dataclass itself, in order: path, dataclass that declares it, field, annotation."""
+def parameters(config: type, where: str = "", base: Any = None) -> Iterator[Parameter]:
+    """Every parameter of a dataclass and of those in it, in order; `base`: an instance with the defaults."""
     hints = typing.get_type_hints(config)
     for field in fields(config):
-        path, annotation = _path(where, field.name), hints[field.name]
+        path, annotation, default = _path(where, field.name), hints[field.name], _default(field, base)
         if isinstance(annotation, type) and is_dataclass(annotation):
-            yield from leaves(annotation, path)
+            yield from parameters(annotation, path, None if default is MISSING else default)
         elif field.init:
-            yield path, config, field, annotation
-
-
-def default_of(field: Field[Any]) -> Any:
-    """The JSON value of a field's default. Raises ParameterError where it must be given."""
-    if not _has_default(field):
-        raise ParameterError(f"{field.name} must be given")
-    return plain_values(field.default if field.default_factory is MISSING else field.default_factory())
+            yield Parameter(path, config, field.name, annotation, plain_values(default))
 
 
 def describe(config: type) -> str:
@@ -86,11 +101,12 @@ def describe(config: type) -> str:
     hints = typing.get_type_hints(config)
     lines = []
     for field in fields(config):
-        if is_dataclass(hints[field.name]):
-            default = ""
+        default = _default(field, None)
+        if default is MISSING:
+            text = "  (must be given)"
         else:
-            default = f" = {default_of(field)}" if _has_default(field) else "  (must be given)"
-        lines.append(f"  {field.name}: {type_name(hints[field.name])}{default}")
+            text = "" if is_dataclass(default) else f" = {plain_values(default)}"
+        lines.append(f"  {field.name}: {type_name(hints[field.name])}{text}")
     return "\n".join(lines) or "  (no parameters)"
 
 
@@ -185,7 +201,7 @@ def _wrong_type(value: Any, annotation: Any, where: str) -> ParameterError:
 
 def _meant(config: type, where: str, name: str, given: Mapping[str, Any]) -> str:
     """The parameter that a wrong name is close to: the one of that name in a nested dataclass or a mapping first."""
-    paths = [path for path, *_ in leaves(config)]
+    paths = [parameter.path for parameter in parameters(config)]
     paths += [f"{key}.{inner}" for key, value in given.items() if isinstance(value, Mapping) for inner in value]
     same = [path for path in paths if "." in path and path.rpartition(".")[2] == name]
     if same:
@@ -193,8 +209,11 @@ def _meant(config: type, where: str, name: str, given: Mapping[str, Any]) -> str
     return did_you_mean(name, parameter_names(config)) or did_you_mean(name, paths)
 
 
-def _has_default(field: Field[Any]) -> bool:
-    return field.default is not MISSING or field.default_factory is not MISSING
+def _default(field: Field[Any], base: Any) -> Any:
+    """What a field has that is not given; MISSING where it must be."""
+    if base is not None:
+        return getattr(base, field.name)
+    return field.default if field.default_factory is MISSING else field.default_factory()
 
 
 def _owner(config: type) -> str:

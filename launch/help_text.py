@@ -1,0 +1,103 @@
+"""`run_all.py --help`: slots, choices and every parameter of what a command line composes, read from the source.
+
+Type, default and the comment beside the field stand in the dataclass alone; the first lines of a choice's file say what
+the choice is.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING
+from pathlib import Path
+from typing import Any
+
+from launch.field_comments import field_comments
+from launch.graph import Graph, Placement, Settings, Slot
+from nodes.runtime.parameters import parameters, plain_values, type_name
+
+HEADER = """\
+Maps a video, a photo sequence or a live camera with Gaussian splats.
+
+  python launch/run_all.py                                   the synthetic room
+  python launch/run_all.py dataset=tum dataset.path=DIR      a TUM RGB-D sequence
+  python launch/run_all.py dataset=camera viewer=viser       a camera, live; Ctrl-C ends the stream, not the map
+  python launch/run_all.py resume=DIR                        goes on with an interrupted run, in its directory
+  python launch/run_all.py -m mapper.iterations=100,300      a sweep
+  python launch/run_all.py --inline                          everything in one process, for a debugger
+  python launch/run_all.py --graph mapper=paper              shows the graph of any command line, and runs nothing
+  python launch/run_all.py --help mapper=paper               this, for what that command line composes
+  python launch/run_all.py tracker._target_=my_tracker.Mine  a node of your own, from a file in this directory
+  python launch/run_all.py tracker=external                  prints how to run that node by hand, elsewhere
+"""
+EDGES = 'Edges: <slot>.reads.<Message>=<slot that sends it>; with "?" after it: newest only, never slows the sender.'
+COMMENT_COLUMN = 44
+MIN_WIDTH, MAX_WIDTH = 100, 140
+
+
+def help_text(graph: Graph, choices: Mapping[str, Any], folders: Sequence[Path]) -> str:
+    """The whole text. `choices`: the choice of each slot; `folders`: where the choices' files are."""
+    slots = [name for name in graph.resolved if name not in Settings.__dataclass_fields__]
+    there = {
+        slot: sorted({path.stem for folder in folders for path in (folder / slot).glob("*.yaml")}) for slot in slots
+    }
+    lines = [HEADER, "== Slots and their choices: slot=choice ==", ""]
+    lines += [f"{slot}: {', '.join(names)}" for slot, names in there.items()]
+    lines += ["", "== What this command line gives: slot.parameter=value =="]
+    for name, slot in graph.slots.items():
+        choice = choices.get(name)
+        lines += ["", f"{name}={choice}: {slot.target}", *_about(folders, name, choice), *_of_node(slot)]
+    lines += ["", "== Keys of no slot: key=value ==", "", *_of(Settings, "", plain_values(graph.settings))]
+    lines += ["", "== What every slot takes besides: slot.key=value ==", "", *_of(Placement, "slot", {})]
+    return "\n".join([*lines, EDGES])
+
+
+def _about(folders: Sequence[Path], slot: str, choice: Any) -> Iterator[str]:
+    """The comment at the head of a choice's file."""
+    for file in (folder / slot / f"{choice}.yaml" for folder in folders):
+        if file.exists():
+            for line in file.read_text().splitlines():
+                if not line.startswith("#"):
+                    return
+                yield "  " + line.lstrip("# ")
+
+
+def _of_node(slot: Slot) -> Iterator[str]:
+    yield from _of(slot.node.Config, slot.name, slot.config)
+
+
+def _of(config: type, where: str, values: Mapping[str, Any]) -> Iterator[str]:
+    """A line for each parameter: path and value, type, comment, and the default where the value is another."""
+    for parameter in parameters(config, where):
+        path, default = parameter.path, parameter.default
+        value = _at(values, path.removeprefix(f"{where}."), default)
+        what = [type_name(parameter.annotation), field_comments(parameter.owner).get(parameter.name, "")]
+        entries = value if isinstance(value, Mapping) else {}
+        if default is not MISSING and value != default and not entries:
+            what.append(f"(default: {_text(default)})")
+        yield from _columns(f"  {path}" if entries else f"  {path}={_text(value)}", "; ".join(filter(None, what)))
+        for key, entry in entries.items():
+            yield f"    {path}.{key}={_text(entry)}"
+
+
+def _at(values: Any, path: str, default: Any) -> Any:
+    for key in path.split("."):
+        if key not in values:
+            return default
+        values = values[key]
+    return values
+
+
+def _columns(left: str, right: str) -> list[str]:
+    width = min(max(shutil.get_terminal_size((MAX_WIDTH, 24)).columns, MIN_WIDTH), MAX_WIDTH)
+    wrapped = textwrap.wrap(right, width - COMMENT_COLUMN) or [""]
+    if len(left) >= COMMENT_COLUMN:
+        return [left, *(" " * COMMENT_COLUMN + line for line in wrapped)]
+    return [f"{left:{COMMENT_COLUMN}}{wrapped[0]}".rstrip(), *(" " * COMMENT_COLUMN + line for line in wrapped[1:])]
+
+
+def _text(value: Any) -> str:
+    """As it is written on a command line."""
+    return value if isinstance(value, str) and value else json.dumps(value)

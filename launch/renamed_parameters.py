@@ -1,0 +1,55 @@
+"""Names that parameters had once: refused, with the name to write instead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import is_dataclass
+from typing import Any, get_type_hints
+
+from launch.refusal import GraphError
+
+RENAMED: Mapping[str, str] = {
+    "tracker.keyframe_share": "tracker.keyframe_fraction",
+    "tracker.readout": "tracker.readout_time",
+    "tracker.unroll": "tracker.rectify_rolling_shutter",
+    "mvs.best_views": "mvs.top_k",
+    "mvs.least_cells": "mvs.min_cells",
+    "depth_fusion.least_views": "depth_fusion.min_views",
+    "depth_fusion.rim": "depth_fusion.discontinuity_radius",
+    "mapper.density": "mapper.kernel",
+}
+GONE: Mapping[str, str] = {
+    "mvs.skip_certain": "it cost precision and saved no time",
+    "mvs.skip_explained": "it passed over no keyframe of a camera's stream",
+    "mvs.tolerance": "it was of mvs=skipping",
+}
+
+
+def refuse_old_names(slot: str, config: type, given: Mapping[str, Any]) -> None:
+    """Raises GraphError for those of a slot's parameters that have another name now, or are gone."""
+    found = [
+        f"{old} is {RENAMED[old]} now" if old in RENAMED else f"{old} is gone: {GONE[old]}"
+        for old in (*RENAMED, *GONE)
+        if old.startswith(f"{slot}.") and _given(given, old.split(".")[1:]) and not _takes(config, old.split(".")[1:])
+    ]
+    if found:
+        raise GraphError("; ".join(found))
+
+
+def _given(values: Any, path: list[str]) -> bool:
+    """Whether a value stands there; a mapping is none, as a parameter of that name may have become a group."""
+    for key in path:
+        if not isinstance(values, Mapping) or key not in values:
+            return False
+        values = values[key]
+    return not isinstance(values, Mapping)
+
+
+def _takes(config: Any, path: list[str]) -> bool:
+    """Whether the node's dataclass has that parameter after all: a node of one's own may."""
+    for key in path:
+        hints = get_type_hints(config) if is_dataclass(config) else {}
+        if key not in hints:
+            return False
+        config = hints[key]
+    return not is_dataclass(config)

@@ -1,0 +1,142 @@
+"""What the launcher prints of a command line without running it, and what it says of names that are gone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from launch.compose import CONF, compose
+from launch.field_comments import field_comments
+from launch.graph import load_node
+from launch.graph_text import graph_text
+from launch.help_text import MAX_WIDTH
+from launch.refusal import GraphError
+from launch.renamed_parameters import GONE, RENAMED
+from msgs import FusedKeyframe, Preview
+from nodes import Node
+from nodes.runtime.parameters import parameters
+from tests.support.shared_data import ROOT
+
+
+def run_all(*words: str) -> str:
+    command = [sys.executable, ROOT / "launch/run_all.py", *words]
+    shown = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert shown.returncode == 0, shown.stderr
+    return shown.stdout
+
+
+class Dense(Node):
+    """Nobody's mapper, with a parameter that the mapper had once."""
+
+    @dataclass
+    class Config:
+        density: int = 1
+
+    def on_fused(self, keyframe: FusedKeyframe) -> Iterator[Preview]:
+        yield from ()
+
+
+@dataclass
+class Commented:
+    first: int = 1  # beside it
+    # above it,
+    # in two lines
+    second: Sequence[float] = (1.0, 2.0)
+    third: dict[str, int] = field(  # in the midst of it
+        default_factory=lambda: {"what": 1, "is": 2, "too": 3, "long": 4, "for": 5, "one": 6, "line": 7}
+    )
+    fourth: int = 4
+
+    fifth: str = "# no comment"
+
+
+@dataclass
+class Inherited(Commented):
+    fourth: int = 5  # what the base does not say
+    first: int = 6
+
+
+def test_a_field_s_comment_is_read_where_it_stands() -> None:
+    assert field_comments(Commented) == {
+        "first": "beside it", "second": "above it, in two lines", "third": "in the midst of it",
+    }  # fmt: skip
+    assert field_comments(Inherited) == field_comments(Commented) | {"fourth": "what the base does not say"}
+
+
+def test_help_has_every_parameter_with_its_type_default_and_comment() -> None:
+    shown = run_all("--help", "mapper=paper", "device=cpu")
+    for word in ("dataset: ", "tum", "mapper", "--inline", "--graph", "tracker=external", "_target_=my_tracker"):
+        assert word in shown
+    lines = shown.splitlines()
+    for slot, parameter, words in (
+        ("mapper", "iterations=1000", ("int; ", "(default: 30)")),
+        ("tracker", "area=76800", ("int; pixels of the tracker's own image",)),
+        ("dataset", "size=[240, 320]", ("[height, width]",)),
+        ("slot", "cpu=null", ("[int] or null; cores to pin to",)),
+    ):
+        at = lines.index(next(line for line in lines if line.startswith(f"  {slot}.{parameter}")))
+        for word in words:
+            assert word in " ".join(line.strip() for line in lines[at : at + 3])
+    assert any(line.startswith("  seed=0") for line in lines)
+    assert "The paper's parameters, where it gives them" in shown
+    assert max(len(line) for line in lines if "://" not in line and "/runs/" not in line) <= MAX_WIDTH
+
+
+@pytest.mark.parametrize("slot", ["tracker", "mvs", "depth_fusion", "mapper", "viewer", "evaluator", "recorder"])
+def test_every_parameter_of_every_choice_says_what_it_is(slot: str) -> None:
+    for file in (CONF / slot).glob("*.yaml"):
+        target = next(line for line in file.read_text().splitlines() if line.startswith("_target_:")).split(": ")[1]
+        if not target.startswith("null"):
+            for parameter in parameters(load_node(slot, target).Config, slot):
+                assert field_comments(parameter.owner).get(parameter.name) or parameter.name in ("seed", "title")
+
+
+def test_the_graph_is_shown_on_one_screen_and_nothing_runs(tmp_path: Path) -> None:
+    shown = run_all("--graph", f"output={tmp_path}/new", "viewer=viser", "mvs=external", "dataset=camera")
+    lines = shown.splitlines()
+    assert len(lines) <= 30
+    assert max(map(len, lines)) <= 130
+    assert lines[0].split() == ["dataset=camera", "nodes.camera.Camera", "source"]
+    assert lines[1].split() == ["Frame", "->", "tracker", "newest", "only"]
+    assert ["mvs=plane_sweep", "nodes.mvs.Mvs", "external"] in [line.split() for line in lines]
+    assert ["Depth", "->", "depth_fusion", "reliable"] in [line.split() for line in lines]
+    assert ["viewer=viser", "nodes.viewer.Viewer", "observer"] in [line.split() for line in lines]
+    assert "off: recorder" in lines
+    assert not (tmp_path / "new").exists()
+
+
+def test_every_edge_of_the_graph_is_in_its_text() -> None:
+    graph = compose(["device=cpu"])
+    arrows = [line.split()[:3] for line in graph_text(graph, {}).splitlines() if "->" in line]
+    assert sorted(arrows) == sorted([edge.message.__name__, "->", edge.reader] for edge in graph.edges)
+
+
+def test_hydra_s_own_flags_work() -> None:
+    assert "_target_: nodes.mapper.Mapper\n" in run_all("--cfg", "job", "mapper.window=5")
+    assert "== Flags ==" in run_all("--hydra-help")
+
+
+@pytest.mark.parametrize("old", sorted(RENAMED))
+def test_an_old_name_is_refused_with_the_new_one(old: str) -> None:
+    slot = old.partition(".")[0]
+    with pytest.raises(GraphError) as refused:
+        compose([f"{old}=1", "device=cpu"])
+    assert str(refused.value) == f"{old} is {RENAMED[old]} now"
+    there = [parameter.path for parameter in parameters(compose([]).slots[slot].node.Config, slot)]
+    assert RENAMED[old] in there
+
+
+@pytest.mark.parametrize("old", sorted(GONE))
+def test_a_parameter_that_is_gone_is_refused_with_the_reason(old: str) -> None:
+    with pytest.raises(GraphError, match=f"{old} is gone: {GONE[old]}"):
+        compose([f"{old}=1", "device=cpu"])
+
+
+def test_a_node_of_one_s_own_may_have_a_parameter_of_an_old_name() -> None:
+    graph = compose(["mapper._target_=tests.test_help.Dense", "mapper.density=2", "evaluator._target_=null"])
+    assert graph.slots["mapper"].config == {"density": 2}
