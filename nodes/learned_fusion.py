@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-import torch
+from typing import Literal
 
 from mvsgs_core.fusion.fusion import DepthFusion as Fusion
-from mvsgs_core.fusion.fusion import FusionConfig
-from mvsgs_core.fusion.learned import RANDOM, VFuseConfig
 from mvsgs_core.fusion.learned import LearnedFusion as LearnedCore
+from mvsgs_core.fusion.learned import VFuseConfig
+from mvsgs_core.networks.checkpoints import RANDOM
 from nodes.depth_fusion import FusionNode
 
 
@@ -19,8 +18,11 @@ class LearnedFusion(FusionNode):
     @dataclass
     class Config:
         weights: str | None = None  # checkpoint; null: where mvsgs_core.weights finds it; random: untrained, for tests
-        center: str = "conf"  # of a pixel's search window: conf, the most confident depth, or mean, the weighted mean
-        confidence_mode: str = "swr"  # swr, single, pns, pns_swr, pkrn: see mvsgs_core.networks.vfuse_confidence
+        center: Literal["conf", "mean"] = (
+            "conf"  # of a pixel's search window: conf, the most confident depth, or mean, the weighted mean
+        )
+        # see mvsgs_core.networks.vfuse_confidence
+        confidence_mode: Literal["swr", "single", "pns", "pns_swr", "pkrn"] = "swr"
         lag: int = 2  # keyframes after the reference that are waited for
         window: int = 4  # keyframes before the reference that may be neighbors
         neighbors: int = 4  # depth maps that a reference is refined and checked with
@@ -36,13 +38,13 @@ class LearnedFusion(FusionNode):
 
     def _make_fusion(self) -> Fusion:
         c = self.config
-        device = c.device
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
         if c.weights == RANDOM:
             self.stats.warn("V-FUSE runs untrained, with random weights: its refinement is noise")
         return LearnedCore(
-            FusionConfig(
+            VFuseConfig(
+                weights=c.weights,
+                center=c.center,
+                confidence_mode=c.confidence_mode,
                 lag=c.lag,
                 window=c.window,
                 neighbors=c.neighbors,
@@ -55,6 +57,5 @@ class LearnedFusion(FusionNode):
                 speckle=0,
                 device=c.device,
                 threads=c.threads,
-            ),
-            VFuseConfig(file=c.weights, center=c.center, confidence=c.confidence_mode, device=device),
+            )
         )

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
-import torch
-
-from mvsgs_core.mvs.cascade import CascadeConfig
 from mvsgs_core.mvs.hypotheses import RangeConfig
-from mvsgs_core.mvs.learned import RANDOM, LearnedCascade, LearnedConfig
+from mvsgs_core.mvs.learned import LearnedStereo, LearnedStereoConfig
 from mvsgs_core.mvs.neighbors import NeighborConfig
+from mvsgs_core.networks.checkpoints import RANDOM
 from nodes.mvs import StereoNode
 
 
@@ -18,7 +17,7 @@ class LearnedMvs(StereoNode):
 
     @dataclass
     class Config:
-        network: str = "itermvs"  # mvsformer, mvsformer_p or itermvs
+        network: Literal["itermvs", "mvsformer", "mvsformer_p"] = "itermvs"
         weights: str | None = None  # checkpoint; null: where mvsgs_core.weights finds it; random: untrained, for tests
         network_area: int = 512 * 384  # pixels of the images that the network sees, aspect kept
         area: int = 320 * 240  # pixels of a depth map, aspect kept
@@ -33,22 +32,21 @@ class LearnedMvs(StereoNode):
 
     config: Config
 
-    def _make_cascade(self) -> LearnedCascade:
+    def _make_stereo(self) -> LearnedStereo:
         c = self.config
-        device = c.device
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        if c.threads:
-            torch.set_num_threads(c.threads)
         if c.weights == RANDOM:
             self.stats.warn(f"{c.network} runs untrained, with random weights: its depth is noise")
-        return LearnedCascade(
-            CascadeConfig(
+        return LearnedStereo(
+            LearnedStereoConfig(
+                network=c.network,
+                weights=c.weights,
+                network_area=c.network_area,
                 area=c.area,
                 lag=c.lag,
                 window=c.window,
                 neighbors=NeighborConfig(count=c.neighbors),
                 ranges=RangeConfig(margin=c.range_margin, min_cells=c.min_cells),
-            ),
-            LearnedConfig(network=c.network, file=c.weights, area=c.network_area, device=device),
+                device=c.device,
+                threads=c.threads,
+            )
         )

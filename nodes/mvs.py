@@ -5,30 +5,29 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from msgs import Depth, Keyframe, Poses
-from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth
+from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth, OnlineStereo
 from mvsgs_core.mvs.hypotheses import RangeConfig
 from mvsgs_core.mvs.neighbors import NeighborConfig
-from mvsgs_core.mvs.pruning import PruningConfig
-from mvsgs_core.mvs.stereo import Stage, StereoConfig
+from mvsgs_core.mvs.stereo import Stage
 from nodes import Node
 
 
 class StereoNode(Node, ABC):
-    """What every multi-view stereo does with messages; a subclass makes the cascade itself from its Config."""
+    """What every multi-view stereo does with messages; a subclass makes the stereo itself from its Config."""
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        self._cascade = self._make_cascade()
+        self._stereo = self._make_stereo()
         self._keyframes: dict[int, Keyframe] = {}  # without depth yet
         self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
 
     @abstractmethod
-    def _make_cascade(self) -> Cascade: ...
+    def _make_stereo(self) -> OnlineStereo: ...
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
         passed_over = self.config.resume_after is not None and keyframe.index <= self.config.resume_after
@@ -37,7 +36,7 @@ class StereoNode(Node, ABC):
         else:
             self._keyframes[keyframe.index] = keyframe
         with self.stats.time("prepare"):
-            view = self._cascade.prepare(
+            view = self._stereo.prepare(
                 keyframe.index,
                 keyframe.image,
                 keyframe.intrinsics,
@@ -49,17 +48,17 @@ class StereoNode(Node, ABC):
             )
         if keyframe.index in self._poses:  # corrected before it came
             view = view.moved(*self._poses[keyframe.index])
-        yield from self._timed(self._cascade.add(view, wanted=not passed_over))
+        yield from self._timed(self._stereo.add(view, wanted=not passed_over))
 
     def on_poses(self, poses: Poses) -> Iterator[Poses]:
         """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
         for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
             self._poses[int(i)] = (pose, float(scale))
-        self._cascade.move(self._poses)
+        self._stereo.move(self._poses)
         yield poses
 
     def on_end(self) -> Iterator[Depth]:
-        yield from self._timed(self._cascade.flush())
+        yield from self._timed(self._stereo.flush())
 
     def _timed(self, depths: Iterator[CascadeDepth]) -> Iterator[Depth]:
         while True:
@@ -108,7 +107,7 @@ class Mvs(StereoNode):
         neighbors: int = 4  # views that a reference is matched with
         top_k: int = 3  # of these, per pixel and hypothesis: the others may be occluded
         stages: list[dict[str, Any]] = field(default_factory=list)  # of the cascade, empty: the defaults of the core
-        paths: int = 8  # directions of the smoothing, 4 or 8
+        paths: Literal[4, 8] = 8  # directions of the smoothing
         range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
         min_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
         skip_cells: bool = True  # hypotheses that the tracker's depths around rule out
@@ -118,12 +117,9 @@ class Mvs(StereoNode):
 
     config: Config
 
-    def _make_cascade(self) -> Cascade:
+    def _make_stereo(self) -> Cascade:
         c = self.config
-        skips = PruningConfig(outside_cells=c.skip_cells)
-        stereo = StereoConfig(top_k=c.top_k, paths=c.paths, skips=skips)
-        if c.stages:
-            stereo = replace(stereo, stages=tuple(Stage(**stage) for stage in c.stages))
+        base = CascadeConfig()
         return Cascade(
             CascadeConfig(
                 area=c.area,
@@ -133,6 +129,9 @@ class Mvs(StereoNode):
                 threads=c.threads,
                 neighbors=NeighborConfig(count=c.neighbors),
                 ranges=RangeConfig(margin=c.range_margin, min_cells=c.min_cells),
-                stereo=stereo,
+                stages=tuple(Stage(**stage) for stage in c.stages) or base.stages,
+                cost=replace(base.cost, top_k=c.top_k),
+                smoothing=replace(base.smoothing, paths=c.paths),
+                pruning=replace(base.pruning, outside_cells=c.skip_cells),
             )
         )

@@ -20,7 +20,8 @@ from mvsgs_core.mapping.losses import LossConfig
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
-from mvsgs_core.mvs.interface import CostOptions, SmoothOptions
+from mvsgs_core.mvs.interface import SmoothingConfig
+from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
@@ -55,13 +56,13 @@ def test_networks(name: str) -> None:
 
 def test_stereo_equals_that_of_the_cpu() -> None:
     p = problem()
-    surface = (p["reference"], p["neighbors"], p["warps"], np.full(SIZE, 0.22, np.float32), CostOptions())
+    surface = np.full(SIZE, 0.22, np.float32)
     results = []
     with PretendDevice():
         for backend in (TorchBackend(DEVICE), TorchBackend("cpu")):
-            cost = backend.cost_volume(**p, hypotheses=5, options=CostOptions(radius=2, best=2))
-            choice = backend.semi_global(cost, p["reference"], p["first"], p["step"], SmoothOptions())
-            results.append([cost, *vars(choice).values(), backend.view_correlation(*surface)])
+            cost = backend.cost_volume(p.images, p.first, p.step, 5, 2, CostConfig(top_k=2))
+            found = backend.semi_global(cost, p.images.reference, p.first, p.step, 0.3, 2.0, SmoothingConfig())
+            results.append([cost, *vars(found).values(), backend.view_correlation(p.images, surface, 2, CostConfig())])
     for there, here in zip(*results, strict=True):
         np.testing.assert_array_equal(there, here)
 

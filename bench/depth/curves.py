@@ -12,7 +12,7 @@ from bench.depth.run import run, score
 from bench.table import Row
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
-from mvsgs_core.mvs.stereo import Stage, StereoConfig
+from mvsgs_core.mvs.stereo import Stage
 
 SCALES = (1, 2, 4, 8)
 AREAS = {"160x120": 160 * 120, "240x176": 240 * 176, "512x384": 512 * 384}
@@ -40,31 +40,31 @@ class Point:
 
 def settings(area: int) -> dict[str, dict[str, CascadeConfig]]:
     """Curve -> label -> configuration; all else at its default."""
-    base, stereo = CascadeConfig(area=area), StereoConfig()
-    first = stereo.stages[0]
+    base = CascadeConfig(area=area)
+    first = base.stages[0]
     coarse = Stage(4, first.step, 64, first.radius, first.p1, first.p2)
     coarsest = replace(coarse, scale=8, hypotheses=32)
     middle = Stage(2, 0.5, 15, first.radius, 0.1, 0.8)
     between = replace(middle, scale=4)
 
     def staged(*stages: Stage) -> CascadeConfig:
-        return replace(base, stereo=replace(stereo, stages=stages))
+        return replace(base, stages=stages)
 
     def stepped(step: float) -> CascadeConfig:
         most_hypotheses = round(first.hypotheses * first.step / step)
-        return staged(replace(first, step=step, hypotheses=most_hypotheses), *stereo.stages[1:])
+        return staged(replace(first, step=step, hypotheses=most_hypotheses), *base.stages[1:])
 
     return {
         "size": {label: replace(base, area=a) for label, a in AREAS.items()},
         "views": {str(n): replace(base, neighbors=replace(base.neighbors, count=n)) for n in (2, 3, 6)},
         "first step, pixels": {str(step): stepped(step) for step in (0.35, 1.0, 1.4)},
         "later hypotheses": {
-            str(n): staged(first, *(replace(s, hypotheses=n) for s in stereo.stages[1:])) for n in (5, 7, 17)
+            str(n): staged(first, *(replace(s, hypotheses=n) for s in base.stages[1:])) for n in (5, 7, 17)
         },
         "stages": {
             "1": staged(replace(first, scale=1)),
-            "3": staged(coarse, middle, *stereo.stages[1:]),
-            "4": staged(coarsest, between, middle, *stereo.stages[1:]),
+            "3": staged(coarse, middle, *base.stages[1:]),
+            "4": staged(coarsest, between, middle, *base.stages[1:]),
         },
     }
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from bench.table import Row, at_most
 from mvsgs_core.mvs.backend import NativeBackend
-from mvsgs_core.mvs.interface import CostOptions
+from mvsgs_core.mvs.interface import MatchingImages
+from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.warp import relative_warp
 
 SOURCE = Path(__file__).with_name("plain_cost_volume.cpp")
@@ -46,18 +47,18 @@ def _compare(plain: Callable[..., object], height: int, width: int, hypotheses: 
     poses[:, 0, 3] = 0.1 * np.arange(1, VIEWS + 1)
     warps = np.stack([relative_warp(intrinsics, np.eye(4), intrinsics, pose) for pose in poses]).astype(np.float32)
     first, step = np.full((height, width), 0.1, np.float32), np.full((height, width), 0.01, np.float32)
-    options = CostOptions()
+    pair, radius, config = MatchingImages(images[0], images[1:], warps), 2, CostConfig()
     theirs = np.empty((height, hypotheses, width), np.float32)
     backend = NativeBackend()
 
     def ours() -> np.ndarray:
-        return backend.cost_volume(images[0], images[1:], warps, first, step, hypotheses, options)
+        return backend.cost_volume(pair, first, step, hypotheses, radius, config)
 
     def loops() -> None:
         floats = [a.ctypes.data_as(ctypes.c_void_p) for a in (images[0], images[1:], warps, first, step, theirs)]
         plain(
-            floats[0], height, width, floats[1], floats[2], VIEWS, floats[3], floats[4], hypotheses, options.radius,
-            options.best, ctypes.c_float(options.noise), ctypes.c_float(options.contrast), floats[5],
+            floats[0], height, width, floats[1], floats[2], VIEWS, floats[3], floats[4], hypotheses, radius,
+            config.top_k, ctypes.c_float(config.noise), ctypes.c_float(config.contrast), floats[5],
         )  # fmt: skip
 
     loops()

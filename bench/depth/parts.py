@@ -12,7 +12,6 @@ from bench.depth.run import Run, run, score
 from bench.table import Row
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
-from mvsgs_core.mvs.stereo import StereoConfig
 
 Variant = tuple[CascadeConfig, FusionConfig]
 _COUNTED = ("outside the range", "outside the cells")
@@ -21,18 +20,17 @@ _COUNTED = ("outside the range", "outside the cells")
 def part_variants(area: int) -> dict[str, Variant]:
     """Parts of stereo, and filters."""
     base, fusion = CascadeConfig(area=area), FusionConfig()
-    stereo = StereoConfig()
 
     def changed(**values: object) -> Variant:
-        return replace(base, stereo=replace(stereo, **values)), fusion  # type: ignore[arg-type]
+        return replace(base, **values), fusion  # type: ignore[arg-type]
 
     return {
-        "no adaptive windows": changed(contrast=1e6),
-        "4 paths": changed(paths=4),
+        "no adaptive windows": changed(cost=replace(base.cost, contrast=1e6)),
+        "4 paths": changed(smoothing=replace(base.smoothing, paths=4)),
         "no membrane": changed(fill=False),
         "no choice at depth edges": changed(depth_edges=None),
-        "best 2 views": changed(top_k=2),
-        "all 4 views": changed(top_k=4),
+        "best 2 views": changed(cost=replace(base.cost, top_k=2)),
+        "all 4 views": changed(cost=replace(base.cost, top_k=4)),
         "2 neighbors": (replace(base, neighbors=replace(base.neighbors, count=2)), fusion),
         "no refinement": (base, replace(fusion, refine=False)),
         "no consistency check": (base, replace(fusion, check=False)),
@@ -49,11 +47,10 @@ def part_variants(area: int) -> dict[str, Variant]:
 
 def skip_variants(area: int) -> dict[str, Variant]:
     """The skips, off one by one where they are on, on where they are off."""
-    base, fusion, stereo = CascadeConfig(area=area), FusionConfig(), StereoConfig()
+    base, fusion = CascadeConfig(area=area), FusionConfig()
 
     def skips(**values: object) -> Variant:
-        chosen = replace(stereo.skips, **values)  # type: ignore[arg-type]
-        return replace(base, stereo=replace(stereo, skips=chosen)), fusion
+        return replace(base, pruning=replace(base.pruning, **values)), fusion  # type: ignore[arg-type]
 
     return {
         "no skip": skips(outside_range=False, outside_cells=False),

@@ -22,8 +22,9 @@ from mvsgs_core.datasets import open_dataset
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.cascade import CascadeConfig
-from mvsgs_core.mvs.interface import CostOptions
+from mvsgs_core.mvs.interface import MatchingImages
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
+from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.warp import apply_warp, relative_warp
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker
@@ -138,9 +139,8 @@ def _correlation(fused: FusedDepth, reference: StereoKeyframe, other: StereoKeyf
     kept = fused.depth > 0
     inverse = np.where(kept, 1.0 / np.where(kept, fused.depth, 1.0), 1.0).astype(np.float32)
     warp = relative_warp(reference.intrinsics, reference.world_from_cam, other.intrinsics, other.world_from_cam)
-    found = NativeBackend().view_correlation(
-        reference.gray(1), other.gray(1)[None], warp[None].astype(np.float32), inverse, CostOptions()
-    )[0]
+    images = MatchingImages(reference.gray(1), other.gray(1)[None], warp[None].astype(np.float32))
+    found = NativeBackend().view_correlation(images, inverse, radius=2, cost=CostConfig())[0]
     return np.asarray(found[kept & (found > -1.5)])
 
 

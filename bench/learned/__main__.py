@@ -32,8 +32,8 @@ from bench.tracking.__main__ import run as track
 from mvsgs_core import weights
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
-from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth
-from mvsgs_core.mvs.learned import LearnedCascade, LearnedConfig
+from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth, OnlineStereo
+from mvsgs_core.mvs.learned import LearnedStereo, LearnedStereoConfig
 from mvsgs_core.tracking.tracker import TrackerConfig
 
 AREA = 320 * 240  # pixels of a depth map
@@ -69,17 +69,17 @@ def photographs(scene: Scene, source: Source) -> list[np.ndarray]:
     return [images[view.index] for view in scene.views]
 
 
-def run(scene: Scene, images: Sequence[np.ndarray], cascade: Cascade) -> Maps:
+def run(scene: Scene, images: Sequence[np.ndarray], stereo: OnlineStereo) -> Maps:
     found: list[CascadeDepth] = []
     seconds = 0.0
     for image, view in zip(images, scene.views, strict=True):
         start = time.process_time()
-        if isinstance(cascade, LearnedCascade):
-            cascade.remember(view.index, image)
-        found += cascade.add(view)
+        if isinstance(stereo, LearnedStereo):
+            stereo.remember(view.index, image)
+        found += stereo.add(view)
         seconds += time.process_time() - start
     start = time.process_time()
-    found += cascade.flush()
+    found += stereo.flush()
     seconds += time.process_time() - start
     fusion = DepthFusion(FusionConfig(threads=1))
     fused = [f for one in found for f in fusion.add(depth_view(one))] + list(fusion.flush())
@@ -90,10 +90,9 @@ def depth_rows(name: str, frames: int | None, folder: Path) -> list[Row]:
     short = shortened(name, frames)
     scene = load_tracked(short, AREA)
     images = photographs(scene, SOURCES[short])
-    config = CascadeConfig(area=AREA, threads=1)
     methods = {
-        "default": run(scene, images, Cascade(config)),
-        "IterMVS": run(scene, images, LearnedCascade(config, LearnedConfig("itermvs"))),
+        "default": run(scene, images, Cascade(CascadeConfig(area=AREA, threads=1))),
+        "IterMVS": run(scene, images, LearnedStereo(LearnedStereoConfig(area=AREA, threads=1))),
     }
     rows = [Row(f"{name}: keyframes", len(scene.views))]
     for method, maps in methods.items():

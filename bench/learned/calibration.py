@@ -15,8 +15,8 @@ import torch
 from bench.depth.calibration import INLIER, fit, load, reliability
 from bench.depth.data import SHARED, SOURCES
 from bench.learned.__main__ import AREA, photographs
-from mvsgs_core.mvs.cascade import CascadeConfig, CascadeDepth
-from mvsgs_core.mvs.learned import NETWORKS, LearnedCascade, LearnedConfig, logit
+from mvsgs_core.mvs.cascade import CascadeDepth
+from mvsgs_core.mvs.learned import NETWORKS, LearnedStereo, LearnedStereoConfig, logit
 
 FIT = ("room", "replica", "fr1_xyz tracked")
 CHECK = ("redkitchen tracked",)
@@ -28,12 +28,12 @@ def samples(name: str, keyframes: int) -> tuple[np.ndarray, np.ndarray]:
     scene = load(name, AREA)
     source = SOURCES[name.partition(" ")[0]]
     images = photographs(scene, source) if source.folder else [item.image for item in scene.items]
-    cascade = LearnedCascade(CascadeConfig(area=AREA, threads=1), LearnedConfig("itermvs"), calibrate=False)
+    stereo = LearnedStereo(LearnedStereoConfig(area=AREA, threads=1), calibrate=False)
     found: list[CascadeDepth] = []
     for view, image in list(zip(scene.views, images))[:keyframes]:
-        cascade.remember(view.index, image)
-        found += cascade.add(view)
-    found += cascade.flush()
+        stereo.remember(view.index, image)
+        found += stereo.add(view)
+    found += stereo.flush()
     confidence, inlier = [], []
     for one, truth in zip(found, scene.truths):
         if truth is None or not one.neighbors:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core import native
+from mvsgs_core.devices import resolve_device
 from mvsgs_core.fusion.interface import Fused, FusionBackend
 
 
@@ -63,12 +64,9 @@ class NativeFusionBackend:
 
 def make_fusion_backend(device: str, threads: int | None = None) -> FusionBackend:
     """`device`: "auto" (CUDA if there is one), "cpu" (C++), "torch" (PyTorch, CPU) or a torch device like "cuda"."""
-    if device == "auto":
-        import torch
-
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = resolve_device(device)
     if device == "cpu":
         return NativeFusionBackend(threads)
     from mvsgs_core.fusion.torch_backend import TorchFusionBackend
 
-    return TorchFusionBackend("cpu" if device == "torch" else device)
+    return TorchFusionBackend(device)

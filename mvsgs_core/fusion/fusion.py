@@ -10,10 +10,11 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.fusion.backend import make_fusion_backend
 from mvsgs_core.fusion.confidence import features_of, probability_of_inlier
-from mvsgs_core.fusion.filters import discontinuity_mask, not_speckle
+from mvsgs_core.fusion.filters import discontinuity_mask, speckle_mask
 from mvsgs_core.fusion.interface import FusionBackend
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, warps_between
 from mvsgs_core.fusion.normals import normals_of
+from mvsgs_core.keyframe_window import KeyframeWindow
 
 ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
 
@@ -34,11 +35,11 @@ class FusionConfig:
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
     min_views: int = 2  # views that must agree, the reference counted
-    confidence: float = 0.77  # least confidence of a kept pixel
-    discontinuity_radius: int = 2  # pixels: nothing is kept that close to something farther; 0: off
-    speckle: int = 200  # pixels: patches up to this size are not kept; 0: off
-    device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda"
-    threads: int | None = None  # of the C++ kernels; None: all
+    confidence: float = 0.795  # of a kept pixel at least: lower fills more of the map, with more outliers
+    discontinuity_radius: int = 3  # pixels: nothing is kept that close to something farther; 0: off
+    speckle: int = 100  # pixels: patches up to this size are not kept; 0: off
+    device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
+    threads: int | None = None  # of the C++ kernels; null: all
 
 
 @dataclass(frozen=True)
@@ -62,33 +63,23 @@ class DepthFusion:
     def __init__(self, config: FusionConfig | None = None) -> None:
         self.config = config or FusionConfig()
         self._backend = make_fusion_backend(self.config.device, self.config.threads)
-        self._views: list[KeyframeDepth] = []
-        self._waiting: list[int] = []
+        self._window = KeyframeWindow[KeyframeDepth](self.config.window, self.config.lag)
 
     def add(self, view: KeyframeDepth) -> Iterator[FusedDepth]:
         """Fused depth of the keyframe `lag` before this one; of all that wait if a new segment or size starts."""
-        if self._views and (view.segment != self._views[-1].segment or view.size != self._views[-1].size):
-            yield from self.flush()
-            self._views.clear()
-        self._views.append(view)
-        self._waiting.append(view.index)
-        while len(self._waiting) > self.config.lag:
-            yield self._next()
-        del self._views[: max(0, len(self._views) - self.config.window - self.config.lag - 1)]
+        for reference, others in self._window.add(view):
+            yield self._fused(reference, others)
 
     def flush(self) -> Iterator[FusedDepth]:
         """Fused depth of the keyframes that still wait."""
-        while self._waiting:
-            yield self._next()
+        for reference, others in self._window.flush():
+            yield self._fused(reference, others)
 
     def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
         """Corrected poses (world_from_cam (4, 4), scale) by keyframe index: stored depths are scaled with them."""
-        self._views = [v.moved(*poses[v.index]) if v.index in poses else v for v in self._views]
+        self._window.move(poses)
 
-    def _next(self) -> FusedDepth:
-        index = self._waiting.pop(0)
-        reference = next(v for v in self._views if v.index == index)
-        others = [v for v in self._views if v.index != index]
+    def _fused(self, reference: KeyframeDepth, others: list[KeyframeDepth]) -> FusedDepth:
         neighbors = nearest_views(reference, others, self.config.neighbors)
         return fuse(self._prepared(reference, neighbors), neighbors, self.config, self._backend)
 
@@ -166,11 +157,12 @@ def fuse(
         counts["rejected: consistency"] = float((keep & ~agreed).sum())
         keep = keep & agreed
     keep = keep & sure
-    continuous = discontinuity_mask(np.where(keep, depth, 0.0), config.discontinuity_radius)
-    counts["rejected: discontinuity"] = float((keep & ~continuous).sum())
-    in_patch = not_speckle(np.where(continuous, depth, 0.0), config.speckle, config.relative)
-    counts["rejected: speckle"] = float((continuous & ~in_patch).sum())
-    keep = in_patch
+    at_edge = keep & discontinuity_mask(np.where(keep, depth, 0.0), config.discontinuity_radius)
+    counts["rejected: discontinuity"] = float(at_edge.sum())
+    keep = keep & ~at_edge
+    in_speckle = keep & speckle_mask(np.where(keep, depth, 0.0), config.speckle, config.relative)
+    counts["rejected: speckle"] = float(in_speckle.sum())
+    keep = keep & ~in_speckle
     counts["kept"] = float(keep.sum())
     filtered = np.where(keep, depth, 0.0).astype(np.float32)
     normals = normals_of(filtered, reference.intrinsics)

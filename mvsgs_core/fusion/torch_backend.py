@@ -6,17 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvsgs_core.devices import TorchTwin
 from mvsgs_core.fusion.interface import Fused
 
 
-class TorchFusionBackend:
+class TorchFusionBackend(TorchTwin):
     """Runs on `device`, a torch device such as "cuda" or "cpu"; arrays in and out are numpy."""
-
-    def __init__(self, device: str) -> None:
-        self.device = torch.device(device)
-
-    def _on(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
 
     @torch.no_grad()
     def consistent_views(
@@ -111,7 +106,7 @@ class TorchFusionBackend:
         return Fused(*(best[name].cpu().numpy() for name in ("depth", "for", "against", "own")))
 
 
-def _pixels(shape: torch.Size, device: torch.device) -> tuple[Tensor, Tensor]:
+def _pixels(shape: torch.Size, device: str) -> tuple[Tensor, Tensor]:
     v, u = torch.meshgrid(
         torch.arange(shape[0], device=device, dtype=torch.float32),
         torch.arange(shape[1], device=device, dtype=torch.float32),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core import native
-from mvsgs_core.mvs.interface import Backend, Choice, ChooseOptions, CostOptions, SmoothOptions
+from mvsgs_core.devices import resolve_device
+from mvsgs_core.mvs.interface import Backend, ChooseOptions, MatchingImages, SmoothingConfig, SurfaceEstimate
+from mvsgs_core.mvs.matching_cost import CostConfig
 
 
 class NativeBackend:
@@ -16,41 +18,36 @@ class NativeBackend:
         self._threads = threads or 0
 
     def cost_volume(
-        self,
-        reference: np.ndarray,
-        neighbors: np.ndarray,
-        warps: np.ndarray,
-        first: np.ndarray,
-        step: np.ndarray,
-        hypotheses: int,
-        options: CostOptions,
-        needed: np.ndarray | None = None,
-    ) -> np.ndarray:
+        self, images: MatchingImages, first: np.ndarray, step: np.ndarray, hypotheses: int, radius: int,
+        cost: CostConfig, needed: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
         return np.asarray(
             self._kernels.cost_volume(
-                reference, neighbors, warps, first, step, hypotheses, options.radius, options.best, options.noise,
-                options.contrast, options.level, options.level_range, threads=self._threads, needed=needed,
-            )
-        )  # fmt: skip
-
-    def semi_global(
-        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
-    ) -> Choice:
-        return Choice(
-            *self._kernels.semi_global(
-                cost, reference, first, step, options.p1, options.p2, options.edge,
-                options.break_steps, options.temperature, options.paths, threads=self._threads,
+                images.reference, images.neighbors, images.warps, first, step, hypotheses, radius, cost.top_k,
+                cost.noise, cost.contrast, cost.intensity_weight, cost.intensity_range, threads=self._threads,
+                needed=needed,
             )
         )  # fmt: skip
 
     def surface_costs(
-        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, surfaces: np.ndarray,
-        options: CostOptions, needed: np.ndarray | None = None,
+        self, images: MatchingImages, surfaces: np.ndarray, radius: int, cost: CostConfig,
+        needed: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
         return np.asarray(
             self._kernels.surface_costs(
-                reference, neighbors, warps, surfaces, options.radius, options.best, options.noise, options.contrast,
-                options.level, options.level_range, threads=self._threads, needed=needed,
+                images.reference, images.neighbors, images.warps, surfaces, radius, cost.top_k, cost.noise,
+                cost.contrast, cost.intensity_weight, cost.intensity_range, threads=self._threads, needed=needed,
+            )
+        )  # fmt: skip
+
+    def semi_global(
+        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, p1: float, p2: float,
+        smoothing: SmoothingConfig,
+    ) -> SurfaceEstimate:  # fmt: skip
+        return SurfaceEstimate(
+            *self._kernels.semi_global(
+                cost, reference, first, step, p1, p2, smoothing.edge, smoothing.break_steps, smoothing.temperature,
+                smoothing.paths, threads=self._threads,
             )
         )  # fmt: skip
 
@@ -58,31 +55,32 @@ class NativeBackend:
         self, cost: np.ndarray, surfaces: np.ndarray, reference: np.ndarray, options: ChooseOptions
     ) -> tuple[np.ndarray, np.ndarray]:
         best, gap = self._kernels.choose_surface(
-            cost, surfaces, reference, options.p1, options.p2, options.edge, options.apart,
-            threads=self._threads,
-        )  # fmt: skip
+            cost, surfaces, reference, options.p1, options.p2, options.edge, options.apart, threads=self._threads
+        )
         return np.asarray(best), np.asarray(gap)
 
     def view_correlation(
-        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,
-        options: CostOptions,
-    ) -> np.ndarray:  # fmt: skip
+        self, images: MatchingImages, inverse_depth: np.ndarray, radius: int, cost: CostConfig
+    ) -> np.ndarray:
         return np.asarray(
             self._kernels.view_correlation(
-                reference, neighbors, warps, inverse_depth, options.radius, options.noise, options.contrast,
+                images.reference,
+                images.neighbors,
+                images.warps,
+                inverse_depth,
+                radius,
+                cost.noise,
+                cost.contrast,
                 threads=self._threads,
             )
-        )  # fmt: skip
+        )
 
 
 def make_backend(device: str, threads: int | None = None) -> Backend:
     """`device`: "auto" (CUDA if there is one), "cpu" (C++), "torch" (PyTorch, CPU) or a torch device like "cuda"."""
-    if device == "auto":
-        import torch
-
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = resolve_device(device)
     if device == "cpu":
         return NativeBackend(threads)
     from mvsgs_core.mvs.torch_backend import TorchBackend
 
-    return TorchBackend("cpu" if device == "torch" else device)
+    return TorchBackend(device)

@@ -1,12 +1,14 @@
-"""Online multi-view stereo: keyframes in, with two keyframes of lag depth maps out."""
+"""Online multi-view stereo: keyframes in, with some keyframes of lag depth maps out."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from mvsgs_core.keyframe_window import KeyframeWindow
 from mvsgs_core.mvs.backend import make_backend
 from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, search_range
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
@@ -15,17 +17,21 @@ from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, empty_depth, estima
 
 
 @dataclass(frozen=True)
-class CascadeConfig:
-    """Online stereo."""
+class OnlineStereoConfig:
+    """What every online stereo needs, whatever finds the depth."""
 
     area: int = 320 * 240  # pixels of a depth map, aspect kept
     lag: int = 2  # keyframes after the reference that are waited for
     window: int = 8  # keyframes before the reference that may be neighbors
-    device: str = "cpu"  # "cpu" (C++), "auto", "torch", "cuda": see make_backend
-    threads: int | None = None  # of the C++ kernels; None: all
-    neighbors: NeighborConfig = field(default_factory=NeighborConfig)
-    ranges: RangeConfig = field(default_factory=RangeConfig)
-    stereo: StereoConfig = field(default_factory=StereoConfig)
+    neighbors: NeighborConfig = field(default_factory=NeighborConfig)  # which of them a reference is matched with
+    ranges: RangeConfig = field(default_factory=RangeConfig)  # of depth, from the tracker's
+    device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
+    threads: int | None = None  # of the kernels; null: all
+
+
+@dataclass(frozen=True)
+class CascadeConfig(StereoConfig, OnlineStereoConfig):
+    """Online stereo by the plane sweep."""
 
 
 @dataclass(frozen=True)
@@ -39,15 +45,15 @@ class CascadeDepth:
     problem: str = ""  # why there is no depth; empty if there is
 
 
-class Cascade:
+class OnlineStereo(ABC):
     """Feeds on keyframes in stream order; `add` and `flush` yield each keyframe's depth exactly once, in order."""
 
-    def __init__(self, config: CascadeConfig | None = None) -> None:
-        self.config = config or CascadeConfig()
-        self._backend = make_backend(self.config.device, self.config.threads)
-        self._views: list[StereoKeyframe] = []  # a window of the stream, oldest first
-        self._waiting: list[int] = []  # indices without depth yet, oldest first
-        self._previous_range: SearchRange | None = None
+    scales: tuple[int, ...] = (1,)  # sizes of the gray images that a keyframe keeps, as divisors of its own
+
+    def __init__(self, config: OnlineStereoConfig) -> None:
+        self.config = config
+        self._window = KeyframeWindow[StereoKeyframe](config.window, config.lag)
+        self._previous: tuple[tuple[int, tuple[int, int]], SearchRange] | None = None  # segment and size, newest range
 
     def prepare(
         self,
@@ -60,14 +66,14 @@ class Cascade:
         scale: float,
         segment: int,
     ) -> StereoKeyframe:
-        """A view for `add`: image (H, W, 3) uint8 with intrinsics (4,), the tracker's grid (h, w) and its weights."""
+        """A keyframe for `add`: image (H, W, 3) uint8 with intrinsics (4,), the tracker's grid (h, w), its weights."""
         return prepare_keyframe(
             index,
             image,
             intrinsics,
             world_from_cam,
             area=self.config.area,
-            scales=tuple(sorted({s.scale for s in self.config.stereo.stages})),
+            scales=self.scales,
             inverse_depth=inverse_depth,
             weight=weight,
             scale=scale,
@@ -79,43 +85,48 @@ class Cascade:
 
         wanted: whether this one is to get depth too; else it is a neighbor of others only.
         """
-        if self._views and (view.segment != self._views[-1].segment or view.size != self._views[-1].size):
-            yield from self.flush()
-            self._views.clear()
-            self._previous_range = None
-        self._views.append(view)
-        if wanted:
-            self._waiting.append(view.index)
-        while len(self._waiting) > self.config.lag:
-            yield self._next()
-        keep = self.config.window + self.config.lag + 1
-        del self._views[: max(0, len(self._views) - keep)]
+        for reference, others in self._window.add(view, wanted):
+            yield self._depth_of(reference, others)
 
     def flush(self) -> Iterator[CascadeDepth]:
         """Depth of the keyframes that still wait, with the neighbors that are there."""
-        while self._waiting:
-            yield self._next()
+        for reference, others in self._window.flush():
+            yield self._depth_of(reference, others)
 
     def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
         """Corrected poses (world_from_cam (4, 4), scale) by keyframe index, for what is still in the window."""
-        self._views = [v.moved(*poses[v.index]) if v.index in poses else v for v in self._views]
+        self._window.move(poses)
 
-    def _next(self) -> CascadeDepth:
-        index = self._waiting.pop(0)
-        reference = next(v for v in self._views if v.index == index)
-        others = [v for v in self._views if v.index != index]
-        config = self.config
-        search = search_range(reference, others, self._previous_range, config.ranges)
+    def _depth_of(self, reference: StereoKeyframe, others: list[StereoKeyframe]) -> CascadeDepth:
+        kind = (reference.segment, reference.size)
+        if self._previous is not None and self._previous[0] != kind:
+            self._previous = None
+        previous = None if self._previous is None else self._previous[1]
+        search = search_range(reference, others, previous, self.config.ranges)
         if search is None:
             return CascadeDepth(reference, empty_depth(reference.size), (), None, "no depth range is known")
-        chosen = select_neighbors(reference, others, search.typical(), config.neighbors)
+        chosen = select_neighbors(reference, others, search.typical(), self.config.neighbors)
         if not chosen:
             return CascadeDepth(reference, empty_depth(reference.size), (), search, "no neighbor with a baseline")
-        self._previous_range = search
+        self._previous = (kind, search)
         views = [n.view for n in chosen]
-        result = self._estimate(reference, views, search)
-        return CascadeDepth(reference, result, tuple(v.index for v in views), search)
+        return CascadeDepth(
+            reference, self._estimate(reference, views, search), tuple(v.index for v in views), search
+        )  # fmt: skip
+
+    @abstractmethod
+    def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
+        """Where depth comes from: at least one neighbor, all of the reference's size."""
+
+
+class Cascade(OnlineStereo):
+    """By the plane sweep."""
+
+    def __init__(self, config: CascadeConfig | None = None) -> None:
+        self._stereo = config or CascadeConfig()
+        super().__init__(self._stereo)
+        self.scales = tuple(sorted({stage.scale for stage in self._stereo.stages}))
+        self._backend = make_backend(self._stereo.device, self._stereo.threads)
 
     def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
-        """The source of depth: a subclass puts a network here and keeps views, neighbors and ranges."""
-        return estimate_depth(reference, neighbors, search, self.config.stereo, self._backend)
+        return estimate_depth(reference, neighbors, search, self._stereo, self._backend)

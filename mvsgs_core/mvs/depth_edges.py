@@ -1,4 +1,4 @@
-"""Which surface a pixel at an object's rim lies on: candidates are the surfaces around it, continued as planes.
+"""Which surface a pixel at a depth edge lies on: candidates are the surfaces around it, continued as planes.
 
 Matching windows make a near surface grow over what is behind it, at half the image's size by several pixels, and a
 narrow search around that surface does not find the way back.
@@ -6,13 +6,14 @@ narrow search around that surface does not find the way back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
 from mvsgs_core import camera
-from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, CostOptions
+from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, MatchingImages
+from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.mvs.pruning import tile_counts
 from mvsgs_core.warp import apply_warp
 
@@ -25,14 +26,14 @@ class DepthEdgeConfig:
     # what a window covered whole, as between the slats of a chair; the narrow one finds the edge to the pixel.
     rounds: tuple[tuple[int, ...], ...] = ((4, 8, 12), (3, 6))
     radius: int = 1  # pixels, of the matching window: a wide one holds both surfaces
-    top_k: int = 2  # that count: right at a rim half of the views see something else
+    # Right at an edge half of the neighbors see something else; gray levels tell what such small windows do not.
+    cost: CostConfig = field(
+        default_factory=lambda: CostConfig(top_k=2, contrast=5.0, intensity_weight=0.3, intensity_range=10.0)
+    )
     p1: float = 0.3  # cost of a change of inverse depth that moves the point by a pixel
     p2: float = 1.0  # the most that a change costs
-    contrast: float = 5.0  # gray levels: what differs so from a window's center counts 1 / e in it
-    level: float = 0.3  # share of the cost that is the difference of gray level
-    level_range: float = 10.0  # gray levels: that difference costs 1 from here on
-    least: float = 1.0  # pixels: tiles whose candidates differ less keep their depth
-    edge: float = 12.0  # gray levels that halve these
+    min_difference: float = 1.0  # pixels: tiles whose candidates differ less keep their depth
+    edge: float = 12.0  # gray levels that halve P1 and P2
 
 
 def continued_surfaces(inverse_depth: np.ndarray, rings: tuple[int, ...]) -> np.ndarray:
@@ -68,62 +69,51 @@ def _beside(shift: int, length: int) -> tuple[np.ndarray, np.ndarray]:
 
 def refine_depth_edges(
     inverse_depth: np.ndarray,
-    reference: np.ndarray,
-    neighbors: np.ndarray,
-    warps: np.ndarray,
+    images: MatchingImages,
     pixel: float,
-    cost_options: CostOptions,
-    choice: DepthEdgeConfig,
+    top_k: int,
+    config: DepthEdgeConfig,
     backend: Backend,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) float32 inverse depth, and how clear the least clear choice was, 0 to 1, in cost.
 
-    `pixel` is the change of inverse depth that moves a point by a pixel.
+    `pixel` is the change of inverse depth that moves a point by a pixel; of the neighbors `top_k` count at most.
     """
-    neighbors = at_level_of(reference, neighbors, warps, inverse_depth)
-    cost_options = replace(
-        cost_options,
-        radius=choice.radius,
-        best=min(choice.top_k, cost_options.best),
-        contrast=choice.contrast,
-        level=choice.level,
-        level_range=choice.level_range,
-    )
-    options = ChooseOptions(choice.p1 / pixel, choice.p2, choice.edge, pixel)
+    images = equalized(images, inverse_depth)
+    cost_config = replace(config.cost, top_k=min(config.cost.top_k, top_k))
+    options = ChooseOptions(config.p1 / pixel, config.p2, config.edge, pixel)
     clear = np.ones(inverse_depth.shape, dtype=np.float32)
-    for rings in choice.rounds:
+    for rings in config.rounds:
         surfaces = continued_surfaces(inverse_depth, rings)
-        tiles = differing_tiles(surfaces, choice.least * pixel)
-        cost = backend.surface_costs(reference, neighbors, warps, surfaces, cost_options, tiles)
-        best, gap = backend.choose_surface(cost, surfaces, reference, options)
+        tiles = differing_tiles(surfaces, config.min_difference * pixel)
+        cost = backend.surface_costs(images, surfaces, config.radius, cost_config, tiles)
+        best, gap = backend.choose_surface(cost, surfaces, images.reference, options)
         inverse_depth = np.ascontiguousarray(np.take_along_axis(surfaces, best[None], axis=0)[0])
         clear = np.minimum(clear, gap)
     return inverse_depth, clear
 
 
-def at_level_of(
-    reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray, every: int = 4
-) -> np.ndarray:
-    """(N, h, w) float32: neighbors (N, h, w) with the median difference of gray level to the reference taken out.
+def equalized(images: MatchingImages, inverse_depth: np.ndarray, every: int = 4) -> MatchingImages:
+    """The images with each neighbor's median difference of gray level to the reference taken out.
 
-    A camera's exposure changes; of every fourth pixel at the surface found so far the median is hardly wrong.
+    A camera's exposure changes; of every fourth pixel at the surface (H, W) found so far the median is hardly wrong.
     """
     u, v = (a[::every, ::every] for a in camera.pixel_grid(*inverse_depth.shape))
     w = inverse_depth[::every, ::every].astype(np.float64)
-    height, width = neighbors.shape[1:]
-    levelled = []
-    for image, warp in zip(neighbors, warps, strict=True):
+    height, width = images.neighbors.shape[1:]
+    equal = []
+    for image, warp in zip(images.neighbors, images.warps, strict=True):
         x, y, z = apply_warp(warp, u, v, w)
         seen = (z > 1e-6) & (w > 0) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
         there = cv2.remap(image, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
-        difference = (reference[::every, ::every] - there)[seen]
-        levelled.append(image + np.float32(np.median(difference) if len(difference) else 0.0))
-    return np.stack(levelled)
+        difference = (images.reference[::every, ::every] - there)[seen]
+        equal.append(image + np.float32(np.median(difference) if len(difference) else 0.0))
+    return replace(images, neighbors=np.stack(equal))
 
 
-def differing_tiles(surfaces: np.ndarray, least: float) -> np.ndarray:
-    """(tile rows, D, tile columns) uint8: 1 where surfaces (D, H, W) differ by more than `least` anywhere in a tile."""
-    differ = (surfaces.max(axis=0) - surfaces.min(axis=0) > least).astype(np.uint8)
+def differing_tiles(surfaces: np.ndarray, min_difference: float) -> np.ndarray:
+    """(tile rows, D, tile columns) uint8: 1 where surfaces (D, H, W) differ by more anywhere in a tile."""
+    differ = (surfaces.max(axis=0) - surfaces.min(axis=0) > min_difference).astype(np.uint8)
     height, width = differ.shape
     rows, columns = tile_counts((height, width))
     padded = cv2.copyMakeBorder(differ, 0, rows * TILE[0] - height, 0, columns * TILE[1] - width, cv2.BORDER_CONSTANT)

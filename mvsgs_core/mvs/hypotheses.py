@@ -9,7 +9,7 @@ import numpy as np
 
 from mvsgs_core import camera
 from mvsgs_core.membrane import membrane
-from mvsgs_core.mvs.interface import Choice
+from mvsgs_core.mvs.interface import SurfaceEstimate
 from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.warp import apply_warp, relative_warp
 
@@ -37,37 +37,37 @@ class SearchRange:
         return self.low + (self.high - self.low) * np.array([0.15, 0.4, 0.75])
 
 
-def valid_cells(view: StereoKeyframe, choice: RangeConfig) -> np.ndarray:
+def valid_cells(view: StereoKeyframe, config: RangeConfig) -> np.ndarray:
     """(K,) float64 inverse depths that the tracker knows."""
-    good = np.isfinite(view.inverse_depth) & (view.inverse_depth > 0) & (view.weight >= choice.min_weight)
+    good = np.isfinite(view.inverse_depth) & (view.inverse_depth > 0) & (view.weight >= config.min_weight)
     return view.inverse_depth[good].astype(np.float64)
 
 
-def range_of(inverse_depths: np.ndarray, choice: RangeConfig, source: str) -> SearchRange:
+def range_of(inverse_depths: np.ndarray, config: RangeConfig, source: str) -> SearchRange:
     """Percentiles with a margin; robust to a few per cent of outliers."""
-    low, high = np.percentile(inverse_depths, [choice.percentile, 100.0 - choice.percentile])
-    return SearchRange(float(low / choice.margin), float(high * choice.margin), source)
+    low, high = np.percentile(inverse_depths, [config.percentile, 100.0 - config.percentile])
+    return SearchRange(float(low / config.margin), float(high * config.margin), source)
 
 
 def search_range(
-    reference: StereoKeyframe, others: list[StereoKeyframe], previous: SearchRange | None, choice: RangeConfig
+    reference: StereoKeyframe, others: list[StereoKeyframe], previous: SearchRange | None, config: RangeConfig
 ) -> SearchRange | None:
     """The reference's own range; else that of its neighbors' points seen from it; else the previous one; else None."""
-    own = valid_cells(reference, choice)
-    if len(own) >= choice.min_cells:
-        return range_of(own, choice, "own grid")
-    gathered = [own, *(_seen_from(reference, other, choice) for other in others)]
+    own = valid_cells(reference, config)
+    if len(own) >= config.min_cells:
+        return range_of(own, config, "own grid")
+    gathered = [own, *(_seen_from(reference, other, config) for other in others)]
     points = np.concatenate(gathered)
-    if len(points) >= choice.min_cells:
-        return range_of(points, choice, "neighbors' grids")
+    if len(points) >= config.min_cells:
+        return range_of(points, config, "neighbors' grids")
     if previous is not None:
         return SearchRange(previous.low, previous.high, "previous keyframe")
     return None
 
 
-def _seen_from(reference: StereoKeyframe, other: StereoKeyframe, choice: RangeConfig) -> np.ndarray:
+def _seen_from(reference: StereoKeyframe, other: StereoKeyframe, config: RangeConfig) -> np.ndarray:
     """(K,) inverse depths, in the reference, of the cells of another view that project into it."""
-    good = np.isfinite(other.inverse_depth) & (other.inverse_depth > 0) & (other.weight >= choice.min_weight)
+    good = np.isfinite(other.inverse_depth) & (other.inverse_depth > 0) & (other.weight >= config.min_weight)
     if not good.any():
         return np.empty(0)
     size = other.inverse_depth.shape[:2]
@@ -95,27 +95,27 @@ def upsample_surface(inverse_depth: np.ndarray, size: tuple[int, int], max_gap: 
         return np.asarray(smooth)
     linear = cv2.resize(smooth, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
     kernel = np.ones((3, 3), np.uint8)
-    spread = cv2.dilate(smooth, kernel) - cv2.erode(smooth, kernel)
-    jump = cv2.resize(spread, (size[1], size[0]), interpolation=cv2.INTER_NEAREST) > max_gap
+    local_range = cv2.dilate(smooth, kernel) - cv2.erode(smooth, kernel)
+    jump = cv2.resize(local_range, (size[1], size[0]), interpolation=cv2.INTER_NEAREST) > max_gap
     nearest = cv2.resize(smooth, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.ascontiguousarray(np.where(jump, nearest, linear), dtype=np.float32)
 
 
-def certainty(choice: Choice) -> np.ndarray:
+def certainty(estimate: SurfaceEstimate) -> np.ndarray:
     """(H, W) float32, 0 where other hypotheses are as good, 1 where the best one is clearly better than all others."""
-    clear = np.clip(choice.margin / 0.1, 0.0, 1.0)
-    return np.asarray((clear * choice.probability) ** 2, dtype=np.float32)
+    clear = np.clip(estimate.margin / 0.1, 0.0, 1.0)
+    return np.asarray((clear * estimate.probability) ** 2, dtype=np.float32)
 
 
 def fill_uncertain(
-    inverse_depth: np.ndarray, sure: np.ndarray, gray: np.ndarray, *, least: float = 0.05, stiffness: float = 200.0,
-    edge: float = 10.0,
+    inverse_depth: np.ndarray, sure: np.ndarray, gray: np.ndarray, *, min_certainty: float = 0.05,
+    stiffness: float = 200.0, edge: float = 10.0,
 ) -> np.ndarray:  # fmt: skip
-    """Where `sure` (H, W) is below `least`, inverse depth (H, W) becomes a membrane through the sure pixels around.
+    """Where `sure` (H, W) is below `min_certainty`, inverse depth (H, W) becomes a membrane through the sure ones.
 
     The membrane (a weighted least-squares smoother) may bend at gray-level edges of about `edge`. In inverse depth a
     plane stays a plane, so it bridges textureless walls and furniture.
     """
     guide = np.clip(gray + 128.0, 0.0, 255.0).astype(np.uint8)
     sheet = membrane(inverse_depth, sure + np.float32(1e-4), guide, stiffness, edge)
-    return np.where(sure < least, sheet, inverse_depth).astype(np.float32)
+    return np.where(sure < min_certainty, sheet, inverse_depth).astype(np.float32)

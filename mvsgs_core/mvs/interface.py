@@ -1,37 +1,44 @@
-"""What a back end of stereo computes: its options, arrays in, arrays out."""
+"""What a back end of stereo computes: arrays in, arrays out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
+
+from mvsgs_core.mvs.matching_cost import CostConfig
 
 TILE = (8, 16)  # (rows, columns) of the tiles that a sweep can leave out
 
 
 @dataclass(frozen=True)
-class CostOptions:
-    """Windowed ZNCC of a sweep, and a share of the difference of gray level."""
+class MatchingImages:
+    """A reference and the neighbors that it is matched with, at one size of the cascade."""
 
-    radius: int = 2  # pixels: a window of 2 radius + 1
-    best: int = 3  # views whose cost counts, of all
-    noise: float = 1.5  # gray levels²: added to both variances
-    contrast: float = 8.0  # gray levels: a pixel that differs so from the window's center counts 1 / e
-    level: float = 0.0  # share of the cost that is the difference of both windows' means; ZNCC doesn't see it
-    level_range: float = 20.0  # gray levels: that difference costs 1 from here on
+    reference: np.ndarray  # (H, W) float32 gray levels
+    neighbors: np.ndarray  # (N, h, w) float32
+    warps: np.ndarray  # (N, 12) float32, from the reference into each neighbor: see mvsgs_core.warp
 
 
 @dataclass(frozen=True)
-class SmoothOptions:
+class SmoothingConfig:
     """Semi-global smoothing, and the softmax that gives the probability."""
 
-    p1: float = 0.3  # cost of a change by one hypothesis
-    p2: float = 2.0  # cost of a larger change
-    edge: float = 12.0  # gray levels that halve these
+    edge: float = 12.0  # gray levels that halve P1 and P2
     break_steps: float = 4.0  # hypotheses: a larger jump of the surface ends the path
     temperature: float = 0.02  # of the softmax, in cost
-    paths: int = 8  # directions, 4 or 8
+    paths: Literal[4, 8] = 8  # directions
+
+
+@dataclass(frozen=True)
+class SurfaceEstimate:
+    """The hypothesis of each pixel, each (H, W)."""
+
+    index: np.ndarray  # float32 the best hypothesis, between whole ones by a parabola
+    probability: np.ndarray  # float32 softmax mass within one hypothesis of the best
+    margin: np.ndarray  # float32 how much worse the best other hypothesis is, in cost, at most 1
+    best: np.ndarray  # int32 the best hypothesis
 
 
 @dataclass(frozen=True)
@@ -44,44 +51,29 @@ class ChooseOptions:
     apart: float  # inverse depth: a surface farther than this from another is not the same
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What a stage found, each (H, W)."""
-
-    index: np.ndarray  # float32 the best hypothesis, between whole ones by a parabola
-    probability: np.ndarray  # float32 softmax mass within one hypothesis of the best
-    margin: np.ndarray  # float32 how much worse the best other hypothesis is, in cost, at most 1
-    best: np.ndarray  # int32 the best hypothesis
-
-
 class Backend(Protocol):
-    """Images (H, W) and (N, H, W) float32; warps (N, 12) float32; `first`, `step` (H, W) float32: hypothesis k of a
+    """Maps are (H, W) float32, costs (H, D, W) float32 in [0, 1]; `radius` is of the matching window, in pixels.
 
-    pixel is the inverse depth first + k step. Costs are (H, D, W) float32 in [0, 1].
+    `needed` (tile rows, D, tile columns) uint8, tiles of TILE pixels: elsewhere the cost is 1, uncomputed.
     """
 
     def cost_volume(
-        self,
-        reference: np.ndarray,
-        neighbors: np.ndarray,
-        warps: np.ndarray,
-        first: np.ndarray,
-        step: np.ndarray,
-        hypotheses: int,
-        options: CostOptions,
-        needed: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """`needed` (tile rows, D, tile columns) uint8, tiles of TILE pixels: elsewhere the cost is 1, uncomputed."""
-
-    def semi_global(
-        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
-    ) -> Choice: ...
+        self, images: MatchingImages, first: np.ndarray, step: np.ndarray, hypotheses: int, radius: int,
+        cost: CostConfig, needed: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Costs of a sweep: hypothesis k of a pixel is the inverse depth first + k step."""
 
     def surface_costs(
-        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, surfaces: np.ndarray,
-        options: CostOptions, needed: np.ndarray | None = None,
+        self, images: MatchingImages, surfaces: np.ndarray, radius: int, cost: CostConfig,
+        needed: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
-        """(H, D, W) costs of surfaces (D, H, W): each pixel's window follows the surface around it."""
+        """Costs of surfaces (D, H, W): each pixel's window follows the surface around it."""
+
+    def semi_global(
+        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, p1: float, p2: float,
+        smoothing: SmoothingConfig,
+    ) -> SurfaceEstimate:  # fmt: skip
+        """The surface of least cost; p1: of a change by one hypothesis between neighboring pixels, p2: of a larger."""
 
     def choose_surface(
         self, cost: np.ndarray, surfaces: np.ndarray, reference: np.ndarray, options: ChooseOptions
@@ -92,6 +84,6 @@ class Backend(Protocol):
         """
 
     def view_correlation(
-        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,
-        options: CostOptions,
-    ) -> np.ndarray: ...  # fmt: skip
+        self, images: MatchingImages, inverse_depth: np.ndarray, radius: int, cost: CostConfig
+    ) -> np.ndarray:
+        """(N, H, W) ZNCC of each neighbor in the cost's windows; -2 where it does not see the pixel."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from functools import partial
+from typing import Any, Literal, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -11,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from mvsgs_core import camera, geometry
-from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
+from mvsgs_core.devices import torch_device
+from mvsgs_core.mvs.cascade import OnlineStereo, OnlineStereoConfig
 from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.mvs.stereo import StereoDepth
@@ -29,6 +32,7 @@ class _Output(Protocol):
 class Network(NamedTuple):
     """How a published network is made and fed."""
 
+    make: Callable[[], nn.Module]  # untrained
     weights: str  # its name in mvsgs_core.weights
     inside: str  # key of the state dict in its checkpoint
     multiple: int  # sizes of images that it takes
@@ -36,73 +40,55 @@ class Network(NamedTuple):
 
 
 NETWORKS = {
-    "mvsformer": Network("mvsformer", "state_dict", mvsformer.MULTIPLE, None),
-    "mvsformer_p": Network("mvsformer_p", "state_dict", mvsformer.MULTIPLE, None),
+    "mvsformer": Network(partial(mvsformer.MvsFormer, "twins"), "mvsformer", "state_dict", mvsformer.MULTIPLE, None),
+    "mvsformer_p": Network(partial(mvsformer.MvsFormer, "dino"), "mvsformer_p", "state_dict", mvsformer.MULTIPLE, None),
     # of its published weights, by `python -m bench.learned.calibration`: three quarters of the depths are within 5 % of
     # the truth where it says 0.25
-    "itermvs": Network("itermvs", "model", itermvs.MULTIPLE, (2.69, 1.27)),
+    "itermvs": Network(itermvs.IterMvs, "itermvs", "model", itermvs.MULTIPLE, (2.69, 1.27)),
 }
-RANDOM = "random"
 
 
 @dataclass(frozen=True)
-class LearnedConfig:
-    """A network for the cascade."""
+class LearnedStereoConfig(OnlineStereoConfig):
+    """Online stereo by a network."""
 
-    network: str = "itermvs"  # mvsformer, mvsformer_p or itermvs
-    file: str | None = None  # checkpoint; None: where mvsgs_core.weights finds it; "random": untrained, for tests
-    area: int = 512 * 384  # pixels of the images that the network sees, aspect kept
-    device: str = "cpu"  # "cpu" or "cuda[:N]"
+    network: Literal["itermvs", "mvsformer", "mvsformer_p"] = "itermvs"
+    weights: str | None = None  # checkpoint; null: where mvsgs_core.weights finds it; random: untrained, for tests
+    network_area: int = 512 * 384  # pixels of the images that the network sees, aspect kept
 
 
-def make_network(config: LearnedConfig) -> nn.Module:
+def make_network(name: str, file: str | None) -> nn.Module:
     """The network with its weights. Raises ValueError for an unknown name and what `weights.find` and the checkpoint
     reader raise, saying what to fetch from where."""
-    if config.network not in NETWORKS:
-        raise ValueError(f"no network {config.network!r}; there are: {', '.join(NETWORKS)}")
-    entry = NETWORKS[config.network]
-    if config.file == RANDOM:
-        torch.manual_seed(0)
-    net: nn.Module
-    if config.network == "itermvs":
-        net = itermvs.IterMvs()
-    else:
-        net = mvsformer.MvsFormer("dino" if config.network == "mvsformer_p" else "twins")
-    if config.file != RANDOM:
-        checkpoints.load_registered(net, entry.weights, config.file, inside=entry.inside)
-    return net.eval().requires_grad_(False).to(config.device)
+    if name not in NETWORKS:
+        raise ValueError(f"no network '{name}'; there are: {', '.join(NETWORKS)}")
+    entry = NETWORKS[name]
+    return checkpoints.make(entry.make, entry.weights, file, inside=entry.inside)
 
 
-class LearnedCascade(Cascade):
-    """`prepare` keeps a keyframe's image for the network; `remember` it where the view was made elsewhere."""
+class LearnedStereo(OnlineStereo):
+    """`prepare` keeps a keyframe's image for the network; `remember` it where the keyframe was made elsewhere."""
 
-    def __init__(self, config: CascadeConfig, learned: LearnedConfig, calibrate: bool = True) -> None:
+    def __init__(self, config: LearnedStereoConfig, calibrate: bool = True) -> None:
         """calibrate: the network's confidence to the probability of an inlier, where it is known how."""
         super().__init__(config)
-        self.learned = learned
-        self._net = make_network(learned)
-        self._calibration = NETWORKS[learned.network].calibration if calibrate else None
+        self._learned = config
+        self._device = torch_device(config.device)
+        if config.threads:
+            torch.set_num_threads(config.threads)
+        self._net = make_network(config.network, config.weights).to(self._device)
+        self._calibration = NETWORKS[config.network].calibration if calibrate else None
         self._images: dict[int, np.ndarray] = {}  # (h, w, 3) uint8 at the network's size
 
-    def prepare(
-        self,
-        index: int,
-        image: np.ndarray,
-        intrinsics: np.ndarray,
-        world_from_cam: np.ndarray,
-        inverse_depth: np.ndarray,
-        weight: np.ndarray,
-        scale: float,
-        segment: int,
-    ) -> StereoKeyframe:
+    def prepare(self, index: int, image: np.ndarray, *others: Any, **named: Any) -> StereoKeyframe:
         self.remember(index, image)
-        return super().prepare(index, image, intrinsics, world_from_cam, inverse_depth, weight, scale, segment)
+        return super().prepare(index, image, *others, **named)
 
     def remember(self, index: int, image: np.ndarray) -> None:
         """Keeps a keyframe's RGB image (H, W, 3) uint8 at the network's size while it may be needed."""
-        multiple = NETWORKS[self.learned.network].multiple
+        multiple = NETWORKS[self._learned.network].multiple
         height, width = image.shape[:2]
-        size = camera.fit_size(height, width, self.learned.area, multiple)
+        size = camera.fit_size(height, width, self._learned.network_area, multiple)
         self._images[index] = camera.resize_image(image, size)
         for old in sorted(self._images)[: -(self.config.window + self.config.lag + 2)]:
             del self._images[old]
@@ -119,9 +105,9 @@ class LearnedCascade(Cascade):
         cam_from_world[:, :3, 3] /= unit
         with torch.inference_mode():
             output: _Output = self._net(
-                torch.from_numpy(images).permute(0, 3, 1, 2).float().to(self.learned.device),
-                torch.from_numpy(cam_from_world).to(self.learned.device),
-                torch.from_numpy(cameras).to(self.learned.device),
+                torch.from_numpy(images).permute(0, 3, 1, 2).float().to(self._device),
+                torch.from_numpy(cam_from_world).to(self._device),
+                torch.from_numpy(cameras).to(self._device),
                 (1.0 / (search.high * unit), 1.0 / (search.low * unit)),
             )
         confidence = calibrated(output.confidence.cpu().numpy(), self._calibration)

@@ -32,7 +32,7 @@ class Neighbor:
 
 
 def score_neighbor(
-    reference: StereoKeyframe, other: StereoKeyframe, inverse_depths: np.ndarray, choice: NeighborConfig
+    reference: StereoKeyframe, other: StereoKeyframe, inverse_depths: np.ndarray, config: NeighborConfig
 ) -> Neighbor:
     """Baseline, overlap and turn of one candidate; score 0 if it fails a limit. `inverse_depths` (K,): typical ones."""
     warp = relative_warp(reference.intrinsics, reference.world_from_cam, other.intrinsics, other.world_from_cam)
@@ -51,33 +51,33 @@ def score_neighbor(
     turned = float(
         np.degrees(np.arccos(np.clip(reference.world_from_cam[:3, 2] @ other.world_from_cam[:3, 2], -1.0, 1.0)))
     )
-    if angle < choice.min_angle or overlap < choice.min_overlap:
+    if angle < config.min_angle or overlap < config.min_overlap:
         return Neighbor(other, angle, overlap, 0.0)
-    width_of_score = choice.angle_below if angle < choice.best_angle else choice.angle_above
-    by_angle = np.exp(-0.5 * ((angle - choice.best_angle) / width_of_score) ** 2)
-    by_turn = 1.0 / (1.0 + (turned / choice.turn) ** 2)
+    width_of_score = config.angle_below if angle < config.best_angle else config.angle_above
+    by_angle = np.exp(-0.5 * ((angle - config.best_angle) / width_of_score) ** 2)
+    by_turn = 1.0 / (1.0 + (turned / config.turn) ** 2)
     return Neighbor(other, angle, overlap, float(by_angle * by_turn * overlap) + 1e-6)
 
 
 def select_neighbors(
-    reference: StereoKeyframe, candidates: list[StereoKeyframe], inverse_depths: np.ndarray, choice: NeighborConfig
+    reference: StereoKeyframe, candidates: list[StereoKeyframe], inverse_depths: np.ndarray, config: NeighborConfig
 ) -> list[Neighbor]:
-    """Up to `choice.count` neighbors, best first. Half of them from each side in time where these score at all well,
+    """Up to `config.count` neighbors, best first. Half of them from each side in time where these score at all well,
 
     because what one side does not see, behind an edge, the other often does.
     """
-    scored = [score_neighbor(reference, c, inverse_depths, choice) for c in candidates if c.index != reference.index]
+    scored = [score_neighbor(reference, c, inverse_depths, config) for c in candidates if c.index != reference.index]
     usable = sorted((n for n in scored if n.score > 0), key=lambda n: (-n.score, n.view.index))
     if not usable:
         return []
     limit = 0.3 * usable[0].score
     good = [n for n in usable if n.score >= limit]
-    half = choice.count // 2
+    half = config.count // 2
     before = [n for n in good if n.view.index < reference.index][:half]
-    after = [n for n in good if n.view.index > reference.index][: choice.count - half]
+    after = [n for n in good if n.view.index > reference.index][: config.count - half]
     chosen = before + after
     for neighbor in usable:
-        if len(chosen) >= choice.count:
+        if len(chosen) >= config.count:
             break
         if neighbor not in chosen:
             chosen.append(neighbor)

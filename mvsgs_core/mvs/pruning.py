@@ -29,37 +29,37 @@ def tile_counts(size: tuple[int, int]) -> tuple[int, int]:
     return -(-size[0] // TILE[0]), -(-size[1] // TILE[1])
 
 
-def cell_bounds(inverse_depth: np.ndarray, weight: np.ndarray, choice: PruningConfig) -> tuple[np.ndarray, np.ndarray]:
+def cell_bounds(inverse_depth: np.ndarray, weight: np.ndarray, config: PruningConfig) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest inverse depth (h, w) that the known cells around each cell of a grid (h, w) leave open.
 
     0 and infinity where too few are known.
     """
-    known = np.isfinite(inverse_depth) & (inverse_depth > 0) & (weight >= choice.min_weight)
-    r = choice.cell_radius
+    known = np.isfinite(inverse_depth) & (inverse_depth > 0) & (weight >= config.min_weight)
+    r = config.cell_radius
     values = np.pad(np.where(known, inverse_depth, np.inf).astype(np.float32), r, constant_values=np.inf)
     side = 2 * r + 1
     around = np.lib.stride_tricks.sliding_window_view(values, (side, side)).reshape(*inverse_depth.shape, side * side)
     ordered = np.sort(around, axis=-1)  # the unknown ones last
     count = np.isfinite(ordered).sum(axis=-1)
-    out = np.floor(count * choice.cell_percentile / 100.0).astype(np.int64)
-    low = np.take_along_axis(ordered, out[..., None], axis=-1)[..., 0] / choice.cell_margin
+    out = np.floor(count * config.cell_percentile / 100.0).astype(np.int64)
+    low = np.take_along_axis(ordered, out[..., None], axis=-1)[..., 0] / config.cell_margin
     last = np.maximum(count - 1 - out, 0)
-    high = np.take_along_axis(ordered, last[..., None], axis=-1)[..., 0] * choice.cell_margin
-    enough = count >= choice.min_cells
+    high = np.take_along_axis(ordered, last[..., None], axis=-1)[..., 0] * config.cell_margin
+    enough = count >= config.min_cells
     return np.where(enough, low, 0.0), np.where(enough, high, np.inf)
 
 
 def tiles_in_cells(
-    reference: StereoKeyframe, size: tuple[int, int], low: float, interval: float, count: int, choice: PruningConfig
+    reference: StereoKeyframe, size: tuple[int, int], low: float, interval: float, count: int, config: PruningConfig
 ) -> np.ndarray:
     """(tile rows, D, tile columns) uint8: 1 where hypothesis low + k interval of a tile of (H, W) is open."""
-    lowest, highest = cell_bounds(reference.inverse_depth, reference.weight, choice)
+    lowest, highest = cell_bounds(reference.inverse_depth, reference.weight, config)
     rows, columns = tile_counts(size)
     # A tile may lie on several cells: what any of them leaves open, at 4x4 points of the tile.
     order = (columns * 4, rows * 4)
-    spread = [cv2.resize(a.astype(np.float32), order, interpolation=cv2.INTER_NEAREST) for a in (lowest, highest)]
-    begin = spread[0].reshape(rows, 4, columns, 4).min(axis=(1, 3))
-    end = spread[1].reshape(rows, 4, columns, 4).max(axis=(1, 3))
+    enlarged = [cv2.resize(a.astype(np.float32), order, interpolation=cv2.INTER_NEAREST) for a in (lowest, highest)]
+    begin = enlarged[0].reshape(rows, 4, columns, 4).min(axis=(1, 3))
+    end = enlarged[1].reshape(rows, 4, columns, 4).max(axis=(1, 3))
     hypotheses = low + interval * np.arange(count, dtype=np.float32)[None, :, None]
     is_open = (hypotheses >= begin[:, None] - interval) & (hypotheses <= end[:, None] + interval)
     is_open |= ~is_open.any(axis=1, keepdims=True)  # the cells contradict the range: all of it

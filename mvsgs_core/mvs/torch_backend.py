@@ -8,59 +8,53 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.mvs.interface import TILE, Choice, ChooseOptions, CostOptions, SmoothOptions
+from mvsgs_core.devices import TorchTwin
+from mvsgs_core.mvs.interface import TILE, ChooseOptions, MatchingImages, SmoothingConfig, SurfaceEstimate
+from mvsgs_core.mvs.matching_cost import CostConfig, make_cost
 
 _MANY = 1e9
 
 
-class TorchBackend:
+class TorchBackend(TorchTwin):
     """Runs on `device`, a torch device such as "cuda" or "cpu"; arrays in and out are numpy."""
-
-    def __init__(self, device: str) -> None:
-        self.device = torch.device(device)
-
-    def _on(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
 
     @torch.no_grad()
     def cost_volume(
-        self,
-        reference: np.ndarray,
-        neighbors: np.ndarray,
-        warps: np.ndarray,
-        first: np.ndarray,
-        step: np.ndarray,
-        hypotheses: int,
-        options: CostOptions,
-        needed: np.ndarray | None = None,
-    ) -> np.ndarray:
+        self, images: MatchingImages, first: np.ndarray, step: np.ndarray, hypotheses: int, radius: int,
+        cost: CostConfig, needed: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
         start, interval = self._on(first), self._on(step)
         surfaces = (start + k * interval for k in range(hypotheses))
-        return self._sweep(reference, neighbors, warps, surfaces, hypotheses, options, needed)
+        return self._sweep(images, surfaces, hypotheses, radius, cost, needed)
 
     @torch.no_grad()
     def surface_costs(
-        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, surfaces: np.ndarray,
-        options: CostOptions, needed: np.ndarray | None = None,
+        self, images: MatchingImages, surfaces: np.ndarray, radius: int, cost: CostConfig,
+        needed: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
-        return self._sweep(reference, neighbors, warps, iter(self._on(surfaces)), len(surfaces), options, needed)
+        return self._sweep(images, iter(self._on(surfaces)), len(surfaces), radius, cost, needed)
 
     def _sweep(
-        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, surfaces: Iterator[Tensor], count: int,
-        options: CostOptions, needed: np.ndarray | None,
+        self, images: MatchingImages, surfaces: Iterator[Tensor], count: int, radius: int, config: CostConfig,
+        needed: np.ndarray | None,
     ) -> np.ndarray:  # fmt: skip
         """(H, D, W) costs of `count` surfaces (H, W)."""
-        windows = _Windows(self._on(reference), options)
-        images, transforms = self._on(neighbors), self._on(warps)
-        best = min(options.best, len(images))
-        cost = torch.empty((reference.shape[0], count, reference.shape[1]), device=self.device)
+        reference = self._on(images.reference)
+        windows = Windows(reference, radius, config)
+        match = make_cost(windows, config)
+        views = list(zip(self._on(images.neighbors), self._on(images.warps), strict=True))
+        best = min(config.top_k, len(views))
+        volume = torch.empty((reference.shape[0], count, reference.shape[1]), device=self.device)
         for k, surface in enumerate(surfaces):
-            each = torch.stack([windows.cost(i, t, surface, options) for i, t in zip(images, transforms)])
-            cost[:, k] = torch.topk(each, best, dim=0, largest=False).values.mean(dim=0)
+            each = []
+            for image, warp in views:
+                sample, seen = _sample(image, warp, surface)
+                each.append(match(windows.taps_of(sample)).where(seen, 1.0))
+            volume[:, k] = torch.topk(torch.stack(each), best, dim=0, largest=False).values.mean(dim=0)
         if needed is not None:
             tiles = torch.from_numpy(needed).to(self.device).repeat_interleave(TILE[0], 0).repeat_interleave(TILE[1], 2)
-            cost[tiles[: cost.shape[0], :, : cost.shape[2]] == 0] = 1.0
-        return cost.cpu().numpy()
+            volume[tiles[: volume.shape[0], :, : volume.shape[2]] == 0] = 1.0
+        return volume.cpu().numpy()
 
     @torch.no_grad()
     def choose_surface(
@@ -81,74 +75,63 @@ class TorchBackend:
 
     @torch.no_grad()
     def view_correlation(
-        self, reference: np.ndarray, neighbors: np.ndarray, warps: np.ndarray, inverse_depth: np.ndarray,
-        options: CostOptions,
-    ) -> np.ndarray:  # fmt: skip
-        windows = _Windows(self._on(reference), options)
+        self, images: MatchingImages, inverse_depth: np.ndarray, radius: int, cost: CostConfig
+    ) -> np.ndarray:
+        windows = Windows(self._on(images.reference), radius, cost)
         surface = self._on(inverse_depth)
-        pairs = zip(self._on(neighbors), self._on(warps))
-        return torch.stack([windows.correlate(image, warp, surface) for image, warp in pairs]).cpu().numpy()
+        found = []
+        for image, warp in zip(self._on(images.neighbors), self._on(images.warps), strict=True):
+            sample, seen = _sample(image, warp, surface)
+            found.append(windows.correlate(windows.taps_of(sample))[0].where(seen, -2.0))
+        return torch.stack(found).cpu().numpy()
 
     @torch.no_grad()
     def semi_global(
-        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, options: SmoothOptions
-    ) -> Choice:
+        self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, p1: float, p2: float,
+        smoothing: SmoothingConfig,
+    ) -> SurfaceEstimate:  # fmt: skip
         volume, gray, start, interval = (self._on(a) for a in (cost, reference, first, step))
         total = torch.zeros_like(volume)
         sideways = (volume.permute(2, 1, 0), gray.T, start.T, interval.T)
-        shifts = (0, 1, -1) if options.paths == 8 else (0,)
+        shifts = (0, 1, -1) if smoothing.paths == 8 else (0,)
         for reverse in (False, True):
             for shift in shifts:
-                total += _path(volume, gray, start, interval, shift, reverse, options)
-            total += _path(*sideways, 0, reverse, options).permute(2, 1, 0)
-        return _select(total / options.paths, options.temperature)
+                total += _path(volume, gray, start, interval, shift, reverse, p1, p2, smoothing)
+            total += _path(*sideways, 0, reverse, p1, p2, smoothing).permute(2, 1, 0)
+        return _select(total / smoothing.paths, smoothing.temperature)
 
 
-class _Windows:
+class Windows:
     """Adaptive windows of a reference (Yoon and Kweon 2006): normalized weights (taps, H, W), mean and variance."""
 
-    def __init__(self, image: Tensor, options: CostOptions) -> None:
-        r = options.radius
-        self.radius, self.noise = r, options.noise
-        offsets = [(dy, dx) for dy in range(-r, r + 1) for dx in range(-r, r + 1)]
-        shifted = self._neighborhood(image)
-        inside = self._neighborhood(torch.ones_like(image))
-        spread = torch.tensor([-0.5 * (dy * dy + dx * dx) / (r + 1) ** 2 for dy, dx in offsets], device=image.device)
-        weight = torch.exp(spread[:, None, None] - (shifted - image).abs() / options.contrast) * inside
+    def __init__(self, image: Tensor, radius: int, config: CostConfig) -> None:
+        self.radius, self.noise = radius, config.noise
+        side = range(-radius, radius + 1)
+        far = [-0.5 * (dy * dy + dx * dx) / (radius + 1) ** 2 for dy in side for dx in side]
+        self.taps = self.taps_of(image)  # (taps, H, W) gray levels
+        inside = self.taps_of(torch.ones_like(image))
+        distance = torch.tensor(far, device=image.device)
+        weight = torch.exp(distance[:, None, None] - (self.taps - image).abs() / config.contrast) * inside
         self.weight = weight / weight.sum(dim=0)
-        self.weighted = self.weight * shifted
+        self.weighted = self.weight * self.taps
         self.mean = self.weighted.sum(dim=0)
-        square = (self.weighted * shifted).sum(dim=0)
-        self.variance = (square - self.mean**2).clamp(min=0.0) + options.noise
+        square = (self.weighted * self.taps).sum(dim=0)
+        self.variance = (square - self.mean**2).clamp(min=0.0) + config.noise
 
-    def _neighborhood(self, image: Tensor) -> Tensor:
-        """(taps, H, W): each pixel's window, 0 outside the image."""
+    def taps_of(self, image: Tensor) -> Tensor:
+        """(taps, H, W): each pixel's window of an image (H, W), 0 outside."""
         side = 2 * self.radius + 1
         height, width = image.shape
         columns = torch.nn.functional.unfold(image[None, None], side, padding=self.radius)
         return columns.reshape(side * side, height, width)
 
-    def cost(self, neighbor: Tensor, warp: Tensor, inverse_depth: Tensor, options: CostOptions) -> Tensor:
-        """(H, W) in [0, 1]: 1 - ZNCC, with a share of the difference of gray level; 1 where the pixel is not seen."""
-        correlation, mean = self._correlate(neighbor, warp, inverse_depth)
-        shape = (1.0 - correlation).clamp(0.0, 1.0)
-        apart = ((self.mean - mean).abs() / options.level_range).clamp(max=1.0)
-        return torch.where(correlation < -1.5, torch.ones_like(shape), shape + options.level * (apart - shape))
-
-    def correlate(self, neighbor: Tensor, warp: Tensor, inverse_depth: Tensor) -> Tensor:
-        """(H, W) ZNCC against a neighbor (h, w) warped by (12,); -2 where it does not see the pixel."""
-        return self._correlate(neighbor, warp, inverse_depth)[0]
-
-    def _correlate(self, neighbor: Tensor, warp: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-        """ZNCC, and the mean gray level of the neighbor's window."""
-        sample, seen = _sample(neighbor, warp, inverse_depth)
-        shifted = self._neighborhood(sample)
-        total = (self.weight * shifted).sum(dim=0)
-        square = (self.weight * shifted * shifted).sum(dim=0)
-        product = (self.weighted * shifted).sum(dim=0)
+    def correlate(self, samples: Tensor) -> tuple[Tensor, Tensor]:
+        """(H, W) ZNCC against what a neighbor shows in each window, (taps, H, W); and the mean of that."""
+        total = (self.weight * samples).sum(dim=0)
+        square = (self.weight * samples * samples).sum(dim=0)
+        product = (self.weighted * samples).sum(dim=0)
         variance = (square - total**2).clamp(min=0.0) + self.noise
-        correlation = (product - self.mean * total) / torch.sqrt(self.variance * variance)
-        return torch.where(seen, correlation, torch.full_like(correlation, -2.0)), total
+        return (product - self.mean * total) / torch.sqrt(self.variance * variance), total
 
 
 def _sample(image: Tensor, warp: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
@@ -175,8 +158,9 @@ def _sample(image: Tensor, warp: Tensor, inverse_depth: Tensor) -> tuple[Tensor,
 
 
 def _path(
-    cost: Tensor, gray: Tensor, first: Tensor, step: Tensor, shift: int, reverse: bool, options: SmoothOptions
-) -> Tensor:
+    cost: Tensor, gray: Tensor, first: Tensor, step: Tensor, shift: int, reverse: bool, p1: float, p2: float,
+    options: SmoothingConfig,
+) -> Tensor:  # fmt: skip
     """Path costs (R, D, C) of one direction: row by row, the predecessor `shift` columns to the left."""
     rows, count, columns = cost.shape
     result = torch.empty_like(cost)
@@ -199,7 +183,7 @@ def _path(
             base = torch.where(inside, lowest[source], torch.zeros_like(lowest))
             # Outside the image all is 0, as at a path's start, but there is no hypothesis beyond the first and last.
             below, above = torch.cat([high, same[:-1]]), torch.cat([same[1:], high])
-            moved = torch.minimum(torch.minimum(below, above) + options.p1 * relax, base + options.p2 * relax)
+            moved = torch.minimum(torch.minimum(below, above) + p1 * relax, base + p2 * relax)
             value = cost[y] + torch.minimum(same, moved) - base
         result[y] = value
         previous, lowest, before = value, value.min(dim=0).values, y
@@ -229,7 +213,7 @@ def _surface_path(
     return result
 
 
-def _select(total: Tensor, temperature: float) -> Choice:
+def _select(total: Tensor, temperature: float) -> SurfaceEstimate:
     """The best hypothesis of mean path costs (H, D, W), refined by a parabola, and how sure it is."""
     count = total.shape[1]
     lowest, best = total.min(dim=1)
@@ -243,7 +227,7 @@ def _select(total: Tensor, temperature: float) -> Choice:
     both = before + after
     usable = (best > 0) & (best < count - 1) & (both > 1e-9)
     offset = torch.where(usable, 0.5 * (before - after) / both.clamp(min=1e-9), torch.zeros_like(both))
-    return Choice(
+    return SurfaceEstimate(
         index=(best + offset).cpu().numpy().astype(np.float32),
         probability=(near / weight.sum(dim=1)).cpu().numpy(),
         margin=margin.cpu().numpy(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,10 @@ from torch import Tensor, nn
 from mvsgs_core import weights
 from mvsgs_core.bad_file import BadFileError, reading
 
+RANDOM = "random"  # instead of a file
 _LONGEST = 400  # characters of what does not fit
+
+N = TypeVar("N", bound=nn.Module)
 
 
 def read(file: Path, *, inside: str | None = None) -> dict[str, Tensor]:
@@ -97,6 +100,19 @@ def load_registered(
     except ValueError as error:
         raise BadFileError(f"{error}; for the right one: {weights.remedy(name)}") from error
     return path
+
+
+def make(build: Callable[[], N], name: str, file: str | None, *, inside: str) -> N:
+    """`build()`, ready for inference, with the weights `name` of the registry; untrained, but always the same, where
+
+    `file` is RANDOM. Raises what `load_registered` raises.
+    """
+    if file == RANDOM:
+        torch.manual_seed(0)
+    net = build()
+    if file != RANDOM:
+        load_registered(net, name, file, inside=inside)
+    return net.eval().requires_grad_(False)
 
 
 def droid_rows(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -14,7 +14,9 @@ from mvsgs_core.fusion.torch_backend import TorchFusionBackend
 from tests.support.depth_views import SIZE, view
 from tests.support.plane_scene import intrinsics_of, look, true_depth
 
-CONFIG = FusionConfig(device="cpu", threads=1, relative=0.01)
+CONFIG = FusionConfig(  # of a small map: filters of few pixels
+    device="cpu", threads=1, relative=0.01, confidence=0.77, discontinuity_radius=2, speckle=200
+)
 
 
 def brute_force(

@@ -1,30 +1,29 @@
-"""Filters of one depth map: rims of near surfaces, and small patches."""
+"""Filters of one depth map: edges of near surfaces, and small patches."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mvsgs_core.fusion.backend import NativeFusionBackend
-from mvsgs_core.fusion.filters import discontinuity_mask, not_speckle
+from mvsgs_core.fusion.filters import discontinuity_mask, speckle_mask
 from mvsgs_core.fusion.fusion import FusionConfig, fuse
 from tests.support.depth_views import view
 
 
-def test_the_rim_of_the_near_surface_goes_and_what_lies_behind_stays() -> None:
+def test_the_edge_of_the_near_surface_goes_and_what_lies_behind_stays() -> None:
     depth = np.full((30, 40), 4.0, np.float32)
     depth[:, :20] = 2.0
     depth[:, 30:] = 0.0  # unknown: not farther
-    keep = discontinuity_mask(depth, 3)
-    assert keep[:, :17].all()
-    assert not keep[:, 17:20].any()
-    assert keep[:, 20:30].all()
-    assert not keep[:, 30:].any()
-    np.testing.assert_array_equal(discontinuity_mask(depth, 0), depth > 0)
+    reject = discontinuity_mask(depth, 3)
+    assert not reject[:, :17].any()
+    assert reject[:, 17:20].all()
+    assert not reject[:, 20:].any()
+    assert not discontinuity_mask(depth, 0).any()
 
 
-def test_a_slanted_surface_has_no_rim() -> None:
+def test_a_slanted_surface_has_no_edge() -> None:
     depth = np.tile(np.linspace(2.0, 3.0, 100, dtype=np.float32), (20, 1))
-    assert discontinuity_mask(depth, 3).all()
+    assert not discontinuity_mask(depth, 3).any()
 
 
 def test_small_patches_go_at_any_scale_and_large_ones_stay() -> None:
@@ -33,17 +32,16 @@ def test_small_patches_go_at_any_scale_and_large_ones_stay() -> None:
         depth[:, :20] = np.linspace(2.0, 3.0, 20)  # steps of 2.5 % at most: one patch at a tolerance of 3 %
         depth[5:8, 5:8] = 9.0  # in it, but apart
         depth[20:24, 30:34] = 2.0
-        keep = not_speckle(scale * depth, 16, 0.03)
-        expected = depth > 0
-        expected[5:8, 5:8] = expected[20:24, 30:34] = False
-        np.testing.assert_array_equal(keep, expected)
-        np.testing.assert_array_equal(not_speckle(scale * depth, 15, 0.03)[20:24, 30:34], True)
-        np.testing.assert_array_equal(not_speckle(scale * depth, 0, 0.03), depth > 0)
+        expected = np.zeros(depth.shape, dtype=bool)
+        expected[5:8, 5:8] = expected[20:24, 30:34] = True
+        np.testing.assert_array_equal(speckle_mask(scale * depth, 16, 0.03), expected)
+        np.testing.assert_array_equal(speckle_mask(scale * depth, 15, 0.03)[20:24, 30:34], False)
+        assert not speckle_mask(scale * depth, 0, 0.03).any()
 
 
 def test_a_map_without_depth_stays_without() -> None:
     nothing = np.zeros((8, 8), np.float32)
-    assert not not_speckle(nothing, 100, 0.02).any()
+    assert not speckle_mask(nothing, 100, 0.02).any()
     assert not discontinuity_mask(nothing, 3).any()
 
 

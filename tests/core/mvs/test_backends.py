@@ -8,21 +8,32 @@ import numpy as np
 import pytest
 
 from mvsgs_core.mvs.backend import NativeBackend
-from mvsgs_core.mvs.interface import TILE, ChooseOptions, CostOptions, SmoothOptions
+from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, MatchingImages, SmoothingConfig, SurfaceEstimate
+from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.native import load
-from tests.support.stereo_problems import SIZE, problem
+from tests.support.stereo_problems import SIZE, Problem, problem
 
-COST = CostOptions(radius=2, best=2)
-SMOOTH = SmoothOptions()
+COST = CostConfig(top_k=2)
+SMOOTH = SmoothingConfig()
+
+
+def swept(
+    backend: Backend, p: Problem, count: int, cost: CostConfig = COST, radius: int = 2, needed: np.ndarray | None = None
+) -> np.ndarray:
+    return backend.cost_volume(p.images, p.first, p.step, count, radius, cost, needed)
+
+
+def smoothed(
+    backend: Backend, cost: np.ndarray, p: Problem, p1: float = 0.3, p2: float = 2.0, options: SmoothingConfig = SMOOTH
+) -> SurfaceEstimate:
+    return backend.semi_global(cost, p.images.reference, p.first, p.step, p1, p2, options)
 
 
 @pytest.mark.parametrize("radius", [1, 2, 3])
 def test_cost_volumes_of_both_backends_agree(radius: int) -> None:
     p = problem()
-    options = replace(COST, radius=radius)
-    native = NativeBackend(1).cost_volume(**p, hypotheses=9, options=options)
-    twin = TorchBackend("cpu").cost_volume(**p, hypotheses=9, options=options)
+    native, twin = (swept(b, p, 9, radius=radius) for b in (NativeBackend(1), TorchBackend("cpu")))
     assert native.shape == (SIZE[0], 9, SIZE[1])
     assert native.min() >= 0
     assert native.max() <= 1
@@ -31,36 +42,36 @@ def test_cost_volumes_of_both_backends_agree(radius: int) -> None:
     assert native.std() > 0.05
 
 
-def test_a_share_of_the_cost_is_the_difference_of_gray_level() -> None:
+def test_a_part_of_the_cost_is_the_difference_of_gray_level() -> None:
     p = problem()
-    options = replace(COST, level=0.4, level_range=15.0)
-    native = NativeBackend(1).cost_volume(**p, hypotheses=9, options=options)
-    twin = TorchBackend("cpu").cost_volume(**p, hypotheses=9, options=options)
+    options = replace(COST, intensity_weight=0.4, intensity_range=15.0)
+    native, twin = (swept(b, p, 9, options) for b in (NativeBackend(1), TorchBackend("cpu")))
     assert np.mean(np.abs(native - twin) > 1e-3) < 2e-3
     assert native.min() >= 0
     assert native.max() <= 1
-    # Against itself at no motion, ten gray levels brighter: ZNCC sees nothing, the level costs 0.4 * 10 / 15.
+    # Against itself at no motion, ten gray levels brighter: ZNCC sees nothing, that costs 0.4 * 10 / 15.
     stays = np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None].astype(np.float32)
-    own = {**p, "neighbors": p["reference"][None] + 10.0, "warps": stays}
-    cost = NativeBackend(1).cost_volume(**own, hypotheses=1, options=replace(options, best=1, noise=1e-3))
+    own = replace(p, images=MatchingImages(p.images.reference, p.images.reference[None] + 10.0, stays))
+    cost = swept(NativeBackend(1), own, 1, replace(options, top_k=1, noise=1e-3))
     np.testing.assert_allclose(cost[:, 0], 0.4 * 10.0 / 15.0, atol=2e-3)
-    with pytest.raises(ValueError, match="level"):
-        NativeBackend(1).cost_volume(**p, hypotheses=1, options=replace(COST, level=1.5))
+    for backend in (NativeBackend(1), TorchBackend("cpu")):
+        with pytest.raises(ValueError, match=r"level|intensity_weight"):
+            swept(backend, p, 1, replace(COST, intensity_weight=1.5))
 
 
 def test_tiles_that_are_not_needed_cost_one_and_the_others_stay() -> None:
     p = problem()
     rows, columns = (-(-size // tile) for size, tile in zip(SIZE, TILE, strict=True))
     needed = (np.random.default_rng(3).random((rows, 9, columns)) < 0.5).astype(np.uint8)
-    whole = NativeBackend(1).cost_volume(**p, hypotheses=9, options=COST)
-    part = NativeBackend(1).cost_volume(**p, hypotheses=9, options=COST, needed=needed)
-    twin = TorchBackend("cpu").cost_volume(**p, hypotheses=9, options=COST, needed=needed)
+    whole = swept(NativeBackend(1), p, 9)
+    part = swept(NativeBackend(1), p, 9, needed=needed)
+    twin = swept(TorchBackend("cpu"), p, 9, needed=needed)
     inside = needed.repeat(TILE[0], 0).repeat(TILE[1], 2)[: SIZE[0], :, : SIZE[1]] > 0
     np.testing.assert_allclose(part[inside], whole[inside], atol=1e-5)
     assert np.all(part[~inside] == 1)
     assert np.mean(np.abs(part - twin) > 1e-3) < 2e-3
     with pytest.raises(ValueError, match="tile rows"):
-        NativeBackend(1).cost_volume(**p, hypotheses=9, options=COST, needed=needed[:, :8].copy())
+        swept(NativeBackend(1), p, 9, needed=needed[:, :8].copy())
 
 
 def test_the_tile_is_the_kernels() -> None:
@@ -69,7 +80,7 @@ def test_the_tile_is_the_kernels() -> None:
 
 def test_correlations_agree_and_mark_what_is_not_seen() -> None:
     p = problem()
-    arguments = (p["reference"], p["neighbors"], p["warps"], np.full(SIZE, 0.22, np.float32), COST)
+    arguments = (p.images, np.full(SIZE, 0.22, np.float32), 2, COST)
     native, twin = NativeBackend(1).view_correlation(*arguments), TorchBackend("cpu").view_correlation(*arguments)
     assert np.mean(np.abs(native - twin) > 1e-3) < 2e-3
     assert (native == -2).any()
@@ -79,11 +90,10 @@ def test_correlations_agree_and_mark_what_is_not_seen() -> None:
 @pytest.mark.parametrize("paths", [4, 8])
 def test_smoothing_of_both_backends_agrees(paths: int) -> None:
     p = problem()
-    p["first"][:, 30:] += 0.5  # a jump that must end the paths
+    p.first[:, 30:] += 0.5  # a jump that must end the paths
     cost = np.random.default_rng(1).random((SIZE[0], 7, SIZE[1]), dtype=np.float32)
-    options = replace(SMOOTH, paths=paths, p1=0.1, p2=0.4)
-    native = NativeBackend(1).semi_global(cost, p["reference"], p["first"], p["step"], options)
-    twin = TorchBackend("cpu").semi_global(cost, p["reference"], p["first"], p["step"], options)
+    options = replace(SMOOTH, paths=paths)
+    native, twin = (smoothed(b, cost, p, 0.1, 0.4, options) for b in (NativeBackend(1), TorchBackend("cpu")))
     same = native.best == twin.best
     assert same.mean() > 0.995  # near ties may fall to either side
     for name in ("index", "probability", "margin"):
@@ -96,7 +106,6 @@ def test_smoothing_is_the_minimum_over_all_paths_of_a_line() -> None:
     width, count = 5, 3
     cost = rng.random((1, count, width), dtype=np.float32)
     flat, step = np.zeros((1, width), np.float32), np.ones((1, width), np.float32)
-    options = replace(SMOOTH, paths=4, p1=0.2, p2=0.5)
     jump = np.array([[0.0, 0.2, 0.5], [0.2, 0.0, 0.2], [0.5, 0.2, 0.0]])
     forward = np.zeros((count, width))
     forward[:, 0] = cost[0, :, 0]
@@ -107,51 +116,49 @@ def test_smoothing_is_the_minimum_over_all_paths_of_a_line() -> None:
     for x in range(width - 2, -1, -1):
         backward[:, x] = cost[0, :, x] + (backward[:, x + 1][None] + jump).min(axis=1) - backward[:, x + 1].min()
     total = (forward + backward + 2 * cost[0]) / 4  # up and down: a row alone
-    found = NativeBackend(1).semi_global(cost, flat, flat, step, options)
+    found = NativeBackend(1).semi_global(cost, flat, flat, step, 0.2, 0.5, replace(SMOOTH, paths=4))
     np.testing.assert_array_equal(found.best[0], total.argmin(axis=0))
 
 
 def test_exposure_does_not_change_the_cost() -> None:
     p = problem()
     options = replace(COST, noise=0.01)
-    plain = NativeBackend(1).cost_volume(**p, hypotheses=5, options=options)
-    p["neighbors"] = 0.6 * p["neighbors"] + 20.0
-    exposed = NativeBackend(1).cost_volume(**p, hypotheses=5, options=options)
+    plain = swept(NativeBackend(1), p, 5, options)
+    darker = replace(p, images=replace(p.images, neighbors=0.6 * p.images.neighbors + 20.0))
+    exposed = swept(NativeBackend(1), darker, 5, options)
     assert np.quantile(np.abs(plain - exposed), 0.99) < 0.02
 
 
 def test_result_does_not_depend_on_threads() -> None:
     p = problem()
-    one = NativeBackend(1).cost_volume(**p, hypotheses=5, options=COST)
-    two = NativeBackend(2).cost_volume(**p, hypotheses=5, options=COST)
+    one, two = (swept(NativeBackend(threads), p, 5) for threads in (1, 2))
     np.testing.assert_array_equal(one, two)
-    smooth = [NativeBackend(t).semi_global(one, p["reference"], p["first"], p["step"], SMOOTH) for t in (1, 2)]
+    smooth = [smoothed(NativeBackend(threads), one, p) for threads in (1, 2)]
     np.testing.assert_array_equal(smooth[0].index, smooth[1].index)
 
 
 def test_bad_shapes_are_refused() -> None:
     p = problem()
     with pytest.raises(ValueError, match="size"):
-        NativeBackend(1).cost_volume(**{**p, "first": p["first"][:-1].copy()}, hypotheses=5, options=COST)
+        swept(NativeBackend(1), replace(p, first=p.first[:-1].copy()), 5)
     with pytest.raises(ValueError, match="one warp per neighbor"):
-        NativeBackend(1).cost_volume(**{**p, "warps": p["warps"][:1].copy()}, hypotheses=5, options=COST)
+        swept(NativeBackend(1), replace(p, images=replace(p.images, warps=p.images.warps[:1].copy())), 5)
 
 
-def surfaces_of(p: dict[str, np.ndarray], count: int) -> np.ndarray:
-    return np.stack([p["first"] + k * p["step"] for k in range(count)])
+def surfaces_of(p: Problem, count: int) -> np.ndarray:
+    return np.stack([p.first + k * p.step for k in range(count)])
 
 
 def test_the_cost_of_surfaces_is_that_of_a_sweep_through_them() -> None:
     p = problem()
-    images = (p["reference"], p["neighbors"], p["warps"])
     needed = np.ones((-(-SIZE[0] // TILE[0]), 5, -(-SIZE[1] // TILE[1])), np.uint8)
     needed[1, :, 1] = 0
-    native = NativeBackend(2).surface_costs(*images, surfaces_of(p, 5), COST, needed)
-    np.testing.assert_allclose(native, NativeBackend(1).cost_volume(**p, hypotheses=5, options=COST, needed=needed))
-    twin = TorchBackend("cpu").surface_costs(*images, surfaces_of(p, 5), COST, needed)
+    native = NativeBackend(2).surface_costs(p.images, surfaces_of(p, 5), 2, COST, needed)
+    np.testing.assert_allclose(native, swept(NativeBackend(1), p, 5, needed=needed))
+    twin = TorchBackend("cpu").surface_costs(p.images, surfaces_of(p, 5), 2, COST, needed)
     assert np.mean(np.abs(native - twin) > 1e-3) < 2e-3
     with pytest.raises(ValueError, match="surfaces"):
-        NativeBackend(1).surface_costs(*images, surfaces_of(p, 5)[:, 1:].copy(), COST)
+        NativeBackend(1).surface_costs(p.images, surfaces_of(p, 5)[:, 1:].copy(), 2, COST)
 
 
 @pytest.mark.parametrize("count", [1, 6])
@@ -161,12 +168,12 @@ def test_choices_of_both_backends_agree(count: int) -> None:
     cost = rng.random((SIZE[0], count, SIZE[1]), dtype=np.float32)
     surfaces = np.concatenate([surfaces_of(p, count)[:, :18], rng.permuted(surfaces_of(p, count)[:, 18:], axis=0)], 1)
     options = ChooseOptions(p1=20.0, p2=0.6, edge=12.0, apart=0.03)
-    best, gap = NativeBackend(2).choose_surface(cost, surfaces, p["reference"], options)
-    twin, twin_gap = TorchBackend("cpu").choose_surface(cost, surfaces, p["reference"], options)
+    best, gap = NativeBackend(2).choose_surface(cost, surfaces, p.images.reference, options)
+    twin, twin_gap = TorchBackend("cpu").choose_surface(cost, surfaces, p.images.reference, options)
     same = best == twin
     assert same.mean() > 0.995  # near ties may fall to either side
     np.testing.assert_allclose(gap[same], twin_gap[same], atol=2e-3)
-    again = NativeBackend(1).choose_surface(cost, surfaces, p["reference"], options)
+    again = NativeBackend(1).choose_surface(cost, surfaces, p.images.reference, options)
     np.testing.assert_array_equal(best, again[0])
 
 

@@ -1,4 +1,4 @@
-"""The surface of a pixel at an object's rim."""
+"""The surface of a pixel at a depth edge."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.depth_edges import (
     DepthEdgeConfig,
-    at_level_of,
     continued_surfaces,
     differing_tiles,
+    equalized,
     refine_depth_edges,
 )
 from mvsgs_core.mvs.hypotheses import SearchRange
-from mvsgs_core.mvs.interface import TILE, CostOptions
+from mvsgs_core.mvs.interface import TILE, MatchingImages
 from mvsgs_core.mvs.keyframe import prepare_keyframe
 from mvsgs_core.mvs.stereo import StereoConfig, estimate_depth
 from tests.support.plane_scene import look, render, true_depth
@@ -46,24 +46,25 @@ def test_the_level_of_another_exposure_is_taken_out_where_the_neighbor_sees_the_
     warp = np.concatenate([np.eye(3).ravel(), [6.0, 0.0, 0.0]])[None].astype(np.float32)
     there = cv2.warpAffine(reference, np.array([[1.0, 0.0, shift], [0.0, 1.0, 0.0]]), SIZE[::-1])
     there[:20] = 200.0  # something else stands in front of a fifth of it
-    level = at_level_of(reference, (there + 17.0)[None], warp, np.full(SIZE, 0.25, np.float32))
-    np.testing.assert_allclose(level[0], there, atol=0.5)
-    unseen = at_level_of(reference, there[None], warp, np.zeros(SIZE, np.float32))
-    np.testing.assert_array_equal(unseen[0], there)
+    brighter = MatchingImages(reference, (there + 17.0)[None], warp)
+    level = equalized(brighter, np.full(SIZE, 0.25, np.float32))
+    np.testing.assert_allclose(level.neighbors[0], there, atol=0.5)
+    unseen = equalized(MatchingImages(reference, there[None], warp), np.zeros(SIZE, np.float32))
+    np.testing.assert_array_equal(unseen.neighbors[0], there)
 
 
-def test_rims_of_a_box_come_out_sharper() -> None:
+def test_edges_of_a_box_come_out_sharper() -> None:
     poses = [look(x) for x in (0.0, -0.3, -0.15, 0.15, 0.3)]
     views = []
     for k, pose in enumerate(poses):
         image, intrinsics = render(pose, SIZE)
         views.append(prepare_keyframe(k, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2)))
     truth = true_depth(poses[0], SIZE)
-    rim = cv2.dilate(truth, np.ones((9, 9))) > 1.2 * cv2.erode(truth, np.ones((9, 9)))
+    edge = cv2.dilate(truth, np.ones((9, 9))) > 1.2 * cv2.erode(truth, np.ones((9, 9)))
     right = {}
     for name, config in (("with", StereoConfig()), ("without", replace(StereoConfig(), depth_edges=None))):
         found = estimate_depth(views[0], views[1:], SearchRange(0.12, 0.8, "given"), config, NativeBackend(1))
-        right[name] = np.mean(np.abs(found.depth - truth)[rim] < 0.05 * truth[rim])
+        right[name] = np.mean(np.abs(found.depth - truth)[edge] < 0.05 * truth[edge])
     assert right["with"] > right["without"] + 0.02
 
 
@@ -88,12 +89,12 @@ def test_each_round_frees_more_of_what_a_window_covered() -> None:
     truth = np.where(u % 24 < 8, *slats).astype(np.float32)
     closed = np.where((u + 6) % 24 < 20, *slats).astype(np.float32)
     warps = np.stack([[1, 0, 0, 0, 1, 0, 0, 0, 1, -focal * x, 0, 0] for x in places]).astype(np.float32)
-    images = np.stack([seen(x) for x in places]).astype(np.float32)
+    neighbors = np.stack([seen(x) for x in places]).astype(np.float32)
+    images = MatchingImages(seen(0.0).astype(np.float32), neighbors, warps)
     wrong = []
     for rounds in ((), ((4, 8),), DepthEdgeConfig().rounds):
         surface, clear = refine_depth_edges(
-            closed, seen(0.0).astype(np.float32), images, warps, 1.0 / (focal * 0.075), CostOptions(radius=1),
-            DepthEdgeConfig(rounds=rounds), NativeBackend(1),
+            closed, images, 1.0 / (focal * 0.075), 3, DepthEdgeConfig(rounds=rounds), NativeBackend(1),
         )  # fmt: skip
         wrong.append(np.mean(np.abs(surface - truth)[:, 16:112] > 0.01))
         assert np.all((clear >= 0) & (clear <= 1))

@@ -26,11 +26,11 @@ def view(index: int, x: float) -> StereoKeyframe:
     return prepare_keyframe(index, image, intrinsics, pose, area=SIZE[0] * SIZE[1], scales=(1, 2), inverse_depth=grid)
 
 
-def depth_of(skips: PruningConfig, **changes: object) -> StereoDepth:
+def depth_of(pruning: PruningConfig, **changes: object) -> StereoDepth:
     reference = replace(view(0, 0.0), **changes)  # type: ignore[arg-type]
     search = range_of(valid_cells(view(0, 0.0), RangeConfig()), RangeConfig(margin=3.0), "given")
     neighbors = [view(i, x) for i, x in ((1, 0.4), (2, -0.4), (3, 0.8))]
-    return estimate_depth(reference, neighbors, search, StereoConfig(skips=skips), NativeBackend(1))
+    return estimate_depth(reference, neighbors, search, StereoConfig(pruning=pruning), NativeBackend(1))
 
 
 def test_bounds_of_a_cell_are_those_of_the_known_cells_around() -> None:

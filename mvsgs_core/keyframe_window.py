@@ -1,0 +1,70 @@
+"""The newest keyframes of a stream: each is handed out once, `lag` keyframes late, with those around it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Generic, Protocol, Self, TypeVar
+
+import numpy as np
+
+
+class WindowedKeyframe(Protocol):
+    """What the window asks of a keyframe."""
+
+    @property
+    def index(self) -> int: ...
+
+    @property
+    def segment(self) -> int: ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width): keyframes of different sizes are not compared."""
+
+    def moved(self, world_from_cam: np.ndarray, scale: float) -> Self:
+        """The same keyframe after the tracker corrected its pose (4, 4) and the map's scale."""
+
+
+K = TypeVar("K", bound=WindowedKeyframe)
+
+
+class KeyframeWindow(Generic[K]):
+    """Takes keyframes in stream order; `add` and `flush` yield each wanted one exactly once, in order, with its others:
+
+    the one before it, up to `before` more, and `lag` after it. A new segment or size starts a new window.
+    """
+
+    def __init__(self, before: int, lag: int) -> None:
+        self._before, self._lag = before, lag
+        self._keyframes: list[K] = []  # oldest first
+        self._waiting: list[int] = []  # indices of those not handed out yet, oldest first
+
+    def add(self, keyframe: K, wanted: bool = True) -> Iterator[tuple[K, list[K]]]:
+        """Yields the keyframe `lag` before this one; all that wait if this one starts a new window.
+
+        wanted: whether this one is to be handed out too; else it is one of the others only.
+        """
+        last = self._keyframes[-1] if self._keyframes else keyframe
+        if (keyframe.segment, keyframe.size) != (last.segment, last.size):
+            yield from self.flush()
+            self._keyframes.clear()
+        self._keyframes.append(keyframe)
+        if wanted:
+            self._waiting.append(keyframe.index)
+        while len(self._waiting) > self._lag:
+            yield self._next()
+        del self._keyframes[: max(0, len(self._keyframes) - self._before - self._lag - 1)]
+
+    def flush(self) -> Iterator[tuple[K, list[K]]]:
+        """Yields the keyframes that still wait, with the others that are there."""
+        while self._waiting:
+            yield self._next()
+
+    def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
+        """Corrected poses (world_from_cam (4, 4), scale) by keyframe index, for what is still in the window."""
+        self._keyframes = [k.moved(*poses[k.index]) if k.index in poses else k for k in self._keyframes]
+
+    def _next(self) -> tuple[K, list[K]]:
+        index = self._waiting.pop(0)
+        others = [k for k in self._keyframes if k.index != index]
+        return next(k for k in self._keyframes if k.index == index), others
