@@ -7,7 +7,7 @@ choices and edges all come from `conf/`.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -70,7 +70,6 @@ class Edge:
     sender: str
     reader: str
     best_effort: bool
-    feedback: bool = False  # closes a cycle: its reader ends before its sender and does not wait for its End
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ class Graph:
         found: set[str] = set()
         for name, slot in reversed(self.slots.items()):
             only_newest = bool(slot.reads) and all(sender.endswith("?") for sender in slot.reads.values())
-            watched = all(edge.reader in found and not edge.feedback for edge in self.out_of(name))
+            watched = all(edge.reader in found for edge in self.out_of(name))
             if slot.placement.observer or (only_newest and watched):
                 found.add(name)
         return frozenset(found)
@@ -149,7 +148,7 @@ def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) ->
         if section.get("_target_") is not None:
             slots[name] = _build_slot(name, section, replaced.get(name), settings, device)
     edges, warnings = connect(slots, list(sections))
-    names, edges = order(slots, edges)
+    names = order(slots, edges)
     resolved: dict[str, Any] = plain_values(settings)
     resolved |= {name: _section(slots[name]) if name in slots else {"_target_": None} for name in sections}
     graph = Graph({name: slots[name] for name in names}, edges, settings, resolved, warnings)
@@ -275,27 +274,20 @@ def _spared(slot: Slot, message: type) -> bool:
     return bool(must) and slot.reads[message].endswith("?")
 
 
-def order(slots: Collection[str], edges: Collection[Edge]) -> tuple[list[str], list[Edge]]:
-    """Slot names, every sender before its readers, and the edges, with those marked that feed something back.
-
-    Only best-effort edges may close a cycle. Raises GraphError where reliable ones do.
-    """
+def order(slots: Collection[str], edges: Collection[Edge]) -> list[str]:
+    """Slot names, every sender before its readers. Raises GraphError where edges go in a circle."""
     done: list[str] = []
     while len(done) < len(slots):
-        waits = {n: [e for e in edges if e.reader == n and e.sender not in done] for n in slots if n not in done}
-        ready = [n for n, left in waits.items() if not left]
-        ready = ready or [n for n, left in waits.items() if all(e.best_effort for e in left)][:1]
-        if not ready:
-            path = [next(n for n in slots if n not in done)]
+        left = [name for name in slots if name not in done]
+        waits = {name: [e.sender for e in edges if e.reader == name and e.sender not in done] for name in left}
+        if all(waits.values()):
+            path = left[:1]
             while path[-1] not in path[:-1]:
-                path.append(next(e.sender for e in edges if e.reader == path[-1] and e.sender not in done))
+                path.append(waits[path[-1]][0])
             loop = path[path.index(path[-1]) :][::-1]
-            raise GraphError(
-                f"a cycle: {' -> '.join(loop)}; a node cannot wait for what it causes itself"
-                ' (best effort, "slot?", may close one)'
-            )
-        done += ready
-    return done, [replace(e, feedback=done.index(e.sender) >= done.index(e.reader)) for e in edges]
+            raise GraphError(f"a cycle: {' -> '.join(loop)}; a node cannot wait for what it causes itself")
+        done += [name for name in left if not waits[name]]
+    return done
 
 
 def _check_observers(graph: Graph) -> None:

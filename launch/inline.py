@@ -52,7 +52,7 @@ class _Inline:
         for name, runner in self._runners.items():  # senders come before their readers
             self._send(name, runner.end())
             end = self._end(name, runner)
-            for reader in dict.fromkeys(edge.reader for edge in self._graph.out_of(name) if not edge.feedback):
+            for reader in dict.fromkeys(edge.reader for edge in self._graph.out_of(name)):
                 list(self._runners[reader].handle(end))
         return {name: runner.node for name, runner in self._runners.items()}
 

@@ -81,7 +81,6 @@ def spec(
                 "slot": edge.sender,
                 "address": address[topic_of(edge)],
                 "best_effort": edge.best_effort,
-                "feedback": edge.feedback,
             }
             for edge in graph.into(name)
         ],

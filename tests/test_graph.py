@@ -128,12 +128,8 @@ def test_observers_are_those_declared_and_readers_of_best_effort_edges_only() ->
 def test_a_cycle_is_refused_with_its_path() -> None:
     with pytest.raises(GraphError, match=r"a cycle: (relay -> sink -> relay|sink -> relay -> sink)"):
         fake(f"sink._target_={STAGES}.Loop", "relay.reads.Frame=sink")
-
-
-def test_only_best_effort_may_close_a_cycle_and_is_marked() -> None:
-    graph = fake(f"sink._target_={STAGES}.Loop", "relay.reads.Frame=sink?")
-    assert [(e.sender, e.reader) for e in graph.edges if e.feedback] == [("sink", "relay")]
-    assert not any(e.feedback for e in fake().edges)
+    with pytest.raises(GraphError, match="a cycle: "):
+        fake(f"sink._target_={STAGES}.Loop", "relay.reads.Frame=sink?")
 
 
 def test_an_inline_run_that_fails_lets_its_nodes_save_what_they_have(

@@ -176,8 +176,7 @@ class _Process:
         """What a node makes of its inputs, and of the time when none waits."""
         idle = False  # background work is left
         freed = FreedMemory()
-        awaited = [reader for reader, given in zip(self._readers, self._spec.inputs, strict=True) if not given.feedback]
-        while not all(reader.ended for reader in awaited):
+        while not all(reader.ended for reader in self._readers):
             self._signals.check()
             if not idle:
                 self._step.next("waiting")

@@ -30,7 +30,6 @@ class Input:
     slot: str  # that sends it
     address: str
     best_effort: bool = False
-    feedback: bool = False  # its sender ends after this node: its End is not waited for
 
     @property
     def topic(self) -> str:
