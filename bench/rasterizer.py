@@ -16,8 +16,8 @@ Roofline: what an ideal implementation needs at the peaks measured here with the
 - traffic to memory of parameters, gradients, pairs, sums and images, at the rate of a copy.
 
 Sorting and finding tiles count by their traffic alone. Beside it, the fraction if every lane that the kernel evaluates
-counted (4x4 pixels go together), and a simpler estimate of exponentials and bytes: the densities that the kernel
-evaluates at their own rate, no other arithmetic.
+counted (4x4 pixels go together), and a simpler estimate of exponentials and bytes: the values of the splats' kernels
+at their own rate, no other arithmetic.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mvsgs_core import camera, native
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.rasterizer import kernels, spherical_harmonics, ssim
 from mvsgs_core.rasterizer.kernels import KERNELS
-from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.rasterize import RenderSettings, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 
 PASSES = 3  # of the kernel in a round
@@ -106,13 +106,25 @@ def run(
     return render.color.detach()
 
 
+def render_settings(size: tuple[int, int], kernel: str, threads: int) -> RenderSettings:
+    """As the C++ kernels take them, with the blending weights, which count what contributed."""
+    return RenderSettings(
+        pose=torch.eye(4, dtype=torch.float64), intrinsics=tuple(intrinsics(size).tolist()), size=size,
+        exact=kernel == "exact", background=(0.0, 0.0, 0.0), near=1e-3, antialiased=False, degree=0, weights=True,
+        threads=threads,
+    )  # fmt: skip
+
+
+def arrays(splats: Splats) -> list[torch.Tensor]:
+    return [tensor.detach() for tensor in splats.tensors().values()]
+
+
 def run_baseline(splats: Splats, size: tuple[int, int], kernel: str, threads: int, times: Times) -> torch.Tensor:
     color = torch.empty(*size, 3)
+    settings = render_settings(size, kernel, threads)
     seconds = native.load("bench").baseline(
-        *(tensor.detach() for tensor in splats.tensors().values()), torch.eye(4, dtype=torch.float64),
-        tuple(intrinsics(size).tolist()), kernel == "exact", threads, color, torch.ones(*size, 3),
-        torch.empty(len(splats), 9),
-    )  # fmt: skip
+        settings, settings.pose, arrays(splats), color, torch.ones(*size, 3), torch.empty(len(splats), 9)
+    )
     times.add(*seconds)
     return color
 
@@ -121,7 +133,7 @@ def run_baseline(splats: Splats, size: tuple[int, int], kernel: str, threads: in
 class Operations:
     """Arithmetic per pair of splat and pixel; a multiplication with addition is one, a comparison or selection is one.
 
-    Density: u, v 3, log2 of alpha 2, exponential 8 (two to split, five products, one to scale); the exact form adds the
+    Kernel: u, v 3, log2 of alpha 2, exponential 8 (two to split, five products, one to scale); the exact form adds the
     logarithm 13, the exponential 8, their limits 2 and the exponent 1. Forward: clamp, two comparisons, weight,
     transmittance, four sums. Backward: clamp, two comparisons, weight, transmittance, three for dL/dweight, one for
     what lies behind, seven for dL/dalpha (its reciprocal is three), eleven for the sums; the exact form adds eight.
@@ -143,18 +155,16 @@ OPERATIONS = {"gaussian": Operations(13), "exact": Operations(37, backward=35)}
 class Work:
     """What the kernel did in one forward pass."""
 
-    evaluated: int  # densities, lanes off the ellipse included
+    evaluated: int  # values of the splats' kernels, lanes off the ellipse included
     contributed: int  # of those, pairs of splat and pixel that got color
     pairs: int  # of splats and tiles
 
 
 def work(splats: Splats, size: tuple[int, int], kernel: str) -> Work:
-    height, width = size
+    settings = render_settings(size, kernel, threads=0)
     passed = native.load("rasterizer").forward(
-        *(tensor.detach() for tensor in splats.tensors().values()), pose=torch.eye(4, dtype=torch.float64),
-        intrinsics=tuple(intrinsics(size).tolist()), near=1e-3, background=(0.0, 0.0, 0.0), exact=kernel == "exact",
-        antialiased=False, degree=0, tile_mask=None, weights=True, threads=0, color=torch.empty(height, width, 3),
-        depth=torch.empty(size), opacity=torch.empty(size), radii=torch.empty(len(splats)),
+        settings, settings.pose, arrays(splats), color=torch.empty(*size, 3), depth=torch.empty(size),
+        opacity=torch.empty(size), radii=torch.empty(len(splats)),
     )  # fmt: skip
     return Work(passed.evaluated, passed.contributed, passed.pairs)
 
@@ -184,8 +194,8 @@ def roofline(done: Work, count: int, size: tuple[int, int], kernel: str, threads
         blending = max(pairs * OPERATIONS[kernel].pair() / products, state(pairs))
         return 1e3 * (blending + count * PROJECTION_OPERATIONS / products + memory)
 
-    densities_only = 2 * done.evaluated / peaks.peak_densities(kernel == "exact", threads)
-    simple = 1e3 * (max(densities_only, state(done.evaluated)) + memory)
+    kernel_only = 2 * done.evaluated / peaks.peak_kernel_values(kernel == "exact", threads)
+    simple = 1e3 * (max(kernel_only, state(done.evaluated)) + memory)
     return Roofline(bound(done.contributed), bound(done.evaluated), simple)
 
 

@@ -38,7 +38,7 @@ class Group:
     low: float
     high: float
     lead: int = 48  # columns of the flattened parameter that take the full rate,
-    tail: float = 1.0  # the others this share of it
+    tail: float = 1.0  # the others this fraction of it
 
 
 def groups(rates: OptimizerConfig, median_depth: float, factor: float, train_betas: bool, kernel: str) -> list[Group]:
@@ -69,22 +69,19 @@ def step(state: MapState, visible: Tensor, steps: list[Group], decay_steps: int,
         return 0
     if state.device.type != "cpu":
         return step_reference(state, visible, steps, decay_steps)
-    rows: list[list[Tensor]] = [[], [], [], []]
-    settings: list[list[float]] = []
+    groups = []
     for group in steps:
         parameter: Tensor = getattr(state.splats, group.name)
         if parameter.grad is None:
             continue
-        moments = (state.first[group.name], state.second[group.name])
-        for destination, value in zip(rows, (parameter.detach(), parameter.grad, *moments), strict=True):
-            destination.append(value.reshape(len(state), -1))
-        settings.append([group.rate, group.final_rate, group.low, group.high, float(group.lead), group.tail])
-    values, gradients, firsts, seconds = ([tensor.numpy() for tensor in group] for group in rows)
-    if not settings:
+        rows = (parameter.detach(), parameter.grad, state.first[group.name], state.second[group.name])
+        arrays = [value.reshape(len(state), -1).numpy() for value in rows]
+        groups.append((*arrays, group.rate, group.final_rate, group.low, group.high, group.lead, group.tail))
+    if not groups:
         return 0
     refused: int = native.load("mapping").adam(
-        values, gradients, firsts, seconds, settings, visible.numpy(), state.steps.numpy(),
-        BETA_1, BETA_2, EPSILON, decay_steps, threads or torch.get_num_threads(),
+        groups, visible.numpy(), state.steps.numpy(), BETA_1, BETA_2, EPSILON, decay_steps,
+        threads or torch.get_num_threads(),
     )  # fmt: skip
     clear_gradients(state)
     return refused

@@ -23,32 +23,23 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor,
-        betas: Tensor, means2d: Tensor, pose: Tensor, view: RenderSettings, extra: dict[str, Any],
+        betas: Tensor, means2d: Tensor, pose: Tensor, settings: RenderSettings, extra: dict[str, Any],
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        height, width = view.size
         parameters = [t.detach().contiguous() for t in (means, log_scales, quaternions, opacity_logits, sh, betas)]
-        color = torch.empty(height, width, 3)
-        depth, opacity = torch.empty(height, width), torch.empty(height, width)
+        color = torch.empty(*settings.size, 3)
+        depth, opacity = torch.empty(settings.size), torch.empty(settings.size)
         radii = torch.empty(len(means))
         passed = native.load("rasterizer").forward(
-            *(parameter.numpy() for parameter in parameters),
+            settings=settings,
             pose=pose.detach().contiguous().numpy(),
-            intrinsics=view.intrinsics,
-            near=view.near,
-            background=view.background,
-            exact=view.kernel == "exact",
-            antialiased=view.antialiased,
-            degree=view.degree,
-            tile_mask=None if view.tile_mask is None else view.tile_mask.numpy(),
-            weights=view.weights,
-            threads=view.threads,
+            splats=[parameter.numpy() for parameter in parameters],
             color=color.numpy(),
             depth=depth.numpy(),
             opacity=opacity.numpy(),
             radii=radii.numpy(),
         )
         extra.update(passed=passed, radii=radii)
-        ctx.passed, ctx.view, ctx.report = passed, view, extra["backward"]
+        ctx.passed, ctx.settings, ctx.report = passed, settings, extra["backward"]
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*parameters, color, depth, opacity)
         return color, depth, opacity
@@ -59,33 +50,26 @@ class _Rasterize(torch.autograd.Function):
         *parameters, color, depth, opacity = ctx.saved_tensors
         on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous().numpy() for g in gradients)
         results = [torch.empty_like(parameter) for parameter in parameters]
-        on_screen = torch.empty(len(parameters[0]), 2)
+        on_means2d = torch.empty(len(parameters[0]), 2)
         on_pose = torch.zeros(4, 4, dtype=torch.float64)
-        on_means, on_log_scales, on_quaternions, on_opacity_logits, on_sh, on_betas = (r.numpy() for r in results)
         ctx.report.refused = native.load("rasterizer").backward(
             ctx.passed,
-            *(parameter.numpy() for parameter in parameters),
+            splats=[parameter.numpy() for parameter in parameters],
             color=color.numpy(),
             depth=depth.numpy(),
             opacity=opacity.numpy(),
-            color_gradient=np.zeros(color.shape, np.float32) if on_color is None else on_color,
-            depth_gradient=on_depth,
-            opacity_gradient=on_opacity,
-            threads=ctx.view.threads,
-            on_means=on_means,
-            on_log_scales=on_log_scales,
-            on_quaternions=on_quaternions,
-            on_opacity_logits=on_opacity_logits,
-            on_sh=on_sh,
-            on_betas=on_betas,
-            on_screen=on_screen.numpy(),
+            on_color=np.zeros(color.shape, np.float32) if on_color is None else on_color,
+            on_depth=on_depth,
+            on_opacity=on_opacity,
+            on_splats=[result.numpy() for result in results],
+            on_means2d=on_means2d.numpy(),
             on_pose=on_pose.numpy(),
         )
-        *shared, of_betas = results
-        return (*shared, of_betas if ctx.view.kernel == "exact" else None, on_screen, on_pose, None, None)
+        *shared, on_betas = results
+        return (*shared, on_betas if ctx.settings.exact else None, on_means2d, on_pose, None, None)
 
 
-def render(splats: Splats, view: RenderSettings) -> Render:
+def render(splats: Splats, settings: RenderSettings) -> Render:
     """See `rasterizer.rasterize`. Raises ValueError unless the splats are float32 in main memory."""
     if splats.means.dtype != torch.float32 or splats.means.device.type != "cpu":
         raise ValueError(
@@ -93,11 +77,11 @@ def render(splats: Splats, view: RenderSettings) -> Render:
             "take backend='reference' for float64"
         )
     count = len(splats)
-    means2d = means2d_leaf(splats, view)
+    means2d = means2d_leaf(splats, settings)
     extra: dict[str, Any] = {"backward": Backward()}
-    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), means2d, view.pose, view, extra)
+    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), means2d, settings.pose, settings, extra)
     weight_sum = weight_max = None
-    if view.weights:
+    if settings.weights:
         weight_sum, weight_max = torch.empty(count), torch.empty(count)
         native.load("rasterizer").weights(extra["passed"], weight_sum.numpy(), weight_max.numpy())
     return Render(

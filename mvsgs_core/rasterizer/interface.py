@@ -1,4 +1,4 @@
-"""What the rasterizer and its back ends share: the view asked for, the render that comes back, the constants."""
+"""What the rasterizer and its back ends share: the settings of a render, the render that comes back, the constants."""
 
 from __future__ import annotations
 
@@ -17,19 +17,17 @@ MIN_COMPENSATION = 0.005  # floor of the antialiased opacity factor
 MAX_VARIANCE = 1e16  # px^2
 MAX_REACH = 1e12  # of m, where an exact kernel of a small exponent ends at the latest
 MIN_QUATERNION = 1e-8
-TILE = 16  # pixels
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What the back ends get besides the splats: a checked camera and the switches."""
+    """What the back ends get besides the splats: a checked camera and the switches. The C++ kernels read it by name."""
 
     pose: Tensor  # (4, 4) float64 world_from_cam, may carry a gradient
     intrinsics: tuple[float, ...]  # fx, fy, cx, cy, px at `size`
     size: tuple[int, int]  # height, width, px
-    kernel: str  # "gaussian" or "exact"
+    exact: bool  # the generalized exponential of each splat's beta, else the Gaussian
     background: tuple[float, ...]  # red, green, blue
-    tile_mask: Tensor | None  # (ceil(H / 16), ceil(W / 16)) bool, False = leave the tile out
     near: float  # map units
     antialiased: bool
     degree: int  # of the spherical harmonics
@@ -53,22 +51,15 @@ class Render:
     opacity: Tensor  # (H, W), 0 to 1
     visible: Tensor  # (N,) bool: in front, on the image, opacity at least 1/255
     radii: Tensor  # (N,), half of the longer side of the splat's box on the image, px; 0 if not visible
-    means2d: (
-        Tensor  # (N, 2) zeros; after backward its .grad is dL/d(mean on the image), in units of half the image (3DGS)
-    )
+    means2d: Tensor  # (N, 2) zeros; after backward .grad is dL/d(mean on the image) in halves of the image, as in 3DGS
     weight_sum: Tensor | None  # (N,), blending weight alpha * T summed over the pixels; None unless asked for
     weight_max: Tensor | None  # (N,), the largest blending weight at any pixel; None unless asked for
     refused: int  # splats left out because a parameter is not finite or degenerate
     backward: Backward  # what the backward pass reports, once it has run
 
 
-def tile_grid(size: tuple[int, int]) -> tuple[int, int]:
-    """(rows, columns) of 16x16 tiles that cover an image of (height, width)."""
-    return -(-size[0] // TILE), -(-size[1] // TILE)
-
-
-def means2d_leaf(splats: Splats, view: RenderSettings) -> Tensor:
+def means2d_leaf(splats: Splats, settings: RenderSettings) -> Tensor:
     """Zeros (N, 2) for `Render.means2d`; they take a gradient where anything else does."""
-    inputs = [*splats.tensors().values(), view.pose]
+    inputs = [*splats.tensors().values(), settings.pose]
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs)
     return splats.means.new_zeros(len(splats), 2).requires_grad_(wanted)

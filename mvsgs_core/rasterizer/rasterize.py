@@ -25,10 +25,10 @@ import torch
 from torch import Tensor
 
 from mvsgs_core.rasterizer import cpu, kernels, reference, spherical_harmonics
-from mvsgs_core.rasterizer.interface import TILE, Render, RenderSettings, tile_grid
+from mvsgs_core.rasterizer.interface import Render, RenderSettings
 from mvsgs_core.rasterizer.splats import Splats
 
-__all__ = ["BACKENDS", "TILE", "Render", "RenderSettings", "rasterize", "se3_exp", "tile_grid"]
+__all__ = ["BACKENDS", "Render", "RenderSettings", "rasterize", "se3_exp"]
 
 BACKENDS = ("auto", "reference", "cpu", "triton")
 
@@ -55,7 +55,6 @@ def rasterize(
     backend: str = "auto",
     exposure: Tensor | None = None,
     pose_delta: Tensor | None = None,
-    tile_mask: Tensor | np.ndarray | None = None,
     near: float = 1e-3,
     antialiased: bool = False,
     degree: int | None = None,
@@ -69,7 +68,6 @@ def rasterize(
     background: (3,) color behind the splats, black if None; carries no gradient.
     exposure: (3, 4) affine [A | b]; the color returned is A color + b.
     pose_delta: (6,) twist (translation, rotation) in the camera's frame: renders from world_from_cam @ exp(pose_delta).
-    tile_mask: (rows, columns) of `tile_grid`, False leaves a tile out: background there, and no gradient from it.
     near: splats with z <= near are left out, map units: relate it to the scene's depth.
     degree: highest degree of the spherical harmonics used; None = all that `splats.sh` has.
     weights: fill `Render.weight_sum` and `weight_max` (adds about a quarter to the forward pass).
@@ -80,9 +78,9 @@ def rasterize(
     """
     splats.check()
     kernels.check_kernel(kernel)
-    most = spherical_harmonics.degree_of(splats.sh.shape[1])
-    if degree is not None and not 0 <= degree <= most:
-        raise ValueError(f"degree {degree}: the splats have spherical harmonics up to {most}")
+    max_degree = spherical_harmonics.degree_of(splats.sh.shape[1])
+    if degree is not None and not 0 <= degree <= max_degree:
+        raise ValueError(f"degree {degree}: the splats have spherical harmonics up to {max_degree}")
     if size[0] < 1 or size[1] < 1:
         raise ValueError(f"an image of {size[0]}x{size[1]} pixels cannot be rendered")
     if kernel == "ges_scale":
@@ -91,20 +89,19 @@ def rasterize(
             splats.means, splats.log_scales + shift[:, None], splats.quaternions, splats.opacity_logits, splats.sh,
             splats.betas.detach(),
         )  # fmt: skip
-    view = RenderSettings(
+    settings = RenderSettings(
         pose=_pose(world_from_cam, pose_delta),
         intrinsics=_floats(intrinsics, 4, "intrinsics"),
         size=(int(size[0]), int(size[1])),
-        kernel="exact" if kernel == "exact" else "gaussian",
+        exact=kernel == "exact",
         background=(0.0, 0.0, 0.0) if background is None else _floats(background, 3, "background"),
-        tile_mask=_mask(tile_mask, size),
         near=float(near),
         antialiased=antialiased,
-        degree=most if degree is None else degree,
+        degree=max_degree if degree is None else degree,
         weights=weights,
         threads=threads or 0,
     )
-    render = _backend(backend, splats.means.device)(splats, view)
+    render = _backend(backend, splats.means.device)(splats, settings)
     if exposure is not None:
         if tuple(exposure.shape) != (3, 4):
             raise ValueError(f"exposure is {tuple(exposure.shape)}: expected (3, 4)")
@@ -141,12 +138,3 @@ def _floats(values: Tensor | np.ndarray, count: int, name: str) -> tuple[float, 
     if len(array) != count or not bool(torch.isfinite(array).all()):
         raise ValueError(f"{name}: expected {count} finite numbers, got {array.tolist()}")
     return tuple(array.tolist())
-
-
-def _mask(mask: Tensor | np.ndarray | None, size: tuple[int, int]) -> Tensor | None:
-    if mask is None:
-        return None
-    tensor = torch.as_tensor(mask)
-    if tuple(tensor.shape) != tile_grid(size) or tensor.dtype != torch.bool:
-        raise ValueError(f"tile_mask is {tensor.dtype} {tuple(tensor.shape)}: expected bool {tile_grid(size)}")
-    return tensor.contiguous()

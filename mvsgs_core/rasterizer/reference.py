@@ -35,10 +35,10 @@ def usable(splats: Splats) -> Tensor:
     return torch.stack(finite).all(dim=0) & (splats.quaternions.norm(dim=-1) > interface.MIN_QUATERNION)
 
 
-def axes_on_image(splats: Splats, points: Tensor, view: RenderSettings) -> Tensor:
+def axes_on_image(splats: Splats, points: Tensor, settings: RenderSettings) -> Tensor:
     """(N, 2, 3) in px: the splats' axes, each one standard deviation long, projected by the Jacobian at `points`."""
-    fx, fy, cx, cy = view.intrinsics
-    height, width = view.size
+    fx, fy, cx, cy = settings.intrinsics
+    height, width = settings.size
     x, y, z = points.unbind(-1)
     margin_x, margin_y = (interface.CLAMP_MARGIN * 0.5 * n / f for n, f in ((width, fx), (height, fy)))
     slope_x = (x / z).clamp(-(cx + 0.5) / fx - margin_x, (width - 0.5 - cx) / fx + margin_x)
@@ -47,7 +47,7 @@ def axes_on_image(splats: Splats, points: Tensor, view: RenderSettings) -> Tenso
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx * slope_x / z], -1), torch.stack([zero, fy / z, -fy * slope_y / z], -1)], -2
     )
-    cam_from_world = view.pose[:3, :3].T.to(points)
+    cam_from_world = settings.pose[:3, :3].T.to(points)
     axes = rotation_matrices(splats.quaternions) * torch.exp(splats.log_scales)[:, None, :]
     return jacobian @ cam_from_world @ axes
 
@@ -67,29 +67,29 @@ class Projected:
     betas: Tensor  # (N,)
 
 
-def project(splats: Splats, means2d: Tensor, view: RenderSettings) -> Projected:
+def project(splats: Splats, means2d: Tensor, settings: RenderSettings) -> Projected:
     """EWA projection of usable splats in front of the camera; `means2d` (N, 2) moves them, unit half the image."""
-    fx, fy, cx, cy = view.intrinsics
-    height, width = view.size
+    fx, fy, cx, cy = settings.intrinsics
+    height, width = settings.size
     dtype, device = splats.means.dtype, splats.means.device
-    pose = view.pose.to(device)
+    pose = settings.pose.to(device)
     from_camera = splats.means.double() - pose[:3, 3]
     points = (from_camera @ pose[:3, :3]).to(dtype)
     depths = points[:, 2]
     centers = torch.stack([fx * points[:, 0] / depths + cx, fy * points[:, 1] / depths + cy], dim=-1)
     centers = centers + means2d * torch.tensor([0.5 * width, 0.5 * height], dtype=dtype, device=device)
 
-    row_x, row_y = axes_on_image(splats, points, view).unbind(1)
+    row_x, row_y = axes_on_image(splats, points, settings).unbind(1)
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     # the determinant as a sum of squares (Lagrange's identity): no cancellation for needles
     sharp = torch.linalg.cross(row_x, row_y).square().sum(-1)
     determinant = sharp + interface.BLUR * (xx + yy) + interface.BLUR**2
 
     opacity = torch.sigmoid(splats.opacity_logits)
-    if view.antialiased:
+    if settings.antialiased:
         opacity = opacity * (sharp / determinant).clamp(min=interface.MIN_COMPENSATION**2).sqrt()
     directions = from_camera / from_camera.norm(dim=-1, keepdim=True)
-    colors = spherical_harmonics.colors(splats.sh, directions.to(dtype), view.degree)
+    colors = spherical_harmonics.colors(splats.sh, directions.to(dtype), settings.degree)
     return Projected(
         centers, depths, xx + interface.BLUR, xy, yy + interface.BLUR, determinant, opacity, colors, splats.betas
     )
@@ -105,17 +105,17 @@ class Choice:
 
 
 @torch.no_grad()
-def choose(splats: Splats, view: RenderSettings) -> Choice:
+def choose(splats: Splats, settings: RenderSettings) -> Choice:
     """Leaves out what is not usable, behind the near plane, degenerate on the image, too faint or off the image."""
-    height, width = view.size
+    height, width = settings.size
     keep = usable(splats)
-    pose = view.pose.to(splats.means.device)
+    pose = settings.pose.to(splats.means.device)
     z = ((splats.means.double() - pose[:3, 3]) @ pose[:3, 2]).nan_to_num(0.0)
-    kept = torch.nonzero(keep & (z > view.near))[:, 0]
+    kept = torch.nonzero(keep & (z > settings.near))[:, 0]
     chosen = Splats(*(tensor[kept] for tensor in splats.tensors().values()))
-    p = project(chosen, torch.zeros_like(chosen.means[:, :2]), view)
+    p = project(chosen, torch.zeros_like(chosen.means[:, :2]), settings)
     sane = torch.isfinite(p.determinant) & (p.xx < interface.MAX_VARIANCE) & (p.yy < interface.MAX_VARIANCE)
-    reach = kernels.extent(p.opacity, p.betas, view.kernel).clamp(max=interface.MAX_REACH)
+    reach = kernels.extent(p.opacity, p.betas, settings.exact).clamp(max=interface.MAX_REACH)
     half_x, half_y = (reach * p.xx).sqrt(), (reach * p.yy).sqrt()
     on_image = (p.centers[:, 0] + half_x >= 0) & (p.centers[:, 0] - half_x <= width - 1)
     on_image &= (p.centers[:, 1] + half_y >= 0) & (p.centers[:, 1] - half_y <= height - 1)
@@ -125,26 +125,23 @@ def choose(splats: Splats, view: RenderSettings) -> Choice:
     return Choice(kept[seen], torch.stack([half_x, half_y], dim=1)[seen], refused)
 
 
-def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, view: RenderSettings) -> Tensor:
-    """(P, V) of pixels (P,) by splats (V,); 0 below 1/255 and in tiles left out."""
+def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, settings: RenderSettings) -> Tensor:
+    """(P, V) of pixels (P,) by splats (V,); 0 below 1/255."""
     dx, dy = pixel_x[:, None] - p.centers[:, 0], pixel_y[:, None] - p.centers[:, 1]
     m = p.yy / p.determinant * (dx - p.xy / p.yy * dy) ** 2 + dy * dy / p.yy
-    alpha = (p.opacity * kernels.falloff(m, p.betas, view.kernel)).clamp(max=interface.MAX_ALPHA)
-    counted = alpha >= kernels.MIN_ALPHA
-    if view.tile_mask is not None:
-        counted = counted & view.tile_mask[pixel_y // interface.TILE, pixel_x // interface.TILE][:, None]
-    return torch.where(counted, alpha, 0.0)
+    alpha = (p.opacity * kernels.falloff(m, p.betas, settings.exact)).clamp(max=interface.MAX_ALPHA)
+    return torch.where(alpha >= kernels.MIN_ALPHA, alpha, 0.0)
 
 
-def render(splats: Splats, view: RenderSettings) -> Render:
+def render(splats: Splats, settings: RenderSettings) -> Render:
     """See `rasterizer.rasterize`."""
     dtype, device, count = splats.means.dtype, splats.means.device, len(splats)
-    height, width = view.size
-    means2d = interface.means2d_leaf(splats, view)
-    choice = choose(splats, view)
+    height, width = settings.size
+    means2d = interface.means2d_leaf(splats, settings)
+    choice = choose(splats, settings)
     shown = Splats(*(tensor.index_select(0, choice.order) for tensor in splats.tensors().values()))
-    p = project(shown, means2d.index_select(0, choice.order), view)
-    background = torch.tensor(view.background, dtype=dtype, device=device)
+    p = project(shown, means2d.index_select(0, choice.order), settings)
+    background = torch.tensor(settings.background, dtype=dtype, device=device)
     weight_sum, weight_max, radii = splats.means.new_zeros(3, count).unbind(0)
 
     rows_at_once = max(1, PAIRS_AT_ONCE // max(1, width * len(choice.order)))
@@ -153,7 +150,7 @@ def render(splats: Splats, view: RenderSettings) -> Render:
     for first in range(0, height, rows_at_once):
         rows = torch.arange(first, min(first + rows_at_once, height), device=device)
         pixel_y, pixel_x = (grid.reshape(-1) for grid in torch.meshgrid(rows, columns, indexing="ij"))
-        alpha = alphas(p, pixel_x, pixel_y, view)
+        alpha = alphas(p, pixel_x, pixel_y, settings)
         before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1.0 - alpha], dim=1), dim=1)[:, :-1]
         before = before[:, : alpha.shape[1]]
         alpha = alpha * (before >= interface.MIN_TRANSMITTANCE)
@@ -176,8 +173,8 @@ def render(splats: Splats, view: RenderSettings) -> Render:
         visible=radii > 0,
         radii=radii,
         means2d=means2d,
-        weight_sum=weight_sum if view.weights else None,
-        weight_max=weight_max if view.weights else None,
+        weight_sum=weight_sum if settings.weights else None,
+        weight_max=weight_max if settings.weights else None,
         refused=choice.refused,
         backward=Backward(),
     )

@@ -1,5 +1,5 @@
-// What the benchmark of the rasterizer compares with: 3D Gaussian Splatting's algorithm in plain loops. Lists by tile from 3-sigma boxes,
-// each pixel walks its tile's list; backward from the last splat to the first, sums by atomic additions, down to the
+// What the benchmark of the rasterizer compares with: 3D Gaussian Splatting's algorithm in plain loops. Lists by tile
+// from 3-sigma boxes, each pixel walks its tile's list; backward from the last splat to the first, sums by atomic additions, down to the
 // gradients on the image (mean, inverse covariance, opacity, color); the projection's backward pass is not in it.
 #include "bench/bench.hpp"
 
@@ -27,7 +27,7 @@ struct Scene {
     int tiles_x, tiles_y;
 };
 
-float density(const Flat& s, float dx, float dy, bool exact, float& m) {
+float kernel(const Flat& s, float dx, float dy, bool exact, float& m) {
     m = s.a * dx * dx + 2 * s.b * dx * dy + s.c * dy * dy;
     return std::exp(-0.5f * (exact ? std::pow(larger(m, kCenterM), s.half_beta) : m));
 }
@@ -108,7 +108,7 @@ BaselineSeconds baseline(const Camera& camera, const Parameters& p, float* color
                 int k = 0;
                 for (; k < int(list.size()) && transmittance >= kMinTransmittance; ++k) {
                     const Flat& s = scene.splats[list[k]];
-                    const float alpha = smaller(s.opacity * density(s, x - s.u, y - s.v, p.exact, m), kMaxAlpha);
+                    const float alpha = smaller(s.opacity * kernel(s, x - s.u, y - s.v, p.exact, m), kMaxAlpha);
                     if (alpha < 1.0f / 255.0f) continue;
                     for (int c = 0; c < 3; ++c) sum[c] += transmittance * alpha * s.color[c];
                     transmittance *= 1.0f - alpha;
@@ -133,7 +133,7 @@ BaselineSeconds baseline(const Camera& camera, const Parameters& p, float* color
                 float transmittance = left[at], behind = 0.0f, m;
                 for (int k = used[at] - 1; k >= 0; --k) {
                     const Flat& s = scene.splats[list[k]];
-                    const float dx = x - s.u, dy = y - s.v, shape = density(s, dx, dy, p.exact, m);
+                    const float dx = x - s.u, dy = y - s.v, shape = kernel(s, dx, dy, p.exact, m);
                     const float alpha = smaller(s.opacity * shape, kMaxAlpha);
                     if (alpha < 1.0f / 255.0f) continue;
                     transmittance /= 1.0f - alpha;

@@ -13,8 +13,8 @@ struct BaselineSeconds {
 BaselineSeconds baseline(const Camera& camera, const Parameters& parameters, float* color, const float* color_gradient,
                          float* image_gradient, int threads);
 
-// Densities per second: u and v to alpha, in registers, all threads together.
-double peak_densities(bool exact, int threads);
+// Kernel values per second: u and v to alpha, in registers, all threads together.
+double peak_kernel_values(bool exact, int threads);
 
 // Multiplications with addition per second, single precision, in registers, all threads together.
 double peak_products(int threads);

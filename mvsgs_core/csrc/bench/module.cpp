@@ -7,16 +7,16 @@ using namespace splats;
 namespace {
 
 // (forward, backward) seconds of the plain-loop rasterizer.
-std::tuple<double, double> run_baseline(In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas,
-                                        Array<const double> pose, Intrinsics intrinsics, bool exact, int threads,
+std::tuple<double, double> run_baseline(nb::handle settings, Array<const double> pose, const SplatArrays& splats,
                                         Out color, In color_gradient, Out image_gradient) {
-    const Camera camera = camera_of(pose, intrinsics, 1e-3f, int(color.shape(1)), int(color.shape(0)));
+    const Camera camera = camera_of(settings, pose);
     Frame frame;
-    frame.exact = exact;
-    const Parameters p = parameters(frame, means, log_scales, quaternions, opacity_logits, sh, betas);
+    frame.exact = setting<bool>(settings, "exact");
+    const Parameters p = parameters(frame, splats);
+    const int threads = thread_count(setting<int>(settings, "threads"));
     const nb::gil_scoped_release released;
     const BaselineSeconds seconds =
-        baseline(camera, p, color.data(), color_gradient.data(), image_gradient.data(), thread_count(threads));
+        baseline(camera, p, color.data(), color_gradient.data(), image_gradient.data(), threads);
     return {seconds.forward, seconds.backward};
 }
 
@@ -25,7 +25,7 @@ std::tuple<double, double> run_baseline(In means, In log_scales, In quaternions,
 #define BENCH_MODULE(name) NB_MODULE(name, m)
 BENCH_MODULE(MVSGS_MODULE) {
     m.def("baseline", &run_baseline);
-    m.def("peak_densities", &peak_densities);
+    m.def("peak_kernel_values", &peak_kernel_values);
     m.def("peak_products", &peak_products);
     m.def("peak_tile_bytes", &peak_tile_bytes);
     m.def("peak_memory_bytes", &peak_memory_bytes);

@@ -9,7 +9,7 @@
 namespace splats {
 namespace {
 
-constexpr int kStreams = 4;  // independent chains of densities, to hide latency
+constexpr int kStreams = 4;  // independent chains of kernel values, to hide latency
 #if defined(__AVX512F__)
 constexpr int kRegisters = 1;  // of a `Lanes`
 #elif defined(__AVX2__)
@@ -66,7 +66,7 @@ void multiply(int rounds) {
 
 }  // namespace
 
-double peak_densities(bool exact, int threads) {
+double peak_kernel_values(bool exact, int threads) {
     constexpr int kRounds = 1 << 18;
     const double seconds = best_seconds(threads, [&] { exact ? evaluate<true>(kRounds) : evaluate<false>(kRounds); });
     return double(kStreams) * kLanes * kRounds * threads / seconds;

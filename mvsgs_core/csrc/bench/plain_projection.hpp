@@ -1,5 +1,5 @@
-// One splat at a time from the map to the image, for the plain loops: the arithmetic of splats/projection.hpp and
-// splats/shading.hpp, which take sixteen.
+// One splat at a time from the map to the image, for the plain loops: the arithmetic of rasterizer/projection.hpp
+// and rasterizer/shading.hpp, which take sixteen.
 #pragma once
 
 #include <bit>

@@ -3,6 +3,7 @@
 // A splat with any non-finite gradient, or whose step would give a non-finite parameter, is left as it was and counted.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 #include <omp.h>
 
@@ -10,6 +11,7 @@
 #include <cmath>
 #include <cstdint>
 #include <stdexcept>
+#include <tuple>
 #include <vector>
 
 namespace nb = nanobind;
@@ -29,7 +31,7 @@ struct Group {
     float final_rate;  // and of an old one: log-linear in between over `decay_steps`
     float low, high;   // values are kept inside
     int lead;          // columns that take the full rate,
-    float tail;        // the others this share of it: spherical harmonics beyond degree 0
+    float tail;        // the others this fraction of it: spherical harmonics beyond degree 0
     std::vector<float> rates{};  // by age, as far as a table goes; empty where the rate stays
 
     float computed_rate(int32_t age, int decay_steps) const {
@@ -201,27 +203,23 @@ struct Block {
     }
 };
 
-int64_t adam(const std::vector<Rows>& values, const std::vector<Rows>& gradients, const std::vector<Rows>& firsts,
-             const std::vector<Rows>& seconds, const std::vector<std::vector<float>>& settings, Flags visible,
-             Counts steps, float beta1, float beta2, float epsilon, int decay_steps, int threads) {
+// value, gradient, first and second moment (N, width) of a parameter; rate, final_rate, low, high, lead and tail of Group
+using Parameter = std::tuple<Rows, Rows, Rows, Rows, float, float, float, float, int, float>;
+
+int64_t adam(const std::vector<Parameter>& parameters, Flags visible, Counts steps, float beta1, float beta2,
+             float epsilon, int decay_steps, int threads) {
     const int64_t n = static_cast<int64_t>(visible.shape(0));
-    const size_t count = values.size();
-    if (gradients.size() != count || firsts.size() != count || seconds.size() != count || settings.size() != count)
-        throw std::invalid_argument("adam: every group needs a gradient, two moments and its settings");
     if (static_cast<int64_t>(steps.shape(0)) != n)
         throw std::invalid_argument("adam: steps and visible differ in length");
     std::vector<Group> groups;
-    for (size_t j = 0; j < count; ++j) {
-        const auto width = values[j].shape(1);
-        for (const Rows* rows : {&values[j], &gradients[j], &firsts[j], &seconds[j]})
+    for (const auto& [value, gradient, first, second, rate, final_rate, low, high, lead, tail] : parameters) {
+        const auto width = value.shape(1);
+        for (const Rows* rows : {&value, &gradient, &first, &second})
             if (static_cast<int64_t>(rows->shape(0)) != n || rows->shape(1) != width)
                 throw std::invalid_argument("adam: the arrays of a group differ in shape");
         if (width > kMaxWidth) throw std::invalid_argument("adam: more than 48 values a splat");
-        if (settings[j].size() != 6)
-            throw std::invalid_argument("adam: settings are (rate, final rate, low, high, lead, tail)");
-        groups.push_back({values[j].data(), gradients[j].data(), firsts[j].data(), seconds[j].data(),
-                          static_cast<int>(width), settings[j][0], settings[j][1], settings[j][2], settings[j][3],
-                          static_cast<int>(settings[j][4]), settings[j][5], {}});
+        groups.push_back({value.data(), gradient.data(), first.data(), second.data(), static_cast<int>(width), rate,
+                          final_rate, low, high, lead, tail, {}});
     }
     const Constants constants{beta1, beta2, epsilon, std::max(decay_steps, 1)};
     for (Group& g : groups)
@@ -263,8 +261,7 @@ int64_t adam(const std::vector<Rows>& values, const std::vector<Rows>& gradients
 #define MVSGS_DEFINE(name) NB_MODULE(name, m)
 MVSGS_DEFINE(MVSGS_MODULE) {
     m.doc() = "Kernels of the online mapper.";
-    m.def("adam", &adam, nb::arg("values"), nb::arg("gradients"), nb::arg("firsts"), nb::arg("seconds"),
-          nb::arg("settings"), nb::arg("visible"), nb::arg("steps"), nb::arg("beta1"), nb::arg("beta2"),
+    m.def("adam", &adam, nb::arg("parameters"), nb::arg("visible"), nb::arg("steps"), nb::arg("beta1"), nb::arg("beta2"),
           nb::arg("epsilon"), nb::arg("decay_steps"), nb::arg("threads"),
-          "One step of every group in place; returns how many splats were refused for non-finite values.");
+          "One step of every parameter in place; returns how many splats were refused for non-finite values.");
 }

@@ -3,6 +3,8 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <omp.h>
 
@@ -17,25 +19,39 @@ using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
 using In = Array<const float>;
 using Out = Array<float>;
 
-inline Parameters parameters(const Frame& frame, In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas) {
+// The fields of splats.py's Splats, in their order.
+using SplatArrays = std::array<In, 6>;
+
+inline Parameters parameters(const Frame& frame, const SplatArrays& splats) {
+    const auto& [means, log_scales, quaternions, opacity_logits, sh, betas] = splats;
     return {means.data(), log_scales.data(), quaternions.data(), opacity_logits.data(), sh.data(), betas.data(),
             int64_t(means.shape(0)), int(sh.shape(1)), frame.degree, frame.exact, frame.antialiased};
 }
 
+// The data of an array, null for None.
+inline const float* data_of(const std::optional<In>& array) { return array ? array->data() : nullptr; }
+
+// A field of interface.py's RenderSettings.
+template <class T>
+T setting(nb::handle settings, const char* name) {
+    return nb::cast<T>(settings.attr(name));
+}
+
 inline int thread_count(int threads) { return std::max(1, threads > 0 ? threads : omp_get_max_threads()); }
 
-using Intrinsics = std::tuple<float, float, float, float>;
-
-inline Camera camera_of(Array<const double> pose, Intrinsics intrinsics, float near, int width, int height) {
+// pose: world_from_cam by rows, apart from the settings because it may carry a gradient.
+inline Camera camera_of(nb::handle settings, Array<const double> pose) {
     Camera camera;
+    const auto [height, width] = setting<std::tuple<int, int>>(settings, "size");
     for (int i = 0; i < 3; ++i) {
         for (int j = 0; j < 3; ++j) camera.rotation[i][j] = pose.data()[4 * i + j];
         camera.center[i] = pose.data()[4 * i + 3];
     }
-    std::tie(camera.fx, camera.fy, camera.cx, camera.cy) = intrinsics;
+    std::tie(camera.fx, camera.fy, camera.cx, camera.cy) =
+        setting<std::tuple<float, float, float, float>>(settings, "intrinsics");
     camera.width = width;
     camera.height = height;
-    camera.near = near;
+    camera.near = setting<float>(settings, "near");
     const float margin_x = kClampMargin * 0.5f * width / camera.fx, margin_y = kClampMargin * 0.5f * height / camera.fy;
     camera.slope_min[0] = -(camera.cx + 0.5f) / camera.fx - margin_x;
     camera.slope_max[0] = (width - 0.5f - camera.cx) / camera.fx + margin_x;

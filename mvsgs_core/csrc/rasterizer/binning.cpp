@@ -14,7 +14,7 @@ namespace {
 constexpr size_t kAhead = 12;  // splats fetched early: the depth order jumps through memory
 
 // Splats on the image and their footprints; depth is 0 where nothing is seen.
-SPLATS_INLINE void place(const Camera& camera, const Parameters& p, int64_t first, int count, ScreenSplat* out,
+SPLATS_INLINE void place(const Camera& camera, const Parameters& p, int64_t first, int count, ProjectedSplat* out,
                          Footprints& f, int64_t& refused) {
     Projection r;
     project(camera, p, first, count, r);
@@ -57,18 +57,18 @@ SPLATS_INLINE void place(const Camera& camera, const Parameters& p, int64_t firs
     if (count == kLanes)
         std::memcpy(out, rows, sizeof(rows));  // of a size known: no call
     else
-        std::memcpy(out, rows, size_t(count) * sizeof(ScreenSplat));
+        std::memcpy(out, rows, size_t(count) * sizeof(ProjectedSplat));
 }
 
 // Projects one chunk of splats, finds their tiles; spans count from the chunk's first pair.
-void fill_chunk(Frame& frame, const Parameters& p, const bool* mask, size_t chunk, float* radii, int64_t& refused) {
+void fill_chunk(Frame& frame, const Parameters& p, size_t chunk, float* radii, int64_t& refused) {
     PairList& pairs = frame.chunk_pairs[chunk];
     pairs.count = 0;
-    TileWalk walk(frame, mask, pairs);
+    TileWalk walk(frame, pairs);
     const size_t end = std::min(size_t(p.count), (chunk + 1) * kChunk);
     for (size_t first = chunk * kChunk; first < end; first += kLanes) {
         const int count = int(std::min(size_t(kLanes), end - first));
-        ScreenSplat* splats = frame.splats.data() + first;
+        ProjectedSplat* splats = frame.splats.data() + first;
         Footprints footprints;
         place(frame.camera, p, int64_t(first), count, splats, footprints, refused);
         for (int i = 0; i < count; ++i) {
@@ -178,7 +178,7 @@ void distribute(Frame& frame, size_t seen, int parts) {
 
 }  // namespace
 
-void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, float* radii, int threads) {
+void bin(Frame& frame, const Parameters& parameters, float* radii, int threads) {
     const size_t count = size_t(parameters.count), chunks = (count + kChunk - 1) / kChunk;
     frame.splats.resize(count);
     frame.spans.resize(count);
@@ -186,7 +186,7 @@ void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, floa
     if (frame.chunk_pairs.size() < chunks) frame.chunk_pairs.resize(chunks);
     int64_t refused = 0;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : refused)
-    for (size_t chunk = 0; chunk < chunks; ++chunk) fill_chunk(frame, parameters, tile_mask, chunk, radii, refused);
+    for (size_t chunk = 0; chunk < chunks; ++chunk) fill_chunk(frame, parameters, chunk, radii, refused);
     frame.refused = refused;
     join_chunks(frame, count, chunks, threads);
     const size_t seen = gather_seen(frame, count);

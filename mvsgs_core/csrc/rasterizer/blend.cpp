@@ -59,10 +59,10 @@ PixelSums blend_block(const Tile& tile, int block, Workspace& work) {
     for (; first < found && any(at_least(ahead, kMinTransmittance)); first += kForward) {
         const uint32_t* list = work.list.data() + first;
         const Placed* placed = work.placed.data();
-        const Densities<Exact, kForward> densities([&](int i) -> const Placed& { return placed[list[i]]; },
+        const KernelValues<Exact, kForward> values([&](int i) -> const Placed& { return placed[list[i]]; },
                                                    [&](int) { return x; }, [&](int) { return y; });
         Lanes alphas[kForward];
-        store<kForward>(minimum(densities.alpha, Group<kForward>{} + kMaxAlpha), alphas);
+        store<kForward>(minimum(values.alpha, Group<kForward>{} + kMaxAlpha), alphas);
         for (int i = 0; i < kForward; ++i) {
             const Placed& s = placed[list[i]];
             const Mask counted = at_least(ahead, kMinTransmittance);

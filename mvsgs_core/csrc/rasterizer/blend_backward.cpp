@@ -62,10 +62,10 @@ SPLATS_INLINE void fetch(const Frame& frame, uint32_t index) {
     __builtin_prefetch(&frame.slots[pair.slot], 1);
 }
 
-// A splat on a block, as its density leaves it to the sums.
+// A splat on a block, as its kernel leaves it to the sums.
 struct Visit {
     Lanes u, v, alpha;
-    Lanes slope, growth;  // of the exact density: derivative of m^(beta/2) by m, and by beta / 2
+    Lanes slope, growth;  // of the exact kernel: derivative of m^(beta/2) by m, and by beta / 2
 };
 
 // The Gaussian, on the spot: its chain of operations is short.
@@ -126,7 +126,7 @@ SPLATS_INLINE void sum_pair(const Placed& s, uint32_t blocks, Visits& visits, co
     slot = sums(total);
 }
 
-// Some pairs of a tile and the blocks that they may color: the exact density's long chain of operations takes several
+// Some pairs of a tile and the blocks that they may color: the exact kernel's long chain of operations takes several
 // blocks at once, of whichever splats.
 struct Batch {
     using Several = Group<kBackward>;
@@ -139,7 +139,7 @@ struct Batch {
     uint8_t who[kRoom], where[kRoom];
     Visit found[kRoom];
 
-    SPLATS_INLINE_MEMBER void add(const ScreenSplat& s, const Tile& tile, const Pair& pair) {
+    SPLATS_INLINE_MEMBER void add(const ProjectedSplat& s, const Tile& tile, const Pair& pair) {
         placed[pairs] = Placed(s, tile);
         slots[pairs] = pair.slot;
         blocks[pairs] = pair.blocks;
@@ -153,7 +153,7 @@ struct Batch {
     void evaluate(const BlockPixels& pixels) {
         for (int i = 0; i < kBackward; ++i) who[visits + i] = where[visits + i] = 0;
         for (int first = 0; first < visits; first += kBackward) {
-            const Densities<true, kBackward> d([&](int i) -> const Placed& { return placed[who[first + i]]; },
+            const KernelValues<true, kBackward> d([&](int i) -> const Placed& { return placed[who[first + i]]; },
                                     [&](int i) { return pixels.x[where[first + i] & 3]; },
                                     [&](int i) { return pixels.y[where[first + i] >> 2]; });
             const Several half_beta =

@@ -29,7 +29,7 @@ constexpr float kMaxVariance = 1e16f;  // px^2
 constexpr float kMinQuaternion = 1e-8f;
 constexpr float kMaxReach = 1e12f;
 constexpr float kMinBeta = 0.1f, kMaxBeta = 20.0f;
-constexpr float kCenterM = 1e-6f;      // the exact density is flat below this m
+constexpr float kCenterM = 1e-6f;      // the exact kernel is flat below this m
 constexpr float kSqrtHalfLog2e = 0.8493218002880191f;  // sqrt(log2(e) / 2)
 constexpr float kHalfLog2e = 0.7213475204444817f;
 
@@ -86,7 +86,7 @@ struct Camera {
     float slope_min[2], slope_max[2];  // limits of x/z and y/z in the Jacobian
 };
 
-// Read-only parameters; shapes as in model.py.
+// Read-only parameters; shapes as in splats.py.
 struct Parameters {
     const float *means, *log_scales, *quaternions, *opacity_logits, *sh, *betas;
     int64_t count;
@@ -97,7 +97,7 @@ struct Parameters {
 // A splat on the image, one cache line. With d = pixel - mean: u = pitch_u (dx - shear dy), v = pitch_v dy;
 // Gaussian: log2(alpha) = log2_opacity - u^2 - v^2; exact: m = u^2 + v^2 and
 // log2(alpha) = log2_opacity - log2(e)/2 m^(beta/2). The mean is split, for dx keeps its precision far from the corner.
-struct alignas(64) ScreenSplat {
+struct alignas(64) ProjectedSplat {
     float whole_x, whole_y, part_x, part_y;  // mean = whole + part, px
     float pitch_u, shear, pitch_v;
     float log2_opacity;
@@ -132,9 +132,9 @@ struct Frame {
     int degree = 0, tiles_x = 0, tiles_y = 0;
     float background[3] = {0, 0, 0};
     int64_t refused = 0, pair_count = 0, visible_count = 0;
-    int64_t evaluated = 0;    // densities of the last forward pass, lanes off the ellipse included
+    int64_t evaluated = 0;    // kernel values of the last forward pass, lanes off the ellipse included
     int64_t contributed = 0;  // of those, pairs of splat and pixel that got color; counted with the weights only
-    Buffer<ScreenSplat> splats;      // by splat index
+    Buffer<ProjectedSplat> splats;      // by splat index
     Buffer<SlotSpan> spans;          // by splat index
     Buffer<uint32_t> order, order_scratch, depth_keys, depth_keys_scratch;
     std::vector<PairList> chunk_pairs;  // of kChunk splats each
@@ -148,14 +148,13 @@ struct Frame {
 };
 
 struct Gradients {
-    float *means, *log_scales, *quaternions, *opacity_logits, *sh, *betas, *screen;
+    float *means, *log_scales, *quaternions, *opacity_logits, *sh, *betas, *means2d;
     double* pose;  // (3, 4): of the rotation and of the camera's center
     int64_t refused = 0;
 };
 
-// Projects and orders the splats and pairs them with the tiles they touch. tile_mask may be null; radii (N), px, are 0
-// where nothing is seen.
-void bin(Frame& frame, const Parameters& parameters, const bool* tile_mask, float* radii, int threads);
+// Projects and orders the splats and pairs them with the tiles they touch; radii (N), px, are 0 where nothing is seen.
+void bin(Frame& frame, const Parameters& parameters, float* radii, int threads);
 
 // Blends all tiles; color (H, W, 3), depth (H, W), opacity (H, W). weights: fill frame.weight_slots as well.
 void blend(Frame& frame, bool weights, float* color, float* depth, float* opacity, int threads);

@@ -38,53 +38,48 @@ Pool& pool() {
 // What Python holds between the forward and the backward pass.
 struct Pass {
     std::unique_ptr<Frame> frame = pool().take();
+    int threads = 1;
     Pass() = default;
     Pass(const Pass&) = delete;
     ~Pass() { pool().give(std::move(frame)); }
 };
 
-std::unique_ptr<Pass> forward(In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas,
-                              Array<const double> pose, Intrinsics intrinsics, float near,
-                              std::tuple<float, float, float> background, bool exact, bool antialiased, int degree,
-                              nb::object tile_mask, bool weights, int threads, Out color, Out depth, Out opacity,
-                              Out radii) {
+std::unique_ptr<Pass> forward(nb::handle settings, Array<const double> pose, const SplatArrays& splats, Out color,
+                              Out depth, Out opacity, Out radii) {
     auto pass = std::make_unique<Pass>();
     Frame& frame = *pass->frame;
-    frame.camera = camera_of(pose, intrinsics, near, int(color.shape(1)), int(color.shape(0)));
-    std::tie(frame.background[0], frame.background[1], frame.background[2]) = background;
-    frame.exact = exact;
-    frame.antialiased = antialiased;
-    frame.degree = degree;
+    frame.camera = camera_of(settings, pose);
+    std::tie(frame.background[0], frame.background[1], frame.background[2]) =
+        setting<std::tuple<float, float, float>>(settings, "background");
+    frame.exact = setting<bool>(settings, "exact");
+    frame.antialiased = setting<bool>(settings, "antialiased");
+    frame.degree = setting<int>(settings, "degree");
     frame.tiles_x = (frame.camera.width + kTile - 1) / kTile;
     frame.tiles_y = (frame.camera.height + kTile - 1) / kTile;
-    const Parameters p = parameters(frame, means, log_scales, quaternions, opacity_logits, sh, betas);
-    Array<const bool> mask;
-    if (!tile_mask.is_none()) mask = nb::cast<Array<const bool>>(tile_mask);
+    pass->threads = thread_count(setting<int>(settings, "threads"));
+    const bool weights = setting<bool>(settings, "weights");
+    const Parameters p = parameters(frame, splats);
     {
         const nb::gil_scoped_release released;
-        bin(frame, p, mask.is_valid() ? mask.data() : nullptr, radii.data(), thread_count(threads));
-        blend(frame, weights, color.data(), depth.data(), opacity.data(), thread_count(threads));
+        bin(frame, p, radii.data(), pass->threads);
+        blend(frame, weights, color.data(), depth.data(), opacity.data(), pass->threads);
     }
     return pass;
 }
 
-// Returns how many splats had a gradient that is not finite: theirs are 0.
-int64_t backward(Pass& pass, In means, In log_scales, In quaternions, In opacity_logits, In sh, In betas, In color,
-                 In depth, In opacity, In color_gradient, nb::object depth_gradient, nb::object opacity_gradient,
-                 int threads, Out on_means, Out on_log_scales, Out on_quaternions, Out on_opacity_logits, Out on_sh,
-                 Out on_betas, Out on_screen, Array<double> on_pose) {
+// on_splats: of the fields of Splats. Returns how many splats had a gradient that is not finite: theirs are 0.
+int64_t backward(Pass& pass, const SplatArrays& splats, In color, In depth, In opacity, In on_color,
+                 std::optional<In> on_depth, std::optional<In> on_opacity, const std::array<Out, 6>& on_splats,
+                 Out on_means2d, Array<double> on_pose) {
     Frame& frame = *pass.frame;
-    const Parameters p = parameters(frame, means, log_scales, quaternions, opacity_logits, sh, betas);
-    In of_depth, of_opacity;
-    if (!depth_gradient.is_none()) of_depth = nb::cast<In>(depth_gradient);
-    if (!opacity_gradient.is_none()) of_opacity = nb::cast<In>(opacity_gradient);
-    Gradients gradients{on_means.data(), on_log_scales.data(), on_quaternions.data(), on_opacity_logits.data(),
-                        on_sh.data(), on_betas.data(), on_screen.data(), on_pose.data(), 0};
+    const Parameters p = parameters(frame, splats);
+    const auto& [means, log_scales, quaternions, opacity_logits, sh, betas] = on_splats;
+    Gradients gradients{means.data(), log_scales.data(), quaternions.data(), opacity_logits.data(),
+                        sh.data(),    betas.data(),      on_means2d.data(),  on_pose.data()};
     const nb::gil_scoped_release released;
-    blend_backward(frame, color.data(), depth.data(), opacity.data(), color_gradient.data(),
-                   of_depth.is_valid() ? of_depth.data() : nullptr,
-                   of_opacity.is_valid() ? of_opacity.data() : nullptr, thread_count(threads));
-    project_backward(frame, p, gradients, thread_count(threads));
+    blend_backward(frame, color.data(), depth.data(), opacity.data(), on_color.data(), data_of(on_depth),
+                   data_of(on_opacity), pass.threads);
+    project_backward(frame, p, gradients, pass.threads);
     return gradients.refused;
 }
 
@@ -94,25 +89,23 @@ void weights(const Pass& pass, Out weight_sum, Out weight_max) {
     const size_t count = weight_sum.shape(0);
     for (size_t i = 0; i < count; ++i) {
         const SlotSpan span = frame.spans[i];
-        float sum = 0.0f, most = 0.0f;
+        float sum = 0.0f, max = 0.0f;
         for (uint32_t k = span.first; k < span.first + span.count; ++k) {
             sum += frame.weight_slots[2 * size_t(k)];
-            most = std::max(most, frame.weight_slots[2 * size_t(k) + 1]);
+            max = std::max(max, frame.weight_slots[2 * size_t(k) + 1]);
         }
         weight_sum.data()[i] = sum;
-        weight_max.data()[i] = most;
+        weight_max.data()[i] = max;
     }
 }
 
 // (weighted L1, SSIM); `gradient` gets that of their weighted sum. pixel_weight may be None.
-std::tuple<double, double> image_loss(In image, In target, nb::object pixel_weight, float l1_weight, float ssim_weight,
-                                      Out gradient, int threads) {
-    In weight;
-    if (!pixel_weight.is_none()) weight = nb::cast<In>(pixel_weight);
+std::tuple<double, double> image_loss(In image, In target, std::optional<In> pixel_weight, float l1_weight,
+                                      float ssim_weight, Out gradient, int threads) {
     const nb::gil_scoped_release released;
     const Photometric result =
-        photometric(image.data(), target.data(), weight.is_valid() ? weight.data() : nullptr, int(image.shape(0)),
-                    int(image.shape(1)), l1_weight, ssim_weight, gradient.data(), thread_count(threads));
+        photometric(image.data(), target.data(), data_of(pixel_weight), int(image.shape(0)), int(image.shape(1)),
+                    l1_weight, ssim_weight, gradient.data(), thread_count(threads));
     return {result.l1, result.ssim};
 }
 
@@ -126,15 +119,11 @@ SPLATS_MODULE(MVSGS_MODULE) {
         .def_prop_ro("pairs", [](const Pass& pass) { return pass.frame->pair_count; })
         .def_prop_ro("evaluated", [](const Pass& pass) { return pass.frame->evaluated; })
         .def_prop_ro("contributed", [](const Pass& pass) { return pass.frame->contributed; });
-    m.def("forward", &forward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg("pose"),
-          nb::arg("intrinsics"), nb::arg("near"), nb::arg("background"), nb::arg("exact"), nb::arg("antialiased"),
-          nb::arg("degree"), nb::arg("tile_mask").none(), nb::arg("weights"), nb::arg("threads"), nb::arg("color"),
+    m.def("forward", &forward, nb::arg("settings"), nb::arg("pose"), nb::arg("splats"), nb::arg("color"),
           nb::arg("depth"), nb::arg("opacity"), nb::arg("radii"));
-    m.def("backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
-          nb::arg("color"), nb::arg("depth"), nb::arg("opacity"), nb::arg("color_gradient"),
-          nb::arg("depth_gradient").none(), nb::arg("opacity_gradient").none(), nb::arg("threads"),
-          nb::arg("on_means"), nb::arg("on_log_scales"), nb::arg("on_quaternions"), nb::arg("on_opacity_logits"),
-          nb::arg("on_sh"), nb::arg("on_betas"), nb::arg("on_screen"), nb::arg("on_pose"));
+    m.def("backward", &backward, nb::arg(), nb::arg("splats"), nb::arg("color"), nb::arg("depth"), nb::arg("opacity"),
+          nb::arg("on_color"), nb::arg("on_depth").none(), nb::arg("on_opacity").none(), nb::arg("on_splats"),
+          nb::arg("on_means2d"), nb::arg("on_pose"));
     m.def("weights", &weights);
     m.def("image_loss", &image_loss, nb::arg("image"), nb::arg("target"), nb::arg("pixel_weight").none(),
           nb::arg("l1_weight"), nb::arg("ssim_weight"), nb::arg("gradient"), nb::arg("threads"));

@@ -139,7 +139,7 @@ Photometric photometric(const float* image, const float* target, const float* pi
             row_ssim[row] = similarity_row(lines, on_a + at, on_p + at, on_r + at);
         }
     }
-    const float share = 1.0f / float(size), ssim_scale = -ssim_weight * share;
+    const float mean = 1.0f / float(size), ssim_scale = -ssim_weight * mean;
 #pragma omp parallel num_threads(threads)
     {
         Lines lines(3, length);
@@ -162,7 +162,7 @@ Photometric photometric(const float* image, const float* target, const float* pi
             float* __restrict weight = lines.inner(0);
             for (int column = 0; column < width; ++column) {
                 const float extra = pixel_weight ? pixel_weight[size_t(row) * width + column] : 0.0f;
-                weight[3 * column] = weight[3 * column + 1] = weight[3 * column + 2] = (l1_weight + extra) * share;
+                weight[3 * column] = weight[3 * column + 1] = weight[3 * column + 2] = (l1_weight + extra) * mean;
             }
             float l1 = 0.0f;
 #pragma omp simd reduction(+ : l1)

@@ -13,9 +13,9 @@ constexpr float kLn2 = 0.6931471805599453f;
 constexpr size_t kAhead = 96;  // slots fetched early
 
 struct SplatGradient {
-    Lanes mean[3], log_scale[3], quaternion[4], opacity_logit, beta, screen[2];
+    Lanes mean[3], log_scale[3], quaternion[4], opacity_logit, beta, mean2d[2];
     Lanes sh[48];                   // by base and color
-    Lanes rotation[3][3], offset[3];  // shares of the pose's gradient
+    Lanes rotation[3][3], offset[3];  // parts of the pose's gradient
 };
 
 struct ImageGradient {
@@ -25,7 +25,7 @@ struct ImageGradient {
 };
 
 ImageGradient on_image(const Frame& frame, size_t first, int count) {
-    Lanes total[16] = {}, screen[16] = {};
+    Lanes total[16] = {}, projected[16] = {};
     for (int i = 0; i < count; ++i) {
         const SlotSpan span = frame.spans[first + i];
         for (uint32_t k = 0; k < span.count; ++k) {
@@ -34,12 +34,12 @@ ImageGradient on_image(const Frame& frame, size_t first, int count) {
         }
     }
     if (count == kLanes)
-        std::memcpy(screen, frame.splats.data() + first, sizeof(screen));  // of a size known: no call
+        std::memcpy(projected, frame.splats.data() + first, sizeof(projected));  // of a size known: no call
     else
-        std::memcpy(screen, frame.splats.data() + first, size_t(count) * sizeof(ScreenSplat));
+        std::memcpy(projected, frame.splats.data() + first, size_t(count) * sizeof(ProjectedSplat));
     transpose(total);
-    transpose(screen);
-    const Lanes a = screen[4], k = screen[5], b = screen[6];  // pitch_u, shear, pitch_v
+    transpose(projected);
+    const Lanes a = projected[4], k = projected[5], b = projected[6];  // pitch_u, shear, pitch_v
     const float unit = frame.exact ? 1.0f : kSqrtHalfLog2e, second = -0.5f / (unit * unit);
     const Lanes u = -0.5f / unit * total[kSumLane[kU]], v = -0.5f / unit * total[kSumLane[kV]];
     const Lanes uu = second * total[kSumLane[kUU]], uv = second * total[kSumLane[kUV]];
@@ -118,8 +118,8 @@ SPLATS_INLINE void splats_backward(const Camera& camera, const Parameters& p, in
                                    const Projection& r, const ImageGradient& g, SplatGradient& out) {
     out.opacity_logit = g.log_opacity * (1.0f - r.sigmoid);
     out.beta = where(r.beta_inside, g.beta);
-    out.screen[0] = g.u * (0.5f * camera.width);
-    out.screen[1] = g.v * (0.5f * camera.height);
+    out.mean2d[0] = g.u * (0.5f * camera.width);
+    out.mean2d[1] = g.v * (0.5f * camera.height);
 
     Lanes axes[2][3];
     for (int k = 0; k < 3; ++k) {
@@ -179,9 +179,9 @@ SPLATS_INLINE void scatter(const Lanes& lanes, float* values, size_t stride, int
 struct PoseSum {
     alignas(64) double lanes[12][kLanes] = {};
 
-    void add(int entry, const Lanes& share) {
+    void add(int entry, const Lanes& part) {
         alignas(64) float values[kLanes];
-        store(share, values);
+        store(part, values);
         for (int i = 0; i < kLanes; ++i) lanes[entry][i] += values[i];
     }
 };
@@ -218,14 +218,14 @@ int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int c
         find_bad(g.log_scale, bad);
         find_bad(g.quaternion, bad);
         find_bad(others, bad);
-        find_bad(g.screen, bad);
+        find_bad(g.mean2d, bad);
         find_bad(g.sh, bad, used);
         const Mask good = seen & without_sign(bad);
         refused = splats::count(seen) - splats::count(good);
         keep(good, g.mean);
         keep(good, g.log_scale);
         keep(good, g.quaternion);
-        keep(good, g.screen);
+        keep(good, g.mean2d);
         keep(good, g.sh, used);
         g.opacity_logit = where(good, g.opacity_logit);
         g.beta = where(good, g.beta);
@@ -242,7 +242,7 @@ int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int c
     store_rows(g.mean, out.means + 3 * first, count);
     store_rows(g.log_scale, out.log_scales + 3 * first, count);
     store_rows(g.quaternion, out.quaternions + 4 * first, count);
-    store_rows(g.screen, out.screen + 2 * first, count);
+    store_rows(g.mean2d, out.means2d + 2 * first, count);
     scatter(g.opacity_logit, out.opacity_logits + first, 1, count);
     scatter(g.beta, out.betas + first, 1, count);
     return refused;

@@ -1,4 +1,4 @@
-// What the forward and the backward pass share inside a tile: 4x4 blocks of pixels, and a splat's density on a block.
+// What the forward and the backward pass share inside a tile: 4x4 blocks of pixels, and a splat's kernel on a block.
 #pragma once
 
 #include "rasterizer/frame.hpp"
@@ -55,7 +55,7 @@ struct Placed {
     float red, green, blue, depth;
 
     Placed() = default;
-    SPLATS_INLINE_MEMBER Placed(const ScreenSplat& s, const Tile& tile)
+    SPLATS_INLINE_MEMBER Placed(const ProjectedSplat& s, const Tile& tile)
         : u_x(s.pitch_u), u_y(-s.pitch_u * s.shear), v_y(s.pitch_v), log2_opacity(s.log2_opacity),
           half_beta(s.half_beta), red(s.red), green(s.green), blue(s.blue), depth(s.depth) {
         const float dx = (float(tile.x) - s.whole_x) - s.part_x, dy = (float(tile.y) - s.whole_y) - s.part_y;
@@ -66,18 +66,18 @@ struct Placed {
     SPLATS_INLINE_MEMBER Lanes v(Lanes y) const { return v0 + v_y * y; }
 };
 
-// Densities of a group of splats, each on a block.
+// Kernel values of a group of splats, each on a block.
 template <bool Exact, int Count>
-struct Densities {
+struct KernelValues {
     using Wide = Group<Count>;
 
     Wide u, v;
-    Wide m, log2_m, power;  // of the exact density: power = m^(beta/2), with m limited from below
+    Wide m, log2_m, power;  // of the exact kernel: power = m^(beta/2), with m limited from below
     Wide alpha;             // before it is clamped; 0 where it is below 1/255
 
     // at(i): the splat of place i in the group; x(i), y(i): its pixels.
     template <class At, class X, class Y>
-    SPLATS_INLINE_MEMBER Densities(At at, X x, Y y) {
+    SPLATS_INLINE_MEMBER KernelValues(At at, X x, Y y) {
         u = group<Count>([&](int i) { return at(i).u(x(i), y(i)); });
         v = group<Count>([&](int i) { return at(i).v(y(i)); });
         const Wide log2_opacity = group<Count>([&](int i) { return all(at(i).log2_opacity); });

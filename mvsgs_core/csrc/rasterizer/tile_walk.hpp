@@ -22,8 +22,8 @@ struct Footprints {
 
 class TileWalk {
    public:
-    TileWalk(const Frame& frame, const bool* mask, PairList& pairs)
-        : width_(frame.camera.width), tiles_x_(frame.tiles_x), mask_(mask), pairs_(pairs) {
+    TileWalk(const Frame& frame, PairList& pairs)
+        : width_(frame.camera.width), tiles_x_(frame.tiles_x), pairs_(pairs) {
         constexpr Ints kRow = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
         window_ = kColumn + kRow * (Ints{} + tiles_x_);
     }
@@ -102,25 +102,10 @@ class TileWalk {
             pairs_.tiles.resize(2 * pairs_.tiles.size() + 4096);
             pairs_.blocks.resize(pairs_.tiles.size());
         }
-        const uint32_t added =
-            append(blocks, tiles, pairs_.blocks.data() + pairs_.count, pairs_.tiles.data() + pairs_.count);
-        pairs_.count += mask_ ? keep_wanted(added) : added;
-    }
-
-    // Of the pairs just appended, those of tiles that the mask has.
-    uint32_t keep_wanted(uint32_t added) {
-        uint32_t *tiles = pairs_.tiles.data() + pairs_.count, kept = 0;
-        uint16_t* blocks = pairs_.blocks.data() + pairs_.count;
-        for (uint32_t k = 0; k < added; ++k) {
-            tiles[kept] = tiles[k];
-            blocks[kept] = blocks[k];
-            kept += mask_[tiles[k]];
-        }
-        return kept;
+        pairs_.count += append(blocks, tiles, pairs_.blocks.data() + pairs_.count, pairs_.tiles.data() + pairs_.count);
     }
 
     int width_, tiles_x_;
-    const bool* mask_;
     PairList& pairs_;
     Ints window_;
 };

@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, means2d_leaf, tile_grid
+from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, means2d_leaf
 from mvsgs_core.rasterizer.splats import Splats
 
 try:
     import triton
 
-    from mvsgs_core.rasterizer.triton.blend import SUMS, blend, blend_backward
+    from mvsgs_core.rasterizer.triton.blend import SUMS, TILE, blend, blend_backward
     from mvsgs_core.rasterizer.triton.lists import Lists, emit, sort_by_tile
     from mvsgs_core.rasterizer.triton.projection import FOOTPRINT, ROW, project
     from mvsgs_core.rasterizer.triton.projection_backward import project_backward
@@ -29,8 +29,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 BLOCK = 64  # splats of a program
-MOST_PAIRS = 1 << 31  # places are 32-bit integers
-LAUNCH = {"num_warps": 2, "enable_fp_fusion": True}
+MAX_PAIRS = 1 << 31  # places are 32-bit integers
 LAUNCH_TILE = {"num_warps": 1, "enable_fp_fusion": True}
 
 
@@ -45,14 +44,27 @@ class Pass:
     refused: int
 
 
-def projected(parameters: list[Tensor], view: RenderSettings) -> Pass:
+def of_projection(settings: RenderSettings, bases: int) -> dict[str, Any]:
+    """What the kernels of the projection are compiled for and launched with; bases: coefficients of the harmonics."""
+    return {
+        "BASES": bases, "USED": (settings.degree + 1) ** 2, "EXACT": settings.exact,
+        "ANTIALIASED": settings.antialiased, "BLOCK": BLOCK, "ROW": ROW, "num_warps": 2, "enable_fp_fusion": True,
+    }  # fmt: skip
+
+
+def tile_grid(size: tuple[int, int]) -> tuple[int, int]:
+    """(rows, columns) of tiles that cover an image of (height, width)."""
+    return triton.cdiv(size[0], TILE.value), triton.cdiv(size[1], TILE.value)
+
+
+def projected(parameters: list[Tensor], settings: RenderSettings) -> Pass:
     """Projects and lists the splats of `parameters`, the fields of `Splats`. Raises ValueError for too many pairs."""
     means, sh = parameters[0], parameters[4]
     count, device = len(means), means.device
-    height, width = view.size
-    tiles_y, tiles_x = tile_grid(view.size)
+    height, width = settings.size
+    tiles_y, tiles_x = tile_grid(settings.size)
     tiles = tiles_y * tiles_x
-    camera = view.pose.detach().reshape(-1).to(device)
+    camera = settings.pose.detach().reshape(-1).to(device)
     rows, footprints = means.new_empty(count, ROW), means.new_empty(count, FOOTPRINT)
     depths, radii = means.new_empty(2, count).unbind(0)
     pairs = torch.empty(count, dtype=torch.int32, device=device)
@@ -61,24 +73,21 @@ def projected(parameters: list[Tensor], view: RenderSettings) -> Pass:
     if count:
         project[(programs,)](
             *parameters, camera, rows, footprints, depths, radii, pairs, refused, count, width, height,
-            *view.intrinsics, view.near, BASES=sh.shape[1], USED=(view.degree + 1) ** 2, EXACT=view.kernel == "exact",
-            ANTIALIASED=view.antialiased, BLOCK=BLOCK, ROW=ROW, FOOTPRINT=FOOTPRINT, **LAUNCH,
+            *settings.intrinsics, settings.near, FOOTPRINT=FOOTPRINT, **of_projection(settings, sh.shape[1]),
         )  # fmt: skip
     order = torch.argsort(depths, stable=True)
     ends = torch.cumsum(pairs[order], dim=0, dtype=torch.int64)
     slots = torch.empty_like(pairs)
     slots[order] = (ends - pairs[order]).int()
     total, left_out = torch.stack([pairs.sum(dtype=torch.int64), refused.sum()]).tolist()  # the host waits here
-    if total >= MOST_PAIRS:
+    if total >= MAX_PAIRS:
         raise ValueError(f"{total} pairs of splats and tiles are too many for a view: fewer or smaller splats are")
     pair_tiles = torch.full((total,), tiles, dtype=torch.int32, device=device)
     pair_splats = torch.zeros(total, dtype=torch.int32, device=device)
-    mask = None if view.tile_mask is None else view.tile_mask.to(device=device, dtype=torch.uint8)
     if total:
         emit[(triton.cdiv(count, 32),)](
-            order, rows, footprints, radii, slots, pairs, pair_tiles if mask is None else mask, pair_tiles,
-            pair_splats, count, width, height, tiles_x, tiles, MASKED=mask is not None, BLOCK=32, ROW=ROW,
-            FOOTPRINT=FOOTPRINT, **LAUNCH_TILE,
+            order, rows, footprints, radii, slots, pairs, pair_tiles, pair_splats, count, width, height, tiles_x,
+            tiles, BLOCK=32, ROW=ROW, FOOTPRINT=FOOTPRINT, **LAUNCH_TILE,
         )  # fmt: skip
     lists = Lists(*sort_by_tile(pair_tiles, pair_splats, tiles), slots, pairs)
     return Pass(camera, rows, radii, lists, int(left_out))
@@ -90,26 +99,26 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor,
-        betas: Tensor, means2d: Tensor, pose: Tensor, view: RenderSettings, extra: dict[str, Any],
+        betas: Tensor, means2d: Tensor, pose: Tensor, settings: RenderSettings, extra: dict[str, Any],
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         parameters = [t.detach().contiguous() for t in (means, log_scales, quaternions, opacity_logits, sh, betas)]
-        passed = projected(parameters, view)
+        passed = projected(parameters, settings)
         lists = passed.lists
-        height, width = view.size
-        tiles_y, tiles_x = tile_grid(view.size)
+        height, width = settings.size
+        tiles_y, tiles_x = tile_grid(settings.size)
         color = means.new_empty(height, width, 3)
         depth, opacity = means.new_empty(2, height, width).unbind(0)
-        weights = means.new_zeros(2, len(lists.pair_splats) if view.weights else 1)
+        weights = means.new_zeros(2, len(lists.pair_splats) if settings.weights else 1)
         blend[(tiles_y * tiles_x,)](
             passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
-            weights[1], *view.background, height, width, tiles_x, EXACT=view.kernel == "exact", WEIGHTS=view.weights,
+            weights[1], *settings.background, height, width, tiles_x, EXACT=settings.exact, WEIGHTS=settings.weights,
             ROW=ROW, **LAUNCH_TILE,
         )  # fmt: skip
         extra.update(passed=passed)
-        if view.weights:
+        if settings.weights:
             extra["weight_sum"] = lists.sums(weights[0][:, None])[:, 0]
-            extra["weight_max"] = lists.sums(weights[1][:, None], largest=True)[:, 0]
-        ctx.passed, ctx.view = passed, view
+            extra["weight_max"] = lists.sums(weights[1][:, None], maximum=True)[:, 0]
+        ctx.passed, ctx.settings = passed, settings
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*parameters, color, depth, opacity)
         return color, depth, opacity
@@ -118,17 +127,17 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         *parameters, color, depth, opacity = ctx.saved_tensors
-        passed, view = ctx.passed, ctx.view
+        passed, settings = ctx.passed, ctx.settings
         lists, count = passed.lists, len(parameters[0])
-        height, width = view.size
-        tiles_y, tiles_x = tile_grid(view.size)
+        height, width = settings.size
+        tiles_y, tiles_x = tile_grid(settings.size)
         outputs = (color, depth, opacity)
         on_color, on_depth, on_opacity = (
             torch.zeros_like(output) if gradient is None else gradient.contiguous()
             for output, gradient in zip(outputs, gradients)
         )
         sums = color.new_zeros(len(lists.pair_splats), SUMS)
-        exact = view.kernel == "exact"
+        exact = settings.exact
         blend_backward[(tiles_y * tiles_x,)](
             passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, *outputs, on_color, on_depth,
             on_opacity, sums, height, width, tiles_x, EXACT=exact, DEPTH=any(g is not None for g in gradients[1:]),
@@ -142,23 +151,23 @@ class _Rasterize(torch.autograd.Function):
         if count:
             project_backward[(programs,)](
                 *parameters, passed.camera, passed.rows, lists.sums(sums), lists.pairs, *results, on_means2d, on_pose,
-                count, width, height, *view.intrinsics, BASES=parameters[4].shape[1], USED=(view.degree + 1) ** 2,
-                EXACT=exact, ANTIALIASED=view.antialiased, POSE=wants_pose, BLOCK=BLOCK, ROW=ROW, SUMS=SUMS, **LAUNCH,
+                count, width, height, *settings.intrinsics, POSE=wants_pose, SUMS=SUMS,
+                **of_projection(settings, parameters[4].shape[1]),
             )  # fmt: skip
         pose = None
         if wants_pose:
-            pose = torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(view.pose.device)
+            pose = torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(settings.pose.device)
         *shared, on_betas = results
         return (*shared, on_betas if exact else None, on_means2d, pose, None, None)
 
 
-def render(splats: Splats, view: RenderSettings) -> Render:
+def render(splats: Splats, settings: RenderSettings) -> Render:
     """See `rasterizer.rasterize`. Raises ValueError for other than float32."""
     if splats.means.dtype != torch.float32:
         raise ValueError(f"the triton back end takes float32 splats, got {splats.means.dtype}")
-    means2d = means2d_leaf(splats, view)
+    means2d = means2d_leaf(splats, settings)
     extra: dict[str, Any] = {}
-    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), means2d, view.pose, view, extra)
+    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), means2d, settings.pose, settings, extra)
     passed: Pass = extra["passed"]
     return Render(
         color=color,

@@ -66,10 +66,10 @@ def row_span(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def emit(  # type: ignore[no-untyped-def]
-    order, rows, footprints, radii, slots, pairs, tile_mask, pair_tiles, pair_splats, count, width, height,
-    tiles_x, tiles, MASKED: tl.constexpr, BLOCK: tl.constexpr, ROW: tl.constexpr, FOOTPRINT: tl.constexpr,
+    order, rows, footprints, radii, slots, pairs, pair_tiles, pair_splats, count, width, height,
+    tiles_x, tiles, BLOCK: tl.constexpr, ROW: tl.constexpr, FOOTPRINT: tl.constexpr,
 ):  # fmt: skip
-    """Tile and splat of every pair from slots[n] on; tile `tiles` where no block of the tile is touched or wanted.
+    """Tile and splat of every pair from slots[n] on; tile `tiles` where no block of the tile is touched.
 
     Never beyond the pairs that `project` counted, should its compiled code round a border otherwise than this one.
     """
@@ -110,8 +110,6 @@ def emit(  # type: ignore[no-untyped-def]
                 )  # fmt: skip
                 touched = touched | ((begin <= 4 * column + 3) & (end >= 4 * column))
             tile = tile_row * tiles_x + column
-            if MASKED:
-                touched = touched & (tl.load(tile_mask + tile, mask=listed, other=0) != 0)
             tl.store(pair_tiles + slot, tl.where(touched, tile, tiles), mask=listed)
             tl.store(pair_splats + slot, n.to(tl.int32), mask=listed)
             slot += listed.to(tl.int32)
@@ -122,10 +120,10 @@ def emit(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def per_splat(  # type: ignore[no-untyped-def]
-    values, slots, pairs, result, count, COLUMNS: tl.constexpr, WIDTH: tl.constexpr, LARGEST: tl.constexpr,
+    values, slots, pairs, result, count, COLUMNS: tl.constexpr, WIDTH: tl.constexpr, MAXIMUM: tl.constexpr,
     SPLATS: tl.constexpr, AT_ONCE: tl.constexpr,
 ):  # fmt: skip
-    """result (N, COLUMNS): the sum, or with LARGEST the maximum, of the values (P, COLUMNS) of each splat's pairs."""
+    """result (N, COLUMNS): the sum, or with MAXIMUM the maximum, of the values (P, COLUMNS) of each splat's pairs."""
     n = tl.program_id(0) * SPLATS + tl.arange(0, SPLATS)
     first = tl.load(slots + n, mask=n < count, other=0)
     length = tl.load(pairs + n, mask=n < count, other=0)
@@ -138,7 +136,7 @@ def per_splat(  # type: ignore[no-untyped-def]
         address = (first[:, None] + pair).to(tl.int64)[:, :, None] * COLUMNS + column
         there = (pair < length[:, None])[:, :, None] & (column < COLUMNS)
         block = tl.load(values + address, mask=there, other=0.0)
-        if LARGEST:
+        if MAXIMUM:
             total = tl.maximum(total, tl.max(block, axis=1))
         else:
             total += tl.sum(block, axis=1)
@@ -149,7 +147,7 @@ def per_splat(  # type: ignore[no-untyped-def]
 
 @dataclass
 class Lists:
-    """The pairs of splats and tiles; P includes those whose tile is left out, which lie behind the last tile."""
+    """The pairs of splats and tiles; P includes those that touch no block, which lie behind the last tile."""
 
     pair_splats: Tensor  # (P,) int32, by tile, front to back
     pair_slots: Tensor  # (P,) int32, where each lies in the order by splat
@@ -157,14 +155,14 @@ class Lists:
     slots: Tensor  # (N,) int32, first slot of each splat
     pairs: Tensor  # (N,) int32, slots of each splat
 
-    def sums(self, values: Tensor, largest: bool = False) -> Tensor:
-        """(N, C): sum or largest of the values (P, C) >= 0 by slot, over the slots of each splat, in a fixed order."""
+    def sums(self, values: Tensor, maximum: bool = False) -> Tensor:
+        """(N, C): sum or maximum of the values (P, C) >= 0 by slot, over the slots of each splat, in a fixed order."""
         count, columns = len(self.slots), values.shape[1]
         result = values.new_empty(count, columns)
         if count:
             per_splat[(triton.cdiv(count, 8),)](
                 values, self.slots, self.pairs, result, count, COLUMNS=columns, WIDTH=triton.next_power_of_2(columns),
-                LARGEST=largest, SPLATS=8, AT_ONCE=4, num_warps=1, enable_fp_fusion=True,
+                MAXIMUM=maximum, SPLATS=8, AT_ONCE=4, num_warps=1, enable_fp_fusion=True,
             )  # fmt: skip
         return result
 

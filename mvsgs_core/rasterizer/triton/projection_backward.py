@@ -62,7 +62,7 @@ def project_backward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Gradients of all parameters, 0 for splats without pairs and where one is not finite; on_pose (programs, 12)
 
-    float64: each program's share, rotation by rows with the center's as the fourth column; only with POSE.
+    float64: each program's part, rotation by rows with the center's as the fourth column; only with POSE.
     """
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = n < count

@@ -34,7 +34,7 @@ def window(device: torch.device) -> Tensor:
 
 
 @triton.jit
-def _share(taps, rows, source):  # type: ignore[no-untyped-def]
+def _row_taps(taps, rows, source):  # type: ignore[no-untyped-def]
     """(ROWS, 1): the weight of row `source` in the filtered `rows`."""
     tap = source - rows + RADIUS
     return tl.load(taps + tap, mask=(tap >= 0) & (tap <= 2 * RADIUS), other=0.0)[:, None]
@@ -70,12 +70,12 @@ def similarity(  # type: ignore[no-untyped-def]
             row_p += tap * x * x
             row_q += tap * y * y
             row_r += tap * x * y
-        share = _share(taps, rows, source)
-        a += share * row_a[None, :]
-        b += share * row_b[None, :]
-        p += share * row_p[None, :]
-        q += share * row_q[None, :]
-        r += share * row_r[None, :]
+        row_tap = _row_taps(taps, rows, source)
+        a += row_tap * row_a[None, :]
+        b += row_tap * row_b[None, :]
+        p += row_tap * row_p[None, :]
+        q += row_tap * row_q[None, :]
+        r += row_tap * row_r[None, :]
     mean_top = 2 * a * b + C1
     mean_bottom = a * a + b * b + C1
     top = 2 * (r - a * b) + C2
@@ -94,7 +94,7 @@ def similarity(  # type: ignore[no-untyped-def]
 @triton.jit
 def loss_gradient(  # type: ignore[no-untyped-def]
     image, target, pixel_weight, taps, on_a, on_p, on_r, gradient, sums, height, length,
-    l1_weight, l1_share, ssim_share, WEIGHTED: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+    l1_weight, l1_scale, ssim_scale, WEIGHTED: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """`gradient` (H, 3 W) of the whole loss, and the sum of the weighted L1 over each program's block."""
     rows = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
@@ -114,10 +114,10 @@ def loss_gradient(  # type: ignore[no-untyped-def]
             row_a += tap * tl.load(on_a + source * length + at, mask=there, other=0.0)
             row_p += tap * tl.load(on_p + source * length + at, mask=there, other=0.0)
             row_r += tap * tl.load(on_r + source * length + at, mask=there, other=0.0)
-        share = _share(taps, rows, source)
-        a += share * row_a[None, :]
-        p += share * row_p[None, :]
-        r += share * row_r[None, :]
+        row_tap = _row_taps(taps, rows, source)
+        a += row_tap * row_a[None, :]
+        p += row_tap * row_p[None, :]
+        r += row_tap * row_r[None, :]
     inside = (rows < height)[:, None] & (columns < length)[None, :]
     at = rows[:, None] * length + columns[None, :]
     x = tl.load(image + at, mask=inside, other=0.0)
@@ -127,7 +127,7 @@ def loss_gradient(  # type: ignore[no-untyped-def]
         weight += tl.load(pixel_weight + rows[:, None] * (length // 3) + columns[None, :] // 3, mask=inside, other=0.0)
     difference = x - y
     sign = tl.where(difference > 0, 1.0, tl.where(difference < 0, -1.0, 0.0))
-    result = ssim_share * (a + 2 * x * p + y * r) + l1_share * weight * sign
+    result = ssim_scale * (a + 2 * x * p + y * r) + l1_scale * weight * sign
     tl.store(gradient + at, result, mask=inside)
     program = tl.program_id(0) * tl.num_programs(1) + tl.program_id(1)
     tl.store(sums + program, tl.sum(tl.sum(weight * tl.abs(difference), axis=1), axis=0))
@@ -149,13 +149,13 @@ class ImageLoss(torch.autograd.Function):
         similar, different = x.new_empty(2, grid[0] * grid[1]).unbind(0)
         block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "enable_fp_fusion": True}
         similarity[grid](x, y, taps, on_a, on_p, on_r, similar, height, length, **block)
-        share = 1.0 / x.numel()
+        per_value = 1.0 / x.numel()
         loss_gradient[grid](
             x, y, x if pixel_weight is None else pixel_weight, taps, on_a, on_p, on_r, gradient, different,
-            height, length, l1_weight, share, -ssim_weight * share, WEIGHTED=pixel_weight is not None, **block,
+            height, length, l1_weight, per_value, -ssim_weight * per_value, WEIGHTED=pixel_weight is not None, **block,
         )  # fmt: skip
         ctx.save_for_backward(gradient)
-        return share * different.sum() + ssim_weight * (1.0 - share * similar.sum())
+        return per_value * different.sum() + ssim_weight * (1.0 - per_value * similar.sum())
 
     @staticmethod
     @once_differentiable

@@ -113,8 +113,6 @@ def test_what_does_not_fit_is_refused_with_its_name() -> None:
         rasterize(splats, np.full((4, 4), np.nan), camera, SIZE)
     with pytest.raises(ValueError, match="intrinsics"):
         rasterize(splats, np.eye(4), camera[:3], SIZE)
-    with pytest.raises(ValueError, match="tile_mask"):
-        rasterize(splats, np.eye(4), camera, SIZE, tile_mask=np.ones((2, 2), dtype=bool))
     with pytest.raises(ValueError, match="0x5 pixels"):
         rasterize(splats, np.eye(4), camera, (0, 5))
     with pytest.raises(ValueError, match="degree 2"):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.rasterizer import rasterize as rasterizer
 from mvsgs_core.rasterizer.kernels import KERNELS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
@@ -70,22 +69,6 @@ def test_degree_below_what_is_stored() -> None:
     assert bool((found["sh"][:, 4:] == 0).all())
     assert bool((found["sh"][:, :4] != 0).any())
     assert_agree(random_splats(100, bases=16), (40, 56), BACKEND, degree=1)
-
-
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_tiles_left_out(backend: str) -> None:
-    splats, size = random_splats(200), (40, 56)
-    mask = torch.ones(rasterizer.tile_grid(size), dtype=torch.bool)
-    mask[1, 2] = False
-    render = rasterize(splats, POSE, intrinsics(size), size, tile_mask=mask, backend=backend)
-    whole = rasterize(splats, POSE, intrinsics(size), size, backend=backend)
-    left_out = torch.zeros(size, dtype=torch.bool)
-    left_out[16:32, 32:48] = True
-    assert bool((render.color[left_out] == 0).all())
-    assert bool((render.opacity[left_out] == 0).all())
-    torch.testing.assert_close(render.color[~left_out], whole.color[~left_out], rtol=0, atol=1e-6)
-    if backend == BACKEND:
-        assert_agree(splats, size, BACKEND, tile_mask=mask)
 
 
 @pytest.mark.parametrize("kernel", ["gaussian", "exact"])

@@ -5,13 +5,11 @@ from __future__ import annotations
 import os
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from mvsgs_core import native
-from mvsgs_core.rasterizer import rasterize as rasterizer
-from mvsgs_core.rasterizer.rasterize import Render, rasterize
+from mvsgs_core.rasterizer.rasterize import Render, RenderSettings, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.rasterizer_scenes import (
     POSE,
@@ -44,12 +42,10 @@ def test_harmonics_of_degree_three_and_what_a_lower_degree_leaves_out() -> None:
     assert_agree(random_splats(15, bases=9), SIZE, "triton", degree=1)
 
 
-def test_full_pixels_end_and_tiles_left_out() -> None:
+def test_full_pixels_end() -> None:
     splats = random_splats(30, bases=1, log_scale=-1.0)
     splats.opacity_logits += 6.0
-    mask = torch.ones(rasterizer.tile_grid(SIZE), dtype=torch.bool)
-    mask[0, 1] = False
-    assert_agree(splats, SIZE, "triton", tile_mask=mask, antialiased=True)
+    assert_agree(splats, SIZE, "triton", antialiased=True)
 
 
 def needles(count: int) -> Splats:
@@ -59,22 +55,21 @@ def needles(count: int) -> Splats:
     return splats
 
 
-def pairs_of(splats: Splats, size: tuple[int, int], kernel: str, mask: torch.Tensor | None) -> tuple[int, list[int]]:
-    """(pairs that the C++ kernel blends, pairs of each tile in the Triton lists)."""
+def pairs_of(splats: Splats, size: tuple[int, int], kernel: str) -> tuple[int, int]:
+    """(pairs that the C++ kernel blends, pairs in the Triton lists of all tiles)."""
     from mvsgs_core.rasterizer.triton import backend as triton_backend
 
-    view = rasterizer.RenderSettings(
-        pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, kernel=kernel,
-        background=(0.0, 0.0, 0.0), tile_mask=mask, near=1e-3, antialiased=False, degree=0, weights=False, threads=1,
+    settings = RenderSettings(
+        pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, exact=kernel == "exact",
+        background=(0.0, 0.0, 0.0), near=1e-3, antialiased=False, degree=0, weights=False, threads=1,
     )  # fmt: skip
+    parameters = list(splats.tensors().values())
     passed = native.load("rasterizer").forward(
-        *splats.tensors().values(), pose=view.pose, intrinsics=view.intrinsics, near=view.near,
-        background=view.background, exact=kernel == "exact", antialiased=False, degree=0, tile_mask=mask,
-        weights=False, threads=1, color=torch.empty(*size, 3), depth=torch.empty(size), opacity=torch.empty(size),
-        radii=torch.empty(len(splats)),
+        settings, settings.pose, parameters, color=torch.empty(*size, 3), depth=torch.empty(size),
+        opacity=torch.empty(size), radii=torch.empty(len(splats)),
     )  # fmt: skip
-    lists = triton_backend.projected([tensor.to(DEVICE) for tensor in splats.tensors().values()], view).lists
-    return passed.pairs, lists.tile_begin.diff().tolist()
+    lists = triton_backend.projected([tensor.to(DEVICE) for tensor in parameters], settings).lists
+    return passed.pairs, int(lists.tile_begin[-1])
 
 
 @pytest.mark.parametrize("kernel", ["gaussian", "exact"])
@@ -82,12 +77,8 @@ def test_as_many_pairs_as_the_kernel_for_cpus(kernel: str) -> None:
     """Exact spans of the ellipses on each row of blocks, no boxes."""
     size = (70, 90)
     for splats in (random_splats(80, bases=1), needles(40)):
-        expected, per_tile = pairs_of(splats, size, kernel, None)
-        assert sum(per_tile) == expected > 100
-    mask = torch.arange(30).reshape(rasterizer.tile_grid(size)) % 3 > 0
-    expected, per_tile = pairs_of(needles(40), size, kernel, mask)
-    assert sum(per_tile) == expected
-    assert not any(np.array(per_tile)[~mask.flatten().numpy()])
+        expected, listed = pairs_of(splats, size, kernel)
+        assert listed == expected > 100
 
 
 def test_the_same_every_time() -> None:

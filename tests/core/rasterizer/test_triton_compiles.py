@@ -20,10 +20,10 @@ from mvsgs_core.rasterizer.triton import blend, lists, projection, projection_ba
 
 INTEGERS = {"count", "width", "height", "length", "tiles_x", "tiles"}
 FLOATS = {
-    "fx", "fy", "cx", "cy", "near", "red_behind", "green_behind", "blue_behind", "l1_weight", "l1_share", "ssim_share",
+    "fx", "fy", "cx", "cy", "near", "red_behind", "green_behind", "blue_behind", "l1_weight", "l1_scale", "ssim_scale",
 }
 POINTERS = {
-    "camera": "*fp64", "on_pose": "*fp64", "order": "*i64", "tile_mask": "*u8", "pairs": "*i32", "slots": "*i32",
+    "camera": "*fp64", "on_pose": "*fp64", "order": "*i64", "pairs": "*i32", "slots": "*i32",
     "refused": "*i32", "pair_tiles": "*i32", "pair_splats": "*i32", "pair_slots": "*i32", "tile_begin": "*i32",
 }
 
@@ -45,9 +45,9 @@ for capability in (80, 90):
     compile_for(capability, ssim.similarity, 4, ROWS=16, COLUMNS=128)
     compile_for(capability, ssim.loss_gradient, 4, WEIGHTED=True, ROWS=16, COLUMNS=128)
     footprint = projection.FOOTPRINT
-    compile_for(capability, lists.emit, 1, MASKED=True, BLOCK=32, ROW=16, FOOTPRINT=footprint)
+    compile_for(capability, lists.emit, 1, BLOCK=32, ROW=16, FOOTPRINT=footprint)
     compile_for(
-        capability, lists.per_splat, 1, COLUMNS=sums, WIDTH=16, LARGEST=False, SPLATS=8, AT_ONCE=4
+        capability, lists.per_splat, 1, COLUMNS=sums, WIDTH=16, MAXIMUM=False, SPLATS=8, AT_ONCE=4
     )
     if capability == 80:  # the longest ones, with their whole range of switches on, once
         compile_for(capability, projection.project, 2, FOOTPRINT=footprint, **splats)
