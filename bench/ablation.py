@@ -20,6 +20,7 @@ import numpy as np
 from bench import pieces
 from bench.runs import Matrix, Run, figure, folder
 from bench.table import Row, main
+from mvsgs_core.evaluation.metrics import at
 
 SCENES = ("room", "tum_fr1_xyz", "redkitchen")
 TABLE_III = ("A", "B", "C", "D")
@@ -31,16 +32,16 @@ OTHERS = (
     "no_density_control", "relocate", "exact", "ges_scale", "ges_loss", "harmonics", "exposure", "refine_poses",
     "global_shutter", "no_rectification", "true_poses",
 )  # fmt: skip
-FIGURES = {  # path in the report, unit, digits
-    "held-out PSNR": ("rendering.held_out.psnr", "dB", 2),
-    "keyframe PSNR": ("rendering.keyframes.psnr", "dB", 2),
-    "depth inliers": ("depth.inlier_ratio", "", 3),
-    "completeness": ("depth.completeness", "", 3),
-    "splats": ("map.splats", "", 0),
-    "mapper's processor time": ("time.cpu.mapper", "s", 1),
-    "stereo's": ("time.cpu.mvs", "s", 1),
-    "tracker's": ("time.cpu.tracker", "s", 1),
-    "wall time": ("time.wall", "s", 1),
+FIGURES = {  # path in the report
+    "held-out PSNR": "rendering.held_out.psnr",
+    "keyframe PSNR": "rendering.keyframes.psnr",
+    "depth inliers": "depth.inlier_ratio",
+    "completeness": "depth.completeness",
+    "splats": "map.splats",
+    "mapper's processor time": "time.cpu.mapper",
+    "stereo's": "time.cpu.mvs",
+    "tracker's": "time.cpu.tracker",
+    "wall time": "time.wall",
 }
 
 
@@ -83,17 +84,19 @@ def rows_of(runs: list[Run], scenes: Sequence[str], variants: Sequence[str]) -> 
     rows = []
     for scene in scenes:
         full = select(runs, scene, "full")
-        for name, (path, unit, _) in FIGURES.items():
+        for name, path in FIGURES.items():
             base = [v for v in (figure(run.report, path) for run in full) if v is not None]
             if base:
                 spread = float(np.ptp(base) / 2) if len(base) > 1 else None
-                rows.append(Row(f"{scene}: full: {name}", float(np.mean(base)), unit, spread=spread))
+                rows.append(Row(f"{scene}: full: {name}", float(np.mean(base)), at(path).unit, spread=spread))
         for variant in variants:
-            for name, (path, unit, digits) in FIGURES.items():
+            for name, path in FIGURES.items():
                 found = difference(select(runs, scene, variant), full, path)
                 if found is not None:
                     real = "" if found.real else "~ " if found.runs > 1 else "once: "
-                    rows.append(Row(f"{scene}: {variant}: {name}, change", real + found.text(digits), unit))
+                    rows.append(
+                        Row(f"{scene}: {variant}: {name}, change", real + found.text(at(path).digits), at(path).unit)
+                    )
     return rows
 
 

@@ -13,12 +13,13 @@ import argparse
 import math
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bench.record import RECORDED, Record, read_rows
 from bench.runs import machine
+from mvsgs_core.evaluation.metrics import DEPTH, IMAGE, TRAJECTORY
 
 
 @dataclass(frozen=True)
@@ -42,20 +43,49 @@ _UNITS = {
     "1/s": Tolerance(1.4, 2.5, True, machine_bound=True),
     "MB": Tolerance(1.2, 1.6, False, floor=20.0),
 }
-_RATIO = 1.5, 2.5  # of two times in one run: the machine is out of it, its other work is not
-_WORDS = {  # of a row's name, for figures without a telling unit or goal; the first that occurs decides
-    "psnr": Tolerance(0.3, 1.0, True, absolute=True),
+_RATIO = 1.5, 2.5  # of two figures of one run: the machine is out of it, its other work is not
+_ATE = Tolerance(1.5, 3.0, False, floor=1e-3)
+_METRICS = {  # by key; of others the direction says it
     "ssim": Tolerance(0.01, 0.04, True, absolute=True),
     "lpips": Tolerance(0.01, 0.04, False, absolute=True),
-    "inlier": Tolerance(0.03, 0.1, True, absolute=True),
-    "complete": Tolerance(0.03, 0.1, True, absolute=True),
-    "outlier": Tolerance(0.02, 0.1, False, absolute=True),
-    "ate": Tolerance(1.5, 3.0, False, floor=1e-3),
-    "error": Tolerance(1.3, 2.0, False, floor=1e-6),
-    "abs rel": Tolerance(1.3, 2.0, False),
-    "wall": _UNITS["s"],
-    "seconds": _UNITS["s"],
+    "ate_rmse": _ATE,
+    "ate_percent": _ATE,
 }
+_DIRECTIONS = {  # parts of a whole differ by so much, errors by a factor
+    "higher": Tolerance(0.03, 0.1, True, absolute=True),
+    "lower": Tolerance(1.3, 2.0, False, floor=1e-6),
+}
+_WORDS = {  # of a figure's name, for those that only benchmarks measure
+    r"outliers?": Tolerance(0.02, 0.1, False, absolute=True),
+    r"errors?": _DIRECTIONS["lower"],
+    r"wall (s|time)": _UNITS["s"],
+    r"seconds": _UNITS["s"],
+}
+_NAMED = {
+    **{
+        rf"{re.escape(metric.label.lower())}(ness)?": _METRICS.get(metric.key, _DIRECTIONS[metric.better])
+        for metric in (*IMAGE, *DEPTH, *TRAJECTORY)
+        if metric.better
+    },
+    **_WORDS,
+}
+
+
+def tolerance(row: dict[str, Any]) -> Tolerance | None:
+    """How a figure is compared; None where nothing says which way is better.
+
+    A goal says it for the row that has one: a ratio of outliers may be the better the higher it is, a difference in dB
+    the lower.
+    """
+    figure = row["name"].rpartition(": ")[2].lower()
+    known = _UNITS.get(row["unit"])
+    ratio = row["unit"] == "x" or re.search(r" / | over ", figure)  # says nothing without a goal
+    if known is None and not ratio:
+        known = next((rule for words, rule in _NAMED.items() if re.search(rf"\b{words}(?!\w)", figure)), None)
+    if row["goal"][:2] not in ("<=", ">="):
+        return known
+    higher = row["goal"].startswith(">=")
+    return replace(known, higher_is_better=higher) if known else Tolerance(*_RATIO, higher_is_better=higher)
 
 
 @dataclass(frozen=True)
@@ -68,19 +98,6 @@ class Change:
     worse: bool
     regression: bool
     note: str = ""
-
-
-def tolerance(row: dict[str, Any]) -> Tolerance | None:
-    """How a figure is compared; None where nothing says which way is better."""
-    if row["unit"] in _UNITS:
-        return _UNITS[row["unit"]]
-    words = row["name"].lower()
-    by_name = next((rule for word, rule in _WORDS.items() if re.search(rf"\b{word}", words)), None)
-    if by_name is not None and row["unit"] != "x":
-        return by_name
-    if row["goal"][:2] in ("<=", ">="):
-        return Tolerance(*_RATIO, higher_is_better=row["goal"].startswith(">="))
-    return None
 
 
 def change(row: dict[str, Any], before: dict[str, Any], same_machine: bool) -> Change | None:

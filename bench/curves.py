@@ -16,6 +16,7 @@ import numpy as np
 from bench import pieces, plots
 from bench.runs import Matrix, Run, Setting, figure, folder, stage_seconds
 from bench.table import Row, main
+from mvsgs_core.evaluation.metrics import at
 
 # The cascade of the core with one stage more: scale, step, hypotheses, radius, p1, p2
 _COARSEST = "{scale: 4, step: 0.7, hypotheses: 64, radius: 3, p1: 0.3, p2: 2.0}"
@@ -33,9 +34,9 @@ CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point 
     "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200)},
     "mapper.max_splats": {f"{n // 1000}k": (f"mapper.max_splats={n}",) for n in (10000, 20000)},
 }
-ERRORS = {  # what a curve is drawn over besides the held-out PSNR: path in the report, unit
-    "ATE": ("trajectory.ate_percent", "% of the path"),
-    "depth inliers": ("depth.inlier_ratio", ""),
+ERRORS = {  # what a curve is drawn over besides the held-out PSNR: path in the report
+    "ATE": "trajectory.ate_percent",
+    "depth inliers": "depth.inlier_ratio",
 }
 
 
@@ -97,7 +98,7 @@ def rows_of(scene: str, default: Point, others: list[Point]) -> list[Row]:
             continue
         rows.append(Row(f"{name}: wall time", point.seconds, "s"))
         rows.append(Row(f"{name}: held-out PSNR", point.psnr, "dB"))
-        rows += [Row(f"{name}: {e}", figure(point.run.report, path), unit) for e, (path, unit) in ERRORS.items()]
+        rows += [Row(f"{name}: {e}", figure(point.run.report, path), at(path).unit) for e, path in ERRORS.items()]
         rows += [Row(f"{name}: {n}", stage_seconds(point.run.report, n), "s") for n in ("tracker", "mvs", "mapper")]
         rows.append(Row(f"{name}: splats", figure(point.run.report, "map.splats")))
         rows.append(Row(f"{name}: on the front", "yes" if k in front else "no"))

@@ -15,29 +15,19 @@ import numpy as np
 from bench import plots
 from bench.runs import Matrix, Run, available_scenes, choices, figure, folder, said
 from bench.table import Row, main
-from mvsgs_core.evaluation import svg
+from mvsgs_core.evaluation import metrics, svg
 
-# column: path in the report, unit
-COLUMNS = {
-    "KF PSNR": ("rendering.keyframes.psnr", "dB"),
-    "held-out PSNR": ("rendering.held_out.psnr", "dB"),
-    "all PSNR": ("rendering.all.psnr", "dB"),
-    "held-out, unrefined": ("rendering_before_refinement.held_out.psnr", "dB"),
-    "SSIM": ("rendering.held_out.ssim", ""),
-    "LPIPS": ("rendering.held_out.lpips", ""),
-    "ATE": ("trajectory.ate_rmse", ""),
-    "ATE %": ("trajectory.ate_percent", "% of the path"),
-    "abs rel": ("depth.abs_rel", ""),
-    "inliers": ("depth.inlier_ratio", ""),
-    "complete": ("depth.completeness", ""),
-    "KFs": ("trajectory.keyframes", ""),
-    "KF/s": ("time.keyframes_per_second", "1/s"),
-    "wall s": ("time.wall", "s"),
-    "splats": ("map.splats", ""),
-    "MB": ("map.bytes", "MB"),
-    "peak MB": ("memory", "MB"),
+COLUMNS = {  # path in the report
+    "KF PSNR": "rendering.keyframes.psnr",
+    "held-out PSNR": "rendering.held_out.psnr",
+    "all PSNR": "rendering.all.psnr",
+    "held-out, unrefined": "rendering_before_refinement.held_out.psnr",
+    **{metric.label: f"rendering.held_out.{metric.key}" for metric in metrics.IMAGE[1:]},
+    **{metric.label: f"trajectory.{metric.key}" for metric in metrics.TRAJECTORY},
+    **{metric.label: f"depth.{metric.key}" for metric in metrics.DEPTH},
+    **{metric.label: place for place, metric in metrics.RUN.items() if "*" not in place},
 }
-_FACTORS = {"MB": 1e-6, "peak MB": 1e-6}
+PEAK = "peak MB"  # sum over the nodes
 
 # Tables I and II of the paper: PSNR, SSIM, LPIPS as published; which frames were scored is not stated there
 PAPER = {
@@ -56,13 +46,12 @@ PAPER = {
 
 
 def value(run: Run, column: str) -> float | None:
-    """A figure of a run in the column's unit; peak memory is the sum over the nodes."""
-    if column == "peak MB":
+    """A figure of a run in the column's unit."""
+    if column == PEAK:
         peaks = (run.report or {}).get("memory", {}).get("peak_bytes", {})
-        found = float(sum(peaks.values())) if peaks else None
-    else:
-        found = figure(run.report, COLUMNS[column][0])
-    return None if found is None else found * _FACTORS.get(column, 1.0)
+        return 1e-6 * float(sum(peaks.values())) if peaks else None
+    found = figure(run.report, COLUMNS[column])
+    return None if found is None else found * metrics.at(COLUMNS[column]).factor
 
 
 def time_against_error(runs: list[Run]) -> str:
@@ -78,9 +67,10 @@ def time_against_error(runs: list[Run]) -> str:
 def rows(runs: list[Run]) -> list[Row]:
     """Of each scene and variant the mean over the seeds, with half their range; the paper's figures; failures."""
     found = []
+    units = {column: metrics.at(path).unit for column, path in COLUMNS.items()} | {PEAK: "MB"}
     for scene, variant in dict.fromkeys((run.scene, run.variant) for run in runs):
         group = [run for run in runs if (run.scene, run.variant) == (scene, variant)]
-        for column, (_, unit) in COLUMNS.items():
+        for column, unit in units.items():
             values = [v for v in (value(run, column) for run in group) if v is not None]
             if values:
                 spread = (max(values) - min(values)) / 2 if len(values) > 1 else None
@@ -91,8 +81,8 @@ def rows(runs: list[Run]) -> list[Row]:
             if run.report is None
         ]
     for scene in dict.fromkeys(run.scene for run in runs if run.scene in PAPER):
-        published = zip(("all PSNR", "SSIM", "LPIPS"), PAPER[scene], ("dB", "", ""))
-        found += [Row(f"{scene}/the paper: {column}", measured, unit) for column, measured, unit in published]
+        published = zip(("all PSNR", "SSIM", "LPIPS"), PAPER[scene])
+        found += [Row(f"{scene}/the paper: {column}", measured, units[column]) for column, measured in published]
     return found
 
 

@@ -152,6 +152,20 @@ def test_the_figures_name_rows_that_are_recorded_and_benchmarks_that_print_them(
         (row("ratio", 1.0, "x", "<= 2", True), row("ratio", 1.3, "x", "<= 2", True), None),
         (row("ratio", 1.0, "x", "<= 2", True), row("ratio", 3.0, "x", "<= 2", False), "regression"),
         (row("speedup", 5.0, "x", ">= 4", True), row("speedup", 3.0, "x", ">= 4", False), "worse"),
+        (
+            row("its outliers over ours", 3.0, "", ">= 2"),
+            row("its outliers over ours", 9.0, "", ">= 2"),
+            "better",
+        ),
+        (
+            row("its outliers over ours", 3.0, "", ">= 2"),
+            row("its outliers over ours", 1.0, "", ">= 2"),
+            "regression",
+        ),
+        (row("outliers of kept", 0.01, "", "<= 0.05"), row("outliers of kept", 0.2, "", "<= 0.05"), "regression"),
+        (row("PSNR lost", 0.1, "dB", "<= 0.3"), row("PSNR lost", 1.5, "dB", "<= 0.3"), "regression"),
+        (row("room: LPIPS", 0.2), row("room: LPIPS", 0.1), "better"),
+        (row("bare walls: kept", 0.2), row("bare walls: kept", 0.9), None),  # no wall time
         (row("splats", 1000), row("splats", 5000), None),  # neither is better
         (row("map finite", "all", "", "finite", True), row("map finite", "NaN", "", "finite", False), "regression"),
     ],
