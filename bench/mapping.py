@@ -26,7 +26,6 @@ from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
 from mvsgs_core.mapping.training import SkipConfig
-from mvsgs_core.rasterizer.rasterize import rasterize
 
 KITCHEN = Path(__file__).resolve().parent.parent.parent / "shared/data/seven_scenes_redkitchen"
 
@@ -106,13 +105,8 @@ def held_out_psnr(mapper: OnlineMapper, scene: Scene) -> float:
     scores = []
     final = mapper.snapshot()
     for view in scene.held_out:
-        pose = view.world_from_cam.copy()
-        pose[:3, 3] -= final.origin
-        with torch.no_grad():
-            color = rasterize(
-                final.splats, pose, view.intrinsics, view.image.shape[:2], kernel=final.kernel,
-                near=1e-3 * (mapper.unit or 1.0),
-            ).color  # fmt: skip
+        near = 1e-3 * (mapper.unit or 1.0)
+        color = final.render(view.world_from_cam, view.intrinsics, view.image.shape[:2], near=near).color
         scores.append(psnr(color.clamp(0.0, 1.0).numpy(), view.image.astype(np.float32) / 255.0))
     return float(np.mean(scores))
 

@@ -15,7 +15,6 @@ from mvsgs_core import camera, geometry
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.keyframe_images import image_name
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 
 BEHIND = 0.03  # of the rendered depth: a point farther behind the surface is hidden by it
@@ -106,13 +105,11 @@ class _Tracks:
 
 def _seen(final: Snapshot, means: np.ndarray, cameras: Cameras, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (M,) of `means` (N, 3), relative to the origin, that camera k sees, and where (M, 2), in our pixels."""
-    local = cameras.world_from_cam[k].copy()
-    local[:3, 3] -= final.origin
     height, width = cameras.sizes[k].tolist()
-    with torch.no_grad():
-        render = rasterize(final.splats, local, cameras.intrinsics[k], (height, width), kernel=final.kernel)
+    render = final.render(cameras.world_from_cam[k], cameras.intrinsics[k], (height, width))
     surface = torch.where(render.opacity >= 0.5, render.depth, torch.inf).numpy()
-    in_camera = means @ geometry.inverse(local)[:3, :3].T + geometry.inverse(local)[:3, 3]
+    cam_from_map = geometry.inverse(final.relative_pose(cameras.world_from_cam[k]))
+    in_camera = means @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
     ahead = np.flatnonzero(in_camera[:, 2] > 0)
     pixels = camera.project(in_camera[ahead], cameras.intrinsics[k])
     inside = ((pixels > -0.5) & (pixels < [width - 0.5, height - 0.5])).all(axis=1)

@@ -12,7 +12,6 @@ from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.glb import write_glb
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.open3d_loader import open3d
-from mvsgs_core.rasterizer.rasterize import rasterize
 
 
 def write_mesh(
@@ -27,12 +26,9 @@ def write_mesh(
     o3d = open3d()
     views = []
     for pose, intrinsics, size in zip(cameras.world_from_cam, cameras.intrinsics, cameras.sizes.tolist()):
-        local = pose.copy()
-        local[:3, 3] -= final.origin
-        with torch.no_grad():
-            render = rasterize(final.splats, local, intrinsics, (size[0], size[1]), kernel=final.kernel)
+        render = final.render(pose, intrinsics, (size[0], size[1]))
         depth = torch.where(render.opacity >= min_opacity, render.depth, 0.0)
-        views.append((local, intrinsics, depth.numpy(), render.color.clamp(0.0, 1.0).numpy()))
+        views.append((final.relative_pose(pose), intrinsics, depth.numpy(), render.color.clamp(0.0, 1.0).numpy()))
     seen = [depth[depth > 0] for _, _, depth, _ in views if (depth > 0).any()]
     if not seen:
         raise ValueError("no camera sees the map: nothing to fuse; check that the poses are those of this map")

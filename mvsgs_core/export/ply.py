@@ -13,7 +13,7 @@ from mvsgs_core.rasterizer.kernels import KERNELS, gaussian_std_ratio, log_scale
 from mvsgs_core.rasterizer.spherical_harmonics import degree_of
 from mvsgs_core.rasterizer.splats import Splats
 
-_LONGEST_HEADER = 2**16  # bytes
+_MAX_HEADER = 2**16  # bytes
 FAR = 1e3  # origins farther than this many scene extents stay a comment: float32 positions would lose the detail
 
 
@@ -84,7 +84,7 @@ def read_ply(path: Path) -> Snapshot:
 
 
 def _parse(data: bytes) -> Snapshot:
-    end = data.find(b"end_header\n", 0, _LONGEST_HEADER)
+    end = data.find(b"end_header\n", 0, _MAX_HEADER)
     if not data.startswith(b"ply") or end < 0:
         raise ValueError("it has no header of one")
     header = data[:end].decode("ascii", errors="replace").splitlines()

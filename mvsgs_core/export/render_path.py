@@ -14,9 +14,8 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.export.input import input_arguments, lens, read_map
+from mvsgs_core.export.command_line import input_arguments, lens, read_map, run
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.trajectory_file import read_trajectory
 from mvsgs_core.video_file import write_video
 
@@ -37,11 +36,20 @@ def frames_along(
 ) -> Iterator[np.ndarray]:
     """Renders (H, W, 3) uint8 RGB of the map from each pose (K, 4, 4)."""
     for pose in world_from_cam:
-        local = pose.copy()
-        local[:3, 3] -= final.origin
-        with torch.no_grad():
-            color = rasterize(final.splats, local, intrinsics, size, kernel=final.kernel).color
+        color = final.render(pose, intrinsics, size).color
         yield (color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
+
+
+def render_path(options: argparse.Namespace) -> str:
+    """Does what the command line asks; returns one line that says what was written. Raises ValueError, OSError."""
+    final, left_out = read_map(options)
+    _, poses = read_trajectory(options.trajectory)
+    if not len(poses):
+        raise ValueError(f"{options.trajectory} has no poses")
+    path = resampled(poses, options.frames or len(poses))
+    intrinsics, size = lens(options)
+    count = write_video(options.out, frames_along(final, path, intrinsics, size), size, options.fps)
+    return f"{options.out}: {count} frames{left_out}"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -51,21 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("out", type=Path, help="video.mp4")
     parser.add_argument("--frames", type=int, help="of the video, spread over the path; default: one a pose")
     parser.add_argument("--fps", type=float, default=30.0)
-    options = parser.parse_args(arguments)
-    try:
-        final, left_out = read_map(options)
-        _, poses = read_trajectory(options.trajectory)
-        if not len(poses):
-            raise ValueError(f"{options.trajectory} has no poses")
-        path = resampled(poses, options.frames or len(poses))
-        intrinsics, size = lens(options)
-        count = write_video(options.out, frames_along(final, path, intrinsics, size), size, options.fps)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"render_path: {error}", file=sys.stderr)
-        return 1
-    dropped = f"; {left_out} splats that are not finite were left out" if left_out else ""
-    print(f"{options.out}: {count} frames{dropped}")
-    return 0
+    return run(parser, arguments, render_path)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,15 @@
-"""The map as it leaves the mapper: world units, positions relative to an origin in float64."""
+"""The map as it leaves the mapper or a file: world units, positions relative to an origin in float64."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import torch
 
+from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 
 
@@ -16,9 +20,33 @@ class Snapshot:
     splats: Splats  # detached copies, on the CPU
     anchors: np.ndarray  # (N,) int64 keyframe of each splat
     origin: np.ndarray  # (3,) float64, world position that `splats.means` are relative to
-    kernel: str
+    kernel: str  # "gaussian", "exact" or "ges_scale": what `splats.betas` means
     iterations: int
     keyframes: np.ndarray  # (K,) int64
     world_from_cam: np.ndarray  # (K, 4, 4) float64, as refined, world frame (not relative to the origin)
     scale: np.ndarray  # (K,) float64
     exposures: np.ndarray  # (K, 3, 4) float32
+
+    def relative_pose(self, world_from_cam: np.ndarray) -> np.ndarray:
+        """(4, 4) of a pose in the world (4, 4): relative to `origin`, as the splats are."""
+        local = world_from_cam.copy()
+        local[:3, 3] -= self.origin
+        return local
+
+    @torch.no_grad()
+    def render(
+        self, world_from_cam: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], **options: Any
+    ) -> Render:
+        """The map from a pose in the world (4, 4); intrinsics (4,) and size (height, width) as for `rasterize`, whose
+        other options may be given."""
+        pose = self.relative_pose(world_from_cam)
+        return rasterize(self.splats, pose, intrinsics, size, kernel=self.kernel, **options)
+
+    def scaled(self, factor: float) -> Snapshot:
+        """The same map in another unit."""
+        splats = replace(
+            self.splats, means=self.splats.means * factor, log_scales=self.splats.log_scales + math.log(factor)
+        )
+        poses = self.world_from_cam.copy()
+        poses[:, :3, 3] *= factor
+        return replace(self, splats=splats, origin=self.origin * factor, world_from_cam=poses)

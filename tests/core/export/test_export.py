@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import torch
 from plyfile import PlyData
 
 from mvsgs_core.export import __main__ as export
-from mvsgs_core.export.input import input_arguments, lens
+from mvsgs_core.export.command_line import input_arguments, lens
 from mvsgs_core.export.ply import folded, read_ply, write_ply
 from mvsgs_core.rasterizer.kernels import log_scale_shift
 from mvsgs_core.rasterizer.rasterize import rasterize
@@ -50,6 +52,7 @@ def test_a_saved_map_is_read_back(tmp_path: Path, kernel: str) -> None:
     write_ply(tmp_path / "map.ply", final)
     again = read_ply(tmp_path / "map.ply")
     assert again.kernel == kernel
+    assert f"comment density {kernel}\n".encode() in (tmp_path / "map.ply").read_bytes()  # its name in the files
     for name, value in final.splats.tensors().items():
         if name == "means":
             value = value + torch.from_numpy(ORIGIN)
@@ -170,7 +173,31 @@ def test_splats_that_are_not_finite_are_refused_or_left_out_and_counted(
 
 def test_scaling_a_map_scales_its_picture_not_at_all() -> None:
     final = final_map(1)
-    larger = export.scaled(final, 3.0)
+    larger = final.scaled(3.0)
     pose, k = np.eye(4), np.array([25.0, 25.0, 15.5, 11.5])
     one, two = (rasterize(m.splats, pose, k, (24, 32)).color for m in (final, larger))
     torch.testing.assert_close(one, two, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "written"),
+    [
+        ("mvsgs_core.export", ["map.ply", "map.splat"], "768 splats"),
+        ("mvsgs_core.export.render_path", ["map.ply", "trajectory.txt", "flight.mp4"], "1 frames"),
+    ],
+)
+def test_as_a_command(tmp_path: Path, module: str, arguments: list[str], written: str) -> None:
+    write_ply(tmp_path / "map.ply", final_map(1))
+    save_cameras(tmp_path, [0.0])
+    write_poses(tmp_path / "trajectory.txt", [0.5])
+    words = [tmp_path / word for word in arguments]
+    done = subprocess.run(
+        [sys.executable, "-m", module, *words],
+        cwd=Path(__file__).parents[3],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"{words[-1]}: {written}" in done.stdout
+    assert words[-1].stat().st_size > 0

@@ -13,7 +13,6 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from mvsgs_core.export import __main__ as export
 from mvsgs_core.export.ply import read_ply, write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.splat import write_splat, write_spz
@@ -138,9 +137,9 @@ def test_spz_is_small_and_a_map_too_fine_or_too_large_for_it_is_refused(tmp_path
     np.testing.assert_allclose(cloud.point["scale"].numpy(), final.splats.log_scales.exp().numpy(), rtol=0.05)
     assert (tmp_path / "map.spz").stat().st_size < 32 * len(final.splats)
     with pytest.raises(ValueError, match="1/4096"):
-        write_spz(tmp_path / "fine.spz", export.scaled(final, 1e-3))
+        write_spz(tmp_path / "fine.spz", final.scaled(1e-3))
     with pytest.raises(ValueError, match="768 splats are farther"):
-        write_spz(tmp_path / "large.spz", export.scaled(final, 1e4))
+        write_spz(tmp_path / "large.spz", final.scaled(1e4))
 
 
 def test_splat_rows_are_32_bytes_and_open3d_reads_them(tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
-"""What an export starts from: a map.ply whose splats are sound, and the cameras that saw it."""
+"""What the commands of this folder share: the map.ply and the cameras that they start from, and how they end."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +17,19 @@ from mvsgs_core.export.ply import read_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.trajectory_file import read_trajectory
+
+
+def run(
+    parser: argparse.ArgumentParser, arguments: list[str] | None, command: Callable[[argparse.Namespace], str]
+) -> int:
+    """Prints what a command says it has written, or in one line why it could not be; returns the exit code."""
+    options = parser.parse_args(arguments)
+    try:
+        print(command(options))
+    except (ValueError, OSError, ImportError) as error:
+        print(f"{parser.prog.rpartition('.')[2]}: {error}", file=sys.stderr)
+        return 1
+    return 0
 
 
 def input_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,8 +46,8 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def read_map(options: argparse.Namespace) -> tuple[Snapshot, int]:
-    """The map and the number of splats that were left out because a value of theirs is not finite.
+def read_map(options: argparse.Namespace) -> tuple[Snapshot, str]:
+    """The map, and what is to be said of splats that were left out because a value of theirs is not finite, or nothing.
 
     Raises ValueError where there are such and --drop-unsound was not given.
     """
@@ -49,7 +64,8 @@ def read_map(options: argparse.Namespace) -> tuple[Snapshot, int]:
             "--drop-unsound leaves them out"
         )
     kept = Splats(**{name: value[sound] for name, value in splats.tensors().items()})
-    return replace(final, splats=kept, anchors=final.anchors[sound.numpy()]), unsound
+    said = f"; {unsound} splats that are not finite were left out" if unsound else ""
+    return replace(final, splats=kept, anchors=final.anchors[sound.numpy()]), said
 
 
 def known_cameras(options: argparse.Namespace) -> Cameras | None:
