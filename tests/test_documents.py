@@ -1,0 +1,98 @@
+"""Documents: what they name exists, what is generated equals its generator's output, lines are short enough to read."""
+
+from __future__ import annotations
+
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from bench import figures, plots, record
+from launch.compose import compose
+from launch.refusal import GraphError
+from tests.support.benchmarks import BENCHMARKS
+from tests.support.shared_data import ROOT
+
+DOCUMENTS = [
+    *(ROOT / name for name in ("README.md", "ARCHITECTURE.md", "BENCHMARKS.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "README.md", ROOT / "msgs" / "WIRE.md",
+]  # fmt: skip
+WIDEST, MAX_COLUMNS, LONGEST_PAGE = 120, 8, 150
+FOLDERS = ("bench", "docs", "examples", "launch", "msgs", "mvsgs_core", "nodes", "tests")
+GENERATED = re.compile(r"<!-- bench:([\w/.-]+) -->.*?<!-- /bench:\1 -->", re.DOTALL)
+EVERY = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: str(document.relative_to(ROOT)))
+
+
+def by_hand(document: Path) -> str:
+    """The text without what is generated: recorded commands are those of their commit."""
+    return GENERATED.sub("", document.read_text())
+
+
+@EVERY
+def test_lines_are_as_long_as_a_reader_takes_in(document: Path) -> None:
+    code = False
+    for number, line in enumerate(document.read_text().splitlines(), 1):
+        code ^= line.startswith("```")
+        if line.startswith("|"):
+            assert line.replace("\\|", "").count("|") - 1 <= MAX_COLUMNS, f"{document.name}:{number}: columns"
+        elif not code and not line.startswith("    "):
+            assert len(line) <= WIDEST, f"{document.name}:{number}: {len(line)} characters"
+
+
+def test_the_page_of_figures_is_one_page() -> None:
+    assert len(record.DOCUMENT.read_text().splitlines()) <= LONGEST_PAGE
+
+
+@EVERY
+def test_links_lead_to_files(document: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", document.read_text()):
+        if not target.startswith(("http", "#")):
+            assert (document.parent / target.partition("#")[0]).exists(), f"{document.name}: {target}"
+
+
+@EVERY
+def test_paths_in_code_marks_exist(document: Path) -> None:
+    """`mvsgs_core/mapping/` and `launch/run_all.py` do, and every file that is named with its folder."""
+    for text in re.findall(r"`([^`\n]+)`", by_hand(document)):
+        for path in re.findall(rf"^(?:{'|'.join(FOLDERS)})/[\w./-]*$", text):
+            assert "NAME" in path or (ROOT / path).exists(), f"{document.name}: {path}"
+
+
+@EVERY
+def test_modules_that_are_run_or_imported_exist(document: Path) -> None:
+    text = by_hand(document)
+    for module in re.findall(r"python -m ([a-z_][\w.]*\w)", text) + re.findall(r"from ([a-z_][\w.]*) import", text):
+        assert module.endswith(".NAME") or find_spec(module) is not None, f"{document.name}: {module}"
+
+
+@EVERY
+def test_commands_compose(document: Path) -> None:
+    """Every `launch/run_all.py` command that a document shows: its slots, choices and parameters are there."""
+    for line in re.findall(r"^ *python \S*launch/run_all\.py (.+)$", by_hand(document), re.MULTILINE):
+        words = re.findall(r'(?:[^\s"]|"[^"]*")+', line.partition("  #")[0])
+        overrides = [word.strip('"') for word in words if "=" in word]
+        if any(text in line for text in ("resume=", "_target_", "PATH/TO")):
+            continue
+        try:
+            compose(overrides)
+        except GraphError as error:
+            pytest.fail(f"{document.name}: {line}: {error}")
+
+
+def test_every_benchmark_has_its_page_and_every_page_what_is_recorded() -> None:
+    assert [page.stem for page in sorted(record.PAGES.glob("*.md"))] == BENCHMARKS
+    for document in record.documents():
+        text = document.read_text()
+        names = set(re.findall(r"<!-- bench:(\S+) -->", text))
+        assert names == {"figures" if document == record.DOCUMENT else document.stem}
+        assert record.render(text) == text, f"{document.name} differs from what is recorded: python -m bench.record"
+        if document != record.DOCUMENT:
+            assert f"python -m bench.{document.stem}" in by_hand(document)
+
+
+def test_the_plots_are_of_what_is_recorded(tmp_path: Path) -> None:
+    for name, svg in figures.plots_of(lambda of: record.Record.load(of).rows).items():
+        plots.write(tmp_path / f"{name}.svg", svg)
+        drawn = (record.PAGES / f"{name}.svg").read_text()
+        assert (tmp_path / f"{name}.svg").read_text() == drawn, f"{name}.svg is old: python -m bench.record"
