@@ -29,10 +29,10 @@ from torch import Tensor
 from bench import networks
 from bench.rasterizer import intrinsics, scene, work
 from bench.table import Row, main
-from mvsgs_core.mapping import optimizer
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.map_state import MapState
-from mvsgs_core.mapping.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.mapping.trainer import Trainer
 from mvsgs_core.rasterizer import ssim
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
@@ -169,18 +169,13 @@ def iteration_rows(size: tuple[int, int], count: int, device: torch.device, roun
     g = np.random.default_rng(0)
     image = g.integers(0, 255, (*size, 3), dtype=np.uint8)
     posed = RGBDKeyframe(0, image, intrinsics(size), np.eye(4), np.zeros(size, np.float32))
-    view = training_view(posed, np.eye(4), None, 1, device)
-    training = TrainingConfig(backend="triton")
-    groups = optimizer.groups(optimizer.OptimizerConfig(), 1.0, 1.0, False, training.kernel)
-    log = Stats()
+    view = training_view(posed, np.eye(4), None, device)
+    trainer = Trainer(MapperConfig(training=TrainingConfig(backend="triton")), state, Stats())
     rendered = torch.rand(*size, 3, device=device, requires_grad=True)
-    target = view.target(0)
+    target = view.target
 
     def iteration() -> None:
-        train_once(
-            state, view, training, SkipConfig(), groups, decay_steps=600, median_depth=1.0, global_rate=1.0,
-            refining=True, log=log,
-        )  # fmt: skip
+        trainer.step(view, 1.0, refining=True)
 
     def loss() -> None:
         ssim.image_loss(rendered, target, l1_weight=0.8, ssim_weight=0.2, backend="triton").backward()

@@ -18,11 +18,11 @@ import torch
 from bench.table import Row, main
 from mvsgs_core import camera
 from mvsgs_core.mapping import optimizer
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.optimizer import OptimizerConfig
-from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.rasterizer.ssim import image_loss
@@ -160,8 +160,8 @@ def mapped(name: str, views: list[RGBDKeyframe], config: MapperConfig, minimum: 
     finite = state_finite and all(bool(torch.isfinite(r.color).all()) for r in renders)
     scores = []
     for render, view in zip(renders, mapper.views, strict=True):
-        squared = ((render.color - view.target(0)) ** 2).mean(dim=-1)
-        mean = float(squared.mean() if view.valid is None else squared[view.valid[0]].mean())
+        squared = ((render.color - view.target) ** 2).mean(dim=-1)
+        mean = float(squared.mean() if view.valid is None else squared[view.valid].mean())
         scores.append(10.0 * np.log10(1.0 / max(mean, 1e-12)))
     refused = {key: int(value) for key, value in mapper.log.counts.items() if key.startswith("refused")}
     reached = float(np.mean(scores)) if scores else 0.0
@@ -205,7 +205,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     far = cloud(200)
     far.means[:, 0] += 1e6
     rows.append(once("world origin 1e6 away, float32 means", far, origin=1e6))
-    config = MapperConfig(iterations=40, training=TrainingConfig(threads=1))
+    config = MapperConfig(iterations=40, threads=1)
     views = [box_view(k, 0.2 * k) for k in range(4)]
     rows.append(mapped("mapper, nothing wrong", views, config, GOOD))
     away = [box_view(k, 0.2 * k, origin=1e6) for k in range(4)]
@@ -221,9 +221,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
     wild = replace(usual, **{key: 100.0 * value for key, value in vars(usual).items()
                              if key not in ("means_final", "decay_steps")})  # fmt: skip
     for kernel in ("gaussian", "exact"):
-        training = TrainingConfig(threads=1, kernel=kernel, betas=True)
-        skipping = replace(config.skipping, converged=False)
-        storm = replace(config, iterations=steps // 4, rates=wild, training=training, skipping=skipping)
+        training = TrainingConfig(kernel=kernel, betas=True)
+        convergence = replace(config.convergence, skip=False)
+        storm = replace(config, iterations=steps // 4, optimizer=wild, training=training, convergence=convergence)
         rows.append(mapped(f"{steps} steps at 100 times the rates, {kernel}", views, storm))
     return rows
 

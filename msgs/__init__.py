@@ -165,26 +165,11 @@ class Preview:
 
 
 @dataclass(frozen=True)
-class MapView:
-    """What the map shows from a keyframe's pose, its iterations done: for who can spare work by it. Newest only."""
-
-    index: int
-    segment: int
-    scale: float
-    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
-    intrinsics: Annotated[np.ndarray, "float64 4"]  # in pixels of the render
-    render: Annotated[np.ndarray, "uint8 H W 3"]
-    depth: Annotated[np.ndarray, "float32 H W"]  # 0 where the map shows nothing
-
-
-@dataclass(frozen=True)
 class End:
     """The last message of every topic. `stats` holds what each node upstream counted and timed, by node name."""
 
     stats: Mapping[str, Any] = field(default_factory=dict)
 
 
-Message = (
-    Frame | GroundTruth | Keyframe | Depth | FusedKeyframe | Poses | Trajectory | SplatMap | Preview | MapView | End
-)
+Message = Frame | GroundTruth | Keyframe | Depth | FusedKeyframe | Poses | Trajectory | SplatMap | Preview | End
 TYPES: dict[str, type] = {t.__name__: t for t in get_args(Message)}

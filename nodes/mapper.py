@@ -6,10 +6,11 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from msgs import FusedKeyframe, Keyframe, MapView, Poses, Preview, SplatMap
+from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.mapping.atlas import Atlas
@@ -17,15 +18,14 @@ from mvsgs_core.mapping.checkpoints import checkpoint
 from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.replay import Replay
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.losses import LossConfig
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.optimizer import OptimizerConfig
+from mvsgs_core.mapping.keyframes import ConvergenceConfig, RGBDKeyframe
+from mvsgs_core.mapping.losses import Loss
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
-from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from nodes import Node
 
 _SLICE = 0.05  # seconds of optimization in one on_idle
@@ -46,32 +46,30 @@ class Mapper(Node):
 
     @dataclass
     class Config:
-        iterations: int = 30  # owed for each keyframe, half on the newest, half on all (the paper: 1000)
+        iterations: int = 30  # optimization budget of each keyframe, half on the newest, half on all (the paper: 1000)
         refinement: int = 300  # iterations over all keyframes at the end
         window: int = 6  # keyframes of the local half
-        realtime: bool = False  # a new keyframe cancels what older ones are owed
+        realtime: bool = False  # a new keyframe cancels the pending iterations of older ones
         max_pixels: int | None = None  # area of the training images; null: as they come
         max_keyframes: int = 1000  # whose images are kept and trained on; beyond, they are thinned out evenly
-        kernel: str = "gaussian"  # gaussian, exact or ges_scale
+        kernel: Literal["gaussian", "exact", "ges_scale"] = "gaussian"  # gaussian, exact or ges_scale
         betas: bool = False  # train the shape (exact, ges_scale)
-        loss: str = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
+        loss: Loss = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
         sh_degree: int = 0  # of the view-dependent color, 0 to 3
         exposure: bool = False  # train a color affine for each keyframe
         refine_poses: bool = False  # train the keyframes' poses too
-        unexplored: bool = True  # add splats only where the map does not explain the image
+        unexplored: bool = True  # add splats only where the map's render differs from the image
         unexplored_psnr: float = 25.0  # dB of a pixel; below: unexplored (the paper: 40)
         voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
         map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
         map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another
         fill: int = 4  # pixels: cells that get a splat of doubtful or continued depth where the map stays empty; 0: off
-        density_control: str = "adaptive"  # adaptive, relocate or none
+        density_control: Literal["adaptive", "none"] = "adaptive"  # adaptive (clone, split, prune) or none
         max_splats: int = 1000000  # no growth beyond
         skip_converged: bool = True  # pass over keyframes whose loss no longer falls
-        coarse_to_fine: bool = False  # a keyframe's first visits at half resolution
         selective: bool = True  # step only the splats that were seen
         preview_period: float = 1.0  # seconds between previews; 0: none
         preview_splats: int = 100000  # at most so many in a preview
-        map_views: bool = False  # send what the map shows from each keyframe, as mvs=skipping reads it
         output: str | None = None  # folder for map.ply and cameras.json; null: none is written
         checkpoint: float = 30.0  # seconds of the stream or the clock between checkpoints in the output; 0: none
         keep_checkpoint: bool = False  # of the finished map, after a complete run
@@ -106,7 +104,7 @@ class Mapper(Node):
     def mapper(self) -> OnlineMapper:
         return self.atlas.current
 
-    def on_fused_keyframe(self, view: FusedKeyframe) -> Iterator[Preview | MapView]:
+    def on_fused_keyframe(self, view: FusedKeyframe) -> Iterator[Preview]:
         self._provisional.came(view.index)
         if not self._is_new_view(view):
             return
@@ -114,9 +112,6 @@ class Mapper(Node):
         segment = self.atlas.segment_of.get(view.index, view.segment)
         self._settle()
         self.atlas.enter(segment)
-        if self.config.map_views:
-            self._settle()
-            yield from self._map_view(segment)
         self.atlas.came(view.index, view.timestamp)
         known = len(self.mapper.views)
         self.mapper.add_keyframe(
@@ -209,7 +204,7 @@ class Mapper(Node):
             self.stats.warn(self._replay.problem)
 
     def _settle(self, realtime: bool = True) -> None:
-        """Does what keyframes are owed. realtime: where the mapper is, it is left for the next keyframe to cancel."""
+        """Does the pending iterations. realtime: where the mapper is, it is left for the next keyframe to cancel."""
         while not (realtime and self.config.realtime) and self.mapper.step():
             self._keep()
 
@@ -260,7 +255,7 @@ class Mapper(Node):
         self.stats.values["splats"] = len(self.mapper.state)
         self.stats.values["iterations"] = self.mapper.iterations
         self.stats.values["iterations_pending"] = self.mapper.schedule.pending
-        self.stats.values["image_bytes"] = self.mapper.image_bytes
+        self.stats.values["image_bytes"] = self.mapper.keyframes.image_bytes
 
     def _check(self) -> None:
         found = self.mapper.self_check()
@@ -279,20 +274,6 @@ class Mapper(Node):
             exposures=final.exposures,
         )  # fmt: skip
 
-    def _map_view(self, segment: int) -> Iterator[MapView]:
-        """Of the newest keyframe, at the coarsest size."""
-        if self.mapper.views and len(self.mapper.state):
-            view = self.mapper.views[-1]
-            level = len(view.levels) - 1
-            shown = self.mapper.render(view, level)
-            color = (shown.color.clamp(0.0, 1.0) * 255.0).round().byte().cpu().numpy()
-            depth = (shown.depth * (self.mapper.unit or 1.0)).float().cpu().numpy()
-            yield MapView(
-                index=view.index, segment=segment, scale=view.scale, world_from_cam=view.world_from_cam,
-                intrinsics=view.intrinsics[level], render=color,
-                depth=np.where(shown.opacity.cpu().numpy() > 0.5, depth, np.float32(0)),
-            )  # fmt: skip
-
     @property
     def _previewing(self) -> bool:
         return self.config.preview_period > 0 and Preview not in self.unread
@@ -308,31 +289,19 @@ class Mapper(Node):
             segments = {segment for segment, part in self.atlas.parts.items() if part is self.mapper}
             provisional = self._provisional.splats(self.mapper, segments)
         arrays = preview_arrays(self.mapper, self.config.preview_splats, provisional)
-        origin = np.zeros(3) if self.mapper.origin is None else self.mapper.origin
+        origin = np.zeros(3) if self.mapper.frame.origin is None else self.mapper.frame.origin
         poses = np.stack([view.world_from_cam for view in self.mapper.views])
         poses[:, :3, 3] -= origin
         yield Preview(
             index=view.index, iterations=self.mapper.iterations, world_from_cam=poses[-1],
-            intrinsics=view.intrinsics[0], image=view.levels[0].cpu().numpy(), **arrays,
+            intrinsics=view.intrinsics, image=view.image.cpu().numpy(), **arrays,
             keyframes=np.array([view.index for view in self.mapper.views], dtype=np.int64), keyframe_poses=poses,
             origin=origin,
         )  # fmt: skip
 
 
-def _loss(name: str) -> LossConfig:
-    losses = {"ssim": LossConfig(l1=0.8, ssim=0.2, frequency=0.0), "ges": LossConfig(l1=0.3, ssim=0.2, frequency=0.5)}
-    if name not in losses:
-        raise ValueError(f"mapper.loss={name}: choose one of {', '.join(losses)}")
-    return losses[name]
-
-
 def mapper_config(config: Mapper.Config) -> MapperConfig:
     """The core's configuration of the node's parameters; the rest has the core's defaults."""
-    device = config.device
-    if device == "auto":
-        import torch
-
-        device = "cuda:0" if torch.cuda.is_available() else "cpu"
     return MapperConfig(
         iterations=config.iterations,
         refinement=config.refinement,
@@ -342,16 +311,13 @@ def mapper_config(config: Mapper.Config) -> MapperConfig:
         max_keyframes=config.max_keyframes,
         sh_degree=config.sh_degree,
         seed=config.seed,
-        device=device,
+        threads=config.threads,
+        device=config.device,
         training=TrainingConfig(
-            kernel=config.kernel, betas=config.betas, exposure=config.exposure, threads=config.threads,
-            poses=config.refine_poses, loss=_loss(config.loss),
+            kernel=config.kernel, betas=config.betas, loss=config.loss, exposure=config.exposure,
+            refine_poses=config.refine_poses, selective=config.selective,
         ),
-        skipping=SkipConfig(
-            converged=config.skip_converged, coarse_to_fine=config.coarse_to_fine,
-            selective=config.selective,
-        ),
-        rates=OptimizerConfig(),
+        convergence=ConvergenceConfig(skip=config.skip_converged),
         insertion=InsertionConfig(
             unexplored=config.unexplored, unexplored_psnr=config.unexplored_psnr, voxel=config.voxel,
             map_voxel=config.map_voxel, map_voxel_error=config.map_voxel_error, fill=config.fill,

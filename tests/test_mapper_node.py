@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nodes
-from msgs import FusedKeyframe, Keyframe, MapView, Poses, Preview, SplatMap
+from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.image_metrics import psnr
@@ -26,19 +26,7 @@ from tests.support.tiny_scene import pose_on_arc
 
 def test_inputs_and_outputs_are_declared() -> None:
     assert nodes.handlers(Mapper) == {FusedKeyframe: "on_fused_keyframe", Poses: "on_poses", Keyframe: "on_keyframe"}
-    assert set(nodes.outputs(Mapper)) == {SplatMap, Preview, MapView}
-
-
-def test_what_the_map_shows_is_sent_for_the_keyframe_before() -> None:
-    node = Mapper(settings(map_views=True))
-    sent = [m for k in range(3) for m in node.on_fused_keyframe(view_message(7 * k, k / 2)) if isinstance(m, MapView)]
-    assert [m.index for m in sent] == [0, 7]
-    assert node.mapper.iterations == 8  # what the two were owed was done before
-    view = view_message(0, 0.0)
-    shown = cv2.resize(sent[0].depth, view.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    both = (shown > 0) & (view.depth > 0)
-    assert both.mean() > 0.5
-    assert np.median(np.abs(shown - view.depth)[both] / view.depth[both]) < 0.1
+    assert set(nodes.outputs(Mapper)) == {SplatMap, Preview}
 
 
 def test_two_maps_leave_the_mapper_before_and_after_the_refinement(tmp_path: Path) -> None:

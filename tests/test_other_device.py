@@ -14,12 +14,11 @@ from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import load, save
 from mvsgs_core.mapping.checkpoints.files import FOLDER, KEYFRAMES, state_file
-from mvsgs_core.mapping.checkpoints.images import image_names, write_images
+from mvsgs_core.mapping.checkpoints.images import image_name, write_image
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
-from mvsgs_core.mapping.losses import LossConfig
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
-from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from mvsgs_core.mvs.interface import SmoothingConfig
 from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.mvs.torch_backend import TorchBackend
@@ -87,16 +86,14 @@ def test_bundle_adjustment_equals_that_of_the_cpu() -> None:
     np.testing.assert_array_equal(there.inverse_depth, here.inverse_depth)
 
 
-@pytest.mark.parametrize("mode", ["adaptive", "relocate"])
-def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
+def test_mapper_from_the_first_keyframe_to_the_snapshot() -> None:
     config = MapperConfig(
         iterations=4, refinement=1, sh_degree=1, device=DEVICE,
         training=TrainingConfig(
-            backend="reference", exposure=True, poses=True, pose_visits=0, betas=True, kernel="exact",
-            loss=LossConfig(),
+            backend="reference", exposure=True, refine_poses=True, pose_visits=0, betas=True, kernel="exact",
+            loss="ges",
         ),
-        skipping=SkipConfig(coarse_to_fine=True, coarse_visits=1),
-        density_control=DensityControlConfig(every=3, mode=mode),
+        density_control=DensityControlConfig(every=3),
     )  # fmt: skip
     views = [rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(3)]
     with PretendDevice():
@@ -119,7 +116,7 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot(mode: str) -> None:
 
 
 def test_a_checkpoint_of_a_mapper_elsewhere_gives_it_back(tmp_path: Path) -> None:
-    training = TrainingConfig(backend="reference", exposure=True, poses=True, pose_visits=0)
+    training = TrainingConfig(backend="reference", exposure=True, refine_poses=True, pose_visits=0)
     config = MapperConfig(iterations=3, device=DEVICE, training=training)
     views = [rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(2)]
     images = tmp_path / FOLDER / KEYFRAMES
@@ -131,9 +128,9 @@ def test_a_checkpoint_of_a_mapper_elsewhere_gives_it_back(tmp_path: Path) -> Non
         mapper.step()
         atlas = Atlas(mapper, {0: mapper})
         frozen = atlas.frozen()
-        names = [image_names(view) for view in frozen.current.views]
-        for view, files in zip(frozen.current.views, names):
-            write_images(images, view, files, sync=False)
+        names = [image_name(view) for view in frozen.current.views]
+        for view, name in zip(frozen.current.views, names):
+            write_image(images, view, name, sync=False)
         save(frozen, config, state_file(tmp_path, 1), {0: names}, sync=False)
         again = load(tmp_path, config, Stats())[0].current
         while mapper.step() and again.step():
@@ -141,7 +138,7 @@ def test_a_checkpoint_of_a_mapper_elsewhere_gives_it_back(tmp_path: Path) -> Non
         here, there = mapper.snapshot(), again.snapshot()
     assert frozen.current.state.device.type == "cpu"
     assert again.state.splats.means.device.type == DEVICE
-    assert again.views[0].levels[0].device.type == DEVICE
+    assert again.views[0].image.device.type == DEVICE
     for name, value in here.splats.tensors().items():
         assert torch.equal(there.splats.tensors()[name], value), name
     np.testing.assert_array_equal(there.world_from_cam, here.world_from_cam)

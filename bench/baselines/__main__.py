@@ -31,7 +31,7 @@ from mvsgs_core import image_metrics
 from mvsgs_core.datasets import Item
 from mvsgs_core.evaluation import trajectory_metrics
 from mvsgs_core.held_out import is_held_out
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.config import MapperConfig
 from nodes.reader import Reader
 from nodes.runtime.parameters import parameter_names
 
@@ -158,7 +158,7 @@ def train_longer(model: Model, ours: Ours, longest: float, threads: int, kept: P
     results: list[Trained] = []
     seconds = ours.optimization
     while not converged(results) and seconds <= longest * ours.optimization * 1.001:
-        config = SparseConfig(seconds=seconds, training=TrainingConfig(threads=threads))
+        config = SparseConfig(seconds=seconds, mapper=MapperConfig(threads=threads))
         results.append(known[len(results)] if len(results) < len(known) else train(model, ours, config))
         kept.write_text(json.dumps([asdict(result) for result in results]))
         seconds *= 2

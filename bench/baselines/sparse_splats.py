@@ -12,12 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from mvsgs_core.mapping import density_control, optimizer
-from mvsgs_core.mapping.density_control import DensityControlConfig
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.mapping.map_state import MapState
-from mvsgs_core.mapping.optimizer import OptimizerConfig
-from mvsgs_core.mapping.training import SkipConfig, TrainingConfig, train_once
+from mvsgs_core.mapping.trainer import Trainer
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
@@ -31,11 +29,8 @@ class SparseConfig:
     seconds: float = 60.0  # of optimization
     iterations: int | None = None  # of optimization, whatever the time; None: as many as the seconds allow
     settle: float = 0.5  # last fraction of it in which learning rates fall to a tenth and no splat is added
-    seed: int = 0
     initial_opacity: float = 0.1
-    training: TrainingConfig = field(default_factory=TrainingConfig)
-    rates: OptimizerConfig = field(default_factory=OptimizerConfig)
-    density: DensityControlConfig = field(default_factory=DensityControlConfig)
+    mapper: MapperConfig = field(default_factory=MapperConfig)  # training, optimizer, density control, seed, threads
 
 
 @dataclass(frozen=True)
@@ -59,15 +54,16 @@ class SparseMap:
         self.origin = views[0].world_from_cam[:3, 3].copy()
         self.unit = _median_depth(views, points)
         self.state = MapState(1, torch.device("cpu"))
-        self.log = Stats()
-        self.iterations = 0
+        self._trainer = Trainer(config.mapper, self.state, Stats())
         self.seconds = 0.0
-        self._skip = SkipConfig(converged=False, coarse_to_fine=False, levels=1)
-        self._random = np.random.default_rng(config.seed)
-        self._generator = torch.Generator().manual_seed(config.seed)
+        self._random = np.random.default_rng(config.mapper.seed)
         self._views = [self._training(view) for view in views]
         start = _splats((points - self.origin) / self.unit, colors, config.initial_opacity)
         self.state.append(start, torch.zeros(len(start), dtype=torch.int64))
+
+    @property
+    def iterations(self) -> int:
+        return self._trainer.iterations
 
     def optimize(self) -> None:
         """As long as the configuration says."""
@@ -83,7 +79,7 @@ class SparseMap:
         with torch.no_grad():
             color = rasterize(
                 self.state.detached(), self._local(view.world_from_cam), view.intrinsics, view.image.shape[:2],
-                kernel=self.config.training.kernel, threads=self.config.training.threads,
+                kernel=self.config.mapper.training.kernel, threads=self.config.mapper.threads,
             ).color  # fmt: skip
         return np.asarray(color.clamp(0, 1).numpy())
 
@@ -94,27 +90,13 @@ class SparseMap:
 
     def _step(self, view: TrainingView, done: float) -> None:
         settling = max(0.0, (done - 1.0 + self.config.settle) / self.config.settle)
-        groups = optimizer.groups(self.config.rates, 1.0, 0.1**settling, False, self.config.training.kernel)
-        train_once(
-            self.state,
-            view,
-            self.config.training,
-            self._skip,
-            groups,
-            self.config.rates.decay_steps,
-            1.0,
-            1.0,
-            True,
-            self.log,
-        )
-        self.iterations += 1
-        if not settling and self.iterations % self.config.density.every == 0:
-            density_control.control(self.state, self.config.density, 1.0, self._generator)
+        self._trainer.rate = 0.1**settling
+        self._trainer.step(view, 1.0, refining=settling > 0)
 
     def _training(self, view: Posed) -> TrainingView:
         unknown = np.zeros(view.image.shape[:2], dtype=np.float32)
         posed = RGBDKeyframe(view.index, view.image, view.intrinsics, view.world_from_cam, unknown)
-        return training_view(posed, self._local(view.world_from_cam), None, 1, self.state.device)
+        return training_view(posed, self._local(view.world_from_cam), None, self.state.device)
 
     def _local(self, world_from_cam: np.ndarray) -> np.ndarray:
         local = world_from_cam.copy()

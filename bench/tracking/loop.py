@@ -17,9 +17,9 @@ from bench.table import Row, at_least, at_most
 from bench.tracking.baselines import aligned_error
 from mvsgs_core import geometry, image_metrics
 from mvsgs_core.datasets import Item
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.publish import Correction
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
@@ -126,7 +126,7 @@ def rows(items: Sequence[Item], drift: float = 0.25) -> list[Row]:
 
 
 def _mapper() -> OnlineMapper:
-    config = MapperConfig(iterations=ITERATIONS, max_pixels=PIXELS, training=TrainingConfig(threads=1))
+    config = MapperConfig(iterations=ITERATIONS, max_pixels=PIXELS, threads=1)
     return OnlineMapper(config)
 
 
@@ -141,7 +141,7 @@ def _score(mapper: OnlineMapper) -> float:
     scores = []
     for view in mapper.views:
         color = mapper.render(view).color.clamp(0.0, 1.0).numpy()
-        scores.append(image_metrics.psnr(color, view.target(0).numpy()))
+        scores.append(image_metrics.psnr(color, view.target.numpy()))
     return float(np.mean(scores))
 
 

@@ -36,7 +36,7 @@ class Atlas:
         if not self.parts:
             self.parts[segment] = self.current
         if segment not in self.parts:
-            while self.current.step():  # what the part before is owed
+            while self.current.step():  # what is pending of the part before
                 pass
             before = self.current
             self.parts[segment] = OnlineMapper(before.config, before.log, before.corrections)
@@ -71,7 +71,7 @@ class Atlas:
         self.stream_seconds = seconds if math.isfinite(seconds) else self.stream_seconds
         self.stream_ended, self.refined = False, 0
         for part in self.parts.values():
-            part.global_rate = 1.0
+            part.trainer.rate = 1.0
 
     def frozen(self) -> Atlas:
         """A copy that shares nothing that changes, on the CPU. Raises ValueError in the middle of a change."""

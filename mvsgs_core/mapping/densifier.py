@@ -1,19 +1,19 @@
-"""A keyframe's new splats: at its depth where the map does not explain it, sparse ones where it would stay empty."""
+"""A keyframe's new splats: at its depth where the map does not show it, sparse ones where it would stay empty."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 
 from mvsgs_core import camera
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import colors_of_map, fitted_exposure
 from mvsgs_core.mapping.filling import continued_depth, fill_points
+from mvsgs_core.mapping.frame_of_reference import FrameOfReference
 from mvsgs_core.mapping.insertion import (
-    InsertionConfig,
     Points,
     depth_colors,
     near_points,
@@ -24,127 +24,129 @@ from mvsgs_core.mapping.insertion import (
     unoccupied,
     voxel_filter,
 )  # fmt: skip
-from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
+from mvsgs_core.mapping.keyframe_store import KeyframeStore
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, checked_image
 from mvsgs_core.mapping.map_state import MapState
-from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.stats import Stats
 
 SOLID = 0.9  # opacity from which the map's depth at a pixel is its surface's
 
 
-@dataclass(frozen=True)
 class Densifier:
-    """Adds the splats of one keyframe to `state`: `expose` first, then `insert`, then `fill`."""
+    """Adds the splats of one keyframe after the other to a map."""
 
-    config: InsertionConfig
-    training: TrainingConfig
-    max_splats: int
-    state: MapState
-    render: Callable[[TrainingView, int], Render]  # of `state` from a keyframe's pose at a pyramid level
-    unit: float | None  # world units; None: no keyframe had depth yet
-    median_depth: float  # of the scene, in `unit`
-    log: Stats
+    def __init__(
+        self, config: MapperConfig, state: MapState, frame: FrameOfReference, keyframes: KeyframeStore,
+        render: Callable[[TrainingView, tuple[int, int]], Render], log: Stats,
+    ) -> None:  # fmt: skip
+        """render: of `state` from a keyframe's pose at a size (height, width). What is given here changes by itself."""
+        self.config, self.state, self.frame, self.keyframes = config.insertion, state, frame, keyframes
+        self.render, self.log = render, log
+        self._kernel, self._exposure = config.training.kernel, config.training.exposure
+        self._max_splats = config.density_control.max_splats
 
-    def insert(self, view: RGBDKeyframe, added: TrainingView, depth: np.ndarray) -> int:
-        """Adds splats where `depth` (h, w), world units, is known and the map does not explain the image."""
+    def add(self, keyframe: RGBDKeyframe, view: TrainingView, depth: np.ndarray) -> int:
+        """Adds the splats of the store's newest keyframe; returns their number. depth: (h, w), checked, world units."""
+        if self._exposure:
+            self._expose(keyframe, view)
+        inserted = self._insert(keyframe, view, depth) if (depth > 0).any() else 0
+        return inserted + self._fill(keyframe, view)
+
+    def _expose(self, keyframe: RGBDKeyframe, view: TrainingView) -> None:
+        """First guess of a keyframe's exposure: what fits the map, or where that shows too little the earlier one's."""
+        if not len(self.state):
+            return
+        size = _half(view.size)
+        render = self.render(view, size)
+        found = fitted_exposure(render.color.cpu().numpy(), render.opacity.cpu().numpy(), _colors(keyframe, view, size))
+        if found is not None:
+            view.exposure.copy_(torch.from_numpy(found))
+        elif len(self.keyframes) > 1:
+            view.exposure.copy_(self.keyframes.views[-2].exposure.detach())
+
+    def _insert(self, keyframe: RGBDKeyframe, view: TrainingView, depth: np.ndarray) -> int:
+        """Adds splats where `depth` is known and the map does not show the image yet."""
         config = self.config
         size = (depth.shape[0], depth.shape[1])
-        valid = depth > 0
-        if view.confidence is not None and config.min_confidence > 0:
-            valid &= view.confidence >= config.min_confidence
-        valid &= _valid_pixels(added, size)
-        mask, standing_out = valid, np.zeros(size, dtype=bool)
+        median_depth = self.keyframes.median_depth
+        mask = valid = (depth > 0) & _valid_pixels(view, size)
+        standing_out = np.zeros(size, dtype=bool)
         occupancy = config.map_voxel > 0 and len(self.state) > 0
         if (config.unexplored or occupancy) and len(self.state):
-            level = _level_of(added, size)
-            render = self.render(added, level)
-            images = render.color.cpu().numpy(), render.opacity.cpu().numpy(), added.target(level).cpu().numpy()
+            at = _coarsest(view.size, size)
+            render = self.render(view, at)
+            images = render.color.cpu().numpy(), render.opacity.cpu().numpy(), _colors(keyframe, view, at)
             if config.unexplored:
                 mask = valid & _resized(unexplored_mask(*images, config), size)
                 self.log.skip("points_explored", int(valid.sum() - mask.sum()))
             if occupancy and config.map_voxel_error < float("inf"):
                 standing_out = _resized(outliers(*images, config), size)
-        intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
-        colors = self._colors(added, size)
-        assert self.unit is not None
-        points = points_from_depth(depth / self.unit, intrinsics, colors, view.normals, mask)
-        near = self._near(points)
+        intrinsics = camera.scale_intrinsics(keyframe.intrinsics, keyframe.image.shape[:2], size)
+        points = points_from_depth(
+            depth / self.frame.length, intrinsics, self._map_colors(view, size), keyframe.normals, mask
+        )
+        near = self._near(points, median_depth)
         points, standing_out = points.where(near), standing_out[mask][near]
         if occupancy and len(points):
-            pose = added.local_from_cam
+            pose = view.local_from_cam
             positions = points.positions @ pose[:3, :3].T + pose[:3, 3]
             means = self.state.splats.means.detach().cpu().numpy()
-            free = unoccupied(positions, means, config.map_voxel * self.median_depth) | standing_out
+            free = unoccupied(positions, means, config.map_voxel * median_depth) | standing_out
             self.log.skip("points_occupied", int((~free).sum()))
             points = points.where(free)
         if config.voxel > 0 and len(points):
             before = len(points)
-            points = voxel_filter(points, config.voxel * self.median_depth)
+            points = voxel_filter(points, config.voxel * median_depth)
             self.log.skip("points_voxel_filter", before - len(points))
-        return self._append(points, added, config.initial_opacity, config.initial_scale)
+        return self._append(points, view, config.initial_opacity, config.initial_scale)
 
-    def fill(self, view: RGBDKeyframe, added: TrainingView) -> int:
+    def _fill(self, keyframe: RGBDKeyframe, view: TrainingView) -> int:
         """Adds sparse splats wherever the map shows nothing, what was just inserted included: at the depth before the
         filters, and where that says nothing continued from what surrounds it."""
-        config = self.config
-        if config.fill == 0 or view.unfiltered is None or self.unit is None:
+        config, unit = self.config, self.frame.unit
+        if config.fill == 0 or keyframe.unfiltered is None or unit is None:
             return 0
-        depth = checked_depth(view.unfiltered, self.log) * np.float32(added.scale / view.scale / self.unit)
+        depth = checked_depth(keyframe.unfiltered, self.log) * np.float32(view.scale / keyframe.scale / unit)
         size = (depth.shape[0], depth.shape[1])
-        empty, shown = _valid_pixels(added, size), np.zeros(size, dtype=np.float32)
+        empty, shown = _valid_pixels(view, size), np.zeros(size, dtype=np.float32)
         if len(self.state):
-            render = self.render(added, _level_of(added, size))
+            render = self.render(view, _coarsest(view.size, size))
             opacity = render.opacity.cpu().numpy()
             empty = empty & _resized(opacity < config.fill_below, size)
             solid = np.where(opacity > SOLID, render.depth.cpu().numpy(), 0.0).astype(np.float32)
             shown = np.asarray(cv2.resize(solid, size[::-1], interpolation=cv2.INTER_NEAREST))
-        confidence = np.ones(size, dtype=np.float32) if view.confidence is None else view.confidence
-        intrinsics = camera.scale_intrinsics(view.intrinsics, view.image.shape[:2], size)
-        colors = self._colors(added, size)
-        depth = continued_depth(depth, confidence, shown, depth_colors(added.levels[0].cpu().numpy(), size))
-        points = fill_points(depth, confidence, intrinsics, colors, empty, config.fill)
-        points = points.where(self._near(points))
-        filled = self._append(points, added, config.fill_opacity, config.fill_scale)
+        confidence = np.ones(size, dtype=np.float32) if keyframe.confidence is None else keyframe.confidence
+        intrinsics = camera.scale_intrinsics(keyframe.intrinsics, keyframe.image.shape[:2], size)
+        depth = continued_depth(depth, confidence, shown, depth_colors(view.image.cpu().numpy(), size))
+        points = fill_points(depth, confidence, intrinsics, self._map_colors(view, size), empty, config.fill)
+        points = points.where(self._near(points, self.keyframes.median_depth))
+        filled = self._append(points, view, config.fill_opacity, config.fill_scale)
         self.log.count("filled", filled)
         return filled
 
-    def expose(self, added: TrainingView, earlier: TrainingView | None) -> None:
-        """First guess of a keyframe's exposure: what fits the map, or where that shows too little the earlier one's."""
-        if len(self.state):
-            level = len(added.levels) - 1
-            render = self.render(added, level)
-            images = render.color.cpu().numpy(), render.opacity.cpu().numpy(), added.target(level).cpu().numpy()
-            found = fitted_exposure(*images)
-            if found is not None:
-                added.exposure.copy_(torch.from_numpy(found))
-            elif earlier is not None:
-                added.exposure.copy_(earlier.exposure.detach())
-
-    def _colors(self, added: TrainingView, size: tuple[int, int]) -> np.ndarray:
+    def _map_colors(self, view: TrainingView, size: tuple[int, int]) -> np.ndarray:
         """The keyframe's colors (h, w, 3) as the map has them."""
-        colors = depth_colors(added.levels[0].cpu().numpy(), size)
-        if not self.training.exposure:
-            return colors
-        return colors_of_map(colors, added.exposure.detach().cpu().numpy())
+        colors = depth_colors(view.image.cpu().numpy(), size)
+        return colors_of_map(colors, view.exposure.detach().cpu().numpy()) if self._exposure else colors
 
-    def _near(self, points: Points) -> np.ndarray:
-        near = near_points(points, self.config, self.median_depth)
+    def _near(self, points: Points, median_depth: float) -> np.ndarray:
+        near = near_points(points, self.config, median_depth)
         if not near.all():
             self.log.refuse("far_points", int((~near).sum()), "points too far away for the map's voxels were left out")
         return near
 
-    def _append(self, points: Points, added: TrainingView, opacity: float, scale: float) -> int:
+    def _append(self, points: Points, view: TrainingView, opacity: float, scale: float) -> int:
         """Makes splats of camera-frame points, as many as the map has room for; returns their number."""
-        room = self.max_splats - len(self.state)
+        room = self._max_splats - len(self.state)
         if len(points) > room:
             self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
             points = points.first(max(0, room))
         new = splats_from_points(
-            points, added.local_from_cam, self.state.splats.sh.shape[1], self.training.kernel, self.config,
+            points, view.local_from_cam, self.state.splats.sh.shape[1], self._kernel, self.config,
             opacity, scale,
         )  # fmt: skip
-        self.state.append(new, torch.full((len(points),), added.index, dtype=torch.int64))
+        self.state.append(new, torch.full((len(points),), view.index, dtype=torch.int64))
         return len(points)
 
 
@@ -156,17 +158,29 @@ def checked_depth(depth: np.ndarray, log: Stats) -> np.ndarray:
     return np.where(bad, 0.0, depth).astype(np.float32)
 
 
-def _level_of(view: TrainingView, size: tuple[int, int]) -> int:
-    """The coarsest pyramid level that still has the depth map's resolution."""
-    fine = [level for level in range(len(view.levels)) if view.size(level)[0] >= size[0]]
-    return fine[-1] if fine else 0
+def _half(size: tuple[int, int]) -> tuple[int, int]:
+    return max(1, size[0] >> 1), max(1, size[1] >> 1)
+
+
+def _coarsest(image: tuple[int, int], depth: tuple[int, int]) -> tuple[int, int]:
+    """Half the image's size where that still has the depth map's resolution."""
+    half = _half(image)
+    return half if half[0] >= depth[0] else image
+
+
+def _colors(keyframe: RGBDKeyframe, view: TrainingView, size: tuple[int, int]) -> np.ndarray:
+    """The keyframe's colors (h, w, 3) float32 in [0, 1], as its camera saw them, at the training size or half of it."""
+    if size == view.size:
+        return view.target.cpu().numpy()
+    image = torch.from_numpy(np.array(camera.resize_image(checked_image(keyframe.image)[0], size)))
+    return np.asarray((image.to(view.image.device, torch.float32) / 255.0).cpu().numpy())
 
 
 def _valid_pixels(view: TrainingView, size: tuple[int, int]) -> np.ndarray:
     """Pixels (h, w) bool of the depth map whose color is known."""
     if view.valid is None:
         return np.ones(size, dtype=bool)
-    return np.asarray(camera.resize_image(view.valid[0].cpu().numpy().astype(np.float32), size) > 0.999)
+    return np.asarray(camera.resize_image(view.valid.cpu().numpy().astype(np.float32), size) > 0.999)
 
 
 def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:

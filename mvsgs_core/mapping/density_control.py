@@ -1,4 +1,4 @@
-"""Adaptive density control for a map that never stops growing: clone, split, prune; or relocation of dead splats.
+"""Adaptive density control for a map that never stops growing: clone, split, prune.
 
 As in 3DGS (Kerbl et al. 2023), section 5, but opacities are never reset: that needs a rhythm of thousands of iterations
 in which the map may be worse, and an online map is looked at all the time.
@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from mvsgs_core.mapping.map_state import PARAMETERS, MapState, replace_values
+from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.reference import rotation_matrices
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -21,7 +22,7 @@ from mvsgs_core.rasterizer.splats import Splats
 class DensityControlConfig:
     """When and how splats are added and removed during optimization."""
 
-    mode: str = "adaptive"  # "adaptive": clone, split, prune; "relocate": as 3DGS-MCMC; "none"
+    mode: Literal["adaptive", "none"] = "adaptive"  # adaptive: clone, split and prune
     every: int = 100  # iterations between two rounds
     gradient: float = 6.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
@@ -37,7 +38,6 @@ class DensityChange:
     cloned: int = 0
     split: int = 0
     pruned: int = 0
-    relocated: int = 0
 
 
 @torch.no_grad()
@@ -45,13 +45,10 @@ def control(
     state: MapState, config: DensityControlConfig, median_depth: float, generator: torch.Generator
 ) -> DensityChange:
     """One round on the gradients accumulated since the last; resets them. Raises ValueError for an unknown mode."""
-    if config.mode not in ("adaptive", "relocate", "none"):
-        raise ValueError(f"no density control {config.mode!r}; there are: adaptive, relocate, none")
-    if len(state) == 0 or config.mode == "none":
-        change = DensityChange()
-    elif config.mode == "relocate":
-        change = _relocate(state, config, median_depth, generator)
-    else:
+    if config.mode not in ("adaptive", "none"):
+        raise ValueError(f"no density control {config.mode!r}; there are: adaptive, none")
+    change = DensityChange()
+    if len(state) and config.mode == "adaptive":
         change = _adapt(state, config, median_depth, generator)
     state.reset_means2d()
     return change
@@ -116,58 +113,6 @@ def _halves(splats: Splats, generator: torch.Generator) -> Splats:
     doubled["means"] = (splats.means + offsets).reshape(-1, 3)
     doubled["log_scales"] = doubled["log_scales"] - math.log(1.6)
     return Splats(**doubled)
-
-
-def _relocate(
-    state: MapState, config: DensityControlConfig, median_depth: float, generator: torch.Generator
-) -> DensityChange:
-    """Dead splats move onto live ones, drawn by opacity, such that the render changes least.
-
-    Kheradmand et al. 2024 (3DGS as Markov chain Monte Carlo), equation 9: N splats at one place, each of opacity
-    1 - (1 - o)^(1/N), with standard deviations scaled to keep the integral of the rendered splat.
-    """
-    dead = removable(state, config, median_depth)
-    alive = torch.nonzero(~dead)[:, 0]
-    moved = torch.nonzero(dead)[:, 0]
-    if len(moved) == 0 or len(alive) == 0:
-        return DensityChange()
-    values = {name: getattr(state.splats, name).detach().clone() for name in PARAMETERS}
-    opacity = torch.sigmoid(values["opacity_logits"][alive]).cpu().to(torch.float64)
-    drawn = torch.multinomial(opacity, len(moved), replacement=True, generator=generator).to(state.device)
-    copies = torch.bincount(drawn, minlength=len(alive)) + 1
-    sources = torch.nonzero(copies > 1)[:, 0]
-    o = opacity.to(state.device)[sources].clamp(1e-4, 1.0 - 1e-4)
-    shared, shrink = relocation(o, copies[sources])
-    rows = alive[sources]
-    values["opacity_logits"][rows] = torch.logit(shared.clamp(1e-4, 1.0 - 1e-4)).to(torch.float32)
-    values["log_scales"][rows] += shrink.log().to(torch.float32)[:, None]
-    origin = alive[drawn]
-    for name in PARAMETERS:
-        values[name][moved] = values[name][origin]
-    for moments in (state.first, state.second):
-        for value in moments.values():
-            value[moved] = 0.0
-            value[rows] = 0.0
-    state.anchors[moved] = state.anchors[origin]
-    state.steps[moved] = 0
-    replace_values(state, values)
-    return DensityChange(relocated=len(moved))
-
-
-def relocation(opacity: Tensor, copies: Tensor, largest: int = 51) -> tuple[Tensor, Tensor]:
-    """Opacity of each of N copies, and the factor of their standard deviations: (M,), (M,) float64.
-
-    opacity: (M,) in (0, 1); copies: (M,) int64 >= 1, of which at most `largest` count.
-    """
-    n = copies.clamp(max=largest)
-    shared = 1.0 - (1.0 - opacity) ** (1.0 / n)
-    denominator = torch.zeros_like(opacity)
-    for i in range(1, int(n.max()) + 1):
-        term = torch.zeros_like(opacity)
-        for k in range(i):
-            term += math.comb(i - 1, k) * (-1.0) ** k / math.sqrt(k + 1) * shared ** (k + 1)
-        denominator += torch.where(n >= i, term, 0.0)
-    return shared, opacity / denominator.clamp(min=1e-12)
 
 
 def _select(splats: Splats, mask: Tensor) -> Splats:

@@ -1,4 +1,4 @@
-"""New splats from the depth of a keyframe: where the map does not explain the image yet, thinned by a voxel filter.
+"""New splats from the depth of a keyframe: where the map does not show the image yet, thinned by a voxel filter.
 
 MVS-GS, section III.C, "Online Densification". The paper's threshold (40 dB, an RMS error of 0.01) calls nearly every
 textured pixel unexplored, and its voxel of 0.005 m has no meaning at a monocular scale: here both are relative.
@@ -24,20 +24,19 @@ CHUNK = 65536  # of the map's splats that are sorted into voxels at once, in flo
 class InsertionConfig:
     """Where splats are added and what they look like at first."""
 
-    unexplored: bool = True  # False: every pixel with depth makes a point
+    unexplored: bool = True  # only where the map's render differs from the image; false: at every pixel with depth
     unexplored_psnr: float = 25.0  # dB of one pixel over RGB; below: unexplored (the paper: 40)
     unexplored_opacity: float = 0.5  # rendered opacity below: unexplored, whatever the color
     voxel: float = 0.01  # edge of the voxel filter in median depths; 0: no filter
     map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
-    map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another; inf: none
+    map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another; .inf: none
     initial_scale: float = 0.5  # standard deviation in spacings of the points
     flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
     initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
-    fill: int = 4  # pixels, side of the cells that get one splat of doubtful depth where the map is empty; 0: off
+    fill: int = 4  # pixels: cells that get a splat of doubtful or continued depth where the map stays empty; 0: off
     fill_below: float = 0.7  # rendered opacity below: empty; the optimization has no reason to close half a gap
     fill_opacity: float = 0.55  # of these: doubtful ones must be outshone by what comes later, 0 to 1
     fill_scale: float = 0.7  # of these, as initial_scale: so transparent, they leave no gap only where they overlap
-    min_confidence: float = 0.0  # of the depth, 0 to 1; views come filtered already
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Points:
 def unexplored_mask(
     rendered: np.ndarray, opacity: np.ndarray, observed: np.ndarray, config: InsertionConfig
 ) -> np.ndarray:
-    """Pixels (H, W) bool that the map does not explain: PSNR of the pixel below the threshold, or low opacity.
+    """Pixels (H, W) bool that the map does not cover: PSNR of the pixel below the threshold, or low opacity.
 
     rendered, observed: (H, W, 3) in [0, 1]; opacity: (H, W). A pixel has PSNR 10 log10(1 / mean over RGB of (r - o)^2).
     """
@@ -76,7 +75,7 @@ def outliers(rendered: np.ndarray, opacity: np.ndarray, observed: np.ndarray, co
     """Pixels (H, W) bool whose RMS error over RGB is `map_voxel_error` times the median of the pixels that are mapped.
 
     The median is what blur, noise, exposure and a pose's error do to this view: no splat mends that. Where a view is
-    explained to the decibel it is small, and detail that the map lacks stands out.
+    covered to the decibel it is small, and detail that the map lacks stands out.
     """
     squared = np.mean((rendered - observed) ** 2, axis=-1)
     mapped = opacity >= config.unexplored_opacity
@@ -142,7 +141,7 @@ def unoccupied(positions: np.ndarray, means: np.ndarray, edge: float) -> np.ndar
     """Positions (N, 3) whose voxel of side `edge` holds none of the map's means (M, 3): (N,) bool.
 
     The surface there is in the map already, and what its color lacks is the optimization's to find. Without this a
-    noisy or blurred keyframe, which nothing explains to the decibel, lays a second skin over what is mapped. Raises
+    noisy or blurred keyframe, which no map shows to the decibel, lays a second skin over what is mapped. Raises
     ValueError where the positions span more than 2^21 voxels along an axis.
     """
     if len(positions) == 0 or len(means) == 0:

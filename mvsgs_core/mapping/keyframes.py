@@ -1,4 +1,4 @@
-"""Keyframes as the mapper trains on them: image pyramid, pose, exposure, and what is known of their convergence."""
+"""Keyframes as they come to the mapper, and as it trains on them: image, pose, exposure, convergence."""
 
 from __future__ import annotations
 
@@ -27,13 +27,23 @@ class RGBDKeyframe:
     timestamp: float = float("nan")  # seconds; NaN: not known
 
 
+@dataclass(frozen=True)
+class ConvergenceConfig:
+    """When a keyframe is trained enough: mostly passed over then."""
+
+    skip: bool = True  # pass over keyframes whose loss no longer falls
+    visits: int = 30  # iterations on a keyframe before it can count as converged
+    improvement: float = 0.02  # fraction by which the loss must still fall
+    keep: float = 0.5  # fraction of the visits that a converged keyframe still gets
+
+
 @dataclass
 class TrainingView:
-    """A keyframe to train on. `levels[l]` is the image at 1/2^l of the training size, (H, W, 3) uint8."""
+    """A keyframe to train on."""
 
     index: int
-    levels: list[Tensor]
-    intrinsics: list[np.ndarray]  # (4,) for each level
+    image: Tensor  # (H, W, 3) uint8 at the training size; empty where it was let go
+    intrinsics: np.ndarray  # (4,) at that size
     image_intrinsics: np.ndarray  # (4,) at image_size
     image_size: tuple[int, int]  # height, width of the image as it came
     timestamp: float  # seconds; NaN: not known
@@ -47,10 +57,10 @@ class TrainingView:
     pose_steps: int = 0
     fixed: bool = False  # its pose is not refined: it holds the frame of reference
     median_depth: float = 0.0  # of its depth map, in the mapper's unit; 0: it has none
-    valid: list[Tensor] | None = None  # (H, W) bool for each level; None: every pixel is
+    valid: Tensor | None = None  # (H, W) bool; None: every pixel is
     visits: int = 0  # training iterations so far
-    visits_full: int = 0  # of these at full resolution
-    loss_fast: float = field(default=float("nan"))  # running means of the full-resolution loss
+    visits_here: int = 0  # of these since its pose was last corrected
+    loss_fast: float = field(default=float("nan"))  # running means of the loss of these
     loss_slow: float = field(default=float("nan"))
 
     @property
@@ -58,17 +68,28 @@ class TrainingView:
         """(4, 4) the pose to train and render from: the tracker's, and what the map made of it."""
         return self.local_from_cam @ self.pose_delta
 
-    def size(self, level: int) -> tuple[int, int]:
-        height, width = self.levels[level].shape[:2]
+    @property
+    def has_image(self) -> bool:
+        return self.image.numel() > 0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height, width of the training image."""
+        height, width = self.image.shape[:2]
         return height, width
 
-    def target(self, level: int) -> Tensor:
+    @property
+    def target(self) -> Tensor:
         """Image (H, W, 3) float32 in [0, 1]."""
-        return self.levels[level].to(torch.float32) / 255.0
+        return self.image.to(torch.float32) / 255.0
 
-    def drop_images(self) -> None:
+    def intrinsics_at(self, size: tuple[int, int]) -> np.ndarray:
+        """(4,) at another size (height, width)."""
+        return camera.scale_intrinsics(self.image_intrinsics, self.image_size, size)
+
+    def drop_image(self) -> None:
         """Frees what only the training needs; pose, scale and exposure stay."""
-        self.levels, self.valid = [], None
+        self.image, self.valid = self.image.new_zeros((0, 0, 3)), None
 
     def rescale(self, factor: float) -> None:
         """Lengths in a unit of 1 / `factor` of what it was; the moments follow, a gradient is divided by `factor`."""
@@ -78,54 +99,52 @@ class TrainingView:
         self.pose_moments[1, :3] /= factor**2
 
     def record(self, loss: float) -> None:
-        """Takes in the loss of a full-resolution iteration."""
-        self.visits_full += 1
-        if self.visits_full == 1:
+        """Takes in the loss of an iteration."""
+        self.visits_here += 1
+        if self.visits_here == 1:
             self.loss_fast = self.loss_slow = loss
             return
         self.loss_fast += 0.2 * (loss - self.loss_fast)
         self.loss_slow += 0.05 * (loss - self.loss_slow)
 
-    def converged(self, min_visits: int, improvement: float) -> bool:
-        """After `min_visits` the loss no longer falls by the share `improvement` between slow and fast mean."""
-        if self.visits_full < min_visits or not self.loss_slow > 0:
+    def converged(self, config: ConvergenceConfig) -> bool:
+        """Visited often enough, and the loss no longer falls by `improvement` between slow and fast mean."""
+        if self.visits_here < config.visits or not self.loss_slow > 0:
             return False
-        return (self.loss_slow - self.loss_fast) / self.loss_slow < improvement
+        return (self.loss_slow - self.loss_fast) / self.loss_slow < config.improvement
+
+    def begin_anew(self) -> None:
+        """Its pose has changed: what was known of its convergence says nothing any more."""
+        self.visits_here, self.loss_fast, self.loss_slow = 0, float("nan"), float("nan")
 
 
 def training_view(
-    view: RGBDKeyframe, local_from_cam: np.ndarray, max_pixels: int | None, level_count: int, device: torch.device
+    keyframe: RGBDKeyframe, local_from_cam: np.ndarray, max_pixels: int | None, device: torch.device
 ) -> TrainingView:
-    """The pyramid and state of a new keyframe. max_pixels: area of the training image; None: the image's own."""
-    height, width = view.image.shape[:2]
+    """The image and state of a new keyframe. max_pixels: area of the training image; None: the image's own."""
+    height, width = keyframe.image.shape[:2]
     size = (height, width) if max_pixels is None else camera.fit_size(height, width, max_pixels, multiple=1)
-    image, valid = _checked_image(view.image)
-    levels, intrinsics, valid_levels = [], [], []
-    for level in range(level_count):
-        level_size = (max(1, size[0] >> level), max(1, size[1] >> level))
-        levels.append(torch.from_numpy(np.array(camera.resize_image(image, level_size))).to(device))
-        if valid is not None:
-            share = camera.resize_image(valid.astype(np.float32), level_size)
-            valid_levels.append(torch.from_numpy(np.array(share > 0.999)).to(device))
-        intrinsics.append(camera.scale_intrinsics(view.intrinsics, (height, width), level_size))
+    image, valid = checked_image(keyframe.image)
+    if valid is not None:
+        valid = np.array(camera.resize_image(valid.astype(np.float32), size) > 0.999)
     identity = torch.eye(3, 4, device=device)
     return TrainingView(
-        index=view.index,
-        levels=levels,
-        intrinsics=intrinsics,
-        image_intrinsics=np.asarray(view.intrinsics, dtype=np.float64),
+        index=keyframe.index,
+        image=torch.from_numpy(np.array(camera.resize_image(image, size))).to(device),
+        intrinsics=camera.scale_intrinsics(keyframe.intrinsics, (height, width), size),
+        image_intrinsics=np.asarray(keyframe.intrinsics, dtype=np.float64),
         image_size=(height, width),
-        timestamp=view.timestamp,
-        world_from_cam=np.asarray(view.world_from_cam, dtype=np.float64),
-        scale=view.scale,
+        timestamp=keyframe.timestamp,
+        world_from_cam=np.asarray(keyframe.world_from_cam, dtype=np.float64),
+        scale=keyframe.scale,
         local_from_cam=local_from_cam,
         exposure=identity.clone(),
         exposure_moments=(torch.zeros_like(identity), torch.zeros_like(identity)),
-        valid=valid_levels or None,
+        valid=None if valid is None else torch.from_numpy(valid).to(device),
     )
 
 
-def _checked_image(image: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def checked_image(image: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """uint8 image and its valid pixels (H, W) bool, None if all are."""
     if image.dtype == np.uint8:
         return image, None

@@ -1,31 +1,68 @@
-"""The training loss of GES (Hamdi et al. 2024): L1 + SSIM + an L1 inside a frequency-modulated, edge-aware mask.
+"""The training loss: a sum of weighted terms.
 
-The mask comes from a difference of Gaussians of the render, whose width moves with the training's progress
+The photometric ones are those of GES (Hamdi et al. 2024): L1 + SSIM + an L1 inside a frequency-modulated, edge-aware
+mask. The mask comes from a difference of Gaussians of the render, whose width moves with the training's progress
 `frequency` in 0 to 100: in the first half the smooth regions are kept (the mask is inverted), in the second the edges.
 An online run, whose length is not known ahead, gives each view its own progress: see `frequency_of`.
+
+One more term: its weight in `LossWeights`, its function in `TERMS`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mvsgs_core.rasterizer import ssim
+from mvsgs_core.rasterizer.interface import Render
+from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.rasterizer.ssim import image_loss
 
 LOWERED = 0.2  # scale at which the mask is made
 TINY = 1e-20
 
 
 @dataclass(frozen=True)
-class LossConfig:
-    """Weights of the terms; those of GES's released code."""
+class LossWeights:
+    """Weights of the terms; null: what the choice of `loss` has, see `LOSSES`; 0: the term is left out."""
 
-    l1: float = 0.3
-    ssim: float = 0.2  # of 1 - SSIM
-    frequency: float = 0.5  # of the masked L1; 0 leaves the mask out
+    l1: float | None = None  # of the mean absolute error
+    ssim: float | None = None  # of 1 - SSIM
+    frequency: float | None = None  # of the L1 inside the frequency-modulated mask
+
+
+Loss = Literal["ssim", "ges"]
+LOSSES: dict[Loss, LossWeights] = {
+    "ssim": LossWeights(l1=0.8, ssim=0.2),  # as 3DGS
+    "ges": LossWeights(l1=0.3, ssim=0.2, frequency=0.5),  # as GES's released code
+}
+
+
+@dataclass(frozen=True)
+class LossInputs:
+    """What a term is computed from: one iteration's render, which carries gradients, and what it should show."""
+
+    render: Render
+    target: Tensor  # (H, W, 3); equal to the render where the keyframe's pixels are left out
+    splats: Splats  # of the map, in its unit
+    frequency: float  # the keyframe's progress, 0 to 100
+    threads: int | None  # None: all
+
+
+def weights_of(loss: Loss, chosen: LossWeights) -> dict[str, float]:
+    """The weight of each term: the chosen ones, for others the loss's."""
+    given = {name: value for name, value in vars(chosen).items() if value is not None}
+    return {name: value or 0.0 for name, value in vars(replace(LOSSES[loss], **given)).items()}
+
+
+def training_loss(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
+    """The sum of all terms, a scalar."""
+    parts = [part for term in TERMS if (part := term(inputs, weights)) is not None]
+    return sum(parts[1:], start=parts[0])
 
 
 def frequency_of(iterations: int, horizon: int) -> float:
@@ -87,16 +124,32 @@ def frequency_mask(image: Tensor, frequency: float) -> Tensor:
 
 
 def photometric_loss(
-    image: Tensor, target: Tensor, frequency: float, config: LossConfig | None = None, threads: int | None = None
+    image: Tensor,
+    target: Tensor,
+    frequency: float,
+    *,
+    l1: float,
+    ssim: float,
+    masked: float,
+    threads: int | None = None,
 ) -> Tensor:
-    """config.l1 L1 + config.ssim (1 - SSIM) + config.frequency mean |m image - m target|, a scalar; (H, W, 3) images.
+    """l1 L1 + ssim (1 - SSIM) + masked mean |m image - m target|, a scalar, in one pass; (H, W, 3) images.
 
-    Means are over all pixels, the masked one too. The gradient goes to `image` only, none through the mask.
+    Means are over all pixels, the masked one too. The gradient goes to `image` only, none through the mask m.
     """
-    weights = config or LossConfig()
     extra = None
-    if weights.frequency > 0.0:
-        extra = weights.frequency * frequency_mask(image.detach(), frequency).to(image.dtype)
-    return ssim.image_loss(
-        image, target, l1_weight=weights.l1, ssim_weight=weights.ssim, pixel_weight=extra, threads=threads
-    )
+    if masked > 0.0:
+        extra = masked * frequency_mask(image.detach(), frequency).to(image.dtype)
+    return image_loss(image, target, l1_weight=l1, ssim_weight=ssim, pixel_weight=extra, threads=threads)
+
+
+def photometric_terms(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
+    """L1, SSIM and the masked L1, which one kernel computes together."""
+    return photometric_loss(
+        inputs.render.color, inputs.target, inputs.frequency, l1=weights["l1"], ssim=weights["ssim"],
+        masked=weights["frequency"], threads=inputs.threads,
+    )  # fmt: skip
+
+
+# Each gives its part of the sum, weighted: a scalar; None where its weight is 0. The first is never None.
+TERMS: tuple[Callable[[LossInputs, dict[str, float]], Tensor | None], ...] = (photometric_terms,)

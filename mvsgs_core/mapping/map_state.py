@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -64,62 +66,27 @@ class MapState:
     @torch.no_grad()
     def append(self, new: Splats, anchors: Tensor, steps: Tensor | None = None) -> None:
         """Adds splats with moments of zero. `steps`: their age; 0 unless they descend from older splats."""
-        count = len(anchors)
-        values = self._release_tensors()
-        for name in PARAMETERS:
-            added = getattr(new, name).detach().to(self.device)
-            zeros = torch.zeros_like(added)
-            values[name] = torch.cat([values[name], added])
-            self.first[name] = torch.cat([self.first[name], zeros])
-            self.second[name] = torch.cat([self.second[name], zeros])
-        self.splats = _leaves(values)
-        age = torch.zeros(count, dtype=torch.int32, device=self.device) if steps is None else steps
-        zeros = torch.zeros(count, device=self.device)
-        self.steps = torch.cat([self.steps, age])
-        self.anchors = torch.cat([self.anchors, anchors.to(self.device)])
-        self.means2d_gradient = torch.cat([self.means2d_gradient, zeros])
-        self.means2d_views = torch.cat([self.means2d_views, zeros])
+        zeros = torch.zeros(len(anchors), device=self.device)
+        added = {name: getattr(new, name).detach().to(self.device) for name in PARAMETERS}
+        for moment in ("first", "second"):
+            added |= {f"{moment}/{name}": torch.zeros_like(added[name]) for name in PARAMETERS}
+        added |= {
+            "steps": zeros.to(torch.int32) if steps is None else steps, "anchors": anchors.to(self.device),
+            "means2d_gradient": zeros, "means2d_views": zeros,
+        }  # fmt: skip
+        self._replace(lambda name, value: torch.cat([value, added[name]]))
 
     @torch.no_grad()
     def take_over(self, other: MapState) -> None:
         """Adds all splats of another map with their moments, ages, anchors and gradients; `other` stays as it is."""
-        values = self._release_tensors()
-        for name in PARAMETERS:
-            values[name] = torch.cat([values[name], getattr(other.splats, name).detach()])
-            self.first[name] = torch.cat([self.first[name], other.first[name]])
-            self.second[name] = torch.cat([self.second[name], other.second[name]])
-        self.splats = _leaves(values)
-        self.steps = torch.cat([self.steps, other.steps])
-        self.anchors = torch.cat([self.anchors, other.anchors])
-        self.means2d_gradient = torch.cat([self.means2d_gradient, other.means2d_gradient])
-        self.means2d_views = torch.cat([self.means2d_views, other.means2d_views])
+        added = other.tensors()
+        self._replace(lambda name, value: torch.cat([value, added[name]]))
 
     @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
         """Drops the splats where `mask` (N,) bool is False."""
-        if bool(mask.all()):
-            return
-        values = self._release_tensors()
-        for name in PARAMETERS:
-            values[name] = values[name][mask]
-            self.first[name] = self.first[name][mask]
-            self.second[name] = self.second[name][mask]
-        self.splats = _leaves(values)
-        self.steps, self.anchors = self.steps[mask], self.anchors[mask]
-        self.means2d_gradient, self.means2d_views = self.means2d_gradient[mask], self.means2d_views[mask]
-
-    @torch.no_grad()
-    def grow_sh(self, bases: int) -> None:
-        """Appends spherical harmonics of zero up to `bases` = (degree + 1)^2; never removes any."""
-        missing = bases - self.splats.sh.shape[1]
-        if missing <= 0:
-            return
-        values = {name: getattr(self.splats, name).detach() for name in PARAMETERS}
-        padding = torch.zeros((len(self), missing, 3), device=self.device)
-        values["sh"] = torch.cat([values["sh"], padding], dim=1)
-        self.first["sh"] = torch.cat([self.first["sh"], padding], dim=1)
-        self.second["sh"] = torch.cat([self.second["sh"], padding], dim=1)
-        self.splats = _leaves(values)
+        if not bool(mask.all()):
+            self._replace(lambda _, value: value[mask])
 
     @torch.no_grad()
     def accumulate_means2d(self, gradient: Tensor, visible: Tensor) -> None:
@@ -131,11 +98,20 @@ class MapState:
         self.means2d_gradient.zero_()
         self.means2d_views.zero_()
 
-    def _release_tensors(self) -> dict[str, Tensor]:
-        """The splats' tensors, held by nothing else: so that each is freed when a new one takes its place.
+    def _replace(self, change: Callable[[str, Tensor], Tensor]) -> None:
+        """Every one of `tensors()`, by name, becomes what `change` makes of it; one after the other, so that each is
+        freed when the new one takes its place: all at once would need the whole map's memory a second time."""
+        values = self._release_tensors()
+        for name in PARAMETERS:
+            values[name] = change(name, values[name])
+            self.first[name] = change(f"first/{name}", self.first[name])
+            self.second[name] = change(f"second/{name}", self.second[name])
+        self.splats = _leaves(values)
+        for name in SINGLE:
+            setattr(self, name, change(name, getattr(self, name)))
 
-        Growing all of them at once would need the whole map's memory a second time.
-        """
+    def _release_tensors(self) -> dict[str, Tensor]:
+        """The splats' tensors, which nothing else holds then."""
         values = {name: value.detach() for name, value in self.splats.tensors().items()}
         self.splats = _leaves({name: value.new_zeros((0, *value.shape[1:])) for name, value in values.items()})
         return values
@@ -143,11 +119,6 @@ class MapState:
     def detached(self) -> Splats:
         """A view of the splats that no gradient reaches; shares memory."""
         return Splats(**{name: value.detach() for name, value in self.splats.tensors().items()})
-
-
-def replace_values(state: MapState, values: dict[str, Tensor]) -> None:
-    """New values of all parameters, of the same number of splats; moments and gradients are left alone."""
-    state.splats = _leaves(values)
 
 
 def _leaves(values: dict[str, Tensor]) -> Splats:

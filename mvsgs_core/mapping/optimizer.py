@@ -19,7 +19,7 @@ class OptimizerConfig:
     """Rates of a splat's parameters. Lengths are in units of the scene's median depth."""
 
     means: float = 5.0e-4  # median depths a step, for a new splat
-    means_final: float = 0.05  # share of `means` that an old splat keeps
+    means_final: float = 0.05  # fraction of `means` that an old splat keeps
     decay_steps: int = 600  # steps of a splat until then, log-linear
     log_scales: float = 0.03  # natural logarithm a step
     quaternions: float = 0.015  # a step, of a unit quaternion
@@ -125,12 +125,3 @@ def step_reference(state: MapState, visible: Tensor, steps: list[Group], decay_s
 def clear_gradients(state: MapState) -> None:
     for name in PARAMETERS:
         getattr(state.splats, name).grad = None
-
-
-@torch.no_grad()
-def normalize_quaternions(state: MapState) -> None:
-    """Unit quaternions again; the rotation does not change, but Adam's step is a fixed angle only at unit length."""
-    q = state.splats.quaternions
-    norm = q.norm(dim=1, keepdim=True)
-    unit = torch.tensor([1.0, 0.0, 0.0, 0.0], device=q.device)
-    q.copy_(torch.where(norm > 1e-6, q / norm.clamp(min=1e-6), unit))

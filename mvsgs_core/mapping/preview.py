@@ -26,7 +26,7 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
     shown = {name: value[::stride] for name, value in final.tensors().items()}
     if provisional is not None:
         shown = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in shown.items()}
-    unit = mapper.unit or 1.0
+    unit = mapper.frame.length
     shapes = zip(shown["quaternions"].split(CHUNK), shown["log_scales"].split(CHUNK))
     return {
         "render": _bytes(render),

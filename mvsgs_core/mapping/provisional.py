@@ -95,14 +95,14 @@ class Provisional:
         """
         now = time.perf_counter()
         deadline, self._asked = now + self._time_fraction * (now - self._asked), now
-        if mapper.unit is None or mapper.origin is None or not len(mapper.state):
+        if mapper.frame.unit is None or not len(mapper.state):
             return None
         parts: list[Splats] = []
         room = self._limit
         for waiting in reversed(self._waiting):
             if waiting.segment not in segments:
                 continue
-            local = mapper.local(waiting.world_from_cam)
+            local = mapper.frame.local(waiting.world_from_cam)
             if not is_near(local[:3, 3]):
                 continue
             if waiting.points is None and (not parts or time.perf_counter() < deadline):
@@ -111,7 +111,7 @@ class Provisional:
                 continue
             points = waiting.points.first(room)
             room -= len(points)
-            factor = waiting.scale / waiting.view.scale / mapper.unit
+            factor = waiting.scale / waiting.view.scale / mapper.frame.unit
             config = mapper.config.insertion
             parts.append(
                 splats_from_points(
@@ -132,9 +132,9 @@ def _points(waiting: _Waiting, local_from_cam: np.ndarray, mapper: OnlineMapper)
     size = (view.image.shape[0], view.image.shape[1])
     nothing = np.zeros((1, 1), dtype=np.float32)
     posed = RGBDKeyframe(view.index, view.image, view.intrinsics, waiting.world_from_cam, nothing)
-    render = mapper.render(training_view(posed, local_from_cam, None, 1, mapper.state.device))
+    render = mapper.render(training_view(posed, local_from_cam, None, mapper.state.device))
     solid = render.opacity.cpu().numpy() > SOLID
-    factor = waiting.scale / view.scale / (mapper.unit or 1.0)  # of depths as they came to the mapper's
+    factor = waiting.scale / view.scale / mapper.frame.length  # of depths as they came to the mapper's
     shown = np.where(solid, render.depth.cpu().numpy() / factor, 0.0).astype(np.float32)
     depth, confidence = enlarge_inverse_depth(view.inverse_depth, view.weight, size)
     colors = depth_colors(view.image, size)

@@ -1,4 +1,4 @@
-"""How well a finished map explains the images it was made of, and what keeps it from it. No truth is needed for it."""
+"""How well a finished map shows the images it was made of, and what keeps it from it. No truth is needed for it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SelfCheck:
 
     @property
     def warning(self) -> str | None:
-        """What to tell the user; None where the map explains its images, and the images are good."""
+        """What to tell the user; None where the map shows its images, and the images are good."""
         if self.psnr >= MIN_PSNR:
             return self._noise_warning
         causes = []
@@ -43,7 +43,7 @@ class SelfCheck:
         known = " and ".join(causes) or "motion, blur, wrong poses or too few iterations"
         return (
             f"the map renders its own keyframes at {self.psnr:.1f} dB only ({MIN_PSNR:g} expected): the images hold "
-            f"what a static map cannot explain, here {known}"
+            f"what a static map cannot show, here {known}"
         )
 
     @property

@@ -9,6 +9,7 @@ import torch
 
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.exposure import IDENTITY, relative_to_mean
+from mvsgs_core.mapping.frame_of_reference import FrameOfReference
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.splats import Splats
@@ -17,14 +18,13 @@ from mvsgs_core.rasterizer.splats import Splats
 def snapshot(
     state: MapState,
     views: list[TrainingView],
-    origin: np.ndarray | None,
-    unit: float | None,
+    frame: FrameOfReference,
     kernel: str,
     iterations: int,
 ) -> Snapshot:
-    """The state in world units; `unit` is the length of the mapper's unit in the world."""
+    """The state in world units."""
     local = state.detached()
-    length = unit or 1.0
+    length = frame.length
     splats = Splats(**{name: value.cpu().clone() for name, value in local.tensors().items()})
     splats.means = (splats.means.to(torch.float64) * length).to(torch.float32)
     splats.log_scales = splats.log_scales + math.log(length)
@@ -35,7 +35,7 @@ def snapshot(
     return Snapshot(
         splats=splats,
         anchors=state.anchors.cpu().numpy().copy(),
-        origin=np.zeros(3) if origin is None else origin.copy(),
+        origin=np.zeros(3) if frame.origin is None else frame.origin.copy(),
         kernel=kernel,
         iterations=iterations,
         keyframes=np.array([view.index for view in views], dtype=np.int64),

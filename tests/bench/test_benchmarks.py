@@ -22,7 +22,7 @@ from launch.compose import compose
 from launch.refusal import GraphError
 from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.config import MapperConfig
 from tests.support.benchmarks import BENCHMARKS
 from tests.support.shared_data import ROOT
 
@@ -336,7 +336,7 @@ def test_offline_splatting_of_sparse_points_gets_better() -> None:
         seen = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
         points.append(seen @ item.world_from_cam[:3, :3].T + item.world_from_cam[:3, 3])
         colors.append(item.image[v, u])
-    config = SparseConfig(iterations=120, training=TrainingConfig(threads=1))
+    config = SparseConfig(iterations=120, mapper=MapperConfig(threads=1))
     fitted = SparseMap(views, np.concatenate(points), np.concatenate(colors), config)
 
     def error() -> float:

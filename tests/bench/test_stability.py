@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from bench.stability import box_view, mapped
-from mvsgs_core.mapping.mapper import MapperConfig
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.config import MapperConfig
 
 
 def test_a_pass_says_whether_quality_was_judged() -> None:
     views = [box_view(k, 0.2 * k) for k in range(2)]
-    config = MapperConfig(iterations=2, training=TrainingConfig(threads=1))
+    config = MapperConfig(iterations=2, threads=1)
     finite = mapped("finite", views, config)
     assert finite.met
     assert "quality not judged" in finite.goal

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from mvsgs_core.image_metrics import psnr
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.rasterizer.rasterize import rasterize
 
-CONFIG = MapperConfig(iterations=16, refinement=20, training=TrainingConfig(threads=1))
+CONFIG = MapperConfig(iterations=16, refinement=20, threads=1)
 
 
 def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:
@@ -29,7 +29,7 @@ def score(mapper: OnlineMapper, view: RGBDKeyframe) -> float:
     final = mapper.snapshot()
     pose = view.world_from_cam.copy()
     pose[:3, 3] -= final.origin
-    length = mapper.unit or 1.0
+    length = mapper.frame.length
     with torch.no_grad():
         render = rasterize(
             final.splats, pose, view.intrinsics, view.image.shape[:2], kernel=final.kernel, near=1e-3 * length

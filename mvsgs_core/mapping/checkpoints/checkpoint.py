@@ -1,4 +1,4 @@
-"""A atlas as a checkpoint: written to a folder and read back, every value checked. See `checkpoint_files`."""
+"""An atlas as a checkpoint: written to a folder and read back, every value checked. See `files`."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from mvsgs_core.atomic_file import replacing
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, nothing_there, read_state, state_files, write_state
 from mvsgs_core.mapping.checkpoints.state import Arrays, Corrections, pack, unpack, whole
-from mvsgs_core.mapping.mapper import MapperConfig
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.stats import Stats
 
 # What the state's arrays depend on; everything else may be another one when a run goes on, and then is said.
-FIXED = ("sh_degree", "max_pixels", "training.kernel", "skipping.levels")
-OF_THE_MACHINE = ("device", "training.threads", "training.backend")
+FIXED = ("sh_degree", "max_pixels", "training.kernel")
+OF_THE_MACHINE = ("device", "threads", "training.backend")
 LOGGED = ("counts", "skipped", "seconds", "warnings")
 
 
-def save(atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, list[list[str]]], *, sync: bool) -> None:
+def save(atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, list[str]], *, sync: bool) -> None:
     """Writes a frozen atlas's state. config: of its mappers, with their device; names: image files by segment.
 
     Raises OSError.
@@ -75,7 +75,7 @@ def images_of(file: Path) -> set[str]:
     """Names of the image files that a state refers to; none where it is damaged."""
     try:
         mappers = read_state(file)[0].get("mappers")
-        return {name for part in mappers for names in part["images"] for name in names}  # type: ignore[union-attr]
+        return {name for part in mappers for name in part["images"]}  # type: ignore[union-attr]
     except (ValueError, TypeError, KeyError):
         return set()
 

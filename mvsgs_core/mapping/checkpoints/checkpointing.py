@@ -19,7 +19,7 @@ LAST = 2.5  # seconds for the last checkpoint of a run that ends early
 
 
 class Checkpointing:
-    """Saves a atlas every `period` seconds of the stream or of the clock, and as soon as there is a map.
+    """Saves an atlas every `period` seconds of the stream or of the clock, and as soon as there is a map.
 
     Less often where that would take more than `MAX_FRACTION` of the time, or the disk is still writing the last one.
     """

@@ -18,61 +18,54 @@ from torch import Tensor
 from mvsgs_core.atomic_file import replacing
 from mvsgs_core.mapping.keyframes import TrainingView
 
-NAME = re.compile(r"-?\d{1,19}-\d{1,2}-[0-9a-f]{8}\.png", re.ASCII)  # frame index, pyramid level, checksum
+NAME = re.compile(r"-?\d{1,19}-[0-9a-f]{8}\.png", re.ASCII)  # frame index, checksum
 
 
-def image_names(view: TrainingView) -> list[str]:
-    """File names of a keyframe's pyramid, one a level; none where its images were let go."""
-    return [f"{view.index:06d}-{level}-{_checksum(pixels):08x}.png" for level, pixels in enumerate(_pixels(view))]
+def image_name(view: TrainingView) -> str:
+    """File name of a keyframe's image; empty where it was let go."""
+    return f"{view.index:06d}-{_checksum(_pixels(view)):08x}.png" if view.has_image else ""
 
 
-def write_images(folder: Path, view: TrainingView, names: list[str], *, sync: bool) -> None:
-    """Those of a keyframe's images that are not there yet. Raises OSError."""
-    for name, pixels in zip(names, _pixels(view), strict=True):
-        if (folder / name).exists():
-            continue
-        channels = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
-        whole, data = cv2.imencode(".png", cv2.cvtColor(pixels, channels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        if not whole:
-            raise OSError(f"{name} cannot be encoded as PNG")
-        with replacing(folder / name, sync=sync) as aside:
-            aside.write_bytes(data.tobytes())
+def write_image(folder: Path, view: TrainingView, name: str, *, sync: bool) -> None:
+    """A keyframe's image, if it is not there yet. Raises OSError."""
+    if (folder / name).exists():
+        return
+    pixels = _pixels(view)
+    channels = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    whole, data = cv2.imencode(".png", cv2.cvtColor(pixels, channels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not whole:
+        raise OSError(f"{name} cannot be encoded as PNG")
+    with replacing(folder / name, sync=sync) as aside:
+        aside.write_bytes(data.tobytes())
 
 
-def read_images(folder: Path, names: list[str], device: torch.device) -> tuple[list[Tensor], list[Tensor] | None]:
-    """The pyramid's levels (H, W, 3) uint8 and valid pixels (H, W) bool of each, None where all are.
+def read_image(folder: Path, name: str, device: torch.device) -> tuple[Tensor, Tensor | None]:
+    """A keyframe's image (H, W, 3) uint8 and its valid pixels (H, W) bool, None where all are; no name: empty.
 
     Raises ValueError for an image that is missing, damaged or another than its name says.
     """
-    levels, valid = [], []
-    for name in names:
-        if not NAME.fullmatch(name):
-            raise ValueError(f"{name!r} is no name of a keyframe's image")
-        try:
-            data = np.fromfile(folder / name, dtype=np.uint8)
-            found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if _plausible(data) else None
-        except (OSError, cv2.error) as error:
-            raise ValueError(f"{folder / name} cannot be read: {error}") from error
-        if found is None or found.dtype != np.uint8 or found.ndim != 3:
-            raise ValueError(f"{folder / name} is damaged: no image of a keyframe")
-        pixels = cv2.cvtColor(found, cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGB)
-        if f"{_checksum(pixels):08x}" != name[-12:-4]:
-            raise ValueError(f"{folder / name} is damaged: it shows something else than its name says")
-        levels.append(torch.from_numpy(np.ascontiguousarray(pixels[..., :3])).to(device))
-        if pixels.shape[2] == 4:
-            valid.append(torch.from_numpy(pixels[..., 3] > 0).to(device))
-    if valid and len(valid) != len(levels):
-        raise ValueError(f"{folder}: only some of {', '.join(names)} have valid pixels")
-    return levels, valid or None
+    if not name:
+        return torch.zeros((0, 0, 3), dtype=torch.uint8, device=device), None
+    if not NAME.fullmatch(name):
+        raise ValueError(f"{name!r} is no name of a keyframe's image")
+    try:
+        data = np.fromfile(folder / name, dtype=np.uint8)
+        found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if _plausible(data) else None
+    except (OSError, cv2.error) as error:
+        raise ValueError(f"{folder / name} cannot be read: {error}") from error
+    if found is None or found.dtype != np.uint8 or found.ndim != 3:
+        raise ValueError(f"{folder / name} is damaged: no image of a keyframe")
+    pixels = cv2.cvtColor(found, cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+    if f"{_checksum(pixels):08x}" != name[-12:-4]:
+        raise ValueError(f"{folder / name} is damaged: it shows something else than its name says")
+    image = torch.from_numpy(np.ascontiguousarray(pixels[..., :3])).to(device)
+    return image, torch.from_numpy(pixels[..., 3] > 0).to(device) if pixels.shape[2] == 4 else None
 
 
-def _pixels(view: TrainingView) -> list[np.ndarray]:
-    """(H, W, 3), or with the valid pixels as alpha (H, W, 4), uint8 of each level."""
-    images = [np.ascontiguousarray(level.cpu().numpy()) for level in view.levels]
-    if view.valid is None:
-        return images
-    masks = [mask.cpu().numpy().astype(np.uint8) * 255 for mask in view.valid]
-    return [np.dstack([image, mask]) for image, mask in zip(images, masks, strict=True)]
+def _pixels(view: TrainingView) -> np.ndarray:
+    """(H, W, 3), or with the valid pixels as alpha (H, W, 4), uint8."""
+    image = np.ascontiguousarray(view.image.cpu().numpy())
+    return image if view.valid is None else np.dstack([image, view.valid.cpu().numpy().astype(np.uint8) * 255])
 
 
 def _plausible(data: np.ndarray) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info, read_state
-from mvsgs_core.mapping.checkpoints.images import read_images
+from mvsgs_core.mapping.checkpoints.images import read_image
 from mvsgs_core.mapping.checkpoints.state import VIEWS, Arrays
 
 
@@ -23,12 +23,12 @@ class KeptKeyframe:
     intrinsics: np.ndarray  # (4,) in pixels of the training image
     world_from_cam: np.ndarray  # (4, 4) float64, the tracker's
     segment: int  # part of the map
-    images: tuple[Path, list[str]]  # folder and files of its pyramid; no files where its images were let go
+    folder: Path  # of the images
+    name: str  # of its image's file; empty where that was let go
 
     def image(self) -> np.ndarray | None:
         """(H, W, 3) uint8 RGB as it is trained on; None: let go. Raises ValueError for a damaged file."""
-        folder, names = self.images
-        return read_images(folder, names[:1], torch.device("cpu"))[0][0].numpy() if names else None
+        return read_image(self.folder, self.name, torch.device("cpu"))[0].numpy() if self.name else None
 
 
 def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
@@ -57,11 +57,10 @@ def _of_part(part: dict[str, object], arrays: Arrays, folder: Path) -> Iterator[
     count = len(names)
     columns = {
         name: arrays.take(name, VIEWS[name][0], (count, *VIEWS[name][1]), nan=name == "timestamp")
-        for name in ("index", "timestamp", "world_from_cam")
+        for name in ("index", "timestamp", "world_from_cam", "intrinsics")
     }
-    intrinsics = arrays.take("intrinsics", np.float64, (count, None, 4))
     for k in range(count):
         yield KeptKeyframe(
-            int(columns["index"][k]), float(columns["timestamp"][k]), intrinsics[k, 0].copy(),
-            columns["world_from_cam"][k].copy(), segment, (folder, list(names[k])),
+            int(columns["index"][k]), float(columns["timestamp"][k]), columns["intrinsics"][k].copy(),
+            columns["world_from_cam"][k].copy(), segment, folder, str(names[k]),
         )  # fmt: skip

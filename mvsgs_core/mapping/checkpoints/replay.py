@@ -18,7 +18,7 @@ class Replay:
 
     def __init__(self, atlas: Atlas) -> None:
         """atlas: as it was loaded."""
-        self._session = atlas
+        self._atlas = atlas
         self._newest, self._revision = atlas.newest_view, atlas.revision
         self._found: dict[int, tuple[np.ndarray, float]] = {}  # replayed pose and scale of each keyframe
         self._decided = False
@@ -47,8 +47,8 @@ class Replay:
 
     def _disagreement(self) -> str:
         compared = 0
-        for part in self._session.parts.values():
-            length = part.median_depth * (part.unit or 1.0)
+        for part in self._atlas.parts.values():
+            length = part.median_depth * part.frame.length
             for view in part.views:
                 if view.index not in self._found:
                     continue

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvsgs_core.mapping.checkpoints.images import read_images
+from mvsgs_core.mapping.checkpoints.images import read_image
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
-from mvsgs_core.mapping.map_state import MapState
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.map_state import PARAMETERS, MapState
+from mvsgs_core.mapping.mapper import OnlineMapper, device_of
 from mvsgs_core.stats import Stats
 
 Corrections = dict[int, tuple[np.ndarray, float]]
@@ -29,8 +30,8 @@ VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in Trainin
     "scale": (np.float64, ()), "local_from_cam": (np.float64, (4, 4)), "image_intrinsics": (np.float64, (4,)),
     "image_size": (np.int64, (2,)), "exposure": (np.float32, (3, 4)), "exposure_moments": (np.float32, (2, 3, 4)),
     "pose_delta": (np.float64, (4, 4)), "pose_moments": (np.float64, (2, 6)), "pose_steps": (np.int64, ()),
-    "fixed": (np.bool_, ()), "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_full": (np.int64, ()),
-    "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()),
+    "fixed": (np.bool_, ()), "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_here": (np.int64, ()),
+    "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "intrinsics": (np.float64, (4,)),
 }  # fmt: skip
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow")
 
@@ -67,32 +68,31 @@ def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections) -> Onlin
     lengths = {len(value) for value in mapper.state.tensors().values()}
     if len(lengths) > 1:
         raise ValueError(f"the map is in the middle of a change: {sorted(lengths)} splats")
-    cpu = torch.device("cpu")
-    copied = OnlineMapper(replace(mapper.config, device="cpu"), log, corrections)
-    copied.state = MapState.of(mapper.state.tensors(), cpu)
-    copied.views = [_copied(view) for view in mapper.views]
-    copied.with_image = [view for view in copied.views if view.levels]
-    copied.schedule.restore(mapper.schedule.state(), len(copied.with_image))
-    copied.iterations, copied.global_rate = mapper.iterations, mapper.global_rate
-    copied.origin, copied.unit = mapper.origin, mapper.unit
-    copied.generator.set_state(mapper.generator.get_state())
+    state = MapState.of(mapper.state.tensors(), torch.device("cpu"))
+    views = [_copied(view) for view in mapper.views]
+    copied = OnlineMapper(replace(mapper.config, device="cpu"), log, corrections, state, views)
+    copied.schedule.restore(mapper.schedule.state(), len(copied.keyframes.with_image))
+    copied.frame.origin, copied.frame.unit = mapper.frame.origin, mapper.frame.unit
+    copied.trainer.iterations, copied.trainer.rate = mapper.trainer.iterations, mapper.trainer.rate
+    copied.trainer.generator.set_state(mapper.trainer.generator.get_state())
     return copied
 
 
-def pack(mapper: OnlineMapper, prefix: str, names: list[list[str]]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """JSON and arrays of a mapper; `names`: the image files of each of its keyframes."""
+def pack(mapper: OnlineMapper, prefix: str, images: list[str]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Of a mapper on the CPU: what goes into the state's JSON, and arrays whose names begin with the prefix.
+
+    images: the file of each keyframe's image, empty where it was let go.
+    """
+    views, frame = mapper.views, mapper.frame
     arrays = {f"{prefix}/splats/{name}": value.cpu().numpy() for name, value in mapper.state.tensors().items()}
-    views = mapper.views
     for name, (dtype, shape) in VIEWS.items():
         rows = [_plain(getattr(view, name)) for view in views]
         arrays[f"{prefix}/views/{name}"] = np.array(rows, dtype=dtype).reshape(len(views), *shape)
-    levels = mapper.config.skipping.levels
-    arrays[f"{prefix}/views/intrinsics"] = np.array([view.intrinsics for view in views]).reshape(len(views), levels, 4)
-    arrays[f"{prefix}/origin"] = np.zeros(0) if mapper.origin is None else mapper.origin
-    arrays[f"{prefix}/generator"] = mapper.generator.get_state().numpy()
+    arrays[f"{prefix}/origin"] = np.zeros(0) if frame.origin is None else frame.origin
+    arrays[f"{prefix}/generator"] = mapper.trainer.generator.get_state().numpy()
     meta = {
-        "iterations": mapper.iterations, "unit": mapper.unit, "global_rate": mapper.global_rate,
-        "schedule": mapper.schedule.state(), "images": names,
+        "iterations": mapper.iterations, "unit": frame.unit, "rate": mapper.trainer.rate,
+        "schedule": mapper.schedule.state(), "images": images,
     }  # fmt: skip
     return meta, {name: np.ascontiguousarray(value) for name, value in arrays.items()}
 
@@ -103,22 +103,22 @@ def unpack(
     """The mapper that was packed. images: the folder of its keyframes' images. Raises ValueError for damage."""
     if not isinstance(meta, dict):
         raise ValueError("a mapper's part is no object")
-    mapper = OnlineMapper(config, log, corrections)
-    mapper.views = _views(arrays.of("views"), meta.get("images"), config, images)
-    mapper.with_image = [view for view in mapper.views if view.levels]
-    mapper.state = _splats(arrays.of("splats"), mapper)
-    mapper.schedule.restore(_object(meta.get("schedule")), len(mapper.with_image))
-    mapper.iterations = whole(meta.get("iterations"), "iterations")
-    mapper.global_rate = _positive(meta.get("global_rate"))
-    mapper.unit = None if meta.get("unit") is None else _positive(meta.get("unit"))
+    device = device_of(config.device)
+    views = _views(arrays.of("views"), meta.get("images"), device, images)
+    state = _splats(arrays.of("splats"), (config.sh_degree + 1) ** 2, [view.index for view in views], device)
+    mapper = OnlineMapper(config, log, corrections, state, views)
+    mapper.schedule.restore(_object(meta.get("schedule")), len(mapper.keyframes.with_image))
+    mapper.trainer.iterations = whole(meta.get("iterations"), "iterations")
+    mapper.trainer.rate = _positive(meta.get("rate"))
+    mapper.frame.unit = None if meta.get("unit") is None else _positive(meta.get("unit"))
     origin = arrays.take("origin", np.float64, (None,))
-    if len(origin) not in (0, 3) or (len(origin) == 0 and (mapper.views or mapper.unit is not None)):
+    if len(origin) not in (0, 3) or (len(origin) == 0 and (views or mapper.frame.unit is not None)):
         raise ValueError("the origin is no position")
-    mapper.origin = origin.copy() if len(origin) else None
-    if mapper.unit is None and len(mapper.state):
+    mapper.frame.origin = origin.copy() if len(origin) else None
+    if mapper.frame.unit is None and len(state):
         raise ValueError("there are splats, but no unit of length")
     try:
-        mapper.generator.set_state(torch.from_numpy(arrays.take("generator", np.uint8, (None,)).copy()))
+        mapper.trainer.generator.set_state(torch.from_numpy(arrays.take("generator", np.uint8, (None,)).copy()))
     except RuntimeError as error:
         raise ValueError(f"no state of a random generator: {error}") from error
     return mapper
@@ -131,52 +131,40 @@ def whole(value: Any, name: str) -> int:
     return value
 
 
-def _splats(arrays: Arrays, mapper: OnlineMapper) -> MapState:
+def _splats(arrays: Arrays, sh_bases: int, keyframes: list[int], device: torch.device) -> MapState:
     count = len(arrays.take("steps", np.int32, (None,)))
-    rows = SPLATS | {"sh": (np.float32, ((mapper.config.sh_degree + 1) ** 2, 3))}
-    parameters = list(mapper.state.first)
+    rows = SPLATS | {"sh": (np.float32, (sh_bases, 3))}
+    rows |= {f"{moment}/{name}": rows[name] for moment in ("first", "second") for name in PARAMETERS}
     found = {name: arrays.take(name, dtype, (count, *shape)) for name, (dtype, shape) in rows.items()}
-    for name in parameters:
-        dtype, shape = rows[name]
-        for moment in ("first", "second"):
-            found[f"{moment}/{name}"] = arrays.take(f"{moment}/{name}", dtype, (count, *shape))
-    if count and not np.isin(found["anchors"], [view.index for view in mapper.views]).all():
+    if count and not np.isin(found["anchors"], keyframes).all():
         raise ValueError("splats are anchored to keyframes that are not there")
-    if (found["steps"] < 0).any() or any((found[f"second/{name}"] < 0).any() for name in parameters):
+    if (found["steps"] < 0).any() or any((found[f"second/{name}"] < 0).any() for name in PARAMETERS):
         raise ValueError("splats have ages or squares below 0")
     # copied to memory that torch aligned: with other vectors a sum may round otherwise
-    return MapState.of({name: torch.from_numpy(value.copy()) for name, value in found.items()}, mapper.state.device)
+    return MapState.of({name: torch.from_numpy(value.copy()) for name, value in found.items()}, device)
 
 
-def _views(arrays: Arrays, images: Any, config: MapperConfig, folder: Path) -> list[TrainingView]:
-    count, levels = len(arrays.take("index", np.int64, (None,))), config.skipping.levels
+def _views(arrays: Arrays, images: Any, device: torch.device, folder: Path) -> list[TrainingView]:
+    count = len(arrays.take("index", np.int64, (None,)))
     columns = {
         name: arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN)
         for name, (dtype, shape) in VIEWS.items()
     }
-    intrinsics = arrays.take("intrinsics", np.float64, (count, levels, 4))
-    sensible = all((columns[n] >= 0).all() for n in ("pose_steps", "visits", "visits_full", "median_depth"))
+    sensible = all((columns[n] >= 0).all() for n in ("pose_steps", "visits", "visits_here", "median_depth"))
     if not (sensible and (columns["image_size"] > 0).all() and (columns["scale"] > 0).all()):
         raise ValueError("keyframes have sizes, scales or counts that none has")
-    if not (isinstance(images, list) and len(images) == count and all(_is_names(names, levels) for names in images)):
-        raise ValueError("not every keyframe's images are named")
-    device, views = torch.device(config.device), []
-    for k in range(count):
-        row = {name: value[k] for name, value in columns.items()}
-        pyramid, valid = read_images(folder, images[k], device)
-        moments = torch.from_numpy(row["exposure_moments"].copy()).to(device)
+    if not (isinstance(images, list) and len(images) == count and all(isinstance(name, str) for name in images)):
+        raise ValueError("not every keyframe's image is named")
+    views = []
+    for k, name in enumerate(images):
+        row: dict[str, Any] = {key: v[k].copy() if v.ndim > 1 else v[k].item() for key, v in columns.items()}
+        image, valid = read_image(folder, name, device)
+        first, second = torch.from_numpy(row.pop("exposure_moments")).to(device)
         views.append(
             TrainingView(
-                index=int(row["index"]), levels=pyramid, intrinsics=list(intrinsics[k].copy()),
-                image_intrinsics=row["image_intrinsics"].copy(), image_size=_pair(row["image_size"]),
-                timestamp=float(row["timestamp"]), world_from_cam=row["world_from_cam"].copy(),
-                scale=float(row["scale"]), local_from_cam=row["local_from_cam"].copy(),
-                exposure=torch.from_numpy(row["exposure"].copy()).to(device),
-                exposure_moments=(moments[0].clone(), moments[1].clone()), pose_delta=row["pose_delta"].copy(),
-                pose_moments=row["pose_moments"].copy(), pose_steps=int(row["pose_steps"]), fixed=bool(row["fixed"]),
-                median_depth=float(row["median_depth"]), valid=valid, visits=int(row["visits"]),
-                visits_full=int(row["visits_full"]), loss_fast=float(row["loss_fast"]),
-                loss_slow=float(row["loss_slow"]),
+                **row | {"image_size": tuple(row["image_size"].tolist())}
+                | {"exposure": torch.from_numpy(row["exposure"]).to(device)},
+                exposure_moments=(first.clone(), second.clone()), image=image, valid=valid,
             )
         )  # fmt: skip
     return views
@@ -184,11 +172,9 @@ def _views(arrays: Arrays, images: Any, config: MapperConfig, folder: Path) -> l
 
 def _copied(view: TrainingView) -> TrainingView:
     """On the CPU; images are shared, as they never change."""
-    cpu = torch.device("cpu")
-    first, second = (moment.to(cpu, copy=True) for moment in view.exposure_moments)
+    first, second = (moment.to("cpu", copy=True) for moment in view.exposure_moments)
     return replace(
-        view, levels=list(view.levels), valid=None if view.valid is None else list(view.valid),
-        exposure=view.exposure.detach().to(cpu, copy=True), exposure_moments=(first, second),
+        view, exposure=view.exposure.detach().to("cpu", copy=True), exposure_moments=(first, second),
         pose_delta=view.pose_delta.copy(), pose_moments=view.pose_moments.copy(),
     )  # fmt: skip
 
@@ -200,14 +186,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(part) for part in value]
     return value
-
-
-def _pair(values: np.ndarray) -> tuple[int, int]:
-    return int(values[0]), int(values[1])
-
-
-def _is_names(names: Any, levels: int) -> bool:
-    return isinstance(names, list) and len(names) in (0, levels) and all(isinstance(name, str) for name in names)
 
 
 def _object(value: Any) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from pathlib import Path
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import images_of, save
 from mvsgs_core.mapping.checkpoints.files import FOLDER, KEYFRAMES, number_of, state_file, state_files
-from mvsgs_core.mapping.checkpoints.images import image_names, write_images
+from mvsgs_core.mapping.checkpoints.images import image_name, write_image
 from mvsgs_core.mapping.checkpoints.results import write_results
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
-from mvsgs_core.mapping.mapper import MapperConfig
 
 AHEAD = 8  # keyframes whose images may wait to be written before their checkpoint is
 ASIDE = (".map.*.ply", ".trajectory.*.txt")  # what a killed process left half written, see `atomic_file`
@@ -33,7 +33,7 @@ class CheckpointWriter:
         self._number = max((number_of(file) for file in state_files(output)), default=0)
         self._before = resumed  # newest whole state of this run,
         self._images_before: set[str] = set() if resumed is None else images_of(resumed)  # and what it refers to
-        self._names: dict[int, tuple[object, list[str]]] = {}  # by keyframe: its image, and the files of it
+        self._names: dict[int, tuple[object, str]] = {}  # by keyframe: its image, and the file of it
         self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._begun = False  # to write here
         self._changed = threading.Condition()
@@ -47,10 +47,10 @@ class CheckpointWriter:
         return self._pending > 0
 
     def prepare(self, view: TrainingView) -> None:
-        """Writes a new keyframe's images ahead of its checkpoint; not where the disk is behind."""
+        """Writes a new keyframe's image ahead of its checkpoint; not where the disk is behind."""
         if self._jobs.qsize() < AHEAD:
-            kept = replace(view, levels=list(view.levels))  # should they be let go meanwhile
-            self._do(lambda: self._write_images(kept, sync=True))
+            kept = replace(view)  # should it be let go meanwhile
+            self._do(lambda: self._write_image(kept, sync=True))
 
     def submit(self, atlas: Atlas, *, sync: bool = True) -> None:
         """Begins to write a frozen atlas, after what is being written. sync: wait for the disk."""
@@ -102,30 +102,30 @@ class CheckpointWriter:
             self._remove_parts()
             self._begun = True
         known = {
-            segment: [self._write_images(view, sync=sync) for view in part.views]
+            segment: [self._write_image(view, sync=sync) for view in part.views]
             for segment, part in atlas.parts.items()
         }
         file = state_file(self._output, self._number + 1)
         save(atlas, self._config, file, known, sync=sync)
         self._number += 1
-        images = {name for names in known.values() for view in names for name in view}
+        images = {name for names in known.values() for name in names if name}
         self._remove_others({file, self._before}, images | self._images_before)
         self._before, self._images_before = file, images
-        present = {view.index for part in atlas.parts.values() for view in part.views if view.levels}
+        present = {view.index for part in atlas.parts.values() for view in part.keyframes.with_image}
         self._names = {index: entry for index, entry in self._names.items() if index in present}
 
-    def _write_images(self, view: TrainingView, sync: bool) -> list[str]:
-        """Names of a keyframe's image files, which are there then."""
-        if not view.levels:
-            return []
-        image, names = self._names.get(view.index, (None, []))
-        if image is not view.levels[0]:
-            names = image_names(view)
+    def _write_image(self, view: TrainingView, sync: bool) -> str:
+        """Name of a keyframe's image file, which is there then; empty where it was let go."""
+        if not view.has_image:
+            return ""
+        image, name = self._names.get(view.index, (None, ""))
+        if image is not view.image:
+            name = image_name(view)
             folder = self._output / FOLDER / KEYFRAMES
             folder.mkdir(parents=True, exist_ok=True)
-            write_images(folder, view, names, sync=sync)
-            self._names[view.index] = (view.levels[0], names)
-        return names
+            write_image(folder, view, name, sync=sync)
+            self._names[view.index] = (view.image, name)
+        return name
 
     def _remove_others(self, states: set[Path | None], images: set[str]) -> None:
         for file in state_files(self._output):

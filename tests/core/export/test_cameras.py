@@ -11,7 +11,8 @@ import pytest
 
 from mvsgs_core.export.cameras import Cameras, read_cameras, write_cameras
 from mvsgs_core.mapping.checkpoints.results import cameras_of
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 
@@ -43,7 +44,7 @@ def test_a_map_knows_its_cameras_at_the_size_of_the_images_also_where_these_are_
     views = [rgbd_keyframe(5 * k, pose_on_arc(k / 3), (24, 32), origin=100.0) for k in range(4)]
     for view in views:
         mapper.add_keyframe(view)
-    assert any(not view.levels for view in mapper.views)
+    assert any(not view.has_image for view in mapper.views)
     found = cameras_of(mapper.snapshot(), mapper.views)
     assert found.keyframes.tolist() == [0, 5, 10, 15]
     np.testing.assert_allclose(found.world_from_cam, [view.world_from_cam for view in views], atol=1e-12)

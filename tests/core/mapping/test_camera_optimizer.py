@@ -9,14 +9,14 @@ import pytest
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.mapping.camera_optimizer import step_pose
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 TIMES = (0.0, 0.33, 0.66, 1.0)
 OFF = 2.0 * np.array([0.01, -0.008, 0.006, 0.006, -0.008, 0.01])  # (translation, rotation) that one pose is wrong by
-TRAINING = TrainingConfig(threads=1, poses=True, pose_rate=5e-4)
+TRAINING = TrainingConfig(refine_poses=True, pose_rate=5e-4)
 
 
 def views(unit: float = 1.0) -> list[RGBDKeyframe]:
@@ -59,7 +59,7 @@ def test_a_wrong_pose_is_mended_and_the_first_one_stays(unit: float) -> None:
 
 
 def test_without_the_switch_poses_are_the_trackers() -> None:
-    final = mapped(views(), replace(TRAINING, poses=False)).snapshot()
+    final = mapped(views(), replace(TRAINING, refine_poses=False)).snapshot()
     np.testing.assert_array_equal(final.world_from_cam, np.stack([v.world_from_cam for v in views()]))
 
 
@@ -92,7 +92,7 @@ def test_exposures_are_told_from_the_map_and_their_mean_stays_the_identity() -> 
     given = views()
     bright = np.clip(np.round(given[1].image * 1.15), 0, 255).astype(np.uint8)
     given[1] = replace(given[1], image=bright)
-    final = mapped(given, replace(TRAINING, poses=False, exposure=True, exposure_rate=3e-3)).snapshot()
+    final = mapped(given, replace(TRAINING, refine_poses=False, exposure=True, exposure_rate=3e-3)).snapshot()
     np.testing.assert_allclose(final.exposures.mean(axis=0), np.eye(3, 4), atol=1e-5)
     gains = final.exposures[:, :3, :3].sum(axis=2).mean(axis=1)
     assert gains[1] - np.delete(gains, 1).mean() > 0.03

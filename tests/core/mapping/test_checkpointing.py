@@ -18,7 +18,7 @@ from mvsgs_core.mapping.checkpoints.checkpointing import MAX_FRACTION, Checkpoin
 from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_files
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.trajectory_file import read_trajectory
-from tests.support.small_sessions import PLAIN, begun, view
+from tests.support.small_atlas import PLAIN, begun, view
 
 
 class Clock:

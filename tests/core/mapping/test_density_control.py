@@ -1,4 +1,4 @@
-"""Clone, split, prune, relocation and decay: counts, bookkeeping and what the render keeps."""
+"""Clone, split and prune: counts, bookkeeping and what the render keeps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvsgs_core.mapping.density_control import DensityControlConfig, control, relocation
+from mvsgs_core.mapping.density_control import DensityControlConfig, control
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -66,30 +66,5 @@ def test_none_leaves_everything_alone_and_an_unknown_mode_is_refused() -> None:
     state.means2d_gradient += 1.0
     control(state, DensityControlConfig(mode="none"), 1.0, torch.Generator())
     assert torch.equal(before, state.splats.opacity_logits)
-    with pytest.raises(ValueError, match="adaptive, relocate, none"):
+    with pytest.raises(ValueError, match="adaptive, none"):
         control(state, DensityControlConfig(mode="sometimes"), 1.0, torch.Generator())
-
-
-def test_relocation_keeps_the_number_and_moves_the_dead_onto_the_living() -> None:
-    state = state_of(20)
-    with torch.no_grad():
-        state.splats.opacity_logits[5:15] = -8.0
-    living = torch.cat([state.splats.means[:5], state.splats.means[15:]]).detach().clone()
-    change = control(state, DensityControlConfig(mode="relocate"), 1.0, torch.Generator().manual_seed(1))
-    assert change.relocated == 10
-    assert lengths(state) == {20}
-    distances = torch.cdist(state.splats.means.detach()[5:15], living).min(dim=1).values
-    assert distances.max() == 0.0
-
-
-@pytest.mark.parametrize("copies", [1, 2, 7])
-def test_copies_blend_to_the_opacity_of_the_original(copies: int) -> None:
-    opacity = torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
-    shared, shrink = relocation(opacity, torch.full((3,), copies))
-    torch.testing.assert_close(1 - (1 - shared) ** copies, opacity)
-    # The integral over a line of the blended copies, each with std shrink, equals that of the original.
-    x = torch.linspace(-12, 12, 4001, dtype=torch.float64)
-    for o, s, f in zip(opacity, shared, shrink, strict=True):
-        original = torch.trapezoid(o * torch.exp(-0.5 * x * x), x)
-        blended = torch.trapezoid(1 - (1 - s * torch.exp(-0.5 * (x / f) ** 2)) ** copies, x)
-        torch.testing.assert_close(blended, original, rtol=1e-6, atol=0.0)

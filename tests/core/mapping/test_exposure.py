@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.exposure import IDENTITY, KEPT, colors_of_map, fitted_exposure, relative_to_mean
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.rasterizer.rasterize import rasterize
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
@@ -42,7 +42,7 @@ def test_a_map_that_shows_too_little_and_a_flat_image_say_nothing_wild() -> None
 
 
 def test_the_mean_exposure_becomes_the_maps_and_renders_stay() -> None:
-    mapper = OnlineMapper(MapperConfig(iterations=5, refinement=0, sh_degree=1, training=TrainingConfig(threads=1)))
+    mapper = OnlineMapper(MapperConfig(iterations=5, refinement=0, sh_degree=1, threads=1))
     view = rgbd_keyframe(0, pose_on_arc(0.0))
     mapper.add_keyframe(view)
     splats = mapper.snapshot().splats
@@ -65,7 +65,7 @@ def test_a_keyframe_of_another_exposure_starts_with_it_and_lays_no_second_skin()
     counts = {}
     for exposure in (False, True):
         mapper = OnlineMapper(
-            MapperConfig(iterations=40, refinement=0, training=TrainingConfig(threads=1, exposure=exposure))
+            MapperConfig(iterations=40, refinement=0, threads=1, training=TrainingConfig(exposure=exposure))
         )
         mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.0)))
         second = rgbd_keyframe(5, pose_on_arc(0.1))
@@ -80,7 +80,7 @@ def test_a_keyframe_of_another_exposure_starts_with_it_and_lays_no_second_skin()
 def test_a_camera_of_constant_exposure_hardly_drifts() -> None:
     """What is new comes from the last guess and makes the next one: their errors must not add up."""
     rng = np.random.default_rng(1)
-    mapper = OnlineMapper(MapperConfig(iterations=10, refinement=0, training=TrainingConfig(threads=1, exposure=True)))
+    mapper = OnlineMapper(MapperConfig(iterations=10, refinement=0, threads=1, training=TrainingConfig(exposure=True)))
     for k, time in enumerate(np.linspace(0.0, 1.0, 12)):
         view = rgbd_keyframe(k, pose_on_arc(float(time)))
         noisy = np.clip(view.image + rng.normal(0.0, 8.0, view.image.shape), 0, 255).astype(np.uint8)

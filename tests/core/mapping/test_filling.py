@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from mvsgs_core import camera
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.filling import continued_depth, fill_points
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.small_maps import CONFIG, mapped, score
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
@@ -30,7 +30,7 @@ def with_hole(index: int, t: float) -> RGBDKeyframe:
 
 
 def mapper_with(fill: int) -> OnlineMapper:
-    config = MapperConfig(training=TrainingConfig(threads=1), insertion=InsertionConfig(fill=fill))
+    config = MapperConfig(threads=1, insertion=InsertionConfig(fill=fill))
     return OnlineMapper(config)
 
 
@@ -158,7 +158,7 @@ def test_doubtful_depth_is_mapped_where_the_filters_kept_nothing() -> None:
         mapper.add_keyframe(replace(view, depth=nothing, normals=None, confidence=low, unfiltered=view.depth))
         == 12 * 16
     )
-    assert mapper.unit == pytest.approx(float(np.median(view.depth)))
+    assert mapper.frame.unit == pytest.approx(float(np.median(view.depth)))
     assert (mapper.render(mapper.views[0]).opacity.numpy() > 0.5).mean() > 0.99
 
 

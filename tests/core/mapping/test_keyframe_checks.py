@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.insertion import InsertionConfig, unoccupied
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
-CONFIG = MapperConfig(iterations=2, training=TrainingConfig(threads=1))
+CONFIG = MapperConfig(iterations=2, threads=1)
 VIEWS = [
     replace(rgbd_keyframe(k, pose_on_arc(k / 4), (24, 32)), confidence=np.ones((24, 32), np.float32)) for k in range(4)
 ]
@@ -117,7 +117,7 @@ def test_no_mutated_keyframe_ends_the_map_or_makes_it_unsound() -> None:
     """Every field with what no camera gives, singly and at a few pixels; the map goes on after each."""
     random = np.random.default_rng(0)
     wild = np.array([0.0, -1.0, 1e-40, 1e-9, 1e9, 3e4, 1e19, 3e38, -3e38, np.nan, np.inf, -np.inf])
-    training = TrainingConfig(threads=1, exposure=True, poses=True, pose_visits=1)
+    training = TrainingConfig(exposure=True, refine_poses=True, pose_visits=1)
     mapper = OnlineMapper(replace(CONFIG, iterations=1, sh_degree=1, training=training))
     mapper.add_keyframe(VIEWS[0])
     for index in range(1, 120):

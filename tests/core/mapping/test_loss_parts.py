@@ -8,7 +8,6 @@ import torch
 
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping import losses
-from mvsgs_core.mapping.losses import LossConfig
 from mvsgs_core.rasterizer import kernels
 from tests.support.shared_data import shared
 
@@ -44,10 +43,12 @@ def test_differences_of_gaussians(golden: dict[str, np.ndarray]) -> None:
 
 def test_terms_and_psnr(golden: dict[str, np.ndarray]) -> None:
     image, target = as_image(golden["image"]), as_image(golden["gt"])
-    terms = (LossConfig(1.0, 0.0, 0.0), LossConfig(0.0, 1.0, 0.0), LossConfig(0.0, 0.0, 1.0))
+    terms = [dict.fromkeys(("l1", "ssim", "masked"), 0.0) | {name: 1.0} for name in ("l1", "ssim", "masked")]
     last = len(golden["freq"]) - 1
     for i, frequency in enumerate(golden["freq"]):
-        l1, one_minus_ssim, masked = (losses.photometric_loss(image, target, float(frequency), t).item() for t in terms)
+        l1, one_minus_ssim, masked = (
+            losses.photometric_loss(image, target, float(frequency), **t).item() for t in terms
+        )
         wanted = golden["l1_ssim_maskl1"][i]
         assert l1 == pytest.approx(wanted[0], abs=1e-5)
         assert 1 - one_minus_ssim == pytest.approx(wanted[1], abs=1e-5)

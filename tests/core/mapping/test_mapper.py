@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.mapping import training
+from mvsgs_core.mapping import losses
+from mvsgs_core.mapping.config import TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.keyframes import RGBDKeyframe
+from mvsgs_core.mapping.keyframes import ConvergenceConfig, RGBDKeyframe
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.optimizer import OptimizerConfig
-from mvsgs_core.mapping.training import SkipConfig, TrainingConfig
 from tests.support.small_maps import CONFIG, mapped, score
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
@@ -168,23 +168,27 @@ def test_the_map_never_grows_beyond_its_limit_and_says_so() -> None:
 
 
 def test_every_skip_can_be_switched_off() -> None:
-    nothing = SkipConfig(converged=False, coarse_to_fine=False, selective=False)
-    config = replace(CONFIG, skipping=nothing, insertion=InsertionConfig(unexplored=False, voxel=0.0, map_voxel=0.0))
+    config = replace(
+        CONFIG,
+        convergence=ConvergenceConfig(skip=False),
+        training=TrainingConfig(selective=False),
+        insertion=InsertionConfig(unexplored=False, voxel=0.0, map_voxel=0.0),
+    )
     mapper = mapped(tiny_views(), config)
     assert mapper.iterations == 4 * 16 + 20
     assert not any(mapper.log.skipped.values())
 
 
 def test_converged_keyframes_are_passed_over() -> None:
-    skipping = SkipConfig(converged_visits=2, converged_improvement=1.0, converged_keep=0.0, coarse_to_fine=False)
-    mapper = mapped(tiny_views(), replace(CONFIG, skipping=skipping, refinement=0))
+    convergence = ConvergenceConfig(visits=2, improvement=1.0, keep=0.0)
+    mapper = mapped(tiny_views(), replace(CONFIG, convergence=convergence, refinement=0))
     assert mapper.log.skipped["iterations_converged"] + mapper.iterations == 4 * 16
     assert mapper.iterations <= 4 * 6
 
 
 @pytest.mark.parametrize("kernel", ["gaussian", "exact", "ges_scale"])
 def test_every_kernel_trains_with_harmonics_and_exposure(kernel: str) -> None:
-    training = TrainingConfig(kernel=kernel, betas=True, exposure=True, threads=1)
+    training = TrainingConfig(kernel=kernel, betas=True, exposure=True)
     mapper = mapped(tiny_views(), replace(CONFIG, iterations=6, sh_degree=1, training=training))
     assert score(mapper, tiny_views()[1]) > 25.0
     betas = mapper.state.splats.betas.detach()
@@ -196,7 +200,7 @@ def test_every_kernel_trains_with_harmonics_and_exposure(kernel: str) -> None:
 def test_wild_learning_rates_leave_the_map_finite() -> None:
     rates = OptimizerConfig()
     wild = replace(rates, **{k: 100 * v for k, v in vars(rates).items() if k not in ("means_final", "decay_steps")})
-    mapper = mapped(tiny_views(), replace(CONFIG, rates=wild, iterations=30))
+    mapper = mapped(tiny_views(), replace(CONFIG, optimizer=wild, iterations=30))
     for name in PARAMETERS:
         assert torch.isfinite(getattr(mapper.state.splats, name)).all()
     assert torch.isfinite(mapper.render(mapper.views[0]).color).all()
@@ -205,12 +209,12 @@ def test_wild_learning_rates_leave_the_map_finite() -> None:
 def test_images_are_kept_for_a_bounded_number_of_keyframes_spread_over_the_run() -> None:
     views = [rgbd_keyframe(k, pose_on_arc(k / 9)) for k in range(10)]
     mapper = mapped(views, replace(CONFIG, iterations=4, window=2, max_keyframes=5))
-    kept = [view.index for view in mapper.views if view.levels]
+    kept = [view.index for view in mapper.views if view.has_image]
     assert len(kept) == 5
     assert kept[0] == 0
     assert kept[-2:] == [8, 9]
     assert max(np.diff(kept)) <= 4
-    assert mapper.image_bytes == 5 * 48 * 64 * 3 * 5 // 4
+    assert mapper.keyframes.image_bytes == 5 * 48 * 64 * 3
     assert len(mapper.snapshot().keyframes) == 10
     assert any("max_keyframes" in text for text in mapper.log.warnings)
     shift = np.stack([view.world_from_cam for view in views])
@@ -219,11 +223,11 @@ def test_images_are_kept_for_a_bounded_number_of_keyframes_spread_over_the_run()
 
 
 def test_gradients_that_are_not_finite_are_counted_and_the_map_stays_finite(monkeypatch: pytest.MonkeyPatch) -> None:
-    def with_one_bad_pixel(color: torch.Tensor, *others: object) -> torch.Tensor:
+    def with_one_bad_pixel(color: torch.Tensor, *others: object, **weights: object) -> torch.Tensor:
         pixel = color[24, 32, 0]
         return color.mean() + (pixel - pixel.detach()).abs().sqrt()  # 0, with a derivative of NaN
 
-    monkeypatch.setattr(training, "photometric_loss", with_one_bad_pixel)
+    monkeypatch.setattr(losses, "photometric_loss", with_one_bad_pixel)
     mapper = mapped(tiny_views()[:2], replace(CONFIG, iterations=4, refinement=0))
     assert mapper.log.counts["refused_gradients"] > 0
     assert any("gradients" in text for text in mapper.log.warnings)

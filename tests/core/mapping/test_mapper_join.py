@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.map_state import PARAMETERS
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (24, 32)
@@ -19,7 +19,7 @@ CONFIG = MapperConfig(
     window=2,
     max_keyframes=5,
     sh_degree=1,
-    training=TrainingConfig(poses=True, pose_visits=1, exposure=True),
+    training=TrainingConfig(refine_poses=True, pose_visits=1, exposure=True),
 )
 AWAY = geometry.se3_exp(np.array([0.0, 0.0, -60.0, 0.0, np.pi, 0.0]))  # behind the back of the other's cameras
 # As if begun anew, elsewhere. Splats of equal depth may swap by rounding in another frame, which shows in a few pixels
@@ -45,10 +45,10 @@ def test_every_keyframe_sees_after_the_join_what_it_saw_before() -> None:
     ages = torch.cat([part.state.steps for part in (first, second)])
     exposures = {view.index: view.exposure.clone() for part in (first, second) for view in part.views}
     iterations = first.iterations + second.iterations
-    assert first.origin is not None
-    assert first.unit is not None
-    assert second.unit is not None
-    origin = first.origin.copy()
+    assert first.frame.origin is not None
+    assert first.frame.unit is not None
+    assert second.frame.unit is not None
+    origin = first.frame.origin.copy()
 
     poses = np.stack([AWAY @ pose_on_arc(index / 8) for index in (3, 4)])
     second.correct(np.array([3, 4]), poses, np.full(2, 2.5))
@@ -56,13 +56,13 @@ def test_every_keyframe_sees_after_the_join_what_it_saw_before() -> None:
 
     assert [view.index for view in first.views] == [0, 1, 3, 4, 6]
     assert [view.fixed for view in first.views] == [True, False, False, False, False]
-    np.testing.assert_array_equal(first.origin, origin)
+    np.testing.assert_array_equal(first.frame.origin, origin)
     assert first.iterations == iterations == 30
     for view in first.views:
         before, after = seen[view.index][1], first.render(view)
         assert before.opacity.mean() > 0.5
         torch.testing.assert_close(after.color, before.color, atol=2e-3, rtol=0)
-        ratio = second.unit / first.unit * 2.5 if view.index in (3, 4) else 1.0
+        ratio = second.frame.unit / first.frame.unit * 2.5 if view.index in (3, 4) else 1.0
         torch.testing.assert_close(after.depth, before.depth * ratio, atol=0.02, rtol=0)
         torch.testing.assert_close(view.exposure, exposures[view.index])
     torch.testing.assert_close(first.state.first["opacity_logits"], moments)
@@ -73,7 +73,7 @@ def test_every_keyframe_sees_after_the_join_what_it_saw_before() -> None:
     first.add_keyframe(rgbd_keyframe(7, pose_on_arc(7 / 8), SIZE))  # beyond the number of images that are kept
     while first.step():
         pass
-    assert sum(bool(view.levels) for view in first.views) == 5
+    assert sum(view.has_image for view in first.views) == 5
     assert all(bool(torch.isfinite(value).all()) for value in first.state.detached().tensors().values())
 
 
@@ -87,7 +87,7 @@ def test_maps_that_have_no_depth_or_no_keyframe_yet_are_joined() -> None:
     blind.join(full)
     empty.join(blind)
     assert [view.index for view in empty.views] == [0, 1, 2]
-    assert (empty.unit, len(empty.state)) == (full.unit, len(full.state))
+    assert (empty.frame.unit, len(empty.state)) == (full.frame.unit, len(full.state))
     for view, before in zip(empty.views[1:], seen):
         torch.testing.assert_close(empty.render(view).color, before, atol=2e-3, rtol=0)
     np.testing.assert_allclose(empty.snapshot().world_from_cam[0], pose_on_arc(0.0), atol=1e-12)

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 DRIFT = 0.25  # share by which lengths have shrunk at the end
@@ -28,7 +28,7 @@ def drifted(views: list[RGBDKeyframe]) -> tuple[list[RGBDKeyframe], np.ndarray]:
 
 
 def mapped(views: list[RGBDKeyframe]) -> OnlineMapper:
-    mapper = OnlineMapper(MapperConfig(iterations=12, training=TrainingConfig(threads=1)))
+    mapper = OnlineMapper(MapperConfig(iterations=12, threads=1))
     for view in views:
         mapper.add_keyframe(view)
     while mapper.step():
@@ -44,7 +44,7 @@ def refined(mapper: OnlineMapper) -> float:
 
 
 def psnr(mapper: OnlineMapper) -> float:
-    errors = [float((mapper.render(v).color - v.target(0)).square().mean()) for v in mapper.views]
+    errors = [float((mapper.render(v).color - v.target).square().mean()) for v in mapper.views]
     return float(-10.0 * np.log10(np.mean(errors)))
 
 

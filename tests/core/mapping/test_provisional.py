@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
+from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
-from mvsgs_core.mapping.training import TrainingConfig
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
@@ -31,7 +31,7 @@ def coarse(index: int, t: float, known: slice = slice(None), **changes: object) 
 
 @pytest.fixture
 def mapper() -> OnlineMapper:
-    mapper = OnlineMapper(MapperConfig(training=TrainingConfig(threads=1)))
+    mapper = OnlineMapper(MapperConfig(threads=1))
     mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.0)))
     return mapper
 
@@ -42,7 +42,7 @@ def coverage(mapper: OnlineMapper, splats: Splats | None, view: CoarseKeyframe) 
     if splats is not None:
         shown = {name: torch.cat([value, getattr(splats, name)]) for name, value in shown.items()}
     size = view.image.shape[0], view.image.shape[1]
-    render = rasterize(Splats(**shown), mapper.local(view.world_from_cam), view.intrinsics, size)
+    render = rasterize(Splats(**shown), mapper.frame.local(view.world_from_cam), view.intrinsics, size)
     return float((render.opacity.numpy() > 0.5).mean())
 
 
@@ -58,7 +58,7 @@ def test_a_new_keyframes_area_is_shown_at_once_and_the_map_is_left_alone(mapper:
     torch.testing.assert_close(mapper.state.splats.means.detach(), before)
     arrays = preview_arrays(mapper, LIMIT, splats)
     assert len(splats) < len(arrays["means"]) <= LIMIT
-    np.testing.assert_allclose(arrays["means"][-len(splats) :], splats.means.numpy() * mapper.unit, rtol=1e-5)
+    np.testing.assert_allclose(arrays["means"][-len(splats) :], splats.means.numpy() * mapper.frame.unit, rtol=1e-5)
 
 
 def test_it_is_gone_when_the_keyframes_own_depth_comes(mapper: OnlineMapper) -> None:
@@ -83,7 +83,7 @@ def test_corrections_move_it(mapper: OnlineMapper) -> None:
     assert second is not None
 
     def in_camera(splats: Splats, pose: np.ndarray) -> np.ndarray:
-        local = mapper.local(pose)
+        local = mapper.frame.local(pose)
         return np.asarray((splats.means.numpy() - local[:3, 3]) @ local[:3, :3])
 
     np.testing.assert_allclose(

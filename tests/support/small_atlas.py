@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
-from mvsgs_core.mapping.mapper import MapperConfig, OnlineMapper
-from mvsgs_core.mapping.training import TrainingConfig
+from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (24, 32)
 
 
-PLAIN = MapperConfig(iterations=10, refinement=6, window=2, training=TrainingConfig(threads=1))
+PLAIN = MapperConfig(iterations=10, refinement=6, window=2, threads=1)
 
 
 def view(index: int) -> RGBDKeyframe:
@@ -29,17 +29,17 @@ def view(index: int) -> RGBDKeyframe:
 
 def begun(config: MapperConfig) -> Atlas:
     """Two segments, corrections, and iterations that are still owed."""
-    session = Atlas(OnlineMapper(config))
+    atlas = Atlas(OnlineMapper(config))
     for index in range(6):
-        session.enter(int(index == 3))
-        session.current.add_keyframe(view(index))
-        session.came(index, 0.1 * index)
+        atlas.enter(int(index == 3))
+        atlas.current.add_keyframe(view(index))
+        atlas.came(index, 0.1 * index)
         for _ in range(4):
-            session.current.step()
+            atlas.current.step()
     moved = pose_on_arc(0.3)
     moved[:3, 3] += 0.02
-    for part in session.parts.values():
+    for part in atlas.parts.values():
         part.correct(np.array([2, 7]), np.stack([moved, moved]), np.array([1.1, 1.2]))
-    session.segment_of.update({3: 1, 2: 0})
-    session.revision = 4
-    return session
+    atlas.segment_of.update({3: 1, 2: 0})
+    atlas.revision = 4
+    return atlas

@@ -1,0 +1,53 @@
+"""The mapper's parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from mvsgs_core.mapping.density_control import DensityControlConfig
+from mvsgs_core.mapping.insertion import InsertionConfig
+from mvsgs_core.mapping.keyframes import ConvergenceConfig
+from mvsgs_core.mapping.losses import Loss, LossWeights
+from mvsgs_core.mapping.optimizer import OptimizerConfig
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """What is rendered and trained."""
+
+    kernel: Literal["gaussian", "exact", "ges_scale"] = "gaussian"  # of a splat
+    betas: bool = False  # train the kernel's shape (exact, ges_scale)
+    loss: Loss = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
+    loss_weights: LossWeights = field(default_factory=LossWeights)
+    frequency_horizon: int = 60  # visits of a keyframe over which the frequency-modulated mask runs through its bands
+    selective: bool = True  # step only the splats that were seen
+    exposure: bool = False  # train a color affine for each keyframe
+    exposure_rate: float = 1e-3  # learning rate of it
+    refine_poses: bool = False  # train the keyframes' poses too, the first one's excepted
+    pose_rate: float = 4e-5  # learning rate of them, radians and median depths a step
+    pose_visits: int = 5  # iterations on a keyframe before its pose is trained: new splats show nothing new
+    antialiased: bool = False  # scale opacities such that a splat smaller than a pixel does not grow brighter
+    near: float = 1e-3  # splats nearer than this many median depths are left out
+    backend: Literal["auto", "reference", "cpu", "triton"] = "auto"  # of the rasterizer
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """All of them; lengths are relative to the scene's median depth."""
+
+    iterations: int = 30  # optimization budget of each keyframe, half on the newest, half on all (the paper: 1000)
+    refinement: int = 300  # iterations over all keyframes at the end
+    window: int = 6  # newest keyframes, on which the local half of the budget goes
+    realtime: bool = False  # a new keyframe cancels the pending iterations of older ones
+    max_pixels: int | None = None  # area of the training images; null: as they come
+    max_keyframes: int = 1000  # whose images are kept and trained on; beyond, they are thinned out evenly
+    sh_degree: int = 0  # of the view-dependent color, 0 to 3
+    seed: int = 0
+    threads: int | None = None  # of the rasterizer and the optimizer; null: all
+    device: str = "auto"  # auto, cpu or cuda:0
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    insertion: InsertionConfig = field(default_factory=InsertionConfig)
+    density_control: DensityControlConfig = field(default_factory=DensityControlConfig)

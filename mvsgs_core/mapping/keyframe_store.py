@@ -1,0 +1,75 @@
+"""The keyframes of a map, and the bounded number of them whose images are kept to train on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.stats import Stats
+
+
+class KeyframeStore:
+    """In the order of the stream. Beyond `max_images`, images are let go; poses, scales and exposures all stay."""
+
+    def __init__(self, max_images: int, window: int, log: Stats, views: Iterable[TrainingView] = ()) -> None:
+        """window: newest keyframes, whose images are never let go."""
+        self._max_images, self._window, self._log = max_images, window, log
+        self.views = list(views)
+        self.with_image = [view for view in self.views if view.has_image]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @property
+    def median_depth(self) -> float:
+        """Of the scene, in the mapper's unit: what lengths are related to."""
+        known = [view.median_depth for view in self.views if view.median_depth > 0]
+        return float(np.median(known)) if known else 1.0
+
+    @property
+    def image_bytes(self) -> int:
+        """Of the images: what grows with the length of a run, to a bound."""
+        return sum(view.image.numel() for view in self.with_image)
+
+    def add(self, view: TrainingView) -> bool:
+        """Whether images were let go for it, so that positions in `with_image` have changed."""
+        self.views.append(view)
+        self.with_image.append(view)
+        return self._bound_images()
+
+    def take_over(self, other: KeyframeStore) -> None:
+        """The other's keyframes too."""
+
+        def index(view: TrainingView) -> int:
+            return view.index
+
+        self.views = sorted(self.views + other.views, key=index)
+        self.with_image = sorted(self.with_image + other.with_image, key=index)
+        self._bound_images()
+
+    def place_anew(self, local: Callable[[np.ndarray], np.ndarray]) -> None:
+        """The frame of reference has another unit: `local` takes poses (4, 4) of the world to it."""
+        for view in self.views:
+            view.local_from_cam = local(view.world_from_cam)
+
+    def _bound_images(self) -> bool:
+        """Lets go the images of the keyframes whose neighbors in time are closest. Their splats stay, and move with
+        their poses."""
+        changed = False
+        while len(self.with_image) > self._max_images:
+            last = len(self.with_image) - max(1, self._window)
+            if last < 2:
+                break
+            order = [view.index for view in self.with_image]
+            k = min(range(1, last), key=lambda k: order[k + 1] - order[k - 1])
+            self.with_image.pop(k).drop_image()
+            changed = True
+            self._log.refuse(
+                "images",
+                1,
+                f"more than {self._max_images} keyframes (max_keyframes): images of "
+                "older ones are thinned out and no longer trained on",
+            )
+        return changed

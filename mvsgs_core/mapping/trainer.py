@@ -1,0 +1,114 @@
+"""One training iteration: render a keyframe, compare, step what was seen; and every so often density control."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvsgs_core.mapping import density_control, optimizer
+from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
+from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.losses import LossInputs, frequency_of, training_loss, weights_of
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.rasterizer.rasterize import Render, rasterize
+from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.stats import Stats
+
+
+class Trainer:
+    """Optimizes the splats of a map, and the cameras of its keyframes, by one keyframe an iteration.
+
+    What is not finite is refused, counted in the log, and never reaches the map.
+    """
+
+    def __init__(self, config: MapperConfig, state: MapState, log: Stats) -> None:
+        self.config, self.state, self.log = config, state, log
+        self.iterations = 0
+        self.rate = 1.0  # factor on all learning rates: falls during the final refinement
+        self.generator = torch.Generator().manual_seed(config.seed)  # of density control
+        self._weights = weights_of(config.training.loss, config.training.loss_weights)
+
+    def render(self, view: TrainingView, median_depth: float, size: tuple[int, int] | None = None) -> Render:
+        """The map from a keyframe's pose, without gradients. size: height, width; None: the training image's."""
+        intrinsics = view.intrinsics if size is None else view.intrinsics_at(size)
+        exposure = view.exposure if self.config.training.exposure else None
+        with torch.no_grad():
+            return self._rasterize(
+                self.state.detached(), view, intrinsics, size or view.size, median_depth, exposure, None
+            )
+
+    def step(self, view: TrainingView, median_depth: float, *, refining: bool = False) -> None:
+        """One iteration on a keyframe. median_depth: of the scene; refining: no splat is added or removed."""
+        training = self.config.training
+        exposure = view.exposure.requires_grad_(True) if training.exposure else None
+        moving = training.refine_poses and not view.fixed and view.visits >= training.pose_visits
+        twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
+        render = self._rasterize(self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist)
+        loss = training_loss(self._loss_inputs(view, render), self._weights)
+        view.visits += 1
+        value = float(loss.detach())
+        if value < float("inf"):
+            loss.backward()
+            self._step_splats(render, median_depth)
+            self._step_camera(view, twist, median_depth)
+            view.record(value)
+        else:
+            optimizer.clear_gradients(self.state)
+            self.log.refuse("iterations", 1, "an iteration whose loss was not finite was refused")
+        self.iterations += 1
+        self.log.count("iterations")
+        if not refining and self.iterations % self.config.density_control.every == 0:
+            with self.log.time("density_control"):
+                change = density_control.control(self.state, self.config.density_control, median_depth, self.generator)
+            for name, count in vars(change).items():
+                self.log.count(name, count)
+
+    def _rasterize(
+        self, splats: Splats, view: TrainingView, intrinsics: np.ndarray, size: tuple[int, int], median_depth: float,
+        exposure: Tensor | None, twist: Tensor | None,
+    ) -> Render:  # fmt: skip
+        training = self.config.training
+        return rasterize(
+            splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
+            exposure=exposure, pose_delta=twist, near=training.near * median_depth, antialiased=training.antialiased,
+            threads=self.config.threads,
+        )  # fmt: skip
+
+    def _loss_inputs(self, view: TrainingView, render: Render) -> LossInputs:
+        target = view.target
+        if view.valid is not None:  # equal to the render where a pixel is left out: no loss, no gradient
+            target = torch.where(view.valid[..., None], target, render.color.detach())
+        frequency = frequency_of(view.visits, self.config.training.frequency_horizon)
+        return LossInputs(render, target, self.state.splats, frequency, self.config.threads)
+
+    def _step_splats(self, render: Render, median_depth: float) -> None:
+        """Adam on the splats that were seen, by the gradients that the backward pass left."""
+        config, log = self.config, self.log
+        if render.backward.refused:
+            text = "gradients of splats that were not finite were set to 0 in the rasterizer's backward pass"
+            log.refuse("gradients", render.backward.refused, text)
+        if render.means2d.grad is not None:
+            gradient = render.means2d.grad.norm(dim=1)
+            self.state.accumulate_means2d(torch.where(torch.isfinite(gradient), gradient, 0.0), render.visible)
+        selective = config.training.selective
+        stepped = render.visible if selective else torch.ones_like(render.visible)
+        groups = optimizer.groups(
+            config.optimizer, median_depth, self.rate, config.training.betas, config.training.kernel
+        )
+        refused = optimizer.step(self.state, stepped, groups, config.optimizer.decay_steps, config.threads or 0)
+        if refused:
+            log.refuse("steps", refused, "steps of splats with gradients that are not finite were refused")
+        if selective:
+            log.skip("splats_unseen", len(self.state) - int(stepped.sum()))
+
+    def _step_camera(self, view: TrainingView, twist: Tensor | None, median_depth: float) -> None:
+        """Adam on the keyframe's exposure and pose, where they are trained."""
+        training = self.config.training
+        if training.exposure:
+            step_exposure(view, training.exposure_rate)
+        if twist is not None and twist.grad is not None:
+            angle = training.pose_rate * self.rate
+            if not step_pose(view, twist.grad.numpy(), angle, angle * median_depth):
+                self.log.refuse("pose_steps", 1, "a step of a keyframe's pose that was not finite was refused")
