@@ -20,6 +20,7 @@ from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from nodes.mapper import Mapper, mapper_config
+from nodes.runtime.parameters import build
 from tests.support.mapper_messages import settings, view_message
 from tests.support.tiny_scene import pose_on_arc
 
@@ -191,16 +192,6 @@ def test_refusals_reach_the_statistics() -> None:
     assert len(node.stats.warnings) == 1
 
 
-@pytest.mark.parametrize("path", sorted((Path(__file__).parent.parent / "launch/conf/mapper").glob("*.yaml")))
-def test_launch_files_name_every_parameter(path: Path) -> None:
-    from dataclasses import fields
-
-    from omegaconf import OmegaConf
-
-    given = set(OmegaConf.load(path)) - {"_target_", "reads"}
-    assert given == {f.name for f in fields(Mapper.Config)}
-
-
 def test_unfiltered_depth_reaches_the_map() -> None:
     node, message = Mapper(settings()), view_message(0, 0.5)
     depth = message.depth.copy()
@@ -224,13 +215,14 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
 
     small = {"iterations": 30, "refinement": 10, "output": str(tmp_path), "seed": 0, "threads": 1}
     chosen: dict[str, Any] = {str(k): v for k, v in OmegaConf.merge(OmegaConf.load(path), small).items()}
-    node = Mapper(Mapper.Config(**{k: v for k, v in chosen.items() if k not in ("_target_", "reads")}))
+    config = build(Mapper.Config, {k: v for k, v in chosen.items() if k not in ("_target_", "reads")})
+    node = Mapper(config)
     for k in range(3):
         list(node.on_fused_keyframe(view_message(7 * k, k / 2)))
     before, after = [m for m in node.on_end() if isinstance(m, SplatMap)]
     assert before.iterations == 90
-    assert after.kernel == chosen["kernel"]
-    assert bool((after.betas != after.betas[0]).any()) == chosen["betas"]
+    assert after.kernel == config.kernel
+    assert bool((after.betas != after.betas[0]).any()) == config.betas
     assert (tmp_path / "map.ply").exists()
     message = view_message(99, 0.25)
     with torch.no_grad():

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from mvsgs_core.devices import resolve_device
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
@@ -44,7 +45,11 @@ class OnlineMapper:
         self.config = config = config or MapperConfig()
         self.log = log or Stats()
         self.corrections = {} if corrections is None else corrections  # newest pose and scale of each keyframe
-        self.state = MapState((config.sh_degree + 1) ** 2, device_of(config.device)) if state is None else state
+        self.state = (
+            MapState((config.sh_degree + 1) ** 2, torch.device(resolve_device(config.device)))
+            if state is None
+            else state
+        )
         self.frame = FrameOfReference()
         self.keyframes = KeyframeStore(config.max_keyframes, config.window, self.log, views or ())
         self.schedule = Schedule(config.window, config.seed)
@@ -213,13 +218,6 @@ class OnlineMapper:
                 "pixels", int((~view.valid).sum()), "pixels that are not finite were left out of the training"
             )
         return view
-
-
-def device_of(name: str) -> torch.device:
-    """A device by its name; auto: the first GPU where PyTorch sees one."""
-    if name == "auto":
-        name = "cuda:0" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)
 
 
 def _median(depth: np.ndarray) -> float:

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvsgs_core.devices import resolve_device
 from mvsgs_core.mapping.checkpoints.images import read_image
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
-from mvsgs_core.mapping.mapper import OnlineMapper, device_of
+from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.stats import Stats
 
 Corrections = dict[int, tuple[np.ndarray, float]]
@@ -103,7 +104,7 @@ def unpack(
     """The mapper that was packed. images: the folder of its keyframes' images. Raises ValueError for damage."""
     if not isinstance(meta, dict):
         raise ValueError("a mapper's part is no object")
-    device = device_of(config.device)
+    device = torch.device(resolve_device(config.device))
     views = _views(arrays.of("views"), meta.get("images"), device, images)
     state = _splats(arrays.of("splats"), (config.sh_degree + 1) ** 2, [view.index for view in views], device)
     mapper = OnlineMapper(config, log, corrections, state, views)
