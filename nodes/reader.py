@@ -19,7 +19,7 @@ class Reader(Node):
 
     @dataclass
     class Config:
-        name: str  # format, one of mvsgs_core.datasets.READERS
+        name: str  # format, a file of mvsgs_core.datasets
         path: str | None = None  # folder or file
         start: int = 0  # first frame of the original sequence
         stop: int | None = None  # frame to stop before; null: the end

@@ -1,15 +1,21 @@
-"""Readers of image sequences: pure, one file a format, all yielding the same `Item`."""
+"""Readers of image sequences: pure, one file a format, all yielding the same `Item`.
+
+A format is a file here whose class is marked with `@dataset`; `dataset=NAME` is the file's name.
+"""
 
 from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Generator, Iterator, Mapping
+import pkgutil
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -35,26 +41,30 @@ class Sequence(Protocol):
     def __iter__(self) -> Iterator[Item]: ...
 
 
-READERS = {
-    "synthetic": "mvsgs_core.datasets.synthetic:Synthetic",
-    "tum": "mvsgs_core.datasets.tum:Tum",
-    "replica": "mvsgs_core.datasets.replica:Replica",
-    "seven_scenes": "mvsgs_core.datasets.seven_scenes:SevenScenes",
-    "icl_nuim": "mvsgs_core.datasets.icl_nuim:IclNuim",
-    "images": "mvsgs_core.datasets.images:Images",
-    "video": "mvsgs_core.datasets.video:Video",
-    "bag": "mvsgs_core.datasets.bag:Bag",
-}
+_READERS: dict[str, type] = {}  # of the files that were imported so far
+
+
+def dataset(reader: type[R]) -> type[R]:
+    """Marks the class that reads the format which its file is named after. Its parameters are the format's options."""
+    _READERS[reader.__module__.rpartition(".")[2]] = reader
+    return reader
+
+
+def formats() -> list[str]:
+    """All there are: what the files of this folder mark."""
+    for name in _files():
+        importlib.import_module(f"{__name__}.{name}")
+    return sorted(_READERS)
 
 
 def check(name: str, **options: Any) -> None:
     """Opens a sequence as `open_dataset` does, reads its first frame where it begins with the file's, and closes it.
 
-    Raises what that raises: so it is known before a run starts whether its input can be read. "synthetic" reads nothing
-    and takes seconds to make, so of it only the options are looked at.
+    Raises what that raises: so it is known before a run starts whether its input can be read. A format without a path
+    reads nothing and may take seconds to make, so of it only the options are looked at.
     """
     reader = _reader(name, options)
-    if name == "synthetic":
+    if "path" not in inspect.signature(reader).parameters:
         return
     try:
         sequence: Sequence = reader(**options)
@@ -76,11 +86,16 @@ def open_dataset(name: str, **options: Any) -> Sequence:
     return sequence
 
 
-def _reader(name: str, options: Mapping[str, Any]) -> Callable[..., Any]:
-    if name not in READERS:
-        raise ValueError(f"no dataset {name!r}; there are: {', '.join(READERS)}")
-    module, _, attribute = READERS[name].partition(":")
-    reader: Callable[..., Any] = getattr(importlib.import_module(module), attribute)
+def _files() -> list[str]:
+    return [module.name for module in pkgutil.iter_modules(__path__)]
+
+
+def _reader(name: str, options: Mapping[str, Any]) -> type:
+    if name in _files():
+        importlib.import_module(f"{__name__}.{name}")
+    if name not in _READERS:
+        raise ValueError(f"no dataset {name!r}; there are: {', '.join(formats())}")
+    reader = _READERS[name]
     signature = inspect.signature(reader)
     try:
         signature.bind(**options)

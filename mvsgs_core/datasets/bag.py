@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
-from mvsgs_core.datasets import Item
+from mvsgs_core.datasets import Item, dataset
 from mvsgs_core.datasets.bag_file import messages, opened_bag
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.files import Layout
-from mvsgs_core.datasets.framing import Framing, Size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.ros import calibrated, lens_of, rgb_of
-from mvsgs_core.datasets.sequence import Notices, same_shape, selection
+from mvsgs_core.datasets.sequence import FileReader, Notices, same_shape
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -32,7 +32,9 @@ _INFO = "sensor_msgs/msg/CameraInfo"
 _NOT_COLOR = ("depth", "infra", "disparity", "mask")
 
 
-class Bag:
+@dataset
+@dataclass(kw_only=True, eq=False)
+class Bag(FileReader):
     """Images of one topic, undistorted, with the time stamps of their headers.
 
     topic: of the images; null takes the only color one. info_topic: of the calibration; null takes the camera_info
@@ -42,42 +44,25 @@ class Bag:
     which say what was expected, BadFileError for a bag that cannot be read or holds no image that can be.
     """
 
-    def __init__(
-        self,
-        path: str | Path | None = None,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Size = None,
-        intrinsics: Sequence[float] | str | None = None,
-        distortion: Sequence[float] = (),
-        topic: str | None = None,
-        info_topic: str | None = None,
-        crop: int | None = None,
-    ) -> None:
-        if path is None or not str(path):
-            raise LAYOUT.missing("no path was given (set dataset.path)")
-        self._path = Path(path).expanduser()
-        if not self._path.exists():
-            raise LAYOUT.missing(f"{self._path} is missing")
-        self._wanted = selection(start, stop, stride)
-        self._framing = Framing(size, crop)
-        self.warnings: list[str] = Notices()
-        self._notices: Notices = self.warnings  # the same list, with its counting
+    topic: str | None = None
+    info_topic: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._path = LAYOUT.present(self.path)
         with opened_bag(self._path) as bag:
-            self._topic = _image_topic(bag, topic)
+            self._topic = _image_topic(bag, self.topic)
             self._count = sum(c.msgcount for c in bag.connections if c.topic == self._topic)
             lens = None
-            if intrinsics is None:
-                intrinsics = "auto"
-                lens = _recorded_lens(bag, self._topic, info_topic, self._notices)
+            if self.intrinsics is None:
+                lens = _recorded_lens(bag, self._topic, self.info_topic, self._notices)
             if lens is None:
-                lens, notes = lens_from_option(intrinsics, distortion, _first_size(bag, self._topic))
+                given = "auto" if self.intrinsics is None else self.intrinsics
+                lens, notes = lens_from_option(given, self.distortion, _first_size(bag, self._topic))
                 self.warnings += notes
             self._lens = lens
-        if start >= self._count:
-            raise ValueError(f"no frame left: {self._topic} has {self._count}, wanted from {start}")
+        if self.start >= self._count:
+            raise ValueError(f"no frame left: {self._topic} has {self._count}, wanted from {self.start}")
         self._opening_warnings = len(self.warnings)
 
     def __len__(self) -> int:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mvsgs_core.datasets.calibration import lens_for_images
+from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.files import Layout, images_in
-from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
+from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
 from mvsgs_core.trajectory_file import read_trajectory
 
 LAYOUT = Layout(
@@ -28,41 +27,31 @@ _FRAME_RATE = 30.0
 _Y_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
+@dataset
+@dataclass(kw_only=True, eq=False)
 class IclNuim(ImageSequence):
     """A trajectory of ICL-NUIM, with the y axes of camera and world turned down, so that the system is right-handed.
 
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
-    def __init__(
-        self,
-        path: str | Path | None = None,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Size = None,
-        intrinsics: Sequence[float] | str | None = None,
-        distortion: Sequence[float] = (),
-    ) -> None:
-        folder = LAYOUT.folder(path)
+    def _find(self) -> Found:
+        folder = LAYOUT.folder(self.path)
         rgb = folder / "rgb"
         images = [p for p in images_in(rgb) if p.stem.isascii() and p.stem.isdecimal()] if rgb.is_dir() else []
         if not images:
             raise LAYOUT.missing(f"{rgb} has no 0.png, 1.png, ...")
-        lens, notes = _PUBLISHED, list[str]()
-        if intrinsics is not None:
-            lens, notes = lens_for_images(intrinsics, distortion, images)
-        poses, pose_notes = _poses(folder)
+        lens = self._lens(images, _PUBLISHED)
+        poses, notes = _poses(folder)
+        self.warnings += notes
         records = [
             Record(int(p.stem) / _FRAME_RATE, p, lens, poses.get(int(p.stem)), folder / "depth" / f"{p.stem}.png")
             for p in images
         ]
         missing = sum(record.world_from_cam is None for record in records)
         if missing and poses:
-            pose_notes.append(f"{missing} of {len(records)} images have no true pose")
-        super().__init__(records, start=start, stop=stop, stride=stride, size=size, depth_format=_DEPTH)
-        self.warnings += notes + pose_notes
+            self.warnings.append(f"{missing} of {len(records)} images have no true pose")
+        return Found(records, _DEPTH)
 
 
 def _mirror(pose: np.ndarray) -> np.ndarray:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from mvsgs_core.bad_file import BadFileError
-from mvsgs_core.datasets.calibration import image_size, lens_for_images, lens_from_option
+from mvsgs_core.datasets import dataset
+from mvsgs_core.datasets.calibration import image_size, lens_from_option
 from mvsgs_core.datasets.colmap import find_colmap, read_colmap
 from mvsgs_core.datasets.exif import read_exif_lens
 from mvsgs_core.datasets.files import IMAGE_SUFFIXES, Layout, images_in, natural_order
-from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model
-from mvsgs_core.datasets.sequence import ImageSequence, Record
+from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
 from mvsgs_core.datasets.strecha import find_strecha, read_strecha
 from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transforms
 
@@ -26,6 +26,8 @@ LAYOUT = Layout(
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
 
 
+@dataset
+@dataclass(kw_only=True, eq=False)
 class Images(ImageSequence):
     """Images in natural order, undistorted where the distortion is known.
 
@@ -37,37 +39,40 @@ class Images(ImageSequence):
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
-    def __init__(
-        self,
-        path: str | Path | None = None,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Size = None,
-        intrinsics: Sequence[float] | str | None = None,
-        distortion: Sequence[float] = (),
-        model: str | Path | None = None,
-        rate: float = 30.0,
-        crop: int | None = None,
-    ) -> None:
-        if rate <= 0:
-            raise ValueError(f"rate is a positive number of images per second, got {rate}")
-        if intrinsics is not None and model is not None:
+    model: str | Path | None = None
+    rate: float = 30.0
+
+    def _find(self) -> Found:
+        if self.rate <= 0:
+            raise ValueError(f"rate is a positive number of images per second, got {self.rate}")
+        if self.intrinsics is not None and self.model is not None:
             raise ValueError("give intrinsics or model, not both: a model has its own intrinsics")
-        folder = LAYOUT.folder(path)
+        folder = LAYOUT.folder(self.path)
         images = _find_images(folder)
-        notes: list[str] = []
-        found = None if intrinsics is not None else _find_model(folder, images, model)
-        if found is not None:
-            records = _from_model(found, folder, images, rate, notes)
-        else:
-            lenses = _lenses(images, intrinsics, distortion, notes)
-            records = [Record(i / rate, image, lens) for i, (image, lens) in enumerate(zip(images, lenses))]
-        super().__init__(
-            records, start=start, stop=stop, stride=stride, size=size, crop=crop, turn_upright=found is None
+        model = None if self.intrinsics is not None else _find_model(folder, images, self.model)
+        if model is not None:
+            return Found(_from_model(model, folder, images, self.rate, self.warnings), turn_upright=False)
+        lenses = self._lenses(images)
+        return Found([Record(i / self.rate, image, lens) for i, (image, lens) in enumerate(zip(images, lenses))])
+
+    def _lenses(self, images: list[Path]) -> list[Lens]:
+        if self.intrinsics is not None:
+            return [self._given_lens(images, self.intrinsics)] * len(images)
+        found = [read_exif_lens(image) for image in images]
+        known = [lens for lens in found if lens is not None]
+        if not known:
+            lens, warnings = lens_from_option("auto", self.distortion, image_size(images))
+            where = f"{images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal lengths"
+            self.warnings += [f"no calibration for {where} were found", *warnings]
+            return [lens] * len(images)
+        self.warnings.append(
+            f"intrinsics are from EXIF: focal length {known[0].intrinsics[0]:.0f} pixels for "
+            f"{known[0].size[1]}x{known[0].size[0]}, good to a few percent, distortion unknown"
         )
-        self.warnings += notes
+        if len(known) < len(images):
+            without = len(images) - len(known)
+            self.warnings.append(f"images without an EXIF focal length, which take the first one's: {without}")
+        return [lens if lens is not None else known[0] for lens in found]
 
 
 def _find_images(folder: Path) -> list[Path]:
@@ -121,26 +126,3 @@ def _from_model(model: Model, folder: Path, images: list[Path], rate: float, not
         consequence = "they have no true pose" if common is not None else "left out, their camera is unknown"
         notes.append(f"images that the {model.kind} does not know, {consequence}: {len(unknown)} (first: {unknown[0]})")
     return records
-
-
-def _lenses(
-    images: list[Path], intrinsics: Sequence[float] | str | None, distortion: Sequence[float], notes: list[str]
-) -> list[Lens]:
-    if intrinsics is not None:
-        lens, warnings = lens_for_images(intrinsics, distortion, images)
-        notes += warnings
-        return [lens] * len(images)
-    found = [read_exif_lens(image) for image in images]
-    known = [lens for lens in found if lens is not None]
-    if not known:
-        lens, warnings = lens_from_option("auto", distortion, image_size(images))
-        where = f"{images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal lengths were found"
-        notes += [f"no calibration for {where}", *warnings]
-        return [lens] * len(images)
-    notes.append(
-        f"intrinsics are from EXIF: focal length {known[0].intrinsics[0]:.0f} pixels for "
-        f"{known[0].size[1]}x{known[0].size[0]}, good to a few percent, distortion unknown"
-    )
-    if len(known) < len(images):
-        notes.append(f"images without an EXIF focal length, which take the first one's: {len(images) - len(known)}")
-    return [lens if lens is not None else known[0] for lens in found]

@@ -5,18 +5,17 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
-from mvsgs_core.datasets.calibration import lens_for_images
+from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.files import Layout, natural_order, read_numbers
-from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import is_rigid
-from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
+from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
 
 LAYOUT = Layout(
     "Replica (NICE-SLAM layout)",
@@ -29,30 +28,21 @@ _DEPTH_PER_METER = 6553.5
 _FRAME_RATE = 30.0  # the set has no timestamps
 
 
+@dataset
+@dataclass(kw_only=True, eq=False)
 class Replica(ImageSequence):
     """A room of Replica. Raises FileNotFoundError and ValueError, which say what was expected."""
 
-    def __init__(
-        self,
-        path: str | Path | None = None,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Size = None,
-        intrinsics: Sequence[float] | str | None = None,
-        distortion: Sequence[float] = (),
-    ) -> None:
-        folder = LAYOUT.folder(path)
+    def _find(self) -> Found:
+        folder = LAYOUT.folder(self.path)
         images = [p for p in (folder / "results").glob("frame*.*") if re.search(r"[0-9]", p.stem)]
         images.sort(key=lambda p: natural_order(p.name))
         if not images:
             raise LAYOUT.missing(f"{folder / 'results'} has no frame000000.jpg")
-        lens, per_meter = _camera(folder)
-        notes: list[str] = []
-        if intrinsics is not None:
-            lens, notes = lens_for_images(intrinsics, distortion, images)
-        poses, pose_notes = _poses(folder / "traj.txt")
+        published, per_meter = _camera(folder)
+        lens = self._lens(images, published)
+        poses, notes = _poses(folder / "traj.txt")
+        self.warnings += notes
         records = []
         for image in images:
             digits = re.sub(r"[^0-9]", "", image.stem)
@@ -61,9 +51,8 @@ class Replica(ImageSequence):
             records.append(Record(number / _FRAME_RATE, image, lens, pose, image.with_name(f"depth{digits}.png")))
         missing = sum(record.world_from_cam is None for record in records)
         if missing and len(poses):
-            pose_notes.append(f"traj.txt has no pose for {missing} of {len(records)} frames")
-        super().__init__(records, start=start, stop=stop, stride=stride, size=size, depth_format=DepthFormat(per_meter))
-        self.warnings += notes + pose_notes
+            self.warnings.append(f"traj.txt has no pose for {missing} of {len(records)} frames")
+        return Found(records, DepthFormat(per_meter))
 
 
 def _camera(folder: Path) -> tuple[Lens, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import Item
+from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import UnreadableImageError, read_depth, read_image
 from mvsgs_core.datasets.framing import Framing, Size
 from mvsgs_core.datasets.lens import Lens
@@ -68,46 +70,74 @@ def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
     return abs(a[0] * b[1] - a[1] * b[0]) <= 0.01 * a[1] * b[0]
 
 
-class ImageSequence:
-    """Frames in files, read when asked for. A file that can't be read is left out with a warning, and it goes on.
+@dataclass(kw_only=True, eq=False)
+class FileReader:
+    """What every reader of files takes, `dataset.NAME` in a configuration.
 
-    records: all frames of the original sequence, in order. start, stop, stride: the frames wanted of them.
-    size, crop: see `Framing`. turn_upright: whether the calibration is for the image as EXIF says it should be shown.
-    Raises ValueError for options that make no sense and where nothing is selected, BadFileError while iterating where
-    not one image can be read.
+    size, crop: see `Framing`. Raises ValueError for options that make no sense.
     """
 
-    def __init__(
-        self,
-        records: Sequence[Record],
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Size = None,
-        crop: int | None = None,
-        depth_format: DepthFormat | None = None,
-        turn_upright: bool = True,
-    ) -> None:
-        self.records = list(records)[selection(start, stop, stride)]
-        if not self.records:
-            raise ValueError(f"no frame left: the sequence has {len(records)}, wanted from {start} to {stop}")
+    path: str | Path | None = None  # folder or file
+    start: int = 0  # first frame of the original sequence
+    stop: int | None = None  # frame to stop before; None: the end
+    stride: int = 1  # every which frame
+    size: Size = None
+    intrinsics: Sequence[float] | str | None = None  # [fx, fy, cx, cy] in pixels of the original image, or "auto"
+    distortion: Sequence[float] = ()  # with intrinsics, as in OpenCV
+    crop: int | None = None
+
+    def __post_init__(self) -> None:
+        self._wanted = selection(self.start, self.stop, self.stride)
+        self._framing = Framing(self.size, self.crop)
         self.warnings: list[str] = Notices()
         self._notices: Notices = self.warnings  # the same list, with its counting
-        self._framing = Framing(size, crop)
-        self._depth_format = depth_format
-        self._turn_upright = turn_upright
-        self._passes = 0
-        self._opening_warnings = 0
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a reader of image files finds: all frames of the original sequence, in order."""
+
+    records: Sequence[Record]
+    depth_format: DepthFormat | None = None  # None: there are no depth maps
+    turn_upright: bool = True  # whether the calibration is for the image as EXIF says it should be shown
+
+
+@dataclass(kw_only=True, eq=False)
+class ImageSequence(FileReader, ABC):
+    """Frames in files, read when asked for. A file that can't be read is left out with a warning, and it goes on.
+
+    Raises FileNotFoundError and ValueError, which say what was expected, ValueError where nothing is selected too, and
+    BadFileError while iterating where not one image can be read.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        found = self._find()
+        self.records = list(found.records)[self._wanted]
+        if not self.records:
+            count = len(found.records)
+            raise ValueError(f"no frame left: the sequence has {count}, wanted from {self.start} to {self.stop}")
+        self._depth_format, self._turn_upright = found.depth_format, found.turn_upright
+        self._opening_warnings = len(self.warnings)
+
+    @abstractmethod
+    def _find(self) -> Found:
+        """What there is; warnings go to `self.warnings`."""
+
+    def _lens(self, images: Sequence[Path], published: Lens) -> Lens:
+        """The lens that was given, else the `published` one."""
+        return published if self.intrinsics is None else self._given_lens(images, self.intrinsics)
+
+    def _given_lens(self, images: Sequence[Path], intrinsics: Sequence[float] | str) -> Lens:
+        lens, notes = lens_for_images(intrinsics, self.distortion, images)
+        self.warnings += notes
+        return lens
 
     def __len__(self) -> int:
         """Frames selected; those that turn out unreadable are not delivered."""
         return len(self.records)
 
     def __iter__(self) -> Iterator[Item]:
-        if self._passes == 0:
-            self._opening_warnings = len(self._notices)
-        self._passes += 1
         self._notices.truncate(self._opening_warnings)
         index = 0
         first: tuple[int, int] | None = None  # size on disk of the first image
@@ -150,7 +180,7 @@ class ImageSequence:
             depth = self._framing.depth(depth, lens, size)
         return Item(index, record.timestamp, framed, intrinsics, record.world_from_cam, depth, lens.guessed)
 
-    def registered(self, depth: np.ndarray) -> np.ndarray:
+    def _registered(self, depth: np.ndarray) -> np.ndarray:
         """The depth map (h, w) as the color camera would see it: of most sets it is already."""
         return depth
 
@@ -166,7 +196,7 @@ class ImageSequence:
         except UnreadableImageError as error:
             self._notices.tally("depth maps that could not be read, so that depth is not scored there", str(error))
             return None
-        depth = self.registered(depth)
+        depth = self._registered(depth)
         if not same_shape((depth.shape[0], depth.shape[1]), native):
             self._notices.tally(
                 "depth maps left out because they have another aspect ratio than their image", record.image.name

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.camera import project, unproject
-from mvsgs_core.datasets.calibration import lens_for_images
+from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.files import Layout, natural_order, read_numbers
-from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import is_rigid
-from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
+from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
 
 LAYOUT = Layout(
     "7-Scenes",
@@ -37,6 +36,8 @@ _FRAME_RATE = 30.0  # the set has no timestamps
 _DEPTH = DepthFormat(per_unit=1000.0, invalid=(0, 65535))
 
 
+@dataset
+@dataclass(kw_only=True, eq=False)
 class SevenScenes(ImageSequence):
     """A sequence of 7-Scenes.
 
@@ -46,30 +47,18 @@ class SevenScenes(ImageSequence):
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
-    def __init__(
-        self,
-        path: str | Path | None = None,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Size = None,
-        intrinsics: Sequence[float] | str | None = None,
-        distortion: Sequence[float] = (),
-        sequence: str | None = None,
-        registered: bool = True,
-    ) -> None:
-        folder = _sequence_folder(LAYOUT.folder(path), sequence)
+    sequence: str | None = None
+    registered: bool = True
+
+    def _find(self) -> Found:
+        folder = _sequence_folder(LAYOUT.folder(self.path), self.sequence)
         images = [p for p in folder.glob("frame-*.color.*") if re.search(r"[0-9]", p.name.split(".")[0])]
         images.sort(key=lambda p: natural_order(p.name))
         if not images:
             raise LAYOUT.missing(f"{folder} has no frame-*.color.png")
         self._depth_camera = _find_depth_camera(folder)
-        color, notes = (_COLOR_CAMERA if registered else self._depth_camera), list[str]()
-        if intrinsics is not None:
-            color, notes = lens_for_images(intrinsics, distortion, images)
+        color = self._lens(images, _COLOR_CAMERA if self.registered else self._depth_camera)
         self._color_camera = color
-        self._registered = registered
         records = []
         without_pose = []
         for image in images:
@@ -77,18 +66,17 @@ class SevenScenes(ImageSequence):
             pose = _read_pose(folder / f"{stem}.pose.txt")
             if pose is None:
                 without_pose.append(stem)
-            elif registered:
+            elif self.registered:
                 pose[:3, 3] += pose[:3, 0] * _BASELINE
             number = int(re.sub(r"[^0-9]", "", stem))
             records.append(Record(number / _FRAME_RATE, image, color, pose, folder / f"{stem}.depth.png"))
-        super().__init__(records, start=start, stop=stop, stride=stride, size=size, depth_format=_DEPTH)
-        self.warnings += notes
         if without_pose:
             text = f"{len(without_pose)} of {len(images)} frames have no true pose (first: {without_pose[0]})"
             self.warnings.append(text)
+        return Found(records, _DEPTH)
 
-    def registered(self, depth: np.ndarray) -> np.ndarray:
-        if not self._registered:
+    def _registered(self, depth: np.ndarray) -> np.ndarray:
+        if not self.registered:
             return depth
         size = depth.shape[0], depth.shape[1]
         return register(depth, self._depth_camera.at(size), self._color_camera.at(size), _BASELINE)

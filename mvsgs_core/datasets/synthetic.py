@@ -11,7 +11,7 @@ import numpy as np
 from ..scene.difficulties import Difficulties, DifficultPath, Sensor
 from ..scene.renderer import Rendering
 from ..scene.stage import SCENES, stage
-from . import Item
+from . import Item, dataset
 
 FPS = 20.0
 FOCAL = 0.8  # of the image's width: a field of view of 64 degrees
@@ -19,6 +19,7 @@ SUB_FRAMES = 8  # averaged over one exposure
 STRIP = 8  # rows that are read out at once
 
 
+@dataset
 class Synthetic:
     """A sequence through the room or over the landscape."""
 

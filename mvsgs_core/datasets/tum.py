@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mvsgs_core.bad_file import reading
+from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import Layout, inside
-from mvsgs_core.datasets.framing import Size
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.sequence import DepthFormat, ImageSequence, Record
+from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
 from mvsgs_core.geometry import interpolate
 from mvsgs_core.trajectory_file import LATEST, read_trajectory
 
@@ -34,6 +34,8 @@ CALIBRATION_FILE = "camera.txt"  # our own addition: `fx fy cx cy [distortion]` 
 _DEPTH = DepthFormat(per_unit=5000.0)
 
 
+@dataset
+@dataclass(kw_only=True, eq=False)
 class Tum(ImageSequence):
     """A folder in TUM RGB-D layout, undistorted.
 
@@ -46,34 +48,35 @@ class Tum(ImageSequence):
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
-    def __init__(
-        self,
-        path: str | Path | None = None,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Size = None,
-        intrinsics: Sequence[float] | str | None = None,
-        distortion: Sequence[float] = (),
-        camera: str | None = None,
-        crop: int | None = None,
-        max_difference: float = 0.02,
-    ) -> None:
-        folder = LAYOUT.folder(path)
+    camera: str | None = None
+    max_difference: float = 0.02
+
+    def _find(self) -> Found:
+        folder = LAYOUT.folder(self.path)
         images = _read_list(folder, LAYOUT.file(folder / "rgb.txt"))
         if not images:
             raise LAYOUT.missing(f"{folder / 'rgb.txt'} lists no image")
         times = np.array([t for t, _ in images])
-        found, notes = _find_lens(folder, [image for _, image in images], camera, intrinsics, distortion)
-        depth_of = _depth_maps(folder, times, max_difference)
-        poses, pose_notes = _poses(folder, times, max_difference)
-        records = [Record(time, image, found, poses.get(i), depth_of.get(i)) for i, (time, image) in enumerate(images)]
-        super().__init__(
-            records, start=start, stop=stop, stride=stride, size=size, crop=crop,
-            depth_format=_DEPTH if depth_of else None,
-        )  # fmt: skip
-        self.warnings += notes + pose_notes
+        lens = self._camera(folder, [image for _, image in images])
+        depth_of = _depth_maps(folder, times, self.max_difference)
+        poses, notes = _poses(folder, times, self.max_difference)
+        self.warnings += notes
+        records = [Record(time, image, lens, poses.get(i), depth_of.get(i)) for i, (time, image) in enumerate(images)]
+        return Found(records, _DEPTH if depth_of else None)
+
+    def _camera(self, folder: Path, images: list[Path]) -> Lens:
+        calibration = folder / CALIBRATION_FILE
+        if self.intrinsics is not None:
+            return self._given_lens(images, self.intrinsics)
+        if self.camera is not None:
+            if self.camera not in CAMERAS:
+                raise ValueError(f"camera is one of {', '.join(CAMERAS)}, got {self.camera!r}")
+            return CAMERAS[self.camera]
+        if calibration.is_file():
+            with reading(calibration, "must hold `fx fy cx cy` and perhaps the distortion"):
+                values = [float(v) for v in calibration.read_text(encoding="utf-8").split("#")[0].split()]
+                return lens_for_images(values[:4], values[4:], images)[0]  # no guess, so no warning
+        return _published(folder)
 
 
 def nearest(wanted: np.ndarray, available: np.ndarray, max_difference: float) -> dict[int, int]:
@@ -102,34 +105,18 @@ def _read_list(folder: Path, path: Path) -> list[tuple[float, Path]]:
     return sorted(entries)
 
 
-def _find_lens(
-    folder: Path,
-    images: list[Path],
-    camera: str | None,
-    intrinsics: Sequence[float] | str | None,
-    distortion: Sequence[float],
-) -> tuple[Lens, list[str]]:
-    if intrinsics is not None:
-        return lens_for_images(intrinsics, distortion, images)
-    if camera is not None:
-        if camera not in CAMERAS:
-            raise ValueError(f"camera is one of {', '.join(CAMERAS)}, got {camera!r}")
-        return CAMERAS[camera], []
-    calibration = folder / CALIBRATION_FILE
-    if calibration.is_file():
-        with reading(calibration, "must hold `fx fy cx cy` and perhaps the distortion"):
-            values = [float(v) for v in calibration.read_text(encoding="utf-8").split("#")[0].split()]
-            return lens_for_images(values[:4], values[4:], images)
+def _published(folder: Path) -> Lens:
+    """Of the camera that the folder's name or the header of its true poses names."""
     header = folder / "groundtruth.txt"
     head = header.read_text(errors="replace")[:400] if header.is_file() else ""
     for text in (folder.name, folder.resolve().name, head):
         match = re.search(r"(?:freiburg|fr)([123])(?!\d)", text)
         if match:
-            return CAMERAS[f"freiburg{match[1]}"], []
+            return CAMERAS[f"freiburg{match[1]}"]
     raise ValueError(
         f"the name of {folder} does not tell which camera took it: set dataset.options.camera to one of "
         f"{', '.join(CAMERAS)}, or dataset.intrinsics=[fx,fy,cx,cy] (and dataset.distortion), "
-        f"or write them into {calibration}"
+        f"or write them into {folder / CALIBRATION_FILE}"
     )
 
 

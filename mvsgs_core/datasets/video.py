@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, brief, reading
-from mvsgs_core.datasets import Item
+from mvsgs_core.datasets import Item, dataset
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.files import Layout
-from mvsgs_core.datasets.framing import Framing, Size
-from mvsgs_core.datasets.sequence import Notices, same_shape, selection
+from mvsgs_core.datasets.sequence import FileReader, same_shape
 
 LAYOUT = Layout(
     "A video",
@@ -28,7 +27,9 @@ _MAX_COUNT = 2**40  # frames: more is no count
 _GAP_FRAMES, _GAP_SHARE = 2, 0.01
 
 
-class Video:
+@dataset
+@dataclass(kw_only=True, eq=False)
+class Video(FileReader):
     """Frames of a video file, undistorted, with the container's timestamps.
 
     intrinsics: [fx, fy, cx, cy] in pixels of the video's frames, or "auto": 65 degrees across the longer side, for the
@@ -37,30 +38,14 @@ class Video:
     Raises FileNotFoundError and ValueError, which say what was expected, BadFileError for a file that has no frame.
     """
 
-    def __init__(
-        self,
-        path: str | Path | None = None,
-        *,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Size = None,
-        intrinsics: Sequence[float] | str | None = None,
-        distortion: Sequence[float] = (),
-        crop: int | None = None,
-    ) -> None:
-        if path is None or not str(path):
-            raise LAYOUT.missing("no path was given (set dataset.path)")
-        self._path = LAYOUT.file(Path(path).expanduser())
-        if intrinsics is None:
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._path = LAYOUT.file(LAYOUT.present(self.path))
+        if self.intrinsics is None:
             raise ValueError(
                 "a video does not say what camera took it: set dataset.intrinsics=[fx,fy,cx,cy] in pixels of its "
                 "frames, or dataset.intrinsics=auto to have the focal length estimated"
             )
-        self._wanted = selection(start, stop, stride)
-        self._framing = Framing(size, crop)
-        self.warnings: list[str] = Notices()
-        self._notices: Notices = self.warnings  # the same list, with its counting
         capture = self._open()
         with reading(self._path, "cannot be decoded"):
             read, frame = capture.read()
@@ -68,13 +53,13 @@ class Video:
         capture.release()
         if not read:
             raise BadFileError(f"{self._path} opens but has no frame: it is damaged, or no video")
-        self._lens, notes = lens_from_option(intrinsics, distortion, (frame.shape[0], frame.shape[1]))
+        self._lens, notes = lens_from_option(self.intrinsics, self.distortion, (frame.shape[0], frame.shape[1]))
         self._native = frame.shape[0], frame.shape[1]
         self._count = int(count) if 0 < count < _MAX_COUNT else 0
         self._rate = rate if math.isfinite(rate) and 0 < rate < 1000 else _DEFAULT_RATE
         self.warnings += notes
-        if self._count and start >= self._count:
-            raise ValueError(f"no frame left: {self._path.name} has {self._count}, wanted from {start}")
+        if self._count and self.start >= self._count:
+            raise ValueError(f"no frame left: {self._path.name} has {self._count}, wanted from {self.start}")
         if self._rate != rate:
             self.warnings.append(f"{self._path.name} gives no frame rate: {_DEFAULT_RATE:.0f} per second assumed")
         self._opening_warnings = len(self.warnings)
