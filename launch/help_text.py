@@ -94,7 +94,10 @@ def _columns(left: str, right: str) -> list[str]:
     width = min(max(shutil.get_terminal_size((MAX_WIDTH, 24)).columns, MIN_WIDTH), MAX_WIDTH)
     wrapped = textwrap.wrap(right, width - COMMENT_COLUMN) or [""]
     if len(left) >= COMMENT_COLUMN:
-        return [left, *(" " * COMMENT_COLUMN + line for line in wrapped)]
+        return [
+            *textwrap.wrap(left, width, initial_indent="  ", subsequent_indent="    "),
+            *(" " * COMMENT_COLUMN + line for line in wrapped),
+        ]
     return [f"{left:{COMMENT_COLUMN}}{wrapped[0]}".rstrip(), *(" " * COMMENT_COLUMN + line for line in wrapped[1:])]
 
 

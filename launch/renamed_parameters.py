@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import is_dataclass
 from typing import Any, get_type_hints
 
 from launch.refusal import GraphError
+from nodes.runtime.parameters import nested_in
 
 RENAMED: Mapping[str, str] = {
     "tracker.keyframe_share": "tracker.keyframe_fraction",
     "tracker.readout": "tracker.readout_time",
     "tracker.unroll": "tracker.rectify_rolling_shutter",
-    "mvs.best_views": "mvs.top_k",
-    "mvs.least_cells": "mvs.min_cells",
+    "mvs.neighbors": "mvs.neighbors.count",
+    "mvs.best_views": "mvs.cost.top_k",
+    "mvs.paths": "mvs.smoothing.paths",
+    "mvs.range_margin": "mvs.ranges.margin",
+    "mvs.least_cells": "mvs.ranges.min_cells",
+    "mvs.skip_cells": "mvs.pruning.outside_cells",
     "depth_fusion.least_views": "depth_fusion.min_views",
     "depth_fusion.rim": "depth_fusion.discontinuity_radius",
     "mapper.density": "mapper.kernel",
@@ -48,8 +52,8 @@ def _given(values: Any, path: list[str]) -> bool:
 def _takes(config: Any, path: list[str]) -> bool:
     """Whether the node's dataclass has that parameter after all: a node of one's own may."""
     for key in path:
-        hints = get_type_hints(config) if is_dataclass(config) else {}
+        hints = {} if config is None else get_type_hints(config)
         if key not in hints:
             return False
-        config = hints[key]
-    return not is_dataclass(config)
+        config = nested_in(hints[key])
+    return config is None

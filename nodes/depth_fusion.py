@@ -104,42 +104,11 @@ class FusionNode(Node, ABC):
 class DepthFusion(FusionNode):
     """Geometric consistency and temporal refinement; see mvsgs_core.fusion."""
 
-    @dataclass
-    class Config:
-        lag: int = 2  # keyframes after the reference that are waited for
-        window: int = 4  # keyframes before the reference that may be neighbors
-        neighbors: int = 6  # depth maps that a reference is checked with
-        refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
-        sigma: float = 0.01  # relative depth: width of the support
-        check: bool = True  # geometric consistency
-        relative: float = 0.02  # relative depth difference that still agrees
-        round_trip: bool = False  # check by projecting back, instead of the paper's one way
-        min_views: int = 2  # views that must agree, the reference counted
-        confidence: float = 0.795  # least confidence of a kept pixel: lower fills more, with more outliers
-        discontinuity_radius: int = 3  # pixels: nothing is kept that close to something farther; 0: off
-        speckle: int = 100  # pixels: patches up to this size are not kept; 0: off
-        device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
-        threads: int | None = None  # of the C++ kernels; null: all
+    @dataclass(frozen=True)
+    class Config(FusionConfig):
+        pass
 
     config: Config
 
     def _make_fusion(self) -> Fusion:
-        c = self.config
-        return Fusion(
-            FusionConfig(
-                lag=c.lag,
-                window=c.window,
-                neighbors=c.neighbors,
-                refine=c.refine,
-                sigma=c.sigma,
-                check=c.check,
-                relative=c.relative,
-                round_trip=c.round_trip,
-                min_views=c.min_views,
-                confidence=c.confidence,
-                discontinuity_radius=c.discontinuity_radius,
-                speckle=c.speckle,
-                device=c.device,
-                threads=c.threads,
-            )
-        )
+        return Fusion(self.config)

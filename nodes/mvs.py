@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from msgs import Depth, Keyframe, Poses
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth, OnlineStereo
-from mvsgs_core.mvs.hypotheses import RangeConfig
-from mvsgs_core.mvs.neighbors import NeighborConfig
-from mvsgs_core.mvs.stereo import Stage
 from nodes import Node
 
 
@@ -99,39 +96,11 @@ class StereoNode(Node, ABC):
 class Mvs(StereoNode):
     """Plane-sweep cascade without weights; see mvsgs_core.mvs."""
 
-    @dataclass
-    class Config:
-        area: int = 320 * 240  # pixels of a depth map, aspect kept
-        lag: int = 2  # keyframes after the reference that are waited for
-        window: int = 8  # keyframes before the reference that may be neighbors
-        neighbors: int = 4  # views that a reference is matched with
-        top_k: int = 3  # of these, per pixel and hypothesis: the others may be occluded
-        stages: list[dict[str, Any]] = field(default_factory=list)  # of the cascade, empty: the defaults of the core
-        paths: Literal[4, 8] = 8  # directions of the smoothing
-        range_margin: float = 1.6  # factor beyond the 2nd and 98th percentile of the tracker's inverse depths
-        min_cells: int = 24  # valid cells of the tracker's grid; with fewer, its neighbors' give the range
-        skip_cells: bool = True  # hypotheses that the tracker's depths around rule out
-        device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
-        threads: int | None = None  # of the C++ kernels; null: all
+    @dataclass(frozen=True)
+    class Config(CascadeConfig):
         resume_after: int | None = None  # keyframes up to this frame are in a resumed map: neighbors of others only
 
     config: Config
 
     def _make_stereo(self) -> Cascade:
-        c = self.config
-        base = CascadeConfig()
-        return Cascade(
-            CascadeConfig(
-                area=c.area,
-                lag=c.lag,
-                window=c.window,
-                device=c.device,
-                threads=c.threads,
-                neighbors=NeighborConfig(count=c.neighbors),
-                ranges=RangeConfig(margin=c.range_margin, min_cells=c.min_cells),
-                stages=tuple(Stage(**stage) for stage in c.stages) or base.stages,
-                cost=replace(base.cost, top_k=c.top_k),
-                smoothing=replace(base.smoothing, paths=c.paths),
-                pruning=replace(base.pruning, outside_cells=c.skip_cells),
-            )
-        )
+        return Cascade(self.config)

@@ -13,7 +13,7 @@ from nodes.depth_fusion import DepthFusion
 class SlowFusion(DepthFusion):
     """Waits after each depth map for `factor` - 1 times as long as it has taken."""
 
-    @dataclass
+    @dataclass(frozen=True)
     class Config(DepthFusion.Config):
         factor: float = 10.0  # times as slow
 

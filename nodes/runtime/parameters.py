@@ -54,8 +54,8 @@ def build(config: type[T], given: Mapping[str, Any], where: str = "", base: T | 
                 wanted = type_name(hints[name])
                 raise ParameterError(f"{path} must be given: {_owner(config)} has no default for it ({wanted})")
             values[name] = default
-        elif is_dataclass(hints[name]) and is_dataclass(default) and isinstance(given[name], Mapping):
-            values[name] = build(hints[name], given[name], path, default)  # the rest as it is here, not as in general
+        elif (nested := nested_in(hints[name])) and isinstance(default, nested) and isinstance(given[name], Mapping):
+            values[name] = build(nested, given[name], path, default)  # the rest as it is here, not as in general
         else:
             values[name] = convert(given[name], hints[name], path)
     try:
@@ -90,10 +90,17 @@ def parameters(config: type, where: str = "", base: Any = None) -> Iterator[Para
     hints = typing.get_type_hints(config)
     for field in fields(config):
         path, annotation, default = _path(where, field.name), hints[field.name], _default(field, base)
-        if isinstance(annotation, type) and is_dataclass(annotation):
-            yield from parameters(annotation, path, None if default is MISSING else default)
+        nested = nested_in(annotation)
+        if nested is not None and (nested is annotation or isinstance(default, nested)):
+            yield from parameters(nested, path, None if default is MISSING else default)
         elif field.init:
             yield Parameter(path, config, field.name, annotation, plain_values(default))
+
+
+def nested_in(annotation: Any) -> type | None:
+    """The dataclass that a parameter is, or may be beside null; None where it is none."""
+    members = [member for member in typing.get_args(annotation) if member is not type(None)] or [annotation]
+    return members[0] if len(members) == 1 and isinstance(members[0], type) and is_dataclass(members[0]) else None
 
 
 def describe(config: type) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -14,6 +16,7 @@ from bench.pieces import Pieces
 from bench.runs import CONF, Matrix, Run
 from nodes.mapper import Mapper
 from nodes.mvs import Mvs
+from nodes.runtime.parameters import parameters
 
 
 @pytest.fixture
@@ -80,13 +83,22 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
         config = OmegaConf.to_container(OmegaConf.load(CONF / "variant" / f"{name}.yaml"))
         assert isinstance(config, dict)
         chosen = [key for choice in config.pop("defaults", []) if isinstance(choice, dict) for key in choice]
-        return {f"{slot}.{key}" for slot in config for key in config[slot]} | {k.split("/")[-1] for k in chosen}
+        return set(paths(config)) | {k.split("/")[-1] for k in chosen}
+
+    def paths(values: Any, where: str = "") -> Iterator[str]:
+        for key, value in values.items():
+            if isinstance(value, dict):
+                yield from paths(value, f"{where}{key}.")
+            else:
+                yield f"{where}{key}"
 
     switched = set().union(*(keys(name) for name in ablation.TABLE_III + ablation.SKIPS + ablation.OTHERS))
     switches = {f"mapper.{f.name}" for f in dataclasses.fields(Mapper.Config) if isinstance(f.default, bool)}
     switches -= {"mapper.keep_checkpoint", "mapper.save_images"}  # what is written beside the map
-    switches |= {f"mvs.{f.name}" for f in dataclasses.fields(Mvs.Config) if f.name.startswith("skip_")}
-    assert {"mapper.skip_converged", "mvs.skip_cells"} <= switches
+    stereo = [parameter for parameter in parameters(Mvs.Config, "mvs") if isinstance(parameter.default, bool)]
+    switches |= {parameter.path for parameter in stereo if parameter.path.startswith("mvs.pruning.")}
+    switches -= {"mvs.pruning.outside_range"}  # what it leaves out cannot be chosen
+    assert {"mapper.skip_converged", "mvs.pruning.outside_cells"} <= switches
     assert switches <= switched
     others = ("voxel", "map_voxel", "map_voxel_error", "fill", "density_control", "kernel", "loss", "sh_degree")
     assert {f"mapper.{name}" for name in others} <= switched
