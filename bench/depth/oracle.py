@@ -20,6 +20,8 @@ import numpy as np
 from bench.depth.data import Scene
 from bench.table import Row
 from mvsgs_core.fusion.backend import NativeFusionBackend
+from mvsgs_core.fusion.interface import FuseOptions
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.hypotheses import SearchRange
 from mvsgs_core.mvs.keyframe import StereoKeyframe
@@ -109,16 +111,19 @@ def _warp(reference: StereoKeyframe, neighbor: StereoKeyframe) -> np.ndarray:
 
 def _carried(view: StereoKeyframe, truth: np.ndarray, neighbors: list[_Neighbor]) -> np.ndarray:
     """Ratio of depth (P,) of the neighbor that fits best; P is 0 where no neighbor has true depth."""
-    maps = [(neighbor, depth) for neighbor, depth in neighbors if depth is not None]
+    maps = [_with_depth(neighbor, depth) for neighbor, depth in neighbors if depth is not None]
     if not maps:
         return np.ones(0)
-    depths = np.stack([depth for _, depth in maps])
-    back = np.array([_warp(neighbor, view) for neighbor, _ in maps], dtype=np.float32)
-    splatted = NativeFusionBackend(1).splat(depths, np.ones_like(depths), back, 0.0, view.size)
+    all_of_it = FuseOptions(sigma=0.01, violation=1.0, min_neighbor_confidence=0.0)
+    splatted = NativeFusionBackend(1).splat(depth_maps(_with_depth(view, truth), maps), all_of_it)
     reached = (truth > 0) & (splatted > 0).any(axis=0)
     ratios = np.where(splatted > 0, splatted / np.where(truth > 0, truth, 1.0), np.inf)[:, reached]
     best = np.abs(ratios - 1.0).argmin(axis=0)
     return np.asarray(np.take_along_axis(ratios, best[None], axis=0)[0])
+
+
+def _with_depth(view: StereoKeyframe, depth: np.ndarray) -> KeyframeDepth:
+    return KeyframeDepth(view.index, depth, np.ones_like(depth), view.intrinsics, view.world_from_cam, view.scale)
 
 
 def _corners(view: StereoKeyframe, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

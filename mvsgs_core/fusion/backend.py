@@ -2,64 +2,45 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from mvsgs_core import native
 from mvsgs_core.devices import resolve_device
-from mvsgs_core.fusion.interface import Fused, FusionBackend
+from mvsgs_core.fusion.interface import DepthMaps, Fused, FuseOptions, FusionBackend
 
 
 class NativeFusionBackend:
     """The C++ kernels; `threads` None: all that OpenMP has."""
 
     def __init__(self, threads: int | None = None) -> None:
-        self._kernels = native.load("mvs")
+        self._kernels = native.load("fusion")
         self._threads = threads or 0
 
-    def consistent_views(
-        self,
-        depth: np.ndarray,
-        neighbor_depths: np.ndarray,
-        warps: np.ndarray,
-        back: np.ndarray,
-        relative: float,
-        pixels: float,
-        round_trip: bool,
-    ) -> np.ndarray:
+    def consistent_views(self, maps: DepthMaps, relative: float, pixels: float, round_trip: bool) -> np.ndarray:
+        options = self._kernels.ConsistencyOptions(relative, pixels, round_trip, self._threads)
         return np.asarray(
-            self._kernels.consistent_views(
-                depth, neighbor_depths, warps, back, relative, pixels, round_trip, threads=self._threads
-            )
+            self._kernels.consistent_views(maps.depth, maps.neighbor_depths, maps.there, maps.back, options)
         )
 
-    def splat(
-        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, min_neighbor_confidence: float,
-        size: tuple[int, int],
-    ) -> np.ndarray:  # fmt: skip
+    def splat(self, maps: DepthMaps, options: FuseOptions) -> np.ndarray:
         return np.asarray(
             self._kernels.splat_depths(
-                depths, confidences, back, min_neighbor_confidence, size[0], size[1], threads=self._threads
+                maps.neighbor_depths, maps.neighbor_confidences, maps.back, *maps.depth.shape, self._options(options)
             )
         )
 
-    def fuse(
-        self,
-        depth: np.ndarray,
-        confidence: np.ndarray,
-        neighbor_depths: np.ndarray,
-        neighbor_confidences: np.ndarray,
-        splatted: np.ndarray,
-        warps: np.ndarray,
-        sigma: float,
-        violation: float,
-        min_neighbor_confidence: float,
-    ) -> Fused:
+    def fuse(self, maps: DepthMaps, splatted: np.ndarray, options: FuseOptions) -> Fused:
         return Fused(
             *self._kernels.fuse_depth(
-                depth, confidence, neighbor_depths, neighbor_confidences, splatted, warps, sigma, violation,
-                min_neighbor_confidence, threads=self._threads,
+                maps.depth, maps.confidence, maps.neighbor_depths, maps.neighbor_confidences, splatted, maps.there,
+                self._options(options),
             )
         )  # fmt: skip
+
+    def _options(self, options: FuseOptions) -> Any:
+        return self._kernels.FuseOptions(**vars(options), threads=self._threads)
 
 
 def make_fusion_backend(device: str, threads: int | None = None) -> FusionBackend:

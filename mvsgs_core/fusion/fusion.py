@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,8 +11,8 @@ from mvsgs_core import geometry
 from mvsgs_core.fusion.backend import make_fusion_backend
 from mvsgs_core.fusion.confidence import features_of, probability_of_inlier
 from mvsgs_core.fusion.filters import discontinuity_mask, speckle_mask
-from mvsgs_core.fusion.interface import FusionBackend
-from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, warps_between
+from mvsgs_core.fusion.interface import FuseOptions, FusionBackend
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.keyframe_window import KeyframeWindow
 
@@ -128,21 +128,15 @@ def fuse(
     evidence: np.ndarray | None = None
     counts: dict[str, float] = {"pixels": float(depth.size), "known": float(known.sum())}
     if neighbors:
-        there, back = warps_between(reference, neighbors)
-        depths = np.ascontiguousarray(np.stack([n.depth for n in neighbors]))
-        confidences = np.ascontiguousarray(np.stack([n.confidence for n in neighbors]))
+        maps = depth_maps(reference, neighbors)
         if config.refine:
-            splatted = backend.splat(depths, confidences, back, config.min_neighbor_confidence, reference.size)
-            fused = backend.fuse(
-                depth, confidence, depths, confidences, splatted, there, config.sigma, config.violation,
-                config.min_neighbor_confidence,
-            )  # fmt: skip
+            options = FuseOptions(config.sigma, config.violation, config.min_neighbor_confidence)
+            fused = backend.fuse(maps, backend.splat(maps, options), options)
             depth = fused.depth
-        consistent = backend.consistent_views(
-            depth, depths, there, back, config.relative, config.pixels, config.round_trip
-        )
+            maps = replace(maps, depth=depth)
+        consistent = backend.consistent_views(maps, config.relative, config.pixels, config.round_trip)
         if config.refine:
-            seeing = backend.consistent_views(depth, depths, there, back, ANY_DEPTH, config.pixels, False)
+            seeing = backend.consistent_views(maps, ANY_DEPTH, config.pixels, False)
             evidence = features_of(fused, confidence, consistent, seeing)
             confidence = np.where(depth > 0, probability_of_inlier(evidence), 0.0).astype(np.float32)
     keep = depth > 0

@@ -18,19 +18,31 @@ class Fused:
     own: np.ndarray  # the reference's confidence, weighted by agreement
 
 
-class FusionBackend(Protocol):
-    """Depths (H, W) and (N, h, w), warps (N, 12), all float32; 0 in a depth is unknown."""
+@dataclass(frozen=True)
+class FuseOptions:
+    """How depths support and contradict each other."""
 
-    def consistent_views(
-        self,
-        depth: np.ndarray,
-        neighbor_depths: np.ndarray,
-        warps: np.ndarray,
-        back: np.ndarray,
-        relative: float,
-        pixels: float,
-        round_trip: bool,
-    ) -> np.ndarray:
+    sigma: float  # relative depth: width of the support
+    violation: float  # weight of free-space violations against support
+    min_neighbor_confidence: float  # a neighbor's pixel below takes no part
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """A reference's map and its neighbors', all float32; 0 in a depth is unknown."""
+
+    depth: np.ndarray  # (H, W)
+    confidence: np.ndarray  # (H, W)
+    neighbor_depths: np.ndarray  # (N, h, w)
+    neighbor_confidences: np.ndarray  # (N, h, w)
+    there: np.ndarray  # (N, 12) warps from the reference into each neighbor: see mvsgs_core.warp
+    back: np.ndarray  # (N, 12) and back
+
+
+class FusionBackend(Protocol):
+    """The steps of fusion over depth maps."""
+
+    def consistent_views(self, maps: DepthMaps, relative: float, pixels: float, round_trip: bool) -> np.ndarray:
         """(H, W) uint8: neighbors that agree with the reference's depth.
 
         MVS-GS, geometric consistency: the reference's point, projected into the neighbor, against the depth there,
@@ -38,22 +50,8 @@ class FusionBackend(Protocol):
         `pixels` of where it started, and its depth within `relative`.
         """
 
-    def splat(
-        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, min_neighbor_confidence: float,
-        size: tuple[int, int],
-    ) -> np.ndarray:  # fmt: skip
+    def splat(self, maps: DepthMaps, options: FuseOptions) -> np.ndarray:
         """(N, H, W): the neighbors' pixels as depths in the reference, the nearest where several fall."""
 
-    def fuse(
-        self,
-        depth: np.ndarray,
-        confidence: np.ndarray,
-        neighbor_depths: np.ndarray,
-        neighbor_confidences: np.ndarray,
-        splatted: np.ndarray,
-        warps: np.ndarray,
-        sigma: float,
-        violation: float,
-        min_neighbor_confidence: float,
-    ) -> Fused:
+    def fuse(self, maps: DepthMaps, splatted: np.ndarray, options: FuseOptions) -> Fused:
         """The best of the reference's depth and the splatted ones by support - violation, refined by its supporters."""

@@ -1,4 +1,4 @@
-"""A keyframe's depth map as fusion stores it, and the warps between such maps."""
+"""A keyframe's depth map as fusion stores it, and what a back end computes with such maps."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mvsgs_core.fusion.interface import DepthMaps
 from mvsgs_core.warp import relative_warp
 
 
@@ -32,12 +33,19 @@ class KeyframeDepth:
         return replace(self, world_from_cam=world_from_cam, scale=float(scale), depth=self.depth * factor)
 
 
-def warps_between(reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> tuple[np.ndarray, np.ndarray]:
-    """(there (N, 12), back (N, 12)) float32: from the reference into each neighbor, and back."""
-    there = [
-        relative_warp(reference.intrinsics, reference.world_from_cam, n.intrinsics, n.world_from_cam) for n in neighbors
-    ]
-    back = [
-        relative_warp(n.intrinsics, n.world_from_cam, reference.intrinsics, reference.world_from_cam) for n in neighbors
-    ]
-    return np.array(there, dtype=np.float32), np.array(back, dtype=np.float32)
+def depth_maps(reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> DepthMaps:
+    """What a back end computes with; at least one neighbor, all of one size."""
+    there = [_warp(reference, n) for n in neighbors]
+    back = [_warp(n, reference) for n in neighbors]
+    return DepthMaps(
+        depth=reference.depth,
+        confidence=reference.confidence,
+        neighbor_depths=np.ascontiguousarray(np.stack([n.depth for n in neighbors])),
+        neighbor_confidences=np.ascontiguousarray(np.stack([n.confidence for n in neighbors])),
+        there=np.array(there, dtype=np.float32),
+        back=np.array(back, dtype=np.float32),
+    )
+
+
+def _warp(a: KeyframeDepth, b: KeyframeDepth) -> np.ndarray:
+    return relative_warp(a.intrinsics, a.world_from_cam, b.intrinsics, b.world_from_cam)

@@ -1,4 +1,4 @@
-"""The fusion kernels in PyTorch, for a GPU: the same mathematics as mvsgs_core/csrc/mvs, compared by tests."""
+"""The fusion kernels in PyTorch, for a GPU: the same mathematics as mvsgs_core/csrc/fusion, compared by tests."""
 
 from __future__ import annotations
 
@@ -7,27 +7,18 @@ import torch
 from torch import Tensor
 
 from mvsgs_core.devices import TorchTwin
-from mvsgs_core.fusion.interface import Fused
+from mvsgs_core.fusion.interface import DepthMaps, Fused, FuseOptions
 
 
 class TorchFusionBackend(TorchTwin):
     """Runs on `device`, a torch device such as "cuda" or "cpu"; arrays in and out are numpy."""
 
     @torch.no_grad()
-    def consistent_views(
-        self,
-        depth: np.ndarray,
-        neighbor_depths: np.ndarray,
-        warps: np.ndarray,
-        back: np.ndarray,
-        relative: float,
-        pixels: float,
-        round_trip: bool,
-    ) -> np.ndarray:
-        z = self._on(depth)
+    def consistent_views(self, maps: DepthMaps, relative: float, pixels: float, round_trip: bool) -> np.ndarray:
+        z = self._on(maps.depth)
         u, v = _pixels(z.shape, self.device)
         count = torch.zeros(z.shape, dtype=torch.uint8, device=self.device)
-        for map_, there, home in zip(self._on(neighbor_depths), self._on(warps), self._on(back)):
+        for map_, there, home in zip(self._on(maps.neighbor_depths), self._on(maps.there), self._on(maps.back)):
             x, y, seen_depth, front = _project(there, u, v, z)
             at, inside = _nearest(x, y, map_.shape)
             found = map_.reshape(-1)[at]
@@ -43,37 +34,26 @@ class TorchFusionBackend(TorchTwin):
         return count.cpu().numpy()
 
     @torch.no_grad()
-    def splat(
-        self, depths: np.ndarray, confidences: np.ndarray, back: np.ndarray, min_neighbor_confidence: float,
-        size: tuple[int, int],
-    ) -> np.ndarray:  # fmt: skip
-        result = torch.full((len(depths), size[0] * size[1]), torch.inf, device=self.device)
-        for i, (z, c, warp) in enumerate(zip(self._on(depths), self._on(confidences), self._on(back))):
+    def splat(self, maps: DepthMaps, options: FuseOptions) -> np.ndarray:
+        size = (maps.depth.shape[0], maps.depth.shape[1])
+        result = torch.full((len(maps.back), size[0] * size[1]), torch.inf, device=self.device)
+        depths, confidences = self._on(maps.neighbor_depths), self._on(maps.neighbor_confidences)
+        for i, (z, c, warp) in enumerate(zip(depths, confidences, self._on(maps.back), strict=True)):
             u, v = _pixels(z.shape, self.device)
             x, y, depth, front = _project(warp, u, v, z)
             at, inside = _nearest(x, y, size)
-            use = (z > 0) & (c >= min_neighbor_confidence) & front & inside
+            use = (z > 0) & (c >= options.min_neighbor_confidence) & front & inside
             result[i].scatter_reduce_(0, at[use], depth[use], reduce="amin")
         result[torch.isinf(result)] = 0.0
-        return result.reshape(len(depths), *size).cpu().numpy()
+        return result.reshape(-1, *size).cpu().numpy()
 
     @torch.no_grad()
-    def fuse(
-        self,
-        depth: np.ndarray,
-        confidence: np.ndarray,
-        neighbor_depths: np.ndarray,
-        neighbor_confidences: np.ndarray,
-        splatted: np.ndarray,
-        warps: np.ndarray,
-        sigma: float,
-        violation: float,
-        min_neighbor_confidence: float,
-    ) -> Fused:
-        own_depth = self._on(depth)
+    def fuse(self, maps: DepthMaps, splatted: np.ndarray, options: FuseOptions) -> Fused:
+        own_depth, sigma = self._on(maps.depth), options.sigma
         known = own_depth > 0
-        own_confidence = torch.where(known, self._on(confidence), torch.zeros_like(own_depth))
-        maps, sure, there = self._on(neighbor_depths), self._on(neighbor_confidences), self._on(warps)
+        own_confidence = torch.where(known, self._on(maps.confidence), torch.zeros_like(own_depth))
+        depths, sure = self._on(maps.neighbor_depths), self._on(maps.neighbor_confidences)
+        there = self._on(maps.there)
         u, v = _pixels(own_depth.shape, self.device)
         tolerance, zero = 3.0 * sigma, torch.zeros_like(own_depth)
         best = {"score": torch.full_like(own_depth, -1e9), "depth": zero, "for": zero, "against": zero, "own": zero}
@@ -87,18 +67,18 @@ class TorchFusionBackend(TorchTwin):
             weights = from_own.clone()
             inverse = torch.where(known, from_own / torch.where(known, own_depth, safe), zero)
             support = zero.clone()
-            for map_, c_map, warp in zip(maps, sure, there):
+            for map_, c_map, warp in zip(depths, sure, there, strict=True):
                 x, y, expected, front = _project(warp, u, v, safe)
                 at, inside = _nearest(x, y, map_.shape)
                 found, c = map_.reshape(-1)[at], c_map.reshape(-1)[at]
-                use = valid & front & inside & (found > 0) & (c >= min_neighbor_confidence)
+                use = valid & front & inside & (found > 0) & (c >= options.min_neighbor_confidence)
                 off = torch.where(use, (found - expected) / torch.where(use, expected, safe), zero)
                 weight = torch.where(use, c * torch.exp(-0.5 * (off / sigma) ** 2), zero)
                 support += weight
                 weights += weight
                 inverse += torch.where(use, weight / (safe * (1.0 + off)), zero)
                 against += torch.where(use & (off > tolerance), c, zero)
-            score = support + from_own - violation * against
+            score = support + from_own - options.violation * against
             better = valid & (score > best["score"])
             refined = torch.where(inverse > 0, weights / torch.where(inverse > 0, inverse, safe), safe)
             new = {"score": score, "depth": refined, "for": support, "against": against, "own": from_own}

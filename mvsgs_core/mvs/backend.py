@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from mvsgs_core import native
@@ -21,59 +23,43 @@ class NativeBackend:
         self, images: MatchingImages, first: np.ndarray, step: np.ndarray, hypotheses: int, radius: int,
         cost: CostConfig, needed: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
+        options = self._cost_options(radius, cost)
         return np.asarray(
-            self._kernels.cost_volume(
-                images.reference, images.neighbors, images.warps, first, step, hypotheses, radius, cost.top_k,
-                cost.noise, cost.contrast, cost.intensity_weight, cost.intensity_range, threads=self._threads,
-                needed=needed,
-            )
+            self._kernels.cost_volume(**vars(images), first=first, step=step, hypotheses=hypotheses, options=options,
+                                      needed=needed)
         )  # fmt: skip
 
     def surface_costs(
         self, images: MatchingImages, surfaces: np.ndarray, radius: int, cost: CostConfig,
         needed: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
+        options = self._cost_options(radius, cost)
         return np.asarray(
-            self._kernels.surface_costs(
-                images.reference, images.neighbors, images.warps, surfaces, radius, cost.top_k, cost.noise,
-                cost.contrast, cost.intensity_weight, cost.intensity_range, threads=self._threads, needed=needed,
-            )
-        )  # fmt: skip
+            self._kernels.surface_costs(**vars(images), surfaces=surfaces, options=options, needed=needed)
+        )
 
     def semi_global(
         self, cost: np.ndarray, reference: np.ndarray, first: np.ndarray, step: np.ndarray, p1: float, p2: float,
         smoothing: SmoothingConfig,
     ) -> SurfaceEstimate:  # fmt: skip
-        return SurfaceEstimate(
-            *self._kernels.semi_global(
-                cost, reference, first, step, p1, p2, smoothing.edge, smoothing.break_steps, smoothing.temperature,
-                smoothing.paths, threads=self._threads,
-            )
-        )  # fmt: skip
+        options = self._kernels.SmoothOptions(p1=p1, p2=p2, **vars(smoothing), threads=self._threads)
+        return SurfaceEstimate(*self._kernels.semi_global(cost, reference, first, step, options))
 
     def choose_surface(
         self, cost: np.ndarray, surfaces: np.ndarray, reference: np.ndarray, options: ChooseOptions
     ) -> tuple[np.ndarray, np.ndarray]:
-        best, gap = self._kernels.choose_surface(
-            cost, surfaces, reference, options.p1, options.p2, options.edge, options.apart, threads=self._threads
-        )
+        given = self._kernels.ChooseOptions(**vars(options), threads=self._threads)
+        best, gap = self._kernels.choose_surface(cost, surfaces, reference, given)
         return np.asarray(best), np.asarray(gap)
 
     def view_correlation(
         self, images: MatchingImages, inverse_depth: np.ndarray, radius: int, cost: CostConfig
     ) -> np.ndarray:
-        return np.asarray(
-            self._kernels.view_correlation(
-                images.reference,
-                images.neighbors,
-                images.warps,
-                inverse_depth,
-                radius,
-                cost.noise,
-                cost.contrast,
-                threads=self._threads,
-            )
-        )
+        options = self._cost_options(radius, cost)
+        return np.asarray(self._kernels.view_correlation(**vars(images), inverse_depth=inverse_depth, options=options))
+
+    def _cost_options(self, radius: int, cost: CostConfig) -> Any:
+        return self._kernels.CostOptions(**vars(cost), radius=radius, threads=self._threads)
 
 
 def make_backend(device: str, threads: int | None = None) -> Backend:

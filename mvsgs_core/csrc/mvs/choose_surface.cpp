@@ -7,10 +7,10 @@
 #include <cstring>
 #include <vector>
 
-#include "lanes.hpp"
-#include "stereo.hpp"
+#include "mvs/lanes.hpp"
+#include "mvs/mvs.hpp"
 
-namespace stereo {
+namespace mvs {
 namespace {
 
 // (D, R, C) volumes: rows are visited in order, the pixels of a row are independent.
@@ -154,4 +154,4 @@ void choose_surface(const float* cost, const float* surfaces, int count, int hei
     select(down.data(), surfaces, count, pixels, o.apart, best, gap);
 }
 
-}  // namespace stereo
+}  // namespace mvs

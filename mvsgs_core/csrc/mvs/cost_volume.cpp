@@ -1,35 +1,27 @@
-// Matching cost of a plane or surface sweep: warp, ZNCC in adaptive windows, mean over the best views.
+// A plane or surface sweep: warp, match in adaptive windows, mean over the best views.
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 
-#include "lanes.hpp"
-#include "stereo.hpp"
-#include "windows.hpp"
+#include <memory>
+#include <vector>
 
-namespace stereo {
+#include <omp.h>
+
+#include "mvs/matching_cost.hpp"
+#include "mvs/mvs.hpp"
+#include "mvs/windows.hpp"
+#include "mvs/zncc.hpp"
+
+namespace mvs {
 namespace {
 
 constexpr int kMaxBest = 8;
 
-// Columns [from, to) of some rows.
-struct Columns {
-    int from, to;
-    Columns wider(int by, int width) const { return {std::max(from - by, 0), std::min(to + by, width)}; }
-};
-
-// What a thread works in. Rows are as long as the windows' blocks together; `stride`: of samples.
-struct Scratch {
-    int padded, stride;
-    std::vector<float> sample, seen, correlation, mean, variance, best;
-    Scratch(const Windows& w, int top_k)
-        : padded(w.blocks * Windows::kBlock), stride(padded + 2 * w.radius),
-          sample(static_cast<std::size_t>(stride) * (kBand + 2 * w.radius), 0.0f),
-          seen(static_cast<std::size_t>(padded) * (kBand + 2 * w.radius), 0.0f), correlation(padded), mean(padded),
-          variance(padded), best(static_cast<std::size_t>(padded) * kBand * top_k) {}
-};
+// Rows are as long as the windows' blocks together.
+int padded_width(int width) { return (width + Windows::kBlock - 1) / Windows::kBlock * Windows::kBlock; }
 
 // Where a row's pixels lie in the neighbor: the upper left of the four pixels around each, and the others' shares. The
 // four come in two pairs, each one load: gathers are slow, and many instruction sets have none.
@@ -54,21 +46,25 @@ struct Footprints {
     }
 };
 
-// Rows [begin, end) of the reference, one hypothesis, one neighbor: samples, in rows padded by `pad` on both sides,
-// and whether the neighbor sees them, in `s`.
-void warp_rows(const float* neighbor, int nh, int nw, const Warp& warp, int begin, int end, int width, Columns columns,
-               const float* first, const float* step, float k, int pad, Scratch& s) {
+// What neighbor n shows of rows [begin, end) of the reference, as far as there are such, at one hypothesis.
+void warp_rows(const Images& images, int n, int begin, int end, Columns columns, const float* first, const float* step,
+               float k, NeighborRows& there) {
+    const float* neighbor = images.neighbor(n);
+    const int nh = images.neighbor_height, nw = images.neighbor_width, width = images.width;
+    begin = std::max(begin, 0);
+    end = std::min(end, images.height);
+    there.begin = begin;
     const float max_x = static_cast<float>(nw - 1), max_y = static_cast<float>(nh - 1);
     const int last_x = nw - 2, last_y = nh - 2;
-    const Warp t = warp;
+    const Warp t = images.warps[n];
     Footprints found;
     for (int y = begin; y < end; ++y) {
         const float v = static_cast<float>(y);
         const float cx = t.m[1] * v + t.m[2], cy = t.m[4] * v + t.m[5], cz = t.m[7] * v + t.m[8];
         const float* f = first + static_cast<std::size_t>(y) * width;
         const float* per = step + static_cast<std::size_t>(y) * width;
-        float* out = s.sample.data() + static_cast<std::size_t>(y - begin) * s.stride + pad;
-        float* ok = s.seen.data() + static_cast<std::size_t>(y - begin) * s.padded;
+        float* out = there.sample.data() + static_cast<std::size_t>(y - begin) * there.stride + there.radius;
+        float* ok = there.seen.data() + static_cast<std::size_t>(y - begin) * there.padded;
         for (int block = columns.from; block < columns.to; block += Footprints::kBlock) {
             const int count = std::min(Footprints::kBlock, columns.to - block);
 #pragma omp simd
@@ -97,55 +93,12 @@ void warp_rows(const float* neighbor, int nh, int nw, const Warp& warp, int begi
     }
 }
 
-// ZNCC of row y against the samples, -2 where the neighbor does not see the pixel, and the samples' mean in each
-// window: in `s`, from the first of the columns to the end of the last one's vector.
-void correlate_row(const Windows& windows, int y, int y0, int begin, int height, Columns columns, float noise,
-                   Scratch& s) {
-    const int radius = windows.radius, side = 2 * radius + 1, row = y - y0;
-    const int up = std::max(-radius, -y), down = std::min(radius, height - 1 - y);
-    const float *mean_i = windows.mean_row(row), *var_i = windows.variance_row(row);
-    for (int x = columns.from; x < columns.to; x += kLanes) {
-        const float* w = windows.weights(row, x / Windows::kBlock) + x % Windows::kBlock;
-        w += static_cast<std::ptrdiff_t>(up + radius) * side * Windows::kBlock;
-        Lanes sum{}, square{}, product{};  // in registers through all taps
-        for (int dy = up; dy <= down; ++dy) {
-            const float* there = s.sample.data() + static_cast<std::size_t>(y + dy - begin) * s.stride + radius + x;
-            const float* here = windows.gray_row(row + dy) + x;
-            for (int dx = -radius; dx <= radius; ++dx, w += Windows::kBlock) {
-                const Lanes value = load(there + dx), weighted = load(w) * value;
-                sum += weighted;
-                square += weighted * value;
-                product += weighted * load(here + dx);
-            }
-        }
-        const Lanes variance = square - sum * sum;
-        store(&s.mean[x], sum);
-        store(&s.variance[x], (variance > 0.0f ? variance : Lanes{}) + noise);
-        store(&s.correlation[x], product - load(mean_i + x) * sum);
-    }
-    const float *seen = s.seen.data() + static_cast<std::size_t>(y - begin) * s.padded, *variance = s.variance.data();
-    float* correlation = s.correlation.data();
+// Keeps the `best` smallest costs of each pixel of a row, ascending; slots is [best][padded]. What is not seen costs 1.
+void insert_cost(const float* seen, Columns columns, int best, int padded, float* cost, float* slots) {
 #pragma omp simd
-    for (int x = columns.from; x < columns.to; ++x) {
-        const float c = correlation[x] / std::sqrt(var_i[x] * variance[x]);
-        correlation[x] = seen[x] > 0.0f ? c : -2.0f;
-    }
-}
-
-// Turns a row's correlation into costs, with the mean gray levels of both windows, and keeps the `best` smallest of
-// each pixel, ascending; slots is [best][padded].
-void insert_cost(const float* mean, Columns columns, const CostOptions& o, int best, Scratch& s, float* slots) {
-    const float level = o.level, sharpness = 1.0f / o.level_range;
-    const float* mean_there = s.mean.data();
-    float* cost = s.correlation.data();
-#pragma omp simd
-    for (int x = columns.from; x < columns.to; ++x) {
-        const float shape = std::min(std::max(1.0f - cost[x], 0.0f), 1.0f);
-        const float apart = std::min(std::fabs(mean[x] - mean_there[x]) * sharpness, 1.0f);
-        cost[x] = cost[x] < -1.5f ? 1.0f : shape + level * (apart - shape);
-    }
+    for (int x = columns.from; x < columns.to; ++x) cost[x] = seen[x] > 0.0f ? cost[x] : 1.0f;
     for (int j = 0; j < best; ++j) {
-        float* slot = slots + static_cast<std::size_t>(j) * s.padded;
+        float* slot = slots + static_cast<std::size_t>(j) * padded;
 #pragma omp simd
         for (int x = columns.from; x < columns.to; ++x) {
             const float lower = std::min(slot[x], cost[x]);
@@ -180,49 +133,54 @@ struct Hypotheses {
     float factor;
 };
 
-// cost (H, D, W) of the hypotheses: see cost_volume.
-void sweep(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views, int nh,
-           int nw, const Hypotheses& h, const std::uint8_t* needed, const CostOptions& o, float* cost) {
-    const int best = std::min({o.best, views, kMaxBest});
-    const float share = 1.0f / static_cast<float>(best);
+// cost (H, D, W) of `count` hypotheses: see cost_volume.
+void sweep(const Images& images, const Hypotheses& h, int count, const std::uint8_t* needed, const CostOptions& o,
+           float* cost) {
+    const int height = images.height, width = images.width, views = images.views;
+    const int best = std::min({o.top_k, views, kMaxBest});
+    const float mean = 1.0f / static_cast<float>(best);
     const int bands = (height + kBand - 1) / kBand, tiles = (width + kTileColumns - 1) / kTileColumns;
+    const int padded = padded_width(width);
+    const MakeCost make = find_cost(o.name);
+    std::vector<std::unique_ptr<MatchingCost>> matching;  // here: what options without sense raise cannot leave a thread
+    for (int i = 0; i < o.threads; ++i) matching.push_back(make(o, padded));
 #pragma omp parallel num_threads(o.threads)
     {
+        MatchingCost& match = *matching[omp_get_thread_num()];
         Windows windows(width, o.radius);
-        Scratch s(windows, best);
+        NeighborRows there(padded, o.radius);
+        std::vector<float> row(padded), lowest(static_cast<std::size_t>(padded) * kBand * best);
+        const auto slots_of = [&](int band_row) {
+            return lowest.data() + static_cast<std::size_t>(band_row) * padded * best;
+        };
         std::vector<Columns> runs;
 #pragma omp for schedule(dynamic)
         for (int band = 0; band < bands; ++band) {
             const int y0 = band * kBand, y1 = std::min(y0 + kBand, height);
-            const int begin = std::max(y0 - o.radius, 0), end = std::min(y1 + o.radius, height);
-            windows.prepare(reference, height, y0, y1, o.contrast, o.noise);
-            for (int k = 0; k < o.hypotheses; ++k) {
-                const std::size_t at = (static_cast<std::size_t>(band) * o.hypotheses + k) * tiles;
+            windows.prepare(images.reference, height, y0, y1, o.contrast, o.noise);
+            for (int k = 0; k < count; ++k) {
+                const std::size_t at = (static_cast<std::size_t>(band) * count + k) * tiles;
                 runs_of(needed == nullptr ? nullptr : needed + at, tiles, width, runs);
+                const auto out_of = [&](int y) { return cost + (static_cast<std::size_t>(y) * count + k) * width; };
                 if (needed != nullptr)
-                    for (int y = y0; y < y1; ++y) {
-                        float* out = cost + (static_cast<std::size_t>(y) * o.hypotheses + k) * width;
-                        std::fill(out, out + width, 1.0f);
-                    }
+                    for (int y = y0; y < y1; ++y) std::fill_n(out_of(y), width, 1.0f);
                 for (const Columns& run : runs) {
-                    std::fill(s.best.begin(), s.best.end(), 1.0f);
+                    std::fill(lowest.begin(), lowest.end(), 1.0f);
                     for (int n = 0; n < views; ++n) {
-                        warp_rows(neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n], begin, end,
-                                  width, run.wider(o.radius, width), h.first + k * h.stride, h.step,
-                                  h.factor * static_cast<float>(k), o.radius, s);
+                        warp_rows(images, n, y0 - o.radius, y1 + o.radius, run.wider(o.radius, width),
+                                  h.first + k * h.stride, h.step, h.factor * static_cast<float>(k), there);
                         for (int y = y0; y < y1; ++y) {
-                            correlate_row(windows, y, y0, begin, height, run, o.noise, s);
-                            insert_cost(windows.mean_row(y - y0), run, o, best, s,
-                                        s.best.data() + static_cast<std::size_t>(y - y0) * s.padded * best);
+                            match.row(windows, there, y, run, row.data());
+                            insert_cost(there.seen_row(y), run, best, padded, row.data(), slots_of(y - y0));
                         }
                     }
                     for (int y = y0; y < y1; ++y) {
-                        const float* slots = s.best.data() + static_cast<std::size_t>(y - y0) * s.padded * best;
-                        float* out = cost + (static_cast<std::size_t>(y) * o.hypotheses + k) * width;
-                        for (int x = run.from; x < run.to; ++x) out[x] = slots[x] * share;
+                        const float* slots = slots_of(y - y0);
+                        float* out = out_of(y);
+                        for (int x = run.from; x < run.to; ++x) out[x] = slots[x] * mean;
                         for (int j = 1; j < best; ++j) {
-                            slots += s.padded;
-                            for (int x = run.from; x < run.to; ++x) out[x] += slots[x] * share;
+                            slots += padded;
+                            for (int x = run.from; x < run.to; ++x) out[x] += slots[x] * mean;
                         }
                     }
                 }
@@ -233,46 +191,42 @@ void sweep(const float* reference, int height, int width, const float* neighbors
 
 }  // namespace
 
-void cost_volume(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
-                 int nh, int nw, const float* first, const float* step, const std::uint8_t* needed,
-                 const CostOptions& o, float* cost) {
-    sweep(reference, height, width, neighbors, warps, views, nh, nw, {first, 0, step, 1.0f}, needed, o, cost);
+void cost_volume(const Images& images, const float* first, const float* step, int hypotheses,
+                 const std::uint8_t* needed, const CostOptions& o, float* cost) {
+    sweep(images, {first, 0, step, 1.0f}, hypotheses, needed, o, cost);
 }
 
-void surface_costs(const float* reference, int height, int width, const float* neighbors, const Warp* warps, int views,
-                   int nh, int nw, const float* surfaces, const std::uint8_t* needed,
+void surface_costs(const Images& images, const float* surfaces, int count, const std::uint8_t* needed,
                    const CostOptions& o, float* cost) {
-    const std::size_t pixels = static_cast<std::size_t>(height) * width;
+    const std::size_t pixels = static_cast<std::size_t>(images.height) * images.width;
     const std::vector<float> step(pixels, 0.0f);
-    sweep(reference, height, width, neighbors, warps, views, nh, nw, {surfaces, pixels, step.data(), 0.0f}, needed, o,
-          cost);
+    sweep(images, {surfaces, pixels, step.data(), 0.0f}, count, needed, o, cost);
 }
 
-void view_correlation(const float* reference, int height, int width, const float* neighbors, const Warp* warps,
-                      int views, int nh, int nw, const float* inverse_depth, const CostOptions& o,
-                      float* correlation) {
+void view_correlation(const Images& images, const float* inverse_depth, const CostOptions& o, float* correlation) {
+    const int height = images.height, width = images.width;
     const std::vector<float> step(static_cast<std::size_t>(height) * width, 0.0f);
-    const int bands = (height + kBand - 1) / kBand;
+    const int bands = (height + kBand - 1) / kBand, padded = padded_width(width);
 #pragma omp parallel num_threads(o.threads)
     {
         Windows windows(width, o.radius);
-        Scratch s(windows, 1);
+        NeighborRows there(padded, o.radius);
+        Correlation found(padded);
 #pragma omp for schedule(dynamic)
         for (int band = 0; band < bands; ++band) {
             const int y0 = band * kBand, y1 = std::min(y0 + kBand, height);
-            const int begin = std::max(y0 - o.radius, 0), end = std::min(y1 + o.radius, height);
-            windows.prepare(reference, height, y0, y1, o.contrast, o.noise);
-            for (int n = 0; n < views; ++n) {
-                warp_rows(neighbors + static_cast<std::size_t>(n) * nh * nw, nh, nw, warps[n], begin, end, width,
-                          {0, width}, inverse_depth, step.data(), 0.0f, o.radius, s);
+            windows.prepare(images.reference, height, y0, y1, o.contrast, o.noise);
+            for (int n = 0; n < images.views; ++n) {
+                warp_rows(images, n, y0 - o.radius, y1 + o.radius, {0, width}, inverse_depth, step.data(), 0.0f, there);
                 for (int y = y0; y < y1; ++y) {
-                    correlate_row(windows, y, y0, begin, height, {0, width}, o.noise, s);
-                    std::copy_n(s.correlation.data(), width,
-                                correlation + (static_cast<std::size_t>(n) * height + y) * width);
+                    found.row(windows, there, y, {0, width}, o.noise);
+                    const float *value = found.value.data(), *seen = there.seen_row(y);
+                    float* out = correlation + (static_cast<std::size_t>(n) * height + y) * width;
+                    for (int x = 0; x < width; ++x) out[x] = seen[x] > 0.0f ? value[x] : -2.0f;
                 }
             }
         }
     }
 }
 
-}  // namespace stereo
+}  // namespace mvs

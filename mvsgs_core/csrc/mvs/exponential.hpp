@@ -3,7 +3,7 @@
 #include <bit>
 #include <cstdint>
 
-namespace stereo {
+namespace mvs {
 
 // e^x of x <= 0, to 1e-6 of itself; the library's function keeps loops around it from being vectorized.
 inline float exponential(float x) {
@@ -20,4 +20,4 @@ inline float exponential(float x) {
     return p * std::bit_cast<float>((whole + 127) << 23);
 }
 
-}  // namespace stereo
+}  // namespace mvs

@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <cstring>
 
-namespace stereo {
+namespace mvs {
 
 #if defined(__AVX512F__)
 constexpr int kLanes = 16;
@@ -31,4 +31,4 @@ inline Lanes magnitude(Lanes a) {
     return (Lanes)((Bits)a & 0x7fffffff);
 }
 
-}  // namespace stereo
+}  // namespace mvs

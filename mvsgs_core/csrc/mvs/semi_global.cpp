@@ -8,11 +8,11 @@
 #include <cstdint>
 #include <vector>
 
-#include "exponential.hpp"
-#include "lanes.hpp"
-#include "stereo.hpp"
+#include "mvs/exponential.hpp"
+#include "mvs/lanes.hpp"
+#include "mvs/mvs.hpp"
 
-namespace stereo {
+namespace mvs {
 namespace {
 
 struct Plane {  // one orientation of the problem: rows are visited in order, pixels of a row are independent
@@ -174,4 +174,4 @@ void semi_global(const float* cost, int height, int d, int width, const float* i
     }
 }
 
-}  // namespace stereo
+}  // namespace mvs

@@ -7,20 +7,21 @@
 #include <cmath>
 #include <vector>
 
-#include "exponential.hpp"
-#include "stereo.hpp"
+#include "mvs/exponential.hpp"
+#include "mvs/mvs.hpp"
 
-namespace stereo {
+namespace mvs {
 
 constexpr int kBand = kTileRows;  // rows that a thread handles at once: their window weights stay in its cache
 
 inline int taps_of(int radius) { return (2 * radius + 1) * (2 * radius + 1); }
 
-// The windows of rows [y0, y1) of the reference: normalized weights, mean and variance; and the rows themselves.
+// The windows of a band of rows of the reference: normalized weights, mean and variance; and the rows themselves.
 // Weights lie in blocks of kBlock columns, all taps of a block together: read in order, whatever the image's width.
 struct Windows {
     static constexpr int kBlock = kTileColumns;
     int radius, width, blocks;
+    int y0 = 0, height = 0;  // the first row of the band, and the reference's
     std::vector<float> weight;          // [row][block][tap][column of the block]
     std::vector<float> gray;            // [row, `radius` more on both sides][column, as many more]; 0 outside the image
     std::vector<float> mean, variance;  // [row][x]; the variance includes the noise
@@ -41,18 +42,20 @@ struct Windows {
     const float* mean_row(int row) const { return mean.data() + static_cast<std::size_t>(row) * blocks * kBlock; }
     const float* variance_row(int row) const { return variance.data() + (mean_row(row) - mean.data()); }
 
-    void prepare(const float* image, int height, int y0, int y1, float contrast, float noise) {
+    void prepare(const float* image, int rows, int begin, int end, float contrast, float noise) {
+        y0 = begin;
+        height = rows;
         std::fill(gray.begin(), gray.end(), 0.0f);
-        for (int y = std::max(y0 - radius, 0); y < std::min(y1 + radius, height); ++y)
+        for (int y = std::max(y0 - radius, 0); y < std::min(end + radius, height); ++y)
             std::copy_n(image + static_cast<std::size_t>(y) * width, width,
                         gray.data() + (y - y0 + radius) * stride() + radius);
-        for (int y = y0; y < y1; ++y) prepare_row(image, height, y, y - y0, -1.0f / contrast, noise);
+        for (int y = y0; y < end; ++y) prepare_row(image, y, y - y0, -1.0f / contrast, noise);
     }
 
   private:
     std::vector<float> line_, total_, square_;  // of one row: [tap][x], [x], [x]
 
-    void prepare_row(const float* image, int height, int y, int row, float sharpness, float noise) {
+    void prepare_row(const float* image, int y, int row, float sharpness, float noise) {
         const int side = 2 * radius + 1, taps = side * side, padded = blocks * kBlock;
         const float spread = -0.5f / static_cast<float>((radius + 1) * (radius + 1));
         const float* center = image + static_cast<std::size_t>(y) * width;
@@ -93,4 +96,4 @@ struct Windows {
     }
 };
 
-}  // namespace stereo
+}  // namespace mvs

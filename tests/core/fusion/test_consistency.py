@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.fusion.backend import NativeFusionBackend
 from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig, fuse
-from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, warps_between
+from mvsgs_core.fusion.interface import FuseOptions
+from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.torch_backend import TorchFusionBackend
 from tests.support.depth_views import SIZE, view
@@ -54,26 +57,21 @@ def brute_force(
 def test_consistency_equals_brute_force(round_trip: bool) -> None:
     reference, neighbors = view(0, 0.0, 0.01), [view(1, 0.2, 0.01, 0.05), view(2, -0.3, 0.01)]
     reference.depth[5:9, 5:9] = 0
-    there, back = warps_between(reference, neighbors)
-    depths = np.stack([n.depth for n in neighbors])
+    maps = depth_maps(reference, neighbors)
     expected = sum(brute_force(reference, n, 0.02, 0.7, round_trip).astype(int) for n in neighbors)
     for backend in (NativeFusionBackend(1), TorchFusionBackend("cpu")):
-        found = backend.consistent_views(reference.depth, depths, there, back, 0.02, 0.7, round_trip)
+        found = backend.consistent_views(maps, 0.02, 0.7, round_trip)
         assert np.mean(found != expected) < 0.003  # rounding at half a pixel
     assert 0.2 < np.mean(np.asarray(expected) > 0) < 1.0
 
 
 def test_fusion_of_both_backends_agrees() -> None:
     reference, neighbors = view(0, 0.0, 0.03), [view(1, 0.2, 0.01), view(2, -0.3, 0.01), view(3, 0.1, 0.01)]
-    there, back = warps_between(reference, neighbors)
-    depths, confidences = np.stack([n.depth for n in neighbors]), np.stack([n.confidence for n in neighbors])
+    maps, options = depth_maps(reference, neighbors), FuseOptions(0.01, 1.0, 0.4)
     native, twin = NativeFusionBackend(1), TorchFusionBackend("cpu")
-    splats = [b.splat(depths, confidences, back, 0.4, SIZE) for b in (native, twin)]
+    splats = [b.splat(maps, options) for b in (native, twin)]
     assert np.mean(np.abs(splats[0] - splats[1]) > 1e-3) < 0.003
-    results = [
-        b.fuse(reference.depth, reference.confidence, depths, confidences, splats[0], there, 0.01, 1.0, 0.1)
-        for b in (native, twin)
-    ]
+    results = [b.fuse(maps, splats[0], replace(options, min_neighbor_confidence=0.1)) for b in (native, twin)]
     for name in ("depth", "support", "violation", "own"):
         difference = np.abs(getattr(results[0], name) - getattr(results[1], name))
         assert np.mean(difference > 1e-3) < 0.005, name

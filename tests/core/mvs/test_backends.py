@@ -55,7 +55,7 @@ def test_a_part_of_the_cost_is_the_difference_of_gray_level() -> None:
     cost = swept(NativeBackend(1), own, 1, replace(options, top_k=1, noise=1e-3))
     np.testing.assert_allclose(cost[:, 0], 0.4 * 10.0 / 15.0, atol=2e-3)
     for backend in (NativeBackend(1), TorchBackend("cpu")):
-        with pytest.raises(ValueError, match=r"level|intensity_weight"):
+        with pytest.raises(ValueError, match="intensity_weight"):
             swept(backend, p, 1, replace(COST, intensity_weight=1.5))
 
 

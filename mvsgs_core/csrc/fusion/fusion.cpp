@@ -2,10 +2,13 @@
 #include <algorithm>
 #include <cmath>
 
-#include "exponential.hpp"
-#include "stereo.hpp"
+#include "fusion/fusion.hpp"
+#include "mvs/exponential.hpp"
 
-namespace stereo {
+namespace fusion {
+
+using mvs::exponential;
+
 namespace {
 
 struct Projected {
@@ -34,8 +37,11 @@ inline int nearest(float x, float y, int height, int width) {
 
 }  // namespace
 
-void consistent_views(const float* depth, int height, int width, const float* neighbor_depths, const Warp* warps,
-                      const Warp* back, int views, int nh, int nw, const ConsistencyOptions& o, std::uint8_t* count) {
+void consistent_views(const DepthMaps& maps, const Warp* back, const ConsistencyOptions& o, std::uint8_t* count) {
+    const int height = maps.height, width = maps.width, views = maps.views;
+    const int nh = maps.neighbor_height, nw = maps.neighbor_width;
+    const float *depth = maps.depth, *neighbor_depths = maps.neighbors;
+    const Warp* warps = maps.warps;
     const std::size_t stride = static_cast<std::size_t>(nh) * nw;
     const float limit = o.pixels * o.pixels;
 #pragma omp parallel for schedule(static) num_threads(o.threads)
@@ -82,9 +88,13 @@ void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, 
     }
 }
 
-void fuse_depth(const float* depth, const float* confidence, int height, int width, const float* neighbor_depths,
-                const float* neighbor_confidences, const float* splatted, const Warp* warps, int views, int nh, int nw,
-                const FuseOptions& o, float* fused, float* support, float* violation, float* own) {
+void fuse_depth(const DepthMaps& maps, const float* confidence, const float* neighbor_confidences,
+                const float* splatted, const FuseOptions& o, float* fused, float* support, float* violation,
+                float* own) {
+    const int height = maps.height, width = maps.width, views = maps.views;
+    const int nh = maps.neighbor_height, nw = maps.neighbor_width;
+    const float *depth = maps.depth, *neighbor_depths = maps.neighbors;
+    const Warp* warps = maps.warps;
     const std::size_t stride = static_cast<std::size_t>(nh) * nw, pixels = static_cast<std::size_t>(height) * width;
     const float tolerance = 3.0f * o.sigma, sharpness = -0.5f / (o.sigma * o.sigma);
 #pragma omp parallel for schedule(dynamic, 8) num_threads(o.threads)
@@ -135,4 +145,4 @@ void fuse_depth(const float* depth, const float* confidence, int height, int wid
     }
 }
 
-}  // namespace stereo
+}  // namespace fusion

@@ -1,0 +1,50 @@
+// Fusion of depth maps on the CPU. Its twin in PyTorch is mvsgs_core/fusion/torch_backend.py; tests hold both together.
+#pragma once
+
+#include <cstdint>
+
+#include "mvs/warp.hpp"
+
+namespace fusion {
+
+using mvs::Warp;
+
+// A depth map (H, W), 0 where unknown, and those of its neighbors (N, h, w).
+struct DepthMaps {
+    const float* depth;
+    int height, width;
+    const float* neighbors;
+    const Warp* warps;  // from the reference into each neighbor
+    int views, neighbor_height, neighbor_width;
+};
+
+struct ConsistencyOptions {
+    float relative;   // largest difference of depth, relative to the larger one
+    float pixels;     // round trip: largest distance to where it started
+    bool round_trip;
+    int threads;
+};
+
+// views (H, W): the number of neighbors whose depth agrees with the reference's.
+// One way: the reference's point, projected, against the depth found there. Round trip: that depth, projected back.
+void consistent_views(const DepthMaps& maps, const Warp* back, const ConsistencyOptions& options, std::uint8_t* count);
+
+// splatted (H, W): depth in the reference of a neighbor's pixels, the nearest one where several fall; 0 where none.
+void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, int neighbor_height,
+                 int neighbor_width, const Warp& back, float min_neighbor_confidence, int height, int width,
+                 float* splatted);
+
+struct FuseOptions {
+    float sigma;                    // relative depth: width of the support
+    float violation;                // weight of free-space violations against support
+    float min_neighbor_confidence;  // a neighbor's pixel below takes no part
+    int threads;
+};
+
+// Per pixel, of the reference's own depth and those splatted (N, H, W) from neighbors the one with the best score
+// support - violation, refined to the weighted mean of what supports it; with confidences (H, W) and (N, h, w).
+void fuse_depth(const DepthMaps& maps, const float* confidence, const float* neighbor_confidences,
+                const float* splatted, const FuseOptions& options, float* fused, float* support, float* violation,
+                float* own);
+
+}  // namespace fusion
