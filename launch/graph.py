@@ -241,7 +241,7 @@ def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edg
                     f"{name}.reads.{message.__name__}: {slot.target} does not take a {message.__name__}; "
                     f"it takes: {_names(inputs)}"
                 )
-        for message in inputs:
+        for message in [m for m in inputs if m in slot.reads or m not in nodes.free_inputs(slot.node)]:
             senders = ", ".join(other for other, types in sends.items() if message in types)
             hint = f"set {name}.reads.{message.__name__} to one that does: {senders}" if senders else "no slot does"
             refusal = f"{name}: nobody sends {slot.target} a {message.__name__}"

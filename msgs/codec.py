@@ -46,6 +46,10 @@ class CodecError(ValueError):
     """A message that cannot be sent, or a frame that is not a message."""
 
 
+class VersionError(CodecError):
+    """A frame of another version of the wire format."""
+
+
 class Decoded(NamedTuple):
     message: msgs.Message
     sequence: int  # position of the message in its topic, from 0
@@ -220,8 +224,10 @@ def _split(view: memoryview) -> tuple[str, memoryview]:
     delivery, magic, version, name_length, zero, header_length = _PREFIX.unpack_from(view)
     if magic != _MAGIC or delivery not in (RELIABLE, NEWEST):
         raise CodecError(f"no message: it starts with {bytes(view[:4])!r}, not b'RMVS' or b'NMVS'")
-    if version != VERSION or zero:
-        raise CodecError(f"a frame of version {version}, flags {zero}; this program reads version {VERSION}, flags 0")
+    if version != VERSION:
+        raise VersionError(f"a frame of wire version {version}; this program writes and reads version {VERSION}")
+    if zero:
+        raise CodecError(f"a frame with the flags {zero}, which are 0")
     start = _PREFIX.size + name_length
     try:
         name = bytes(view[_PREFIX.size : start]).decode("ascii")

@@ -11,7 +11,7 @@
 
 The parameter's type declares the input, the yielded type the output. Hooks:
 
-- `on_<anything>(self, message: T) -> Iterator[U | V]`: one per input type.
+- `on_<anything>(self, message: T) -> Iterator[U | V]`: one per input type; of a union those that `reads` names.
 - `run(self) -> Iterator[U]`: a source instead has this.
 - `on_idle(self) -> list[U] | None`: one slice (well under 100 ms) of background work while no message waits;
   None when there is nothing to do until the next message.
@@ -98,12 +98,20 @@ def handlers(node: type[Node]) -> dict[type, str]:
             continue
         hints = _hints(node, name)
         parameters = [t for key, t in hints.items() if key != "return"]
-        if len(parameters) != 1 or parameters[0] not in msgs.TYPES.values():
+        kinds = _alternatives(parameters[0]) if len(parameters) == 1 else ()
+        if not kinds or not set(kinds) <= set(msgs.TYPES.values()):
             raise TypeError(f"{node.__qualname__}.{name} must take one message, annotated with its type from msgs")
-        if parameters[0] in found:
-            raise TypeError(f"{node.__qualname__}: {found[parameters[0]]} and {name} take the same type")
-        found[parameters[0]] = name
+        for kind in kinds:
+            if kind in found:
+                raise TypeError(f"{node.__qualname__}: {found[kind]} and {name} take the same type")
+            found[kind] = name
     return found
+
+
+def free_inputs(node: type[Node]) -> set[type]:
+    """Inputs of hooks that take several types, as `Frame | Keyframe` or `Message`: those come that `reads` names."""
+    names = list(handlers(node).values())
+    return {kind for kind, name in handlers(node).items() if names.count(name) > 1}
 
 
 def outputs(node: type[Node]) -> tuple[type, ...]:
@@ -118,6 +126,11 @@ def outputs(node: type[Node]) -> tuple[type, ...]:
         for t in _message_types(returned):
             found[t] = None
     return tuple(found)
+
+
+def _alternatives(annotation: Any) -> tuple[type, ...]:
+    union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    return typing.get_args(annotation) if union else (annotation,)
 
 
 def _hints(node: type[Node], name: str) -> dict[str, Any]:
@@ -137,4 +150,4 @@ def _message_types(annotation: Any) -> Iterator[type]:
             yield from _message_types(part)
 
 
-__all__ = ["Node", "Stats", "handlers", "is_source", "outputs"]
+__all__ = ["Node", "Stats", "free_inputs", "handlers", "is_source", "outputs"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from msgs import Frame, GroundTruth
-from msgs.codec import MAX_MESSAGE_BYTES, decode
+from msgs.codec import MAX_MESSAGE_BYTES, VersionError, decode
 from mvsgs_core.bad_file import BadFileError, brief
 from mvsgs_core.camera import check_intrinsics
 from mvsgs_core.datasets.mcap_file import McapFile, Recorded
@@ -91,14 +91,17 @@ class Player(Node):
                 if passed == names & recording.indexed:
                     return
 
-    @staticmethod
-    def _decoded(record: Recorded, recording: McapFile) -> Frame | GroundTruth | None:
+    def _decoded(self, record: Recorded, recording: McapFile) -> Frame | GroundTruth | None:
         try:
             message = decode(record.data, expect=PLAYED).message
             assert isinstance(message, PLAYED)
             check_intrinsics(message.intrinsics, (message.image.shape[0], message.image.shape[1]))
             if not math.isfinite(message.timestamp):
                 raise ValueError(f"at {message.timestamp} s")
+        except VersionError as error:
+            raise BadFileError(
+                f"{self.config.path} was recorded by another release: {error}; record it anew"
+            ) from error
         except ValueError as error:  # CodecError is one
             recording.leave_out(f"{record.topic} {record.sequence}: {brief(error)}")
             return None

@@ -15,7 +15,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from msgs import Depth, Frame, FusedKeyframe, GroundTruth, Keyframe, Message, Poses, Trajectory
+from msgs import Message
 from msgs.codec import ArraySpec, array_specs, encode
 from nodes import Node
 
@@ -24,7 +24,7 @@ COMPRESSION = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none":
 
 
 class Recorder(Node):
-    """Records the input: Frame and GroundTruth. A recording that was cut off can still be played."""
+    """Records what `reads` names. A recording that was cut off can still be played."""
 
     @dataclass
     class Config:
@@ -47,19 +47,7 @@ class Recorder(Node):
         self._counts: Counter[str] = Counter()
         self._time = 0  # ns, of the last message that had one
 
-    def on_frame(self, message: Frame) -> None:
-        self._write(message)
-
-    def on_ground_truth(self, message: GroundTruth) -> None:
-        self._write(message)
-
-    def on_end(self) -> Iterator[Any]:
-        if self._file is not None:
-            self._writer.finish()
-            self._file.close()
-        yield from ()
-
-    def _write(self, message: Message) -> None:
+    def on_message(self, message: Message) -> None:
         if self._file is None:
             self._open()
         name = type(message).__name__
@@ -75,31 +63,18 @@ class Recorder(Node):
         self._counts[name] += 1
         self.stats.count("recorded")
 
+    def on_end(self) -> Iterator[Any]:
+        if self._file is not None:
+            self._writer.finish()
+            self._file.close()
+        yield from ()
+
     def _open(self) -> None:
         path = Path(self.config.path)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("xb")
         self._writer = Writer(self._file, compression=COMPRESSION[self.config.compression])
         self._writer.start(profile=ENCODING, library="mvsgs")
-
-
-class GraphRecorder(Recorder):
-    """Records the input and what the stages make of it."""
-
-    def on_keyframe(self, message: Keyframe) -> None:
-        self._write(message)
-
-    def on_depth(self, message: Depth) -> None:
-        self._write(message)
-
-    def on_fused_keyframe(self, message: FusedKeyframe) -> None:
-        self._write(message)
-
-    def on_poses(self, message: Poses) -> None:
-        self._write(message)
-
-    def on_trajectory(self, message: Trajectory) -> None:
-        self._write(message)
 
 
 def _describe(message_type: type) -> bytes:

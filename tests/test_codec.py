@@ -192,7 +192,7 @@ def test_foreign_and_damaged_frames_are_named() -> None:
     refused(b"", "too short")
     refused(b"GET / HTTP/1.1\r\n\r\n", "no message")
     refused(data[:4] + b"\x03" + data[5:], "version 3")
-    refused(data[:6] + b"\x01" + data[7:], "flags 1")
+    refused(data[:6] + b"\x01" + data[7:], "flags 1,")
     refused(data.replace(b"Frame", b"Fname"), "type 'Fname'")
     refused(data.replace(b"Frame", b"Fr\xffme"), "not ASCII")
     refused(data[:-1], "not inside the")

@@ -14,13 +14,13 @@ from mcap.reader import make_reader
 from mcap.records import Chunk, Header
 
 from launch.compose import compose
-from msgs import Frame, GroundTruth, Trajectory
+from msgs import TYPES, Frame, GroundTruth, Trajectory
 from msgs.codec import decode, encode
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets.mcap_file import MAGIC
-from nodes import handlers, is_source, outputs
+from nodes import free_inputs, handlers, is_source, outputs
 from nodes.player import Player
-from nodes.recorder import GraphRecorder, Recorder
+from nodes.recorder import Recorder
 from tests.support.example_messages import MESSAGES, assert_equal, example
 
 
@@ -33,8 +33,8 @@ def recorded(path: Path, count: int = 10, **config: Any) -> list[Frame | GroundT
         image = rng.integers(0, 255, (48, 64, 3), np.uint8)
         frame = Frame(index, index / 30, image, np.ones(4))
         truth = GroundTruth(index, index / 30, image, np.ones(4), np.eye(4), np.ones((48, 64), np.float32))
-        recorder.on_frame(frame)
-        recorder.on_ground_truth(truth)
+        recorder.on_message(frame)
+        recorder.on_message(truth)
         messages += [frame, truth]
     assert list(recorder.on_end()) == []
     assert recorder.stats.counts["recorded"] == 2 * count
@@ -67,9 +67,9 @@ def test_ground_truth_may_come_before_its_frame(tmp_path: Path) -> None:
     recorder = Recorder(Recorder.Config(str(tmp_path / "a.mcap")))
     image = np.ones((4, 4, 3), np.uint8)
     for index in (0, 1, 2):  # the two topics reach a recorder in any order
-        recorder.on_ground_truth(GroundTruth(index, 0.0, image, np.ones(4), None, None))
+        recorder.on_message(GroundTruth(index, 0.0, image, np.ones(4), None, None))
     for index in (0, 1, 2):
-        recorder.on_frame(Frame(index, 0.0, image, np.ones(4)))
+        recorder.on_message(Frame(index, 0.0, image, np.ones(4)))
     list(recorder.on_end())
     _, again = played(tmp_path / "a.mcap", stop=2)
     assert sorted((type(m).__name__, m.index) for m in again) == [
@@ -117,11 +117,10 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 
 
 def test_other_tools_can_read_what_is_in_it(tmp_path: Path) -> None:
-    recorder = GraphRecorder(GraphRecorder.Config(str(tmp_path / "a.mcap")))
-    by_type = {t: getattr(recorder, name) for t, name in handlers(GraphRecorder).items()}
-    sent = {t.__name__: example(t) for t in MESSAGES if t in by_type}
+    recorder = Recorder(Recorder.Config(str(tmp_path / "a.mcap")))
+    sent = {t.__name__: example(t) for t in MESSAGES}
     for message in sent.values():
-        by_type[type(message)](message)
+        recorder.on_message(message)
     list(recorder.on_end())
     with (tmp_path / "a.mcap").open("rb") as file:
         seen = {}
@@ -139,9 +138,10 @@ def test_other_tools_can_read_what_is_in_it(tmp_path: Path) -> None:
 
 def test_the_contract_of_both_nodes() -> None:
     assert is_source(Player)
-    assert set(outputs(Player)) == {Frame, GroundTruth} == set(handlers(Recorder))
-    assert set(handlers(Recorder)) < set(handlers(GraphRecorder))
-    assert outputs(GraphRecorder) == ()
+    assert set(outputs(Player)) == {Frame, GroundTruth}
+    assert set(handlers(Recorder)) == free_inputs(Recorder) == set(TYPES.values())
+    assert free_inputs(Player) == set()
+    assert outputs(Recorder) == ()
 
 
 @pytest.mark.parametrize("choice", ["mcap", "mcap_all"])
@@ -197,14 +197,14 @@ def test_a_message_that_is_none_is_left_out(tmp_path: Path) -> None:
     recorder = Recorder(Recorder.Config(str(path)))
     image = np.ones((4, 4, 3), np.uint8)
     for index in range(4):
-        recorder.on_frame(Frame(index, 0.0, image, np.ones(4)))
+        recorder.on_message(Frame(index, 0.0, image, np.ones(4)))
         if index == 1:
             for data in (b"", b"no message", bytes(encode(Frame(9, 0.0, image, np.ones(4))))[:-20]):
                 recorder._writer.add_message(recorder._channels["Frame"], 0, data, 0, 2)
     list(recorder.on_end())
     recorder = Recorder(Recorder.Config(str(tmp_path / "b.mcap")))
     for intrinsics in ([2, 2, 2, 2], [2, 2, 1e9, 2], [0, 2, 2, 2], [np.nan, 2, 2, 2]):
-        recorder.on_frame(Frame(0, 0.0, image, np.array(intrinsics, np.float64)))
+        recorder.on_message(Frame(0, 0.0, image, np.array(intrinsics, np.float64)))
     list(recorder.on_end())
     impossible, kept = played(tmp_path / "b.mcap")
     assert len(kept) == 1
@@ -244,3 +244,14 @@ def compose_and_check(overrides: list[str]) -> None:
     graph = compose([*overrides, "output=/tmp/x"])
     slot = graph.slots["dataset"]
     slot.node.check(slot.parameters)
+
+
+def test_a_recording_of_another_wire_version_is_refused_as_one(tmp_path: Path) -> None:
+    recorder = Recorder(Recorder.Config(str(tmp_path / "a.mcap"), compression="none"))
+    recorder.on_message(Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), np.array([50.0, 50.0, 31.5, 23.5])))
+    older = bytearray(encode(Frame(1, 0.1, np.zeros((48, 64, 3), np.uint8), np.ones(4)), 1))
+    older[4] = 1
+    recorder._writer.add_message(recorder._channels["Frame"], 0, bytes(older), 0, 1)
+    list(recorder.on_end())
+    with pytest.raises(BadFileError, match=r"a\.mcap was recorded by another release: .*version 1; .*version 2"):
+        played(tmp_path / "a.mcap")
