@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from bench.runs import DATA
 from bench.table import Row, at_least, at_most, main
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.fusion.normals import normals_of
@@ -27,7 +28,7 @@ from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 
-KITCHEN = Path(__file__).resolve().parent.parent.parent / "shared/data/seven_scenes_redkitchen"
+KITCHEN = DATA / "seven_scenes_redkitchen"
 
 
 @dataclass(frozen=True)

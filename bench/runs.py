@@ -23,6 +23,7 @@ from mvsgs_core import native
 ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
 SHARED = Path(os.environ.get("MVSGS_SHARED", ROOT.parent / "shared"))
+DATA = SHARED / "data"
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 from bench.depth.baselines import baseline_rows
 from bench.depth.calibration import calibration_rows
 from bench.depth.curves import curve_rows
-from bench.depth.data import SHARED, SOURCES, Scene, load_scene
+from bench.depth.data import SOURCES, Scene, load_scene
 from bench.depth.failures import failure_rows
 from bench.depth.kernel import kernel_rows
 from bench.depth.oracle import oracle_rows
@@ -28,7 +28,7 @@ from bench.depth.pose_refinement import refine_poses
 from bench.depth.run import Run, run, score, surest
 from bench.depth.sensor import sensor_offset, without_offset
 from bench.depth.tracked import load_tracked
-from bench.runs import folder
+from bench.runs import DATA, folder
 from bench.table import Row, at_least, at_most, main
 from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
@@ -47,7 +47,7 @@ def measured(name: str, area: int, count: int | None, tracked: bool) -> tuple[Sc
 
 
 def available(names: tuple[str, ...]) -> list[str]:
-    return [name for name in names if not SOURCES[name].folder or (SHARED / SOURCES[name].folder).exists()]
+    return [name for name in names if not SOURCES[name].folder or (DATA / SOURCES[name].folder).exists()]
 
 
 def quality_section(options: argparse.Namespace, area: int, tracked: bool) -> list[Row]:
@@ -56,7 +56,7 @@ def quality_section(options: argparse.Namespace, area: int, tracked: bool) -> li
     if options.quick:
         names = () if tracked or area == LARGE else ("room",)
     missing = [name for name in names if name not in available(names)]
-    rows = [Row(f"{name}: skipped, {SHARED / SOURCES[name].folder} is missing", None) for name in missing]
+    rows = [Row(f"{name}: skipped, {DATA / SOURCES[name].folder} is missing", None) for name in missing]
     for name in available(names):
         scene, found = measured(name, area, QUICK if options.quick else None, tracked)
         rows += quality_rows(scene, found, tracked)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from bench.runs import DATA
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 
-SHARED = Path(os.environ.get("MVSGS_SHARED", Path(__file__).resolve().parents[2] / "shared")) / "data"
 COARSE = (30, 40)  # cells of the simulated tracker grid
 
 
@@ -66,7 +64,7 @@ def load_scene(
     if source.dataset == "synthetic":
         options["size"] = (240, 320) if area <= 320 * 240 else (384, 512)
     else:
-        options |= {"path": SHARED / source.folder, "stride": source.stride}
+        options |= {"path": DATA / source.folder, "stride": source.stride}
     frames: Iterable[Item] = open_dataset(source.dataset, **options)
     if source.ragged:
         frames = (replace(f, depth=None if f.depth is None else without_ragged_edges(f.depth)) for f in frames)

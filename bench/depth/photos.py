@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.depth.data import SHARED
 from bench.depth.run import Run, run
+from bench.runs import DATA
 from bench.table import Row
 from msgs import Frame, GroundTruth, Keyframe, Poses
 from mvsgs_core.datasets import open_dataset
@@ -49,8 +49,8 @@ PHOTOS = {
 def photo_rows(area: int, names: list[str]) -> list[Row]:
     rows = []
     for name in names:
-        if not (SHARED / PHOTOS[name].folder).exists():
-            rows.append(Row(f"{name}: skipped, {SHARED / PHOTOS[name].folder} is missing", None))
+        if not (DATA / PHOTOS[name].folder).exists():
+            rows.append(Row(f"{name}: skipped, {DATA / PHOTOS[name].folder} is missing", None))
             continue
         views = load_photos(PHOTOS[name], area)
         if len(views) < 3:
@@ -74,7 +74,7 @@ def load_photos(photos: Photos, area: int) -> list[StereoKeyframe]:
                     latest[int(i)] = (pose, float(scale))
 
     tracker = PosedTracker() if photos.posed else Tracker()
-    for item in open_dataset("images", path=SHARED / photos.folder, **photos.options):
+    for item in open_dataset("images", path=DATA / photos.folder, **photos.options):
         take(tracker.on_frame(Frame(item.index, item.timestamp, item.image, item.intrinsics)))
         if isinstance(tracker, PosedTracker):
             pose = item.world_from_cam

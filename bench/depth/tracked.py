@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.depth.data import SHARED, SOURCES, Scene
+from bench.depth.data import SOURCES, Scene
+from bench.runs import DATA
 from msgs import Frame, Keyframe, Poses
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.mvs.keyframe import prepare_keyframe
@@ -22,7 +23,7 @@ def _track(name: str) -> tuple[dict[int, Item], dict[int, Keyframe], dict[int, t
     source = SOURCES[name]
     options = dict(source.options)
     if source.dataset != "synthetic":
-        options["path"] = SHARED / source.folder
+        options["path"] = DATA / source.folder
     items: dict[int, Item] = {}
     keyframes: dict[int, Keyframe] = {}
     latest: dict[int, tuple[np.ndarray, float]] = {}

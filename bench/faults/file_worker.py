@@ -24,7 +24,7 @@ from mvsgs_core.networks.checkpoints import read
 from nodes.player import Player
 
 ADDRESS_SPACE = 4 * 2**30  # bytes beyond those of a fresh worker
-_ROOT = Path(__file__).resolve().parents[1]
+_ROOT = Path(__file__).resolve().parents[2]
 
 
 def read_through(way: str, path: Path) -> int:

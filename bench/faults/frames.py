@@ -21,13 +21,13 @@ import zmq
 
 import msgs
 from bench.faults.frame_mutations import good, mutated
+from bench.runs import ROOT
 from bench.table import Row, at_least, at_most
 from msgs import End, Frame, Message
 from msgs.codec import NEWEST, CodecError, decode, encode
 from mvsgs_core.datasets import open_dataset
 from nodes.player import Player
 
-ROOT = Path(__file__).resolve().parents[2]
 SIZE = 120, 160  # pixels of the robot's images
 RATE = 10.0  # good frames a second
 TRACED = 20  # memory is measured of every so many frames, and of all that take long

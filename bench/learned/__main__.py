@@ -23,9 +23,10 @@ import cv2
 import numpy as np
 import torch
 
-from bench.depth.data import SHARED, SOURCES, Scene, Source
+from bench.depth.data import SOURCES, Scene, Source
 from bench.depth.run import Score, depth_view, score
 from bench.depth.tracked import load_tracked
+from bench.runs import DATA
 from bench.runs import folder as folder_of
 from bench.table import Row, main
 from bench.tracking.__main__ import run as track
@@ -63,7 +64,7 @@ def shortened(name: str, frames: int | None) -> str:
 
 def photographs(scene: Scene, source: Source) -> list[np.ndarray]:
     """The keyframes' images (H, W, 3) uint8, read again."""
-    frames = open_dataset(source.dataset, path=SHARED / source.folder, **source.options)
+    frames = open_dataset(source.dataset, path=DATA / source.folder, **source.options)
     wanted = {view.index for view in scene.views}
     images = {item.index: item.image for item in frames if item.index in wanted}
     return [images[view.index] for view in scene.views]
@@ -143,7 +144,7 @@ def _colors(depth: np.ndarray, low: float, high: float) -> np.ndarray:
 
 def flow_rows(name: str, frames: int | None) -> list[Row]:
     source = SOURCES[name]
-    items = list(islice(open_dataset(source.dataset, path=SHARED / source.folder, **source.options), frames))
+    items = list(islice(open_dataset(source.dataset, path=DATA / source.folder, **source.options), frames))
     rows = []
     for flow in ("lucas_kanade", "raft_small"):
         result = track(items, TrackerConfig(flow=flow))
@@ -156,8 +157,8 @@ def flow_rows(name: str, frames: int | None) -> list[Row]:
 def measure(options: argparse.Namespace) -> list[Row]:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    if (SHARED.parent / "weights").is_dir():
-        os.environ.setdefault("MVSGS_WEIGHTS", str(SHARED.parent / "weights"))
+    if (DATA.parent / "weights").is_dir():
+        os.environ.setdefault("MVSGS_WEIGHTS", str(DATA.parent / "weights"))
     folder = folder_of(options, "learned")
     rows: list[Row] = []
     for name in QUICK if options.quick else SCENES:
@@ -172,8 +173,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
 def _there(name: str, network: str, rows: list[Row]) -> bool:
     """Whether a sequence and a network's weights are there; if not, a row says what is missing."""
     missing: Iterable[str] = ()
-    if not (SHARED / SOURCES[name].folder).exists():
-        missing = (f"{SHARED / SOURCES[name].folder} is missing",)
+    if not (DATA / SOURCES[name].folder).exists():
+        missing = (f"{DATA / SOURCES[name].folder} is missing",)
     try:
         weights.find(network)
     except FileNotFoundError as error:

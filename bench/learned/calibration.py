@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from bench.depth.calibration import INLIER, fit, load, reliability
-from bench.depth.data import SHARED, SOURCES
+from bench.depth.data import SOURCES
 from bench.learned.__main__ import AREA, photographs
+from bench.runs import DATA
 from mvsgs_core.mvs.cascade import CascadeDepth
 from mvsgs_core.mvs.learned import NETWORKS, LearnedStereo, LearnedStereoConfig, logit
 
@@ -52,7 +53,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=24, help="of each sequence at most")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    os.environ.setdefault("MVSGS_WEIGHTS", str(SHARED.parent / "weights"))
+    os.environ.setdefault("MVSGS_WEIGHTS", str(DATA.parent / "weights"))
     data = {name: samples(name, options.keyframes) for name in (*FIT, *CHECK)}
     x = np.concatenate([np.stack([np.ones(SAMPLES), logit(data[name][0])], axis=1) for name in FIT])
     now = fit(x, np.concatenate([data[name][1] for name in FIT]))

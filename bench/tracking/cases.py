@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.runs import SHARED
+from bench.runs import DATA
 from mvsgs_core.datasets import Item, open_dataset
 
 
@@ -25,7 +25,7 @@ class Case:
 
     @property
     def path(self) -> Path | None:
-        return SHARED / "data" / self.folder if self.folder else None
+        return DATA / self.folder if self.folder else None
 
     @property
     def there(self) -> bool:
