@@ -123,9 +123,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", default=",".join(SCENES), help="comma separated")
     parser.add_argument("--variants", default=",".join((*TABLE_III, *SKIPS, *OTHERS)), help="comma separated")
     parser.add_argument("--seeds", default="0,1,2", help="comma separated")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at once; times mean little above 1")
-    pieces.arguments(parser)
-    parser.add_argument("overrides", nargs="*", help="of every run: dataset.stop=100")
+    pieces.arguments(parser, "dataset.stop=100", jobs=True)
 
 
 if __name__ == "__main__":

@@ -165,8 +165,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--curves", help=f"comma separated; default all: {', '.join(CURVES)}")
     parser.add_argument("--seeds", default="0", help="comma separated; figures are means over them")
     parser.add_argument("--repeats", type=int, default=3, help="runs of the default, seeds 0, 1, ...: the noise")
-    pieces.arguments(parser)
-    parser.add_argument("overrides", nargs="*", help="of every run: dataset.stop=60")
+    pieces.arguments(parser, "dataset.stop=60")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Cost of each network at 512x384: parameters, multiply-adds, CPU seconds, GPU milliseconds, memory.
+"""Cost of each network at 512x384: parameters, multiply-adds, CPU seconds, memory (GPU: bench.gpu).
 
     python -m bench.networks [--quick] [--json FILE]
 
@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from bench.runs import SHARED
+from bench.runs import environment
 from bench.table import Row, main
 from mvsgs_core import weights
 from mvsgs_core.droid.networks import random_net
@@ -131,28 +131,12 @@ def measure_one(name: str, h: int, w: int) -> dict[str, float | str]:
     counter = FlopCounterMode(display=False)
     with counter:
         work()
-    figures: dict[str, float | str] = {
+    return {
         "parameters": sum(p.numel() for p in net.parameters()) / 1e6,
         "operations": counter.get_total_flops() / 2e9,
         "seconds": seconds,
         "memory": memory,
     }
-    if torch.cuda.is_available():
-        figures["gpu"] = _gpu_milliseconds(name, h, w)
-    return figures
-
-
-def _gpu_milliseconds(name: str, h: int, w: int, runs: int = 10) -> float:
-    _, work = CASES[name](h, w, "cuda")
-    with torch.autocast("cuda", dtype=torch.float16, enabled=name.startswith("DROID")):
-        for _ in range(3):
-            work()
-        torch.cuda.synchronize()
-        start = time.perf_counter()
-        for _ in range(runs):
-            work()
-        torch.cuda.synchronize()
-    return 1e3 * (time.perf_counter() - start) / runs
 
 
 _UNITS = (
@@ -160,14 +144,12 @@ _UNITS = (
     ("operations", "multiply-adds", "G"),
     ("seconds", "processor", "s"),
     ("memory", "peak memory beyond weights and input", "MB"),
-    ("gpu", "GPU", "ms"),
 )
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     h, w = (192, 256) if options.quick else (384, 512)
-    if (SHARED / "weights").is_dir():
-        os.environ.setdefault("MVSGS_WEIGHTS", str(SHARED / "weights"))
+    os.environ.update(environment())
     rows = [Row("image size", f"{w}x{h}")]
     for name in CASES:
         command = [sys.executable, "-m", "bench.networks", "--case", name, str(h), str(w)]

@@ -83,8 +83,11 @@ class Pieces:
         return done if {key: done.get(key) for key in asked(matrix)} == asked(matrix) else None
 
 
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """What the command line of a benchmark in pieces has for them."""
+def arguments(parser: argparse.ArgumentParser, example: str, jobs: bool = False) -> None:
+    """What the command line of a benchmark in pieces has for them, and the overrides of its runs."""
+    if jobs:
+        parser.add_argument("--jobs", type=int, default=1, help="runs at once; times mean little above 1")
+    parser.add_argument("overrides", nargs="*", help=f"of every run: {example}")
     parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
     parser.add_argument("--resume", action="store_true", help="keep the runs of an earlier call that it finished")
     parser.add_argument("--minutes", type=float, help="start no more runs after; --resume goes on")

@@ -163,8 +163,15 @@ class Matrix:
         return runs
 
 
+def launch(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """One run of the launcher, to its end; its screen is in the result. Raises CalledProcessError where it fails."""
+    command = [sys.executable, str(ROOT / "launch" / "run_all.py"), *arguments]
+    given = {"check": True, "cwd": ROOT, "env": environment(), **options}
+    return subprocess.run(command, capture_output=True, text=True, **given)
+
+
 def environment() -> dict[str, str]:
-    """Environment of the runs: weights for LPIPS from the shared folder, unless MVSGS_WEIGHTS says otherwise."""
+    """Environment of the runs: network weights from the shared folder, unless MVSGS_WEIGHTS says otherwise."""
     weights = SHARED / "weights"
     found = {"MVSGS_WEIGHTS": str(weights)} if weights.is_dir() else {}
     return {**found, **os.environ}

@@ -33,6 +33,11 @@ def at_least(name: str, value: float, unit: str, limit: float) -> Row:
     return Row(name, value, unit, f">= {limit:g}", bool(value >= limit))
 
 
+def all_of(name: str, met: int, runs: int) -> Row:
+    """How many of so many runs did what all should."""
+    return Row(name, f"{met} of {runs}", "", f"{runs} of {runs}", met == runs)
+
+
 def timed(
     name: str, values: Sequence[float], unit: str, maximum: float | None = None, minimum: float | None = None
 ) -> Row:

@@ -262,8 +262,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", default="redkitchen,tum_fr1_xyz", help=f"comma separated; --quick: {QUICK}")
     parser.add_argument("--longest", type=float, default=8.0, help="times our optimization's time, for the offline one")
     parser.add_argument("--threads", type=int, help="of COLMAP and of the offline optimization; default: all cores")
-    pieces.arguments(parser)
-    parser.add_argument("overrides", nargs="*", help="of our runs: dataset.stop=100")
+    pieces.arguments(parser, "dataset.stop=100")
 
 
 if __name__ == "__main__":

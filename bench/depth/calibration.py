@@ -81,6 +81,12 @@ def reliability(
     return error, curve
 
 
+def print_reliability(name: str, tag: str, probability: np.ndarray, labels: np.ndarray) -> None:
+    error, curve = reliability(probability, labels)
+    text = " ".join(f"{c:.2f}:{i:.2f}({s:.2f})" for c, i, s in curve)
+    print(f"  {name:18s} {tag:12s} calibration error {error:.3f}  confidence:inliers(fraction) {text}")
+
+
 def calibration_rows(scene: Scene, found: Run, align: bool, bins: int = 5) -> list[Row]:
     """Inliers (within 5 %) among the pixels of each range of confidence, of stereo and after fusion, unfiltered."""
     rows = []
@@ -120,9 +126,7 @@ def main() -> None:
             features, labels = data[name][kind]
             for tag, w in (("fitted now", weights), ("in the code", module.WEIGHTS)):
                 probability = 1.0 / (1.0 + np.exp(-features @ w))
-                error, curve = reliability(probability, labels)
-                text = " ".join(f"{c:.2f}:{i:.2f}({s:.2f})" for c, i, s in curve)
-                print(f"  {name:12s} {tag:12s} calibration error {error:.3f}  confidence:inliers(fraction) {text}")
+                print_reliability(name, tag, probability, labels)
 
 
 if __name__ == "__main__":

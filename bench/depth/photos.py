@@ -15,15 +15,16 @@ import cv2
 import numpy as np
 
 from bench.depth.run import Run, run
+from bench.depth.tracked import Collected
 from bench.runs import DATA
 from bench.table import Row
-from msgs import Frame, GroundTruth, Keyframe, Poses
+from msgs import Frame, GroundTruth
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.cascade import CascadeConfig
 from mvsgs_core.mvs.interface import MatchingImages
-from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
+from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.warp import apply_warp, relative_warp
 from nodes.posed_tracker import PosedTracker
@@ -62,34 +63,16 @@ def photo_rows(area: int, names: list[str]) -> list[Row]:
 
 def load_photos(photos: Photos, area: int) -> list[StereoKeyframe]:
     """Keyframes with poses and coarse depth: triangulated by the posed tracker, or all by the tracker."""
-    keyframes: dict[int, Keyframe] = {}
-    latest: dict[int, tuple[np.ndarray, float]] = {}
-
-    def take(messages: Any) -> None:
-        for message in messages:
-            if isinstance(message, Keyframe):
-                keyframes[message.index] = message
-            elif isinstance(message, Poses):
-                for i, pose, scale in zip(message.index, message.world_from_cam, message.scale, strict=True):
-                    latest[int(i)] = (pose, float(scale))
-
-    tracker = PosedTracker() if photos.posed else Tracker()
+    tracker, sent = PosedTracker() if photos.posed else Tracker(), Collected()
     for item in open_dataset("images", path=DATA / photos.folder, **photos.options):
-        take(tracker.on_frame(Frame(item.index, item.timestamp, item.image, item.intrinsics)))
+        sent.take(tracker.on_frame(Frame(item.index, item.timestamp, item.image, item.intrinsics)))
         if isinstance(tracker, PosedTracker):
             pose = item.world_from_cam
-            take(tracker.on_ground_truth(
+            sent.take(tracker.on_ground_truth(
                 GroundTruth(item.index, item.timestamp, item.image, item.intrinsics, pose, None)
             ))  # fmt: skip
-    take(tracker.on_end())
-    views = [
-        prepare_keyframe(
-            k.index, k.image, k.intrinsics, k.world_from_cam, area=area, scales=(1, 2), inverse_depth=k.inverse_depth,
-            weight=k.inverse_depth_weight, scale=k.scale, segment=k.segment,
-        )
-        for _, k in sorted(keyframes.items())
-    ]  # fmt: skip
-    return [v.moved(*latest[v.index]) if v.index in latest else v for v in views]
+    sent.take(tracker.on_end())
+    return sent.views(area, (1, 2))
 
 
 def _scores(name: str, views: list[StereoKeyframe], found: Run) -> list[Row]:

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import itertools
 import os
-import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from bench.runs import ROOT
-from bench.table import Row
+from bench.runs import launch
+from bench.table import Row, all_of
 from launch.placement import thread_environment
 
 SMALL = ("dataset.size=[120,160]", "dataset.options.frames=80", "mapper.iterations=20", "mapper.refinement=60")
@@ -44,23 +42,18 @@ def measure(quick: bool) -> list[Row]:
             overrides = (*case.overrides, *QUICK) if quick else case.overrides
             maps = [_map(Path(folder) / str(k), overrides) for k in range(runs)]
             equal = sum(a == b for a, b in itertools.pairwise(maps))
-            rows.append(_all(f"{case.name}: pairs of runs with equal maps", equal, runs - 1))
+            rows.append(all_of(f"{case.name}: pairs of runs with equal maps", equal, runs - 1))
             if case.inline and not quick:
                 inline = _map(Path(folder) / "inline", (*case.overrides, "inline=true"))
-                rows.append(_all(f"{case.name}: equal to a run in one process", int(inline == maps[0]), 1))
+                rows.append(all_of(f"{case.name}: equal to a run in one process", int(inline == maps[0]), 1))
     return rows
-
-
-def _all(name: str, equal: int, pairs: int) -> Row:
-    return Row(name, f"{equal} of {pairs}", "", f"{pairs} of {pairs}", equal == pairs)
 
 
 def _map(output: Path, overrides: tuple[str, ...]) -> bytes:
     """The bytes of the map that a run leaves. Raises CalledProcessError where it fails."""
-    command: list[str | Path] = [
-        sys.executable, ROOT / "launch/run_all.py", f"output={output}", "device=cpu", "evaluator.max_frames=0",
-        "tracker.threads=1", "mvs.threads=1", "depth_fusion.threads=1", "mapper.threads=1", "screen=off", *overrides,
-    ]  # fmt: skip
     environment = {**os.environ, **thread_environment(1)}  # an inline run has only this
-    subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+    launch(
+        f"output={output}", "device=cpu", "evaluator.max_frames=0", "tracker.threads=1", "mvs.threads=1",
+        "depth_fusion.threads=1", "mapper.threads=1", "screen=off", *overrides, env=environment,
+    )  # fmt: skip
     return (output / "map.ply").read_bytes()

@@ -6,8 +6,6 @@ import contextlib
 import itertools
 import json
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -21,7 +19,7 @@ import zmq
 
 import msgs
 from bench.faults.frame_mutations import good, mutated
-from bench.runs import ROOT
+from bench.runs import launch
 from bench.table import Row, at_least, at_most
 from msgs import End, Frame, Message
 from msgs.codec import NEWEST, CodecError, decode, encode
@@ -161,13 +159,12 @@ def _is_end(data: bytes) -> bool:
 def _graph(count: int, good_frames: int) -> list[Row]:
     robot = _Robot(count, good_frames)
     with tempfile.TemporaryDirectory() as folder:
-        command = [
-            sys.executable, str(ROOT / "launch/run_all.py"), f"output={folder}/out", "dataset=robot",
-            f"dataset.path={robot.address}", "dataset.timeout=60", "device=cpu", "mapper.iterations=5",
-            "mapper.refinement=20", "evaluator.lpips=off", "screen=plain", "recorder=mcap",
-        ]  # fmt: skip
         try:
-            run = subprocess.run(command, capture_output=True, text=True, timeout=RUN_SECONDS, cwd=folder)
+            run = launch(
+                f"output={folder}/out", "dataset=robot", f"dataset.path={robot.address}", "dataset.timeout=60",
+                "device=cpu", "mapper.iterations=5", "mapper.refinement=20", "evaluator.lpips=off", "screen=plain",
+                "recorder=mcap", check=False, timeout=RUN_SECONDS,
+            )  # fmt: skip
         finally:
             robot.close()
         lost = run.returncode != 0 or not (Path(folder) / "out/map.ply").exists()

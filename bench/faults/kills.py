@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bench.faults.launched import Launched, map_opens
-from bench.table import Row, at_most
+from bench.table import Row, all_of, at_most
 from launch.outcome import OBSERVER_FAILED
 
 STAGES = ("dataset", "tracker", "mvs", "depth_fusion", "mapper")
@@ -104,8 +104,8 @@ def _killed(faults: Faults, cases: list[tuple[str, signal.Signals]], resumable: 
         else:
             shutil.rmtree(output)
     rows = [
-        _all("stage lost: maps that open", found.maps, found.runs),
-        _all("stage lost: named in the report", found.reported, found.runs),
+        all_of("stage lost: maps that open", found.maps, found.runs),
+        all_of("stage lost: named in the report", found.reported, found.runs),
         at_most("stage lost: processes, sockets, folders left", len(found.left), "", 0),
         at_most("stage killed or ended: all over after, longest", max(found.ends), "s", LONGEST_END),
     ]
@@ -148,8 +148,8 @@ def _observed(faults: Faults, runs: int, whole: Path) -> list[Row]:
             equal += (run.output / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
         shutil.rmtree(run.output)
     return [
-        _all("observer killed, or its disk full: runs that finish and say so", finished, runs),
-        _all("observer killed, or its disk full: the map of an undisturbed run", equal, runs),
+        all_of("observer killed, or its disk full: runs that finish and say so", finished, runs),
+        all_of("observer killed, or its disk full: the map of an undisturbed run", equal, runs),
     ]
 
 
@@ -167,7 +167,3 @@ def _resumed(outputs: list[Path], whole: Path) -> list[Row]:
 def _psnr(output: Path, part: str) -> float:
     report = json.loads((output / "report.json").read_text())
     return float(report["rendering"][part]["psnr"])
-
-
-def _all(name: str, met: int, runs: int) -> Row:
-    return Row(name, f"{met} of {runs}", "", f"{runs} of {runs}", met == runs)

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import json
 import statistics
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from bench.runs import ROOT, environment
+from bench.runs import launch
 from bench.table import Row, at_least, at_most
 
 BEHIND = 6.0  # dB below the median frame
@@ -41,10 +39,6 @@ def rows(name: str, rendering: dict[str, Any]) -> list[Row]:
 def _report(overrides: tuple[str, ...]) -> dict[str, Any]:
     """Of a run in which every frame is scored. Raises CalledProcessError where it fails."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [
-            sys.executable, str(ROOT / "launch/run_all.py"), f"output={folder}/out", "device=cpu", "screen=off",
-            "evaluator.lpips=off", *overrides,
-        ]  # fmt: skip
-        subprocess.run(command, check=True, capture_output=True, cwd=ROOT, env=environment())
+        launch(f"output={folder}/out", "device=cpu", "screen=off", "evaluator.lpips=off", *overrides)
         report: dict[str, Any] = json.loads(Path(folder, "out", "report.json").read_text())
     return report

@@ -26,7 +26,7 @@ import torch
 from bench.depth.data import SOURCES, Scene, Source
 from bench.depth.run import Score, depth_view, score
 from bench.depth.tracked import load_tracked
-from bench.runs import DATA
+from bench.runs import DATA, environment
 from bench.runs import folder as folder_of
 from bench.table import Row, main
 from bench.tracking.__main__ import run as track
@@ -157,8 +157,7 @@ def flow_rows(name: str, frames: int | None) -> list[Row]:
 def measure(options: argparse.Namespace) -> list[Row]:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    if (DATA.parent / "weights").is_dir():
-        os.environ.setdefault("MVSGS_WEIGHTS", str(DATA.parent / "weights"))
+    os.environ.update(environment())
     folder = folder_of(options, "learned")
     rows: list[Row] = []
     for name in QUICK if options.quick else SCENES:

@@ -12,10 +12,10 @@ import os
 import numpy as np
 import torch
 
-from bench.depth.calibration import INLIER, fit, load, reliability
+from bench.depth.calibration import INLIER, fit, load, print_reliability
 from bench.depth.data import SOURCES
 from bench.learned.__main__ import AREA, photographs
-from bench.runs import DATA
+from bench.runs import environment
 from mvsgs_core.mvs.cascade import CascadeDepth
 from mvsgs_core.mvs.learned import NETWORKS, LearnedStereo, LearnedStereoConfig, logit
 
@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=24, help="of each sequence at most")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    os.environ.setdefault("MVSGS_WEIGHTS", str(DATA.parent / "weights"))
+    os.environ.update(environment())
     data = {name: samples(name, options.keyframes) for name in (*FIT, *CHECK)}
     x = np.concatenate([np.stack([np.ones(SAMPLES), logit(data[name][0])], axis=1) for name in FIT])
     now = fit(x, np.concatenate([data[name][1] for name in FIT]))
@@ -63,9 +63,7 @@ def main() -> None:
     for name, (confidence, inlier) in data.items():
         for tag, (offset, slope) in (("fitted now", now), ("in the code", in_code), ("as it comes", (0.0, 1.0))):
             probability = 1 / (1 + np.exp(-offset - slope * logit(confidence)))
-            error, curve = reliability(probability, inlier)
-            text = " ".join(f"{c:.2f}:{i:.2f}({s:.2f})" for c, i, s in curve)
-            print(f"  {name:18s} {tag:12s} calibration error {error:.3f}  confidence:inliers(fraction) {text}")
+            print_reliability(name, tag, probability, inlier)
 
 
 if __name__ == "__main__":

@@ -225,12 +225,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default=",".join(GROUPS), help=f"comma separated: {', '.join(GROUPS)}")
-    parser.add_argument(
-        "--jobs", type=int, default=1, help="difficulties and real sequences at once; times mean little"
-    )
     parser.add_argument("--frames", type=int, default=2000, help="of the long run")
-    pieces.arguments(parser)
-    parser.add_argument("overrides", nargs="*", help="of every run: mapper.iterations=10")
+    pieces.arguments(parser, "mapper.iterations=10", jobs=True)
 
 
 if __name__ == "__main__":

@@ -8,9 +8,7 @@ that what the tracker holds is counted, and not what building the scene or one b
 from __future__ import annotations
 
 import ctypes
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -52,11 +50,6 @@ def _resident() -> float:
     if trim is not None:
         trim(0)
     return float(psutil.Process().memory_info().rss / 1e6)
-
-
-def in_own_process(frames: int) -> list[Sample]:
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(follow, frames).result()
 
 
 def rows(samples: Sequence[Sample]) -> list[Row]:
