@@ -18,17 +18,16 @@ from mvsgs_core.rasterizer.splats import Splats
 
 
 class _Rasterize(torch.autograd.Function):
-    """(parameters, means2d, pose) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
+    """(means2d, pose, fields of Splats) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor,
-        betas: Tensor, means2d: Tensor, pose: Tensor, settings: RenderSettings, extra: dict[str, Any],
-    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        parameters = [t.detach().contiguous() for t in (means, log_scales, quaternions, opacity_logits, sh, betas)]
+        ctx: Any, settings: RenderSettings, extra: dict[str, Any], means2d: Tensor, pose: Tensor, *splats: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        parameters = [tensor.detach().contiguous() for tensor in splats]
         color = torch.empty(*settings.size, 3)
         depth, opacity = torch.empty(settings.size), torch.empty(settings.size)
-        radii = torch.empty(len(means))
+        radii = torch.empty(len(means2d))
         passed = native.load("rasterizer").forward(
             settings=settings,
             pose=pose.detach().contiguous().numpy(),
@@ -66,7 +65,7 @@ class _Rasterize(torch.autograd.Function):
             on_pose=on_pose.numpy(),
         )
         *shared, on_betas = results
-        return (*shared, on_betas if ctx.settings.exact else None, on_means2d, on_pose, None, None)
+        return (None, None, on_means2d, on_pose, *shared, on_betas if ctx.settings.exact else None)
 
 
 def render(splats: Splats, settings: RenderSettings) -> Render:
@@ -79,7 +78,7 @@ def render(splats: Splats, settings: RenderSettings) -> Render:
     count = len(splats)
     means2d = means2d_leaf(splats, settings)
     extra: dict[str, Any] = {"backward": Backward()}
-    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), means2d, settings.pose, settings, extra)
+    color, depth, opacity = _Rasterize.apply(settings, extra, means2d, settings.pose, *splats.tensors().values())
     weight_sum = weight_max = None
     if settings.weights:
         weight_sum, weight_max = torch.empty(count), torch.empty(count)

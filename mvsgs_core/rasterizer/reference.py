@@ -96,8 +96,8 @@ def project(splats: Splats, means2d: Tensor, settings: RenderSettings) -> Projec
 
 
 @dataclass
-class Choice:
-    """Which splats a view shows."""
+class Culled:
+    """Which splats are left after culling."""
 
     order: Tensor  # (V,) indices, front to back
     half_sizes: Tensor  # (V, 2) of the box that holds all with alpha >= 1/255, px
@@ -105,15 +105,15 @@ class Choice:
 
 
 @torch.no_grad()
-def choose(splats: Splats, settings: RenderSettings) -> Choice:
+def cull(splats: Splats, settings: RenderSettings) -> Culled:
     """Leaves out what is not usable, behind the near plane, degenerate on the image, too faint or off the image."""
     height, width = settings.size
     keep = usable(splats)
     pose = settings.pose.to(splats.means.device)
     z = ((splats.means.double() - pose[:3, 3]) @ pose[:3, 2]).nan_to_num(0.0)
     kept = torch.nonzero(keep & (z > settings.near))[:, 0]
-    chosen = Splats(*(tensor[kept] for tensor in splats.tensors().values()))
-    p = project(chosen, torch.zeros_like(chosen.means[:, :2]), settings)
+    ahead = Splats(*(tensor[kept] for tensor in splats.tensors().values()))
+    p = project(ahead, torch.zeros_like(ahead.means[:, :2]), settings)
     sane = torch.isfinite(p.determinant) & (p.xx < interface.MAX_VARIANCE) & (p.yy < interface.MAX_VARIANCE)
     reach = kernels.extent(p.opacity, p.betas, settings.exact).clamp(max=interface.MAX_REACH)
     half_x, half_y = (reach * p.xx).sqrt(), (reach * p.yy).sqrt()
@@ -122,7 +122,7 @@ def choose(splats: Splats, settings: RenderSettings) -> Choice:
     seen = torch.nonzero(sane & on_image & (p.opacity >= kernels.MIN_ALPHA))[:, 0]
     seen = seen[torch.argsort(z[kept][seen].float(), stable=True)]
     refused = int((~keep).sum()) + int((~sane).sum())
-    return Choice(kept[seen], torch.stack([half_x, half_y], dim=1)[seen], refused)
+    return Culled(kept[seen], torch.stack([half_x, half_y], dim=1)[seen], refused)
 
 
 def alphas(p: Projected, pixel_x: Tensor, pixel_y: Tensor, settings: RenderSettings) -> Tensor:
@@ -138,13 +138,13 @@ def render(splats: Splats, settings: RenderSettings) -> Render:
     dtype, device, count = splats.means.dtype, splats.means.device, len(splats)
     height, width = settings.size
     means2d = interface.means2d_leaf(splats, settings)
-    choice = choose(splats, settings)
-    shown = Splats(*(tensor.index_select(0, choice.order) for tensor in splats.tensors().values()))
-    p = project(shown, means2d.index_select(0, choice.order), settings)
+    culled = cull(splats, settings)
+    shown = Splats(*(tensor.index_select(0, culled.order) for tensor in splats.tensors().values()))
+    p = project(shown, means2d.index_select(0, culled.order), settings)
     background = torch.tensor(settings.background, dtype=dtype, device=device)
     weight_sum, weight_max, radii = splats.means.new_zeros(3, count).unbind(0)
 
-    rows_at_once = max(1, PAIRS_AT_ONCE // max(1, width * len(choice.order)))
+    rows_at_once = max(1, PAIRS_AT_ONCE // max(1, width * len(culled.order)))
     columns = torch.arange(width, device=device)
     color, depth, opacity = [], [], []
     for first in range(0, height, rows_at_once):
@@ -161,11 +161,11 @@ def render(splats: Splats, settings: RenderSettings) -> Render:
         depth.append(torch.where(covered > 0, weights @ p.depths, 0.0) / torch.where(covered > 0, covered, 1.0))
         opacity.append(1.0 - transmittance)
         with torch.no_grad():
-            weight_sum[choice.order] += weights.sum(dim=0)
-            if len(choice.order):
-                weight_max[choice.order] = torch.maximum(weight_max[choice.order], weights.amax(dim=0))
+            weight_sum[culled.order] += weights.sum(dim=0)
+            if len(culled.order):
+                weight_max[culled.order] = torch.maximum(weight_max[culled.order], weights.amax(dim=0))
 
-    radii[choice.order] = choice.half_sizes.amax(dim=1)
+    radii[culled.order] = culled.half_sizes.amax(dim=1)
     return Render(
         color=torch.cat(color).reshape(height, width, 3),
         depth=torch.cat(depth).reshape(height, width),
@@ -175,6 +175,6 @@ def render(splats: Splats, settings: RenderSettings) -> Render:
         means2d=means2d,
         weight_sum=weight_sum if settings.weights else None,
         weight_max=weight_max if settings.weights else None,
-        refused=choice.refused,
+        refused=culled.refused,
         backward=Backward(),
     )

@@ -6,14 +6,11 @@
 #include <omp.h>
 
 #include <chrono>
-#include <cmath>
 
 #include "bench/plain_projection.hpp"
 
 namespace splats {
 namespace {
-
-using namespace plain;
 
 struct Flat {
     float u, v, depth, a, b, c;  // inverse covariance
@@ -40,19 +37,17 @@ void bin_plainly(const Camera& camera, const Parameters& p, Scene& scene, int th
 #pragma omp parallel for num_threads(threads)
     for (int64_t i = 0; i < p.count; ++i) {
         Flat& s = scene.splats[i];
-        Projection r;
+        PlainProjection r;
         s.last_x = -1;
-        if (project(camera, p, i, r) != Fate::kSeen) continue;
-        Shading shading;
-        shade(p, i, r, shading);
-        for (int k = 0; k < 3; ++k) s.color[k] = larger(shading.raw[k], 0.0f);
-        s.u = float(r.u);
-        s.v = float(r.v);
+        if (!project_plainly(camera, p, i, r)) continue;
+        shade_plainly(p, i, r, s.color);
+        s.u = r.u;
+        s.v = r.v;
         s.depth = r.z;
         s.a = r.yy / r.determinant;
         s.b = -r.xy / r.determinant;
         s.c = r.xx / r.determinant;
-        s.opacity = r.sigmoid * r.compensation;
+        s.opacity = r.opacity;
         s.half_beta = 0.5f * r.beta;
         const float half = 0.5f * (r.xx + r.yy);
         float reach = 9.0f;

@@ -1,5 +1,5 @@
-// Real spherical harmonics up to degree 3, order and signs as in 3DGS files, and their derivatives: of sixteen
-// directions, one in each lane.
+// Real spherical harmonics up to degree 3, order and signs as in 3DGS files, of one direction or of sixteen, one in each
+// lane; and their derivatives.
 #pragma once
 
 #include "rasterizer/lanes.hpp"
@@ -7,8 +7,9 @@
 namespace splats {
 
 // basis[(degree + 1)^2] at the unit direction (x, y, z).
-SPLATS_INLINE void harmonics(int degree, const Lanes& x, const Lanes& y, const Lanes& z, Lanes* basis) {
-    basis[0] = all(0.28209479177387814f);
+template <class Number>
+SPLATS_INLINE void harmonics(int degree, const Number& x, const Number& y, const Number& z, Number* basis) {
+    basis[0] = Number{} + 0.28209479177387814f;
     if (degree < 1) return;
     basis[1] = -0.4886025119029199f * y;
     basis[2] = 0.4886025119029199f * z;

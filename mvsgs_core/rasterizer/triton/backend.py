@@ -94,21 +94,20 @@ def projected(parameters: list[Tensor], settings: RenderSettings) -> Pass:
 
 
 class _Rasterize(torch.autograd.Function):
-    """(parameters, means2d, pose) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
+    """(means2d, pose, fields of Splats) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, opacity_logits: Tensor, sh: Tensor,
-        betas: Tensor, means2d: Tensor, pose: Tensor, settings: RenderSettings, extra: dict[str, Any],
-    ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-        parameters = [t.detach().contiguous() for t in (means, log_scales, quaternions, opacity_logits, sh, betas)]
+        ctx: Any, settings: RenderSettings, extra: dict[str, Any], means2d: Tensor, pose: Tensor, *splats: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        parameters = [tensor.detach().contiguous() for tensor in splats]
         passed = projected(parameters, settings)
         lists = passed.lists
         height, width = settings.size
         tiles_y, tiles_x = tile_grid(settings.size)
-        color = means.new_empty(height, width, 3)
-        depth, opacity = means.new_empty(2, height, width).unbind(0)
-        weights = means.new_zeros(2, len(lists.pair_splats) if settings.weights else 1)
+        color = means2d.new_empty(height, width, 3)
+        depth, opacity = means2d.new_empty(2, height, width).unbind(0)
+        weights = means2d.new_zeros(2, len(lists.pair_splats) if settings.weights else 1)
         blend[(tiles_y * tiles_x,)](
             passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
             weights[1], *settings.background, height, width, tiles_x, EXACT=settings.exact, WEIGHTS=settings.weights,
@@ -146,7 +145,7 @@ class _Rasterize(torch.autograd.Function):
         results = [torch.empty_like(parameter) for parameter in parameters]
         on_means2d = color.new_empty(count, 2)
         programs = triton.cdiv(count, BLOCK)
-        wants_pose = ctx.needs_input_grad[7]
+        wants_pose = ctx.needs_input_grad[3]
         on_pose = torch.zeros(max(1, programs), 12, dtype=torch.float64, device=color.device)
         if count:
             project_backward[(programs,)](
@@ -158,7 +157,7 @@ class _Rasterize(torch.autograd.Function):
         if wants_pose:
             pose = torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(settings.pose.device)
         *shared, on_betas = results
-        return (*shared, on_betas if exact else None, on_means2d, pose, None, None)
+        return (None, None, on_means2d, pose, *shared, on_betas if exact else None)
 
 
 def render(splats: Splats, settings: RenderSettings) -> Render:
@@ -167,7 +166,7 @@ def render(splats: Splats, settings: RenderSettings) -> Render:
         raise ValueError(f"the triton back end takes float32 splats, got {splats.means.dtype}")
     means2d = means2d_leaf(splats, settings)
     extra: dict[str, Any] = {}
-    color, depth, opacity = _Rasterize.apply(*splats.tensors().values(), means2d, settings.pose, settings, extra)
+    color, depth, opacity = _Rasterize.apply(settings, extra, means2d, settings.pose, *splats.tensors().values())
     passed: Pass = extra["passed"]
     return Render(
         color=color,

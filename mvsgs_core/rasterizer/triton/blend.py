@@ -11,7 +11,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-# A pair's sums: red, green, blue, depth, log opacity, u, v, u u, u v, v v, beta; see triton_projection_backward.
+# A pair's sums: red, green, blue, depth, log opacity, u, v, u u, u v, v v, beta; see projection_backward.
 SUMS = 11
 
 TILE = tl.constexpr(16)
@@ -21,6 +21,15 @@ LOG2_MIN_ALPHA = tl.constexpr(-7.994353436858858)
 HALF_LOG2E = tl.constexpr(0.7213475204444817)
 CENTER_M = tl.constexpr(1e-6)
 TINY = tl.constexpr(1e-30)
+
+
+@triton.jit
+def _pixels(tile, height, width, tiles_x):  # type: ignore[no-untyped-def]
+    """x, y, place in an image by rows, and whether it is on the image, of each pixel of a tile."""
+    lane = tl.arange(0, TILE * TILE)
+    px = (tile % tiles_x) * TILE + lane % TILE
+    py = (tile // tiles_x) * TILE + lane // TILE
+    return px.to(tl.float32), py.to(tl.float32), py * width + px, (px < width) & (py < height)
 
 
 @triton.jit
@@ -47,12 +56,7 @@ def blend(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """color (H, W, 3), depth and opacity (H, W); with WEIGHTS the sum and maximum of each pair's, (P,), 0 before."""
     tile = tl.program_id(0)
-    lane = tl.arange(0, TILE * TILE)
-    px = (tile % tiles_x) * TILE + lane % TILE
-    py = (tile // tiles_x) * TILE + lane // TILE
-    inside = (px < width) & (py < height)
-    x = px.to(tl.float32)
-    y = py.to(tl.float32)
+    x, y, at, inside = _pixels(tile, height, width, tiles_x)
     left = tl.where(inside, 1.0, 0.0)
     red = tl.zeros([TILE * TILE], tl.float32)
     green = tl.zeros([TILE * TILE], tl.float32)
@@ -80,7 +84,6 @@ def blend(  # type: ignore[no-untyped-def]
         if index % 4 == 0:  # noqa: SIM102  # `and` computes both for every pair
             if tl.max(left, axis=0) < MIN_T:
                 index = end
-    at = py * width + px
     covered = tl.where(inside, 1.0 - left, 0.0)
     tl.store(color + 3 * at, red + left * red_behind, mask=inside)
     tl.store(color + 3 * at + 1, green + left * green_behind, mask=inside)
@@ -96,13 +99,7 @@ def blend_backward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """sums (P, SUMS) by slot, 0 before. Without DEPTH the gradients of depth and opacity are taken as 0."""
     tile = tl.program_id(0)
-    lane = tl.arange(0, TILE * TILE)
-    px = (tile % tiles_x) * TILE + lane % TILE
-    py = (tile // tiles_x) * TILE + lane // TILE
-    inside = (px < width) & (py < height)
-    x = px.to(tl.float32)
-    y = py.to(tl.float32)
-    at = py * width + px
+    x, y, at, inside = _pixels(tile, height, width, tiles_x)
     on_red = tl.load(on_color + 3 * at, mask=inside, other=0.0)
     on_green = tl.load(on_color + 3 * at + 1, mask=inside, other=0.0)
     on_blue = tl.load(on_color + 3 * at + 2, mask=inside, other=0.0)
