@@ -15,7 +15,7 @@ from tests.support.sequences import synthetic
 
 COUNT = 9
 # the least size that the networks take, so that noise costs little
-TRIAL = DroidTracker.Config(weights="random", area=64 * 86, stride=1, warmup=5)
+TRIAL = DroidTracker.Config(weights="random", area=64 * 86, constants={"stride": 1, "warmup": 5})
 
 
 def run(config: DroidTracker.Config, count: int = COUNT) -> tuple[DroidTracker, list[msgs.Message], list[Frame]]:
@@ -86,4 +86,4 @@ def test_missing_weights_are_said_before_anything_else(tmp_path: Path, monkeypat
     with pytest.raises(ValueError, match="truncated"):
         DroidTracker()
     with pytest.raises(ValueError, match="demo, tum, replica"):
-        DroidTracker(DroidTracker.Config(weights="random", preset="kitti"))
+        DroidTracker(DroidTracker.Config(weights="random", preset="kitti"))  # type: ignore[arg-type]

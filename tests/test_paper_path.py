@@ -14,7 +14,8 @@ from msgs import Depth, FusedKeyframe, Keyframe, SplatMap, Trajectory
 
 # Hardly more than the least sizes that the networks take: what comes out is noise at any size.
 PATH = [
-    "tracker=droid", "tracker.weights=random", "tracker.area=12288", "tracker.stride=1", "tracker.warmup=5",
+    "tracker=droid", "tracker.weights=random", "tracker.area=12288", "tracker.constants.stride=1",
+    "tracker.constants.warmup=5",
     "mvs=mvsformer", "mvs.weights=random", "mvs.network_area=4096", "mvs.area=1300", "mvs.ranges.min_cells=1",
     "depth_fusion=vfuse", "depth_fusion.weights=random", "depth_fusion.confidence=0", "depth_fusion.check=false",
     "mapper=paper", "mapper.iterations=2", "mapper.refinement=4",

@@ -13,7 +13,7 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import DROID_GLOBAL, DROID
 
 LOCAL, GLOBAL = DROID_LOCAL, DROID_GLOBAL
 _WEIGHT = 1e-3  # information per cell² at full confidence
-_DAMPING, _LEAST_DAMPING = 0.2, 1e-7  # share of the network's damping that counts, and what is added
+_DAMPING, _MIN_DAMPING = 0.2, 1e-7  # fraction of the network's damping that counts, and what is added
 _NO_DAMPING = 1e-6  # of a keyframe that no update has seen
 
 
@@ -52,7 +52,7 @@ def solve(
         information=_WEIGHT * np.stack([e.weight.reshape(-1, 2).T for e in edges]).astype(np.float64),
         free_pose=positions >= first_free,
         free_depth=is_source & (not motion_only),
-        damping=(_DAMPING * damping + _LEAST_DAMPING).reshape(len(frames), -1),
+        damping=(_DAMPING * damping + _MIN_DAMPING).reshape(len(frames), -1),
     )
     solution = adjust(graph, replace(solver, threads=threads))
     for n, frame in enumerate(frames):

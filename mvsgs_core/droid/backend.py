@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+from mvsgs_core.droid.config import Constants, CorrelationKind
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.networks import Networks
-from mvsgs_core.droid.presets import Preset
 from mvsgs_core.droid.proximity import by_proximity
 from mvsgs_core.droid.video import Video
 from mvsgs_core.stats import Stats
 
 _FACTORS_PER_KEYFRAME = 16
-_LEAST = 3  # keyframes
+_MIN_KEYFRAMES = 3
 
 
 def adjust_globally(
-    video: Video, networks: Networks, preset: Preset, steps: int, correlation: str, threads: int, stats: Stats
+    video: Video,
+    networks: Networks,
+    constants: Constants,
+    steps: int,
+    correlation: CorrelationKind,
+    threads: int,
+    stats: Stats,
 ) -> None:
     """Normalizes the scale, chooses edges among all keyframes, and updates all of them `steps` times."""
-    if len(video) < _LEAST:
+    if len(video) < _MIN_KEYFRAMES:
         return
     video.normalize()
     graph = FactorGraph(video, networks, correlation=correlation, transient=True, threads=threads)
@@ -26,10 +32,10 @@ def adjust_globally(
         first_source=0,
         first_to=0,
         existing=[],
-        radius=preset.backend_radius,
-        nms=preset.backend_nms,
-        threshold=preset.backend_threshold,
-        beta=preset.beta,
+        radius=constants.backend_radius,
+        nms=constants.backend_nms,
+        threshold=constants.backend_threshold,
+        beta=constants.beta,
         limit=_FACTORS_PER_KEYFRAME * len(video),
     )
     stats.count("global edges", graph.add(near))

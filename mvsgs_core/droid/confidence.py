@@ -38,8 +38,8 @@ def agreement(video: Video, position: int) -> np.ndarray:
     return count.numpy()
 
 
-def consistent_share(video: Video, position: int) -> float:
-    """Share of a keyframe's cells whose depth at least one neighbor confirms."""
+def consistent_fraction(video: Video, position: int) -> float:
+    """Fraction of a keyframe's cells whose depth at least one neighbor confirms."""
     return float((agreement(video, position) > 0).mean())
 
 
@@ -60,4 +60,4 @@ def coarse_map(video: Video, graph: FactorGraph, position: int, framing: Framing
     return Coarse(np.where(known_there, inverse_depth, zero), np.where(known_there, confidence, zero))
 
 
-__all__ = ["Coarse", "agreement", "coarse_map", "consistent_share"]
+__all__ = ["Coarse", "agreement", "coarse_map", "consistent_fraction"]

@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from mvsgs_core.droid.adjustment import GLOBAL, LOCAL, solve
+from mvsgs_core.droid.config import CorrelationKind
 from mvsgs_core.droid.networks import Correlation, Networks
 from mvsgs_core.droid.proximity import Pair
 from mvsgs_core.droid.video import Video
@@ -50,7 +51,7 @@ class FactorGraph:
         video: Video,
         networks: Networks,
         *,
-        correlation: str = "volume",
+        correlation: CorrelationKind = "volume",
         transient: bool = False,
         max_factors: int | None = None,
         threads: int = 1,

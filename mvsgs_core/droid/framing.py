@@ -11,7 +11,7 @@ import numpy as np
 from mvsgs_core.camera import resize_image, scale_intrinsics
 from mvsgs_core.networks.droid import STRIDE
 
-_LEAST = 8  # cells: the correlation pyramid halves the map three times
+_MIN_CELLS = 8  # each way: the correlation pyramid halves the map three times
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Framing:
         factor = math.sqrt(area / (height * width))
         # the sum keeps an exact product such as 480 * 0.8 from being rounded down
         framing = Framing((height, width), (int(height * factor + 1e-6), int(width * factor + 1e-6)))
-        if min(framing.grid) < _LEAST:
+        if min(framing.grid) < _MIN_CELLS:
             raise ValueError(
                 f"images of {width}x{height} at an area of {area} pixels give a map of {framing.grid[1]}x"
-                f"{framing.grid[0]} cells; DROID-SLAM needs {_LEAST} each way: give a larger area"
+                f"{framing.grid[0]} cells; DROID-SLAM needs {_MIN_CELLS} each way: give a larger area"
             )
         return framing
 

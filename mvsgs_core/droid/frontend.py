@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mvsgs_core.droid.config import Constants
 from mvsgs_core.droid.factor_graph import FactorGraph
-from mvsgs_core.droid.presets import Preset
 from mvsgs_core.droid.proximity import by_proximity, neighborhood
 from mvsgs_core.droid.video import Video
 from mvsgs_core.stats import Stats
@@ -14,12 +14,12 @@ _START_UPDATES = 8  # with edges to neighbors, and again with edges by proximity
 _START_REACH, _START_RADIUS, _START_NMS, _START_BETA = 3, 2, 2, 0.25
 _KEPT_FROM_START = 4  # keyframes before the end of the start whose edges stay active
 _RECENT = 5  # newest keyframes that get new edges
-_LEAST = 4  # keyframes of a forced start
+_MIN_KEYFRAMES = 4  # of a forced start
 
 
 class Frontend:
-    def __init__(self, video: Video, graph: FactorGraph, preset: Preset, stats: Stats) -> None:
-        self.video, self.graph, self.preset, self.stats = video, graph, preset, stats
+    def __init__(self, video: Video, graph: FactorGraph, constants: Constants, stats: Stats) -> None:
+        self.video, self.graph, self.constants, self.stats = video, graph, constants, stats
         self.started = False
         self._mean_over = 1  # keyframes whose mean inverse depth a new one begins with
 
@@ -38,14 +38,14 @@ class Frontend:
     def advance(self) -> bool:
         """A frame joined the video. Returns False if that made the keyframe before it superfluous."""
         if not self.started:
-            if len(self.video) == self.preset.warmup:
+            if len(self.video) == self.constants.warmup:
                 self._start()
             return True
         return self._go_on()
 
     def force_start(self) -> bool:
         """The stream has ended before the warm-up did. Returns False if there are too few keyframes."""
-        if not self.started and len(self.video) >= _LEAST:
+        if not self.started and len(self.video) >= _MIN_KEYFRAMES:
             self._start()
         return self.started
 
@@ -61,23 +61,24 @@ class Frontend:
         self._mean_over = 4
 
     def _go_on(self) -> bool:
-        preset, video, graph = self.preset, self.video, self.graph
+        constants, video, graph = self.constants, self.video, self.graph
         count = len(video)
-        back = max(count - preset.frontend_window, 0)
-        graph.retire_older(preset.max_age)
+        back = max(count - constants.frontend_window, 0)
+        graph.retire_older(constants.max_age)
         graph.forget_before(back - 2 * _RECENT)
         with self.stats.time("edges"):
-            near = self._near(max(count - _RECENT, 0), back, preset.frontend_radius, preset.frontend_nms, preset.beta)
+            first, radius, nms = max(count - _RECENT, 0), constants.frontend_radius, constants.frontend_nms
+            near = self._near(first, back, radius, nms, constants.beta)
             self.stats.count("edges", graph.add(near, make_room=True))
         self._mean_over = 1
         with self.stats.time("local updates"):
-            self._update(preset.first_updates)
-            moved = video.distances(np.array([count - 3]), np.array([count - 2]), preset.beta)[0]
-            if moved < preset.keyframe_threshold:
+            self._update(constants.first_updates)
+            moved = video.distances(np.array([count - 3]), np.array([count - 2]), constants.beta)[0]
+            if moved < constants.keyframe_threshold:
                 graph.remove_keyframe(count - 2)
                 self.stats.skip("keyframes too near the one before")
                 return False
-            self._update(preset.further_updates)
+            self._update(constants.further_updates)
         return True
 
     def _near(self, first_source: int, first_to: int, radius: int, nms: int, beta: float) -> list[tuple[int, int]]:
@@ -88,9 +89,9 @@ class Frontend:
             existing=[edge.pair for edge in (*self.graph.active, *self.graph.inactive)],
             radius=radius,
             nms=nms,
-            threshold=self.preset.frontend_threshold,
+            threshold=self.constants.frontend_threshold,
             beta=beta,
-            limit=self.preset.max_factors,
+            limit=self.constants.max_factors,
         )
 
     def _update(self, times: int, first_free: int | None = None) -> None:

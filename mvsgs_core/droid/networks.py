@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mvsgs_core.droid.config import CorrelationKind
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.correlation import CorrelationVolume, OnTheFlyCorrelation
 from mvsgs_core.networks.droid import DroidNet
@@ -85,7 +86,7 @@ class Networks:
         return hidden[0], context[0]
 
     @torch.no_grad()
-    def correlation(self, source: Tensor, to: Tensor, kind: str) -> Correlation:
+    def correlation(self, source: Tensor, to: Tensor, kind: CorrelationKind) -> Correlation:
         """Of the features (128, h, w) of one edge's two ends."""
         with self._precision():
             return CORRELATIONS[kind](source[None], to[None])

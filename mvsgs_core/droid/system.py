@@ -6,20 +6,19 @@ What is done with a frame depends on the frames before it alone: the same stream
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
 from mvsgs_core import geometry
 from mvsgs_core.droid.backend import adjust_globally
-from mvsgs_core.droid.confidence import Coarse, coarse_map, consistent_share
+from mvsgs_core.droid.confidence import Coarse, coarse_map, consistent_fraction
+from mvsgs_core.droid.config import DroidConfig
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.framing import Framing
 from mvsgs_core.droid.frontend import Frontend
 from mvsgs_core.droid.motion_filter import MotionFilter
 from mvsgs_core.droid.networks import RANDOM, Networks, load
-from mvsgs_core.droid.presets import AREA, Preset
 from mvsgs_core.droid.trajectory_filler import StoredFrame, fill
 from mvsgs_core.droid.video import Video, VideoFrame
 from mvsgs_core.held_out import is_held_out
@@ -29,26 +28,20 @@ from mvsgs_core.tracking.keyframe_choice import HELD_OUT
 from mvsgs_core.tracking.publish import Publisher, Update
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
-_DEGENERATE = 0.05  # share of cells that agree with a neighbor, below which a keyframe's depth is none
-
-
-@dataclass(frozen=True)
-class DroidConfig:
-    preset: Preset = field(default_factory=Preset)
-    weights: str | None = None  # file; None: found by the registry; "random": noise, to try the machinery
-    area: int = AREA  # pixels of the image that the networks see, aspect kept
-    correlation: str = "volume"  # of the frontend: volume (fast) or on_the_fly (little memory)
-    global_correlation: str = "on_the_fly"  # of the backend; volume: one edge's at a time
-    tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not published
-    device: str = "cpu"
-    threads: int = 1  # of the bundle adjustment
+_DEGENERATE = 0.05  # fraction of cells that agree with a neighbor, below which a keyframe's depth is none
 
 
 class DroidSlam:
     def __init__(self, config: DroidConfig | None = None, net: DroidNet | None = None) -> None:
         """Raises FileNotFoundError or ValueError where the weights are missing or wrong. net: instead of weights."""
         self.config = config or DroidConfig()
-        self.networks = Networks(load(self.config.weights) if net is None else net, torch.device(self.config.device))
+        self.constants = self.config.chosen
+        self.threads = self.config.threads or 1
+        device = self.config.device
+        if device == "auto":
+            device = "cuda:0" if torch.cuda.is_available() else "cpu"
+        self.global_correlation = self.config.global_correlation or ("volume" if device == "cpu" else "on_the_fly")
+        self.networks = Networks(load(self.config.weights) if net is None else net, torch.device(device))
         self.stats = Stats()
         if net is None and self.config.weights == RANDOM:
             self.stats.warn("DROID-SLAM runs on random weights: its poses and depths are noise")
@@ -68,7 +61,7 @@ class DroidSlam:
             self.frames.append(StoredFrame.of(index, timestamp, small))
         self.stats.count("frames")
         self._states.append(TrackingState.TRACKED if self.frontend.started else TrackingState.NOT_INITIALIZED)
-        if (len(self.frames) - 1) % self.config.preset.stride:
+        if (len(self.frames) - 1) % self.constants.stride:
             self.stats.skip("frames between strides")
             return Update(self._states[-1])
         with self.stats.time("motion filter"):
@@ -89,9 +82,9 @@ class DroidSlam:
             )
         )
         kept = self.frontend.advance()
-        every = self.config.preset.backend_every
+        every = self.constants.backend_every
         if kept and every and self.frontend.started and len(self.video) % every == 0:
-            self._adjust_globally(self.config.preset.backend_steps[-1:])
+            self._adjust_globally(self.constants.backend_steps[-1:])
         return self._publish(self.frontend.settled)
 
     @property
@@ -108,7 +101,7 @@ class DroidSlam:
         if not self.frontend.started:
             self.nothing = (
                 f"tracking never started: too little motion: {len(self.video)} of {len(self.frames)} frames moved by "
-                f"{self.config.preset.filter_threshold:g} cells or more (filter_threshold) since the one before"
+                f"{self.constants.filter_threshold:g} cells or more (filter_threshold) since the one before"
             )
             self.stats.warn(self.nothing)
             self._trajectory = self._collect(None)
@@ -116,7 +109,7 @@ class DroidSlam:
             return
         self.nothing = ""
         yield self._publish(len(self.video))
-        self._adjust_globally(self.config.preset.backend_steps)
+        self._adjust_globally(self.constants.backend_steps)
         self._trajectory = self._collect(self._fill())
         self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.video.keyframes))
         if self.networks.not_finite:
@@ -144,11 +137,11 @@ class DroidSlam:
             self.video,
             self.networks,
             correlation=config.correlation,
-            max_factors=config.preset.max_factors,
-            threads=config.threads,
+            max_factors=self.constants.max_factors,
+            threads=self.threads,
         )
-        self.motion_filter = MotionFilter(self.networks, config.preset.filter_threshold)
-        self.frontend = Frontend(self.video, self.graph, config.preset, self.stats)
+        self.motion_filter = MotionFilter(self.networks, self.constants.filter_threshold)
+        self.frontend = Frontend(self.video, self.graph, self.constants, self.stats)
         self.publisher = Publisher(self.video, config.tolerance)
 
     def _publish(self, settled: int) -> Update:
@@ -160,7 +153,7 @@ class DroidSlam:
         self.stats.count("keyframes", len(new))
         if self.frontend.started:
             position = max(0, len(self.video) - 2)
-            flat = consistent_share(self.video, position) < _DEGENERATE
+            flat = consistent_fraction(self.video, position) < _DEGENERATE
             self._states[-1] = TrackingState.DEGENERATE if flat else TrackingState.TRACKED
             if flat:
                 self.stats.warn("keyframes whose depth agrees with no other: their poses mean little")
@@ -170,13 +163,7 @@ class DroidSlam:
         with self.stats.time("global bundle adjustment"):
             for count in steps:
                 adjust_globally(
-                    self.video,
-                    self.networks,
-                    self.config.preset,
-                    count,
-                    self.config.global_correlation,
-                    self.config.threads,
-                    self.stats,
+                    self.video, self.networks, self.constants, count, self.global_correlation, self.threads, self.stats
                 )
 
     def _fill(self) -> dict[int, np.ndarray]:
@@ -184,7 +171,7 @@ class DroidSlam:
         own = self.video.keyframes
         others = [frame for frame in self.frames if frame.index not in own]
         with self.stats.time("frames between keyframes"):
-            found = fill(self.video, self.networks, others, self.config.correlation, self.config.threads, self.stats)
+            found = fill(self.video, self.networks, others, self.config.correlation, self.threads, self.stats)
         poses = {frame.index: pose for frame, pose in zip(others, found)}
         return poses | {index: frame.cam_from_world for index, frame in own.items()}
 
@@ -208,4 +195,4 @@ class DroidSlam:
         )
 
 
-__all__ = ["DroidConfig", "DroidSlam"]
+__all__ = ["DroidSlam"]

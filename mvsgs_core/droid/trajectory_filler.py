@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core import geometry
+from mvsgs_core.droid.config import CorrelationKind
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.networks import Networks
 from mvsgs_core.droid.video import Video, VideoFrame
@@ -41,7 +42,7 @@ def fill(
     video: Video,
     networks: Networks,
     frames: Sequence[StoredFrame],
-    correlation: str,
+    correlation: CorrelationKind,
     threads: int,
     stats: Stats,
 ) -> np.ndarray:
@@ -51,56 +52,35 @@ def fill(
     """
     poses = [np.zeros((0, 4, 4))]
     for start in range(0, len(frames), BATCH):
-        poses.append(_fill(video, networks, frames[start : start + BATCH], correlation, threads, stats))
+        batch = frames[start : start + BATCH]
+        count = len(video)
+        before, after = video.around([frame.index for frame in batch])
+        for frame, features, a, b in zip(batch, networks.features([f.image for f in batch]), before, after):
+            pose = between(video.frames[a], video.frames[b], frame.timestamp)
+            depth = np.ones_like(video.frames[a].inverse_depth)
+            video.frames.append(VideoFrame(frame.index, frame.timestamp, pose, depth, features))
+        graph = FactorGraph(video, networks, correlation=correlation, threads=threads)
+        new = range(count, len(video))
+        graph.add([*zip(before.tolist(), new), *zip(after.tolist(), new)])
+        for _ in range(_UPDATES):
+            solution = graph.update(count, motion_only=True)
+            if solution.failure:
+                stats.count("failed bundle adjustments")
+                stats.warn(f"frames between keyframes have no pose: {solution.failure}")
+                break
+        found = np.stack([frame.cam_from_world for frame in video.frames[count:]])
+        poses.append(np.full_like(found, np.nan) if solution.failure else found)
+        del video.frames[count:]
     return np.concatenate(poses)
-
-
-def _fill(
-    video: Video,
-    networks: Networks,
-    frames: Sequence[StoredFrame],
-    correlation: str,
-    threads: int,
-    stats: Stats,
-) -> np.ndarray:
-    count = len(video)
-    before, after = video.around([frame.index for frame in frames])
-    features = networks.features([frame.image for frame in frames])
-    known = video.frames[:count]
-    for n, frame in enumerate(frames):
-        a, b = known[before[n]], known[after[n]]
-        video.frames.append(
-            VideoFrame(
-                frame.index,
-                frame.timestamp,
-                between(a, b, frame.timestamp),
-                np.ones_like(a.inverse_depth),
-                features[n],
-            )
-        )
-    graph = FactorGraph(video, networks, correlation=correlation, threads=threads)
-    new = range(count, count + len(frames))
-    graph.add([*zip(before.tolist(), new), *zip(after.tolist(), new)])
-    for _ in range(_UPDATES):
-        solution = graph.update(count, motion_only=True)
-        if solution.failure:
-            stats.count("failed bundle adjustments")
-            stats.warn(f"frames between keyframes have no pose: {solution.failure}")
-            break
-    found = np.stack([frame.cam_from_world for frame in video.frames[count:]])
-    if solution.failure:
-        found[:] = np.nan
-    del video.frames[count:]
-    return found
 
 
 def between(a: VideoFrame, b: VideoFrame, timestamp: float) -> np.ndarray:
     """cam_from_world (4, 4) at a time on the screw motion from a to b; a's beyond the last keyframe."""
     if a is b:
         return a.cam_from_world.copy()
-    share = (timestamp - a.timestamp) / max(b.timestamp - a.timestamp, 1e-9)
+    fraction = (timestamp - a.timestamp) / max(b.timestamp - a.timestamp, 1e-9)
     twist = geometry.se3_log(b.cam_from_world @ geometry.inverse(a.cam_from_world))
-    return np.asarray(geometry.se3_exp(share * twist) @ a.cam_from_world)
+    return np.asarray(geometry.se3_exp(fraction * twist) @ a.cam_from_world)
 
 
 __all__ = ["StoredFrame", "between", "fill"]

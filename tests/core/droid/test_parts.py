@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from mvsgs_core import geometry, weights
+from mvsgs_core.droid.config import PRESETS, DroidConfig
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.framing import Framing
 from mvsgs_core.droid.motion_filter import MotionFilter
 from mvsgs_core.droid.networks import Networks, load, random_net
-from mvsgs_core.droid.presets import AREA, PRESETS, preset
 from mvsgs_core.droid.proximity import by_proximity, neighborhood
 from mvsgs_core.droid.trajectory_filler import StoredFrame, between, fill
 from mvsgs_core.droid.video import Video, VideoFrame
@@ -38,14 +38,14 @@ def video(positions: list[float]) -> Video:
 
 
 def test_published_sizes() -> None:
-    assert Framing.of(480, 640, AREA).grid == (48, 64)
-    assert Framing.of(680, 1200, AREA).grid == (41, 73)  # 584x328
+    assert Framing.of(480, 640, DroidConfig().area).grid == (48, 64)
+    assert Framing.of(680, 1200, DroidConfig().area).grid == (41, 73)  # 584x328
     with pytest.raises(ValueError, match="larger area"):
         Framing.of(480, 640, 64 * 64)
 
 
 def test_a_pixel_is_seen_at_the_same_ray_before_and_after_framing() -> None:
-    framing = Framing.of(480, 640, AREA)
+    framing = Framing.of(480, 640, DroidConfig().area)
     k = np.array([500.0, 510.0, 319.5, 239.5])
     cells = framing.intrinsics(k)
     u, v = 100.0, 37.0  # of the source: 0.8 of it, about the pixels' centers
@@ -65,11 +65,19 @@ def test_a_linear_map_keeps_its_values_over_the_whole_view() -> None:
 
 
 def test_presets() -> None:
-    assert preset("tum").warmup == 12
+    assert DroidConfig(preset="tum").chosen.warmup == 12
     assert (PRESETS["demo"].frontend_threshold, PRESETS["demo"].backend_threshold) == (16.0, 22.0)
     assert PRESETS["replica"].max_factors == 75
+    assert DroidConfig(preset="tum", constants={"stride": 1, "beta": 1}).chosen == replace(
+        PRESETS["tum"], stride=1, beta=1
+    )
     with pytest.raises(ValueError, match="demo, tum, replica"):
-        preset("kitti")
+        DroidConfig(preset="kitti")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"no constant 'window'; it has: stride, .*frontend_window"):
+        DroidConfig(constants={"window": 10})
+    for name, wrong in (("warmup", 2.5), ("stride", True), ("backend_steps", 3)):
+        with pytest.raises(ValueError, match=rf"constants\.{name}="):
+            DroidConfig(constants={name: wrong})
 
 
 def near(made: Video, **options: float) -> set[tuple[int, int]]:
@@ -266,4 +274,3 @@ def test_an_official_file_loads_and_a_missing_one_says_what_to_do(
 def test_random_weights_repeat() -> None:
     a, b = random_net(), random_net()
     torch.testing.assert_close(a.state_dict(), b.state_dict(), rtol=0, atol=0)
-    assert replace(preset("demo"), stride=1).stride == 1

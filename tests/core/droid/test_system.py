@@ -9,24 +9,24 @@ import numpy as np
 import pytest
 
 from mvsgs_core import geometry
-from mvsgs_core.droid.presets import Preset
-from mvsgs_core.droid.system import DroidConfig, DroidSlam
+from mvsgs_core.droid.config import DroidConfig
+from mvsgs_core.droid.system import DroidSlam
 from mvsgs_core.tracking.tracker import Update
 from mvsgs_core.trajectory import TrackingState, Trajectory
 from tests.support import droid_oracle as oracle
 
 HEIGHT, WIDTH, COUNT = 96, 128, 44
 INTRINSICS = np.array([115.0, 115.0, 63.5, 47.5])
-SMALL = Preset(  # thresholds for a map of 16x12 cells
-    stride=2,
-    filter_threshold=0.4,
-    warmup=6,
-    keyframe_threshold=0.6,
-    frontend_threshold=4.0,
-    backend_threshold=5.0,
-    backend_steps=(4, 8),
-)
-CONFIG = DroidConfig(preset=SMALL, area=HEIGHT * WIDTH, global_correlation="volume")
+SMALL = {  # thresholds for a map of 16x12 cells
+    "stride": 2,
+    "filter_threshold": 0.4,
+    "warmup": 6,
+    "keyframe_threshold": 0.6,
+    "frontend_threshold": 4.0,
+    "backend_threshold": 5.0,
+    "backend_steps": (4, 8),
+}
+CONFIG = DroidConfig(constants=SMALL, area=HEIGHT * WIDTH, device="cpu")
 
 
 def run(
@@ -112,7 +112,7 @@ def test_the_same_stream_gives_the_same_poses() -> None:
 
 
 def test_a_short_stream_starts_by_force() -> None:
-    system, _ = run(replace(CONFIG, preset=replace(SMALL, warmup=12)), frames=range(16))
+    system, _ = run(replace(CONFIG, constants=SMALL | {"warmup": 12}), frames=range(16))
     assert any("forced" in warning for warning in system.stats.warnings)
     distance, _ = errors(system.trajectory())
     assert distance.max() < 0.01
@@ -130,7 +130,7 @@ def test_a_camera_at_rest_never_starts() -> None:
 
 
 def test_the_global_adjustment_on_the_way_rescales_consistently() -> None:
-    config = replace(CONFIG, preset=replace(SMALL, backend_every=8, backend_steps=(8,)))
+    config = replace(CONFIG, constants=SMALL | {"backend_every": 8, "backend_steps": (8,)})
     system = DroidSlam(config, net=oracle.Oracle(oracle.path(COUNT), INTRINSICS / 8))
     published: dict[int, np.ndarray] = {}
     scales: dict[int, float] = {}
