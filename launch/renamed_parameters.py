@@ -22,6 +22,14 @@ RENAMED: Mapping[str, str] = {
     "depth_fusion.rim": "depth_fusion.discontinuity_radius",
     "mapper.density": "mapper.kernel",
 }
+CONSTANTS: Mapping[str, str] = {  # of tracker=droid: of a node that has them in a group
+    "tracker.stride": "tracker.constants.stride",
+    "tracker.filter_threshold": "tracker.constants.filter_threshold",
+    "tracker.keyframe_threshold": "tracker.constants.keyframe_threshold",
+    "tracker.warmup": "tracker.constants.warmup",
+    "tracker.window": "tracker.constants.frontend_window",
+    "tracker.backend_every": "tracker.constants.backend_every",
+}
 GONE: Mapping[str, str] = {
     "mvs.skip_certain": "it cost precision and saved no time",
     "mvs.skip_explained": "it passed over no keyframe of a camera's stream",
@@ -31,9 +39,10 @@ GONE: Mapping[str, str] = {
 
 def refuse_old_names(slot: str, config: type, given: Mapping[str, Any]) -> None:
     """Raises GraphError for those of a slot's parameters that have another name now, or are gone."""
+    renamed = {**RENAMED, **(CONSTANTS if _takes(config, ["constants"]) else {})}
     found = [
-        f"{old} is {RENAMED[old]} now" if old in RENAMED else f"{old} is gone: {GONE[old]}"
-        for old in (*RENAMED, *GONE)
+        f"{old} is {renamed[old]} now" if old in renamed else f"{old} is gone: {GONE[old]}"
+        for old in (*renamed, *GONE)
         if old.startswith(f"{slot}.") and _given(given, old.split(".")[1:]) and not _takes(config, old.split(".")[1:])
     ]
     if found:

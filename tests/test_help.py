@@ -16,7 +16,7 @@ from launch.graph import load_node
 from launch.graph_text import graph_text
 from launch.help_text import MAX_WIDTH
 from launch.refusal import GraphError
-from launch.renamed_parameters import GONE, RENAMED
+from launch.renamed_parameters import CONSTANTS, GONE, RENAMED
 from msgs import FusedKeyframe, Preview
 from nodes import Node
 from nodes.runtime.parameters import parameters
@@ -129,6 +129,17 @@ def test_an_old_name_is_refused_with_the_new_one(old: str) -> None:
     assert str(refused.value) == f"{old} is {RENAMED[old]} now"
     there = [parameter.path for parameter in parameters(compose([]).slots[slot].node.Config, slot)]
     assert RENAMED[old] in there
+
+
+@pytest.mark.parametrize("old", sorted(CONSTANTS))
+def test_old_names_of_droid_slam_s_constants_are_refused_of_its_node(old: str) -> None:
+    droid = ["tracker=droid", "tracker.weights=random", "device=cpu"]
+    with pytest.raises(GraphError) as refused:
+        compose([f"{old}=1", *droid])
+    assert str(refused.value) == f"{old} is {CONSTANTS[old]} now"
+    assert compose([f"{CONSTANTS[old]}=1", *droid]).slots["tracker"].config["constants"] == {
+        CONSTANTS[old].split(".")[-1]: 1
+    }
 
 
 @pytest.mark.parametrize("old", sorted(GONE))

@@ -67,7 +67,7 @@ class DroidConfig:
 
     weights: str | None = None  # file; null: droid.pth in $MVSGS_WEIGHTS or the cache; random: noise, for a trial
     preset: Literal["demo", "tum", "replica"] = "demo"  # the setting that the constants were published for
-    constants: dict[str, Constant] = field(default_factory=dict)  # instead of the preset's, such as {stride: 1}
+    constants: dict[str, Constant] = field(default_factory=dict)  # instead of the preset's, as constants.stride=1
     area: int = 384 * 512  # pixels of the image that the networks see, aspect kept
     correlation: CorrelationKind = "volume"  # of the frontend: volume (fast) or on_the_fly (little memory)
     global_correlation: CorrelationKind | None = None  # of the backend; null: on_the_fly on a GPU, volume on the CPU

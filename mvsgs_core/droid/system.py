@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
+from mvsgs_core.devices import resolve_device
 from mvsgs_core.droid.backend import adjust_globally
 from mvsgs_core.droid.confidence import Coarse, coarse_map, consistent_fraction
 from mvsgs_core.droid.config import DroidConfig
@@ -37,9 +38,7 @@ class DroidSlam:
         self.config = config or DroidConfig()
         self.constants = self.config.chosen
         self.threads = self.config.threads or 1
-        device = self.config.device
-        if device == "auto":
-            device = "cuda:0" if torch.cuda.is_available() else "cpu"
+        device = resolve_device(self.config.device)
         self.global_correlation = self.config.global_correlation or ("volume" if device == "cpu" else "on_the_fly")
         self.networks = Networks(load(self.config.weights) if net is None else net, torch.device(device))
         self.stats = Stats()
