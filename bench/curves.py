@@ -32,7 +32,7 @@ CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point 
     "depth_fusion.min_views": {"3": ("depth_fusion.min_views=3",)},
     "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 60, 120)},
     "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200)},
-    "mapper.max_splats": {f"{n // 1000}k": (f"mapper.max_splats={n}",) for n in (10000, 20000)},
+    "mapper.max_splats": {f"{n // 1000}k": (f"mapper.density_control.max_splats={n}",) for n in (10000, 20000)},
 }
 ERRORS = {  # what a curve is drawn over besides the held-out PSNR: path in the report
     "ATE": "trajectory.ate_percent",

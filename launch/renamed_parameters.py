@@ -20,7 +20,22 @@ RENAMED: Mapping[str, str] = {
     "mvs.skip_cells": "mvs.pruning.outside_cells",
     "depth_fusion.least_views": "depth_fusion.min_views",
     "depth_fusion.rim": "depth_fusion.discontinuity_radius",
-    "mapper.density": "mapper.kernel",
+    "mapper.density": "mapper.training.kernel",
+    "mapper.kernel": "mapper.training.kernel",
+    "mapper.betas": "mapper.training.betas",
+    "mapper.loss": "mapper.training.loss",
+    "mapper.exposure": "mapper.training.exposure",
+    "mapper.refine_poses": "mapper.training.refine_poses",
+    "mapper.selective": "mapper.training.selective",
+    "mapper.skip_converged": "mapper.convergence.skip",
+    "mapper.unexplored": "mapper.insertion.unexplored",
+    "mapper.unexplored_psnr": "mapper.insertion.unexplored_psnr",
+    "mapper.voxel": "mapper.insertion.voxel",
+    "mapper.map_voxel": "mapper.insertion.map_voxel",
+    "mapper.map_voxel_error": "mapper.insertion.map_voxel_error",
+    "mapper.fill": "mapper.insertion.fill",
+    "mapper.density_control": "mapper.density_control.mode",
+    "mapper.max_splats": "mapper.density_control.max_splats",
 }
 CONSTANTS: Mapping[str, str] = {  # of tracker=droid: of a node that has them in a group
     "tracker.stride": "tracker.constants.stride",
@@ -31,6 +46,9 @@ CONSTANTS: Mapping[str, str] = {  # of tracker=droid: of a node that has them in
     "tracker.backend_every": "tracker.constants.backend_every",
 }
 GONE: Mapping[str, str] = {
+    "mapper.coarse_to_fine": "it gained nothing that could be measured",
+    "mapper.skip_tiles": "it gained nothing that could be measured",
+    "mapper.map_views": "it was for mvs=skipping",
     "mvs.skip_certain": "it cost precision and saved no time",
     "mvs.skip_explained": "it passed over no keyframe of a camera's stream",
     "mvs.tolerance": "it was of mvs=skipping",

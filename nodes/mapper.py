@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -18,11 +17,8 @@ from mvsgs_core.mapping.checkpoints import checkpoint
 from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.replay import Replay
-from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
-from mvsgs_core.mapping.density_control import DensityControlConfig
-from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.keyframes import ConvergenceConfig, RGBDKeyframe
-from mvsgs_core.mapping.losses import Loss
+from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
@@ -44,30 +40,8 @@ class Mapper(Node):
     Keyframes are read for the previews alone: until a keyframe's FusedKeyframe comes, its coarse depth stands in there.
     """
 
-    @dataclass
-    class Config:
-        iterations: int = 30  # optimization budget of each keyframe, half on the newest, half on all (the paper: 1000)
-        refinement: int = 300  # iterations over all keyframes at the end
-        window: int = 6  # keyframes of the local half
-        realtime: bool = False  # a new keyframe cancels the pending iterations of older ones
-        max_pixels: int | None = None  # area of the training images; null: as they come
-        max_keyframes: int = 1000  # whose images are kept and trained on; beyond, they are thinned out evenly
-        kernel: Literal["gaussian", "exact", "ges_scale"] = "gaussian"  # gaussian, exact or ges_scale
-        betas: bool = False  # train the shape (exact, ges_scale)
-        loss: Loss = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
-        sh_degree: int = 0  # of the view-dependent color, 0 to 3
-        exposure: bool = False  # train a color affine for each keyframe
-        refine_poses: bool = False  # train the keyframes' poses too
-        unexplored: bool = True  # add splats only where the map's render differs from the image
-        unexplored_psnr: float = 25.0  # dB of a pixel; below: unexplored (the paper: 40)
-        voxel: float = 0.01  # edge of the voxel filter, in median depths; 0: no filter
-        map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
-        map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another
-        fill: int = 4  # pixels: cells that get a splat of doubtful or continued depth where the map stays empty; 0: off
-        density_control: Literal["adaptive", "none"] = "adaptive"  # adaptive (clone, split, prune) or none
-        max_splats: int = 1000000  # no growth beyond
-        skip_converged: bool = True  # pass over keyframes whose loss no longer falls
-        selective: bool = True  # step only the splats that were seen
+    @dataclass(frozen=True)
+    class Config(MapperConfig):
         preview_period: float = 1.0  # seconds between previews; 0: none
         preview_splats: int = 100000  # at most so many in a preview
         output: str | None = None  # folder for map.ply and cameras.json; null: none is written
@@ -75,19 +49,15 @@ class Mapper(Node):
         keep_checkpoint: bool = False  # of the finished map, after a complete run
         resume: str | None = None  # output of a run whose checkpoint is gone on with; null: a new map
         save_images: bool = False  # write each keyframe's image to output/keyframes, for a COLMAP model
-        seed: int = 0
-        threads: int | None = None  # of the rasterizer; null: all
-        device: str = "auto"  # auto, cpu or cuda:0
 
     config: Config
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
-        self._core_config = mapper_config(self.config)
-        self.atlas, resumed = Atlas(OnlineMapper(self._core_config, self.stats)), None
+        self.atlas, resumed = Atlas(OnlineMapper(self.config, self.stats)), None
         self._replay: Replay | None = None
         if self.config.resume is not None:
-            self.atlas, resumed = checkpoint.load(Path(self.config.resume), self._core_config, self.stats)
+            self.atlas, resumed = checkpoint.load(Path(self.config.resume), self.config, self.stats)
             self._replay = Replay(self.atlas)
         self._checkpoints: Checkpointing | None = None
         if self.config.output is not None:
@@ -298,29 +268,3 @@ class Mapper(Node):
             keyframes=np.array([view.index for view in self.mapper.views], dtype=np.int64), keyframe_poses=poses,
             origin=origin,
         )  # fmt: skip
-
-
-def mapper_config(config: Mapper.Config) -> MapperConfig:
-    """The core's configuration of the node's parameters; the rest has the core's defaults."""
-    return MapperConfig(
-        iterations=config.iterations,
-        refinement=config.refinement,
-        window=config.window,
-        realtime=config.realtime,
-        max_pixels=config.max_pixels,
-        max_keyframes=config.max_keyframes,
-        sh_degree=config.sh_degree,
-        seed=config.seed,
-        threads=config.threads,
-        device=config.device,
-        training=TrainingConfig(
-            kernel=config.kernel, betas=config.betas, loss=config.loss, exposure=config.exposure,
-            refine_poses=config.refine_poses, selective=config.selective,
-        ),
-        convergence=ConvergenceConfig(skip=config.skip_converged),
-        insertion=InsertionConfig(
-            unexplored=config.unexplored, unexplored_psnr=config.unexplored_psnr, voxel=config.voxel,
-            map_voxel=config.map_voxel, map_voxel_error=config.map_voxel_error, fill=config.fill,
-        ),
-        density_control=DensityControlConfig(mode=config.density_control, max_splats=config.max_splats),
-    )  # fmt: skip

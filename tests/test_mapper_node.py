@@ -19,7 +19,7 @@ from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from nodes.mapper import Mapper, mapper_config
+from nodes.mapper import Mapper
 from nodes.runtime.parameters import build
 from tests.support.mapper_messages import settings, view_message
 from tests.support.tiny_scene import pose_on_arc
@@ -200,15 +200,6 @@ def test_unfiltered_depth_reaches_the_map() -> None:
     assert node.stats.counts["filled"] == 6 * 4
 
 
-def test_the_core_configuration_has_the_nodes_values() -> None:
-    config = mapper_config(settings(fill=7, voxel=0.5, unexplored_psnr=33.0, kernel="exact", density_control="none"))
-    assert config.insertion.fill == 7
-    assert config.insertion.voxel == 0.5
-    assert config.insertion.unexplored_psnr == 33.0
-    assert config.training.kernel == "exact"
-    assert config.density_control.mode == "none"
-
-
 @pytest.mark.parametrize("path", sorted((Path(__file__).parent.parent / "launch/conf/mapper").glob("*.yaml")))
 def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
     from omegaconf import OmegaConf
@@ -221,8 +212,8 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
         list(node.on_fused_keyframe(view_message(7 * k, k / 2)))
     before, after = [m for m in node.on_end() if isinstance(m, SplatMap)]
     assert before.iterations == 90
-    assert after.kernel == config.kernel
-    assert bool((after.betas != after.betas[0]).any()) == config.betas
+    assert after.kernel == config.training.kernel
+    assert bool((after.betas != after.betas[0]).any()) == config.training.betas
     assert (tmp_path / "map.ply").exists()
     message = view_message(99, 0.25)
     with torch.no_grad():

@@ -29,7 +29,11 @@ class Case:
 CASES = (
     Case("small room", SMALL, True),
     Case("demonstration", (), False),
-    Case("demonstration, exposure and poses trained", ("mapper.exposure=true", "mapper.refine_poses=true"), False),
+    Case(
+        "demonstration, exposure and poses trained",
+        ("mapper.training.exposure=true", "mapper.training.refine_poses=true"),
+        False,
+    ),
     Case("true poses", ("tracker=ground_truth", *SMALL), False),
 )
 

@@ -30,8 +30,8 @@ SMALL = (
 RUNS = {
     "default": SMALL,
     "every option": (
-        *SMALL, "mapper.kernel=exact", "mapper.betas=true", "mapper.loss=ges", "mapper.exposure=true",
-        "mapper.refine_poses=true", "mapper.sh_degree=2",
+        *SMALL, "mapper.training.kernel=exact", "mapper.training.betas=true", "mapper.training.loss=ges",
+        "mapper.training.exposure=true", "mapper.training.refine_poses=true", "mapper.sh_degree=2",
     ),
 }  # fmt: skip
 ONE_THREAD = tuple(f"{slot}.threads=1" for slot in ("tracker", "mvs", "depth_fusion", "mapper"))

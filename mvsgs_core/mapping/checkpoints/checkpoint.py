@@ -80,13 +80,12 @@ def images_of(file: Path) -> set[str]:
         return set()
 
 
-def described(config: Any, prefix: str = "") -> dict[str, str]:
-    """All parameters as text, by name with dots."""
+def described(config: Any, kind: type[Any] = MapperConfig, prefix: str = "") -> dict[str, str]:
+    """All parameters that `kind` declares as text, by name with dots."""
     found: dict[str, str] = {}
-    for entry in fields(config):
-        value = getattr(config, entry.name)
-        name = prefix + entry.name
-        found |= described(value, f"{name}.") if is_dataclass(value) else {name: repr(value)}
+    for entry in fields(kind):
+        value, name = getattr(config, entry.name), prefix + entry.name
+        found |= described(value, type(value), f"{name}.") if is_dataclass(value) else {name: repr(value)}
     return found
 
 
