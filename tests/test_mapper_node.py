@@ -76,8 +76,7 @@ def test_a_disk_that_takes_no_images_does_not_cost_the_map(tmp_path: Path) -> No
 
 
 def test_without_refinement_both_maps_are_the_same() -> None:
-    node = Mapper(settings())
-    node.config.refinement = 0
+    node = Mapper(settings(refinement=0))
     list(node.on_fused_keyframe(view_message(0, 0.5)))
     before, after = list(node.on_end())
     assert np.array_equal(before.means, after.means)
@@ -165,8 +164,7 @@ def test_a_segment_of_which_only_poses_are_known_yet_waits_for_its_views() -> No
 
 
 def test_a_preview_is_capped_and_relative_to_the_origin() -> None:
-    node = Mapper(settings(preview_splats=100))
-    node.config.preview_period = 1e-9
+    node = Mapper(settings(preview_splats=100, preview_period=1e-9))
     (preview,) = list(node.on_fused_keyframe(view_message(0, 0.5)))
     assert isinstance(preview, Preview)
     assert 50 <= len(preview.means) <= 100

@@ -199,8 +199,7 @@ def test_a_refinement_that_was_cut_off_goes_on_where_it_was(tmp_path: Path) -> N
 
 
 def test_who_watches_is_left_with_the_refined_map() -> None:
-    node = Mapper(settings())
-    node.config.preview_period = 1e9
+    node = Mapper(settings(preview_period=1e9))
     list(node.on_fused_keyframe(view_message(0, 0.5)))
     before, preview, after = list(node.on_end())
     assert isinstance(preview, Preview)

@@ -20,4 +20,5 @@ def view_message(index: int, t: float, scale: float = 1.0, segment: int = 0) -> 
 
 
 def settings(**changes: object) -> Mapper.Config:
-    return Mapper.Config(iterations=4, refinement=3, threads=1, preview_period=0.0, device="cpu", **changes)  # type: ignore[arg-type]
+    small = {"iterations": 4, "refinement": 3, "threads": 1, "preview_period": 0.0, "device": "cpu"}
+    return Mapper.Config(**(small | changes))  # type: ignore[arg-type]
