@@ -109,19 +109,6 @@ def rows_of(scene: str, default: Point, others: list[Point]) -> list[Row]:
     return rows
 
 
-def picture(default: Point, others: list[Point]) -> str:
-    """Each curve in the order of its run times, the default on it."""
-    series: dict[str, list[tuple[str, float, float]]] = {}
-    for point in others:
-        series.setdefault(point.curve, [("", default.seconds, default.psnr)]).append(
-            (point.label, point.seconds, point.psnr)
-        )
-    ordered = {curve: sorted(entries, key=lambda entry: entry[1]) for curve, entries in series.items()}
-    return plots.front_plot(
-        ordered, (default.seconds, default.psnr), "wall time, s", "held-out PSNR, dB", noise=default.noise
-    )
-
-
 def _name(curve: str, label: str) -> str:
     return f"{curve}_{label}".replace(".", "_").replace(" ", "_")
 
@@ -156,7 +143,10 @@ def measure(options: argparse.Namespace) -> list[Row]:
         if default is None:
             continue
         rows += rows_of(scene, default, others)
-        plots.write(made.output / f"{scene}.svg", picture(default, others))
+        points = [(p.curve, p.label, p.seconds, p.psnr) for p in others]
+        at = default.seconds, default.psnr
+        axes = ("wall time, s", "held-out PSNR, dB")
+        plots.write(made.output / f"{scene}.svg", plots.front_plot(points, at, *axes, noise=default.noise))
     return rows + made.rows()
 
 

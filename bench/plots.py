@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
@@ -37,16 +37,20 @@ def pareto(cost: Sequence[float], gain: Sequence[float]) -> list[int]:
 
 
 def front_plot(
-    series: dict[str, list[tuple[str, float, float]]],
+    points_of_curves: Iterable[tuple[str, str, float, float]],
     default: tuple[float, float],
     x_label: str,
     y_label: str,
     noise: tuple[float, float] = (0.0, 0.0),
 ) -> str:
-    """Points (label, x, y) by series; more y for less x is better. The front is dashed, the default ringed.
+    """Points (curve, label, x, y), each curve by rising x with the default on it; more y for less x is better.
 
-    noise: of the default, half a range each: drawn as a box around it.
+    The front is dashed, the default ringed. noise: of the default, half a range each: drawn as a box around it.
     """
+    series: dict[str, list[tuple[str, float, float]]] = {}
+    for curve, label, x, y in points_of_curves:
+        series.setdefault(curve, [("", *default)]).append((label, x, y))
+    series = {curve: sorted(entries, key=lambda entry: entry[1]) for curve, entries in series.items()}
     points = [(x, y) for entries in series.values() for _, x, y in entries] + [default]
     xs, ys = (np.array(values, dtype=float) for values in zip(*points))
     finite = np.isfinite(xs) & np.isfinite(ys)

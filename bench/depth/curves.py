@@ -86,13 +86,9 @@ def curve_rows(load: Loader, area: int, align: bool, quick: bool, output: Path) 
         where = "beaten by " + "; ".join(beaten) if beaten else "on the front"
         met = not beaten if point is default else None
         rows.append(Row(f"{title}: front", where, "", "on the front" if point is default else "", met))
-    series: dict[str, list[tuple[str, float, float]]] = {}
-    for point in points[1:]:
-        series.setdefault(point.curve, [("", default.seconds, default.right)])
-        series[point.curve].append((point.label, point.seconds, point.right))
-    ordered = {curve: sorted(entries, key=lambda entry: entry[1]) for curve, entries in series.items()}
+    drawn = [(p.curve, p.label, p.seconds, p.right) for p in points[1:]]
     axes = ("processor seconds a keyframe", "kept and right, part of the true depth")
-    plot = plots.front_plot(ordered, (default.seconds, default.right), *axes)
+    plot = plots.front_plot(drawn, (default.seconds, default.right), *axes)
     plots.write(output / f"{name.replace(', ', '_')}.svg", plot)
     return rows
 

@@ -88,13 +88,6 @@ def beats(point: Point, other: Point) -> bool:
 def draw(file: Path, points: Sequence[Point]) -> None:
     """The curves, error upside down so that better is up; settings that are off by a multiple are left out."""
     default = points[0]
-    limit = 6.0 * default.error
-    series: dict[str, list[tuple[str, float, float]]] = {}
-    for point in points[1:]:
-        if np.isfinite(point.error) and point.error < limit:
-            series.setdefault(point.setting, [("", default.milliseconds, -default.error)]).append(
-                (point.label, point.milliseconds, -point.error)
-            )
-    ordered = {name: sorted(entries, key=lambda entry: entry[1]) for name, entries in series.items()}
+    drawn = [(p.setting, p.label, p.milliseconds, -p.error) for p in points[1:] if p.error < 6.0 * default.error]
     ringed = (default.milliseconds, -default.error)
-    plots.write(file, plots.front_plot(ordered, ringed, "processor time, ms a frame", "- ATE of keyframes, cm"))
+    plots.write(file, plots.front_plot(drawn, ringed, "processor time, ms a frame", "- ATE of keyframes, cm"))
