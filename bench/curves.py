@@ -22,17 +22,17 @@ from mvsgs_core.evaluation.metrics import at
 _COARSEST = "{scale: 4, step: 0.7, hypotheses: 64, radius: 3, p1: 0.3, p2: 2.0}"
 _MIDDLE = "{scale: 2, step: 0.5, hypotheses: 15, radius: 3, p1: 0.1, p2: 0.8}"
 _FINE = "{scale: 1, step: 0.35, hypotheses: 11, radius: 3, p1: 0.05, p2: 0.4}"
-CURVES: dict[str, dict[str, tuple[str, ...]]] = {  # curve: label of each point and its overrides
-    "tracker.area": {f"{a // 1000}k": (f"tracker.area={a}",) for a in (19200, 38400)},
-    "tracker.window": {str(n): (f"tracker.window={n}",) for n in (6, 20)},
-    "mvs.area": {f"{a // 1000}k": (f"mvs.area={a}",) for a in (9600, 19200)},
-    "mvs.neighbors": {str(n): (f"mvs.neighbors.count={n}",) for n in (2, 6)},
-    "mvs.stages": {"3 stages": (f"mvs.stages=[{_COARSEST},{_MIDDLE},{_FINE}]",)},
-    "depth_fusion.confidence": {f"{c}": (f"depth_fusion.confidence={c}",) for c in (0.6, 0.9)},
-    "depth_fusion.min_views": {"3": ("depth_fusion.min_views=3",)},
-    "mapper.iterations": {str(n): (f"mapper.iterations={n}",) for n in (15, 60, 120)},
-    "mapper.max_pixels": {f"{a // 1000}k": (f"mapper.max_pixels={a}",) for a in (9600, 19200)},
-    "mapper.max_splats": {f"{n // 1000}k": (f"mapper.density_control.max_splats={n}",) for n in (10000, 20000)},
+CURVES: dict[str, dict[str, str]] = {  # parameter: label of each point and its value
+    "tracker.area": {"19k": "19200", "38k": "38400"},
+    "tracker.window": {"6": "6", "20": "20"},
+    "mvs.area": {"9k": "9600", "19k": "19200"},
+    "mvs.neighbors.count": {"2": "2", "6": "6"},
+    "mvs.stages": {"3 stages": f"[{_COARSEST},{_MIDDLE},{_FINE}]"},
+    "depth_fusion.confidence": {"0.6": "0.6", "0.9": "0.9"},
+    "depth_fusion.min_views": {"3": "3"},
+    "mapper.iterations": {"15": "15", "60": "60", "120": "120"},
+    "mapper.max_pixels": {"9k": "9600", "19k": "19200"},
+    "mapper.density_control.max_splats": {"10k": "10000", "20k": "20000"},
 }
 ERRORS = {  # what a curve is drawn over besides the held-out PSNR: path in the report
     "ATE": "trajectory.ate_percent",
@@ -63,15 +63,15 @@ class Point:
         return (faster > noise[0] and better > -noise[1]) or (better > noise[1] and faster > -noise[0])
 
 
-def settings(curves: dict[str, dict[str, tuple[str, ...]]]) -> dict[str, list[Setting]]:
+def settings(curves: dict[str, dict[str, str]]) -> dict[str, list[Setting]]:
     """All points by curve, and the default, as choices for Matrices."""
     found = {"default": [Setting("default")]}
     for curve, points in curves.items():
-        found[curve] = [Setting(_name(curve, label), overrides) for label, overrides in points.items()]
+        found[curve] = [Setting(_name(curve, label), (f"{curve}={value}",)) for label, value in points.items()]
     return found
 
 
-def points_of(runs: list[Run], curves: dict[str, dict[str, tuple[str, ...]]]) -> tuple[Point | None, list[Point]]:
+def points_of(runs: list[Run], curves: dict[str, dict[str, str]]) -> tuple[Point | None, list[Point]]:
     """The default, None where it did not run, and the others that did; runs of several seeds are averaged."""
     by_setting: dict[str, list[Run]] = {}
     for run in runs:
@@ -124,7 +124,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     curves = {name: CURVES[name] for name in (options.curves.split(",") if options.curves else CURVES)}
     repeats = options.repeats
     if options.quick:
-        scenes, curves, repeats = scenes[:1], {"mapper.iterations": {"5": ("mapper.iterations=5",)}}, 1
+        scenes, curves, repeats = scenes[:1], {"mapper.iterations": {"5": "5"}}, 1
         overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
     seeds = [int(s) for s in options.seeds.split(",")]
     made = pieces.Pieces.of(options, folder(options, "curves"))

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -78,6 +81,29 @@ def test_commands_compose(document: Path) -> None:
             compose(overrides)
         except GraphError as error:
             pytest.fail(f"{document.name}: {line}: {error}")
+
+
+def flat(config: Mapping[str, Any], prefix: str) -> Iterator[str]:
+    for key, value in config.items():
+        yield f"{prefix}.{key}"
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}.{key}")
+
+
+@cache
+def parameters() -> frozenset[str]:
+    """`slot.path` of what the choices have, as far as their nodes' configurations go."""
+    compositions = ([], ["tracker=droid"], ["tracker=ground_truth"], ["dataset=robot"], ["mvs=itermvs"])
+    slots = [slot for overrides in compositions for slot in compose(list(overrides)).slots.items()]
+    return frozenset(name for slot, known in slots for name in flat(known.config, slot))
+
+
+@EVERY
+def test_parameters_in_code_marks_exist(document: Path) -> None:
+    for name in re.findall(r"`((?:dataset|tracker|mvs|depth_fusion|mapper|evaluator)\.[a-z_.]+)\b", by_hand(document)):
+        launcher = name.split(".")[1] in ("cpu", "_target_", "external")
+        own = document.parent.name == "examples"  # of a node of the reader's own
+        assert launcher or own or name in parameters(), f"{document.name}: {name}"
 
 
 def test_every_benchmark_has_its_page_and_every_page_what_is_recorded() -> None:
