@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from msgs import Frame, GroundTruth
+from msgs import Frame
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.sequence import selection
-from nodes import Node
+from nodes.live import LiveSource
 
 POLL = 0.5  # s at most between two looks at whether the stream goes on
 RETRY = 0.5  # s between two attempts to open a device that was lost
@@ -28,16 +27,12 @@ class CameraError(RuntimeError):
     """A camera that cannot be opened or gives no picture; the message says what to check."""
 
 
-class Camera(Node):
-    """A device or a URL -> Frame, and GroundTruth with the same image to score renders against."""
+class Camera(LiveSource):
+    """A device or a URL. Raises CameraError if it cannot be opened or never gives a picture."""
 
     @dataclass
-    class Config:
+    class Config(LiveSource.Config):
         path: str = "0"  # device number, or what OpenCV opens: rtsp://host/stream, http://host/video.mjpg, /dev/video2
-        start: int = 0  # frames to leave out at first, while exposure settles
-        stop: int | None = None  # end after so many frames from the first one on; null: until Ctrl-C
-        stride: int = 1  # every which frame of those that are taken
-        size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as it is
         resolution: list[int] | None = None  # [height, width] asked of the device; null: its own choice
         fps: float | None = None  # asked of the device, frames per second; null: its own choice
         intrinsics: list[float] | str = "auto"  # [fx, fy, cx, cy] in pixels of the camera's picture; auto: a guess
@@ -49,43 +44,24 @@ class Camera(Node):
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        c = self.config
-        selection(c.start, c.stop, c.stride)  # refuses what is none
-        self._framing = Framing(c.size, c.crop)
+        self._framing = Framing(self.config.size, self.config.crop)
         self._lens: Lens | None = None
 
-    def run(self) -> Iterator[Frame | GroundTruth]:
-        """Ends when the camera is lost after it gave pictures, so that a session still finishes its map.
+    def _open(self) -> None:
+        self._feed = _Feed(self.config, self.stats.warn)
 
-        Raises CameraError if it cannot be opened or never gives one.
-        """
-        feed = _Feed(self.config, self.stats.warn)
-        index = 0
-        taken = 0
-        try:
-            while self.config.stop is None or taken < self.config.stop:
-                shot = feed.newest(self.config.timeout)
-                self.stats.counts["dropped"] = feed.dropped
-                if shot is None:
-                    if index == 0:
-                        raise CameraError(f"camera {self.config.path} gave no picture for {self.config.timeout:g} s")
-                    self.stats.warn(f"camera {self.config.path} was lost: no picture for {self.config.timeout:g} s")
-                    return
-                number, taken = taken, taken + 1
-                if number < self.config.start or (number - self.config.start) % self.config.stride:
-                    continue
-                picture, timestamp = shot
-                image, intrinsics = self._frame(picture)
-                self.stats.count("frames")
-                assert self._lens is not None
-                yield Frame(index, timestamp, image, intrinsics, self._lens.guessed)
-                yield GroundTruth(index, timestamp, image, intrinsics, None, None)
-                index += 1
-        finally:
-            feed.close()
+    def _close(self) -> None:
+        self._feed.close()
 
-    def _frame(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """BGR picture -> RGB image as delivered, with its intrinsics."""
+    def _take(self, first: bool) -> Frame | None:
+        shot = self._feed.newest(self.config.timeout)
+        self.stats.counts["dropped"] = self._feed.dropped
+        if shot is None:
+            if first:
+                raise CameraError(f"camera {self.config.path} gave no picture for {self.config.timeout:g} s")
+            self.stats.warn(f"camera {self.config.path} was lost: no picture for {self.config.timeout:g} s")
+            return None
+        picture, timestamp = shot
         native = picture.shape[0], picture.shape[1]
         if self._lens is None:
             self._lens, notes = lens_from_option(self.config.intrinsics, self.config.distortion, native)
@@ -93,8 +69,13 @@ class Camera(Node):
                 self.stats.warn(note)
         if native != self._lens.size:
             raise CameraError(f"camera {self.config.path} changed its picture from {self._lens.size} to {native}")
-        rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
-        return self._framing.image(rgb, self._lens, self._framing.size_of(native))
+        return Frame(0, timestamp, picture, np.array(self._lens.intrinsics), self._lens.guessed)
+
+    def _framed(self, frame: Frame) -> Frame:
+        assert self._lens is not None
+        rgb = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2RGB))
+        image, intrinsics = self._framing.image(rgb, self._lens, self._framing.size_of(self._lens.size))
+        return replace(frame, image=image, intrinsics=intrinsics)
 
 
 class _Feed:

@@ -12,6 +12,7 @@ from msgs.codec import MAX_MESSAGE_BYTES, VersionError, decode
 from mvsgs_core.bad_file import BadFileError, brief
 from mvsgs_core.camera import check_intrinsics
 from mvsgs_core.datasets.mcap_file import McapFile, Recorded
+from mvsgs_core.datasets.options import Selection
 from nodes import Node
 from nodes.recorder import ENCODING
 
@@ -27,11 +28,8 @@ class Player(Node):
     replayable = True
 
     @dataclass
-    class Config:
+    class Config(Selection):
         path: str | None = None  # .mcap file
-        start: int = 0  # first frame, counted from the recording's first
-        stop: int | None = None  # frame to stop before; null: the end
-        stride: int = 1  # every which frame
 
     config: Config
 
@@ -39,9 +37,6 @@ class Player(Node):
     def check(cls, config: Config) -> None:
         if config.path is None or not Path(config.path).is_file():
             raise FileNotFoundError(f"dataset.path={config.path}: must be an .mcap file, as recorder=mcap writes it")
-        if config.start < 0 or config.stride < 1 or (config.stop is not None and config.stop <= config.start):
-            wanted = f"start={config.start}, stop={config.stop}, stride={config.stride}"
-            raise ValueError(f"{wanted}: 0 <= start < stop and stride >= 1")
         player = cls(config)
         recording = player._recording()
         for record in player._records(recording):
@@ -58,7 +53,7 @@ class Player(Node):
             for record in self._records(recording):
                 place = record.sequence  # in its topic: the nth ground truth belongs to the nth frame, wherever it is
                 last = max(last, place)
-                if place >= c.start and (place - c.start) % c.stride == 0 and (c.stop is None or place < c.stop):
+                if c.has(place):
                     message = self._decoded(record, recording)
                     if message is not None:
                         self.stats.count("frames", isinstance(message, Frame))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from msgs import Frame, GroundTruth
 from mvsgs_core.datasets import Item, Sequence, check, open_dataset
+from mvsgs_core.datasets.options import FileOptions
 from nodes import Node
 
 
@@ -18,16 +19,8 @@ class Reader(Node):
     replayable = True
 
     @dataclass
-    class Config:
+    class Config(FileOptions):
         name: str  # format, a file of mvsgs_core.datasets
-        path: str | None = None  # folder or file
-        start: int = 0  # first frame of the original sequence
-        stop: int | None = None  # frame to stop before; null: the end
-        stride: int = 1  # every which frame
-        size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as it is
-        # [fx, fy, cx, cy] in pixels of the original image; auto: the tracker estimates them; null: the data set's own
-        intrinsics: list[float] | str | None = None
-        distortion: list[float] = field(default_factory=list)  # with intrinsics: [k1, k2, p1, p2(, k3)] as in OpenCV
         # play at the recorded rate, not as fast as it is read; with best_effort=[Frame] it is as a live camera
         realtime: bool = False
         options: dict[str, Any] = field(default_factory=dict)  # of that format: see its class in mvsgs_core.datasets
@@ -63,10 +56,9 @@ class Reader(Node):
 
 
 def _options(c: Reader.Config) -> dict[str, Any]:
-    """Of `open_dataset`."""
-    own = {"path": c.path, "size": c.size, "intrinsics": c.intrinsics, "distortion": c.distortion or None}
-    given = {key: value for key, value in own.items() if value is not None}  # not every format takes all of them
-    return {"start": c.start, "stop": c.stop, "stride": c.stride, **given, **c.options}
+    """Of `open_dataset`: those that were given, for not every format takes all of them."""
+    own, unset = {f.name: getattr(c, f.name) for f in fields(FileOptions)}, vars(FileOptions())
+    return {name: value for name, value in own.items() if value != unset[name]} | c.options
 
 
 def _ground_truth(item: Item) -> GroundTruth:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from msgs import End, Frame, GroundTruth
+from msgs import End, Frame
 from msgs.codec import CodecError
 from mvsgs_core.camera import resize_image, scale_intrinsics
 from mvsgs_core.datasets.framing import target_size
-from mvsgs_core.datasets.sequence import selection
-from nodes import Node
+from nodes.live import LiveSource
 from nodes.runtime.addresses import TransportError, check_address, load_keys
 from nodes.runtime.transport import LiveReader
 from nodes.stream_times import LATEST, StreamTimes
@@ -25,7 +23,7 @@ FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye a
 MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
 
 
-class Robot(Node):
+class Robot(LiveSource):
     """Frames published elsewhere -> Frame, numbered anew, and GroundTruth with the same image to score renders against.
 
     Best effort: only the newest frame is taken, the robot is never held back. What it sends is not trusted: what is no
@@ -33,12 +31,8 @@ class Robot(Node):
     """
 
     @dataclass
-    class Config:
+    class Config(LiveSource.Config):
         path: str = "tcp://127.0.0.1:5555"  # address at which the other program publishes Frame messages
-        start: int = 0  # frames to leave out at first
-        stop: int | None = None  # end after so many frames from the first one on; null: until End or Ctrl-C
-        stride: int = 1  # every which frame of those that are taken
-        size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as sent
         timeout: float = 30.0  # s without a usable frame before the robot counts as gone
         keys: str | None = None  # folder with the CURVE keys that the publisher has too; null: none
 
@@ -46,9 +40,6 @@ class Robot(Node):
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        c = self.config
-        selection(c.start, c.stop, c.stride)  # refuses what is none
-        target_size(c.size, (480, 640))
         self._native: tuple[int, int] | None = None
         self._times = StreamTimes()
 
@@ -61,41 +52,25 @@ class Robot(Node):
         except TransportError as error:
             raise ValueError(str(error)) from error
 
-    def run(self) -> Iterator[Frame | GroundTruth]:
-        """Ends with the publisher's End, or when no usable frame comes any more after there were some.
-
-        Raises TransportError for an address that is none and for refused keys, and TimeoutError if no frame ever comes.
-        """
+    def _open(self) -> None:
+        """Raises TransportError for an address that is none and for refused keys."""
         keys = None if self.config.keys is None else load_keys(Path(self.config.keys))
-        reader = LiveReader(self.config.path, Frame, topic=f"robot at {self.config.path}", keys=keys)
-        taken = index = 0
-        try:
-            while self.config.stop is None or taken < self.config.stop:
-                frame = self._receive(reader, first=taken == 0)
-                if frame is None:
-                    return
-                number, taken = taken, taken + 1
-                if number < self.config.start or (number - self.config.start) % self.config.stride:
-                    continue
-                sized = self._sized(frame, index)
-                self.stats.count("frames")
-                yield sized
-                yield GroundTruth(index, sized.timestamp, sized.image, sized.intrinsics, None, None)
-                index += 1
-        finally:
-            reader.close()
+        self._reader = LiveReader(self.config.path, Frame, topic=f"robot at {self.config.path}", keys=keys)
 
-    def _receive(self, reader: LiveReader, first: bool) -> Frame | None:
-        """The next usable frame, None at the end of the stream."""
+    def _close(self) -> None:
+        self._reader.close()
+
+    def _take(self, first: bool) -> Frame | None:
+        """The next usable frame. Raises TimeoutError where none ever comes."""
         deadline = time.monotonic() + self.config.timeout
         while time.monotonic() < deadline:
             try:
-                message = reader.receive(POLL)
+                message = self._reader.receive(POLL)
             except CodecError as error:
                 self.stats.warn(f"the robot sent what is no Frame, it was left out: {error}")
                 continue
             finally:
-                self._watch(reader)
+                self._watch(self._reader)
             if isinstance(message, End):
                 return None
             usable = self._usable(message) if isinstance(message, Frame) else None
@@ -145,9 +120,8 @@ class Robot(Node):
             return f"frames without valid intrinsics were left out, such as {frame.intrinsics.tolist()} for {native}"
         return None
 
-    def _sized(self, frame: Frame, index: int) -> Frame:
-        """The frame at the wanted size."""
+    def _framed(self, frame: Frame) -> Frame:
         assert self._native is not None
         size = target_size(self.config.size, self._native)
         intrinsics = scale_intrinsics(frame.intrinsics, self._native, size)
-        return Frame(index, frame.timestamp, resize_image(frame.image, size), intrinsics, frame.intrinsics_guessed)
+        return replace(frame, image=resize_image(frame.image, size), intrinsics=intrinsics)

@@ -67,11 +67,11 @@ class Bag(FileReader):
 
     def __len__(self) -> int:
         """Frames selected; those that turn out unreadable are not delivered."""
-        return len(range(self._count)[self._wanted])
+        return len(range(self._count)[self.wanted])
 
     def __iter__(self) -> Iterator[Item]:
         self._notices.truncate(self._opening_warnings)
-        wanted = range(self._count)[self._wanted]
+        wanted = range(self._count)[self.wanted]
         index = 0
         with opened_bag(self._path) as bag:
             connections = [c for c in bag.connections if c.topic == self._topic]

@@ -13,8 +13,9 @@ from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import UnreadableImageError, read_depth, read_image
-from mvsgs_core.datasets.framing import Framing, Size
+from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.options import FileOptions
 
 
 @dataclass(frozen=True)
@@ -58,36 +59,19 @@ class Notices(list[str]):
         self._lines = {text: entry for text, entry in self._lines.items() if entry[0] < length}
 
 
-def selection(start: int, stop: int | None, stride: int) -> slice:
-    """Which frames of the original sequence are wanted; raises ValueError for a bad one."""
-    if start < 0 or stride < 1 or (stop is not None and stop <= start):
-        raise ValueError(f"start >= 0, stop > start (or null) and stride >= 1 wanted, got {start}, {stop}, {stride}")
-    return slice(start, stop, stride)
-
-
 def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
     """Sizes of one aspect ratio, to a percent (a scaled copy is rounded to whole pixels)."""
     return abs(a[0] * b[1] - a[1] * b[0]) <= 0.01 * a[1] * b[0]
 
 
 @dataclass(kw_only=True, eq=False)
-class FileReader:
-    """What every reader of files takes, `dataset.NAME` in a configuration.
+class FileReader(FileOptions):
+    """Base of the readers of files. crop: see `Framing`. Raises ValueError for options that make no sense."""
 
-    size, crop: see `Framing`. Raises ValueError for options that make no sense.
-    """
-
-    path: str | Path | None = None  # folder or file
-    start: int = 0  # first frame of the original sequence
-    stop: int | None = None  # frame to stop before; None: the end
-    stride: int = 1  # every which frame
-    size: Size = None
-    intrinsics: Sequence[float] | str | None = None  # [fx, fy, cx, cy] in pixels of the original image, or "auto"
-    distortion: Sequence[float] = ()  # with intrinsics, as in OpenCV
     crop: int | None = None
 
     def __post_init__(self) -> None:
-        self._wanted = selection(self.start, self.stop, self.stride)
+        super().__post_init__()
         self._framing = Framing(self.size, self.crop)
         self.warnings: list[str] = Notices()
         self._notices: Notices = self.warnings  # the same list, with its counting
@@ -113,7 +97,7 @@ class ImageSequence(FileReader, ABC):
     def __post_init__(self) -> None:
         super().__post_init__()
         found = self._find()
-        self.records = list(found.records)[self._wanted]
+        self.records = list(found.records)[self.wanted]
         if not self.records:
             count = len(found.records)
             raise ValueError(f"no frame left: the sequence has {count}, wanted from {self.start} to {self.stop}")

@@ -66,8 +66,8 @@ class Video(FileReader):
 
     def __len__(self) -> int:
         """Frames selected, as far as the container knows its own length; 0 where it does not and `stop` is null."""
-        end = self._count or self._wanted.stop or self._wanted.start
-        return len(range(end)[self._wanted])
+        end = self._count or self.wanted.stop or self.wanted.start
+        return len(range(end)[self.wanted])
 
     def __iter__(self) -> Iterator[Item]:
         self._notices.truncate(self._opening_warnings)  # those of an earlier pass
@@ -75,7 +75,7 @@ class Video(FileReader):
         number = index = 0
         first, last = math.inf, -math.inf  # seconds
         try:
-            while self._wanted.stop is None or number < self._wanted.stop:
+            while self.wanted.stop is None or number < self.wanted.stop:
                 if not capture.grab():
                     self._judge_end(number, last - first)
                     break
@@ -83,8 +83,8 @@ class Video(FileReader):
                 if not math.isfinite(seconds) or seconds <= last:
                     seconds = last + 1.0 / self._rate if math.isfinite(last) else number / self._rate
                 first, last = min(first, seconds), seconds
-                offset = number - self._wanted.start
-                if offset >= 0 and offset % self._wanted.step == 0:
+                offset = number - self.wanted.start
+                if offset >= 0 and offset % self.wanted.step == 0:
                     item = self._item(index, number, seconds, capture)
                     if item is not None:
                         index += 1

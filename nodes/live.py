@@ -1,0 +1,54 @@
+"""What a live camera and a robot's stream have in common: their frames are numbered as they are taken."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from msgs import Frame, GroundTruth
+from mvsgs_core.datasets.options import SizedSelection
+from nodes import Node
+
+
+class LiveSource(Node, ABC):
+    """Frame, and GroundTruth with the same image to score renders against."""
+
+    @dataclass
+    class Config(SizedSelection):
+        stop: int | None = None  # end after so many frames from the first one on; null: until its end or Ctrl-C
+
+    config: Config
+
+    def run(self) -> Iterator[Frame | GroundTruth]:
+        """Ends where the stream does, and when nothing comes any more, so that a session still finishes its map."""
+        taken = index = 0
+        self._open()
+        try:
+            while self.config.stop is None or taken < self.config.stop:
+                frame = self._take(first=taken == 0)
+                if frame is None:
+                    return
+                if self.config.has(taken):
+                    shown = replace(self._framed(frame), index=index)
+                    self.stats.count("frames")
+                    yield shown
+                    yield GroundTruth(index, shown.timestamp, shown.image, shown.intrinsics, None, None)
+                    index += 1
+                taken += 1
+        finally:
+            self._close()
+
+    @abstractmethod
+    def _open(self) -> None: ...
+
+    @abstractmethod
+    def _take(self, first: bool) -> Frame | None:
+        """The next frame of the stream, as it comes; None at its end. Raises where none ever comes."""
+
+    @abstractmethod
+    def _framed(self, frame: Frame) -> Frame:
+        """As it is delivered."""
+
+    @abstractmethod
+    def _close(self) -> None: ...
