@@ -77,7 +77,7 @@ def _of(config: type, where: str, values: Mapping[str, Any]) -> Iterator[str]:
         entries = value if isinstance(value, Mapping) else {}
         if default is not MISSING and value != default and not entries:
             what.append(f"(default: {_text(default)})")
-        yield from _columns(f"  {path}" if entries else f"  {path}={_text(value)}", "; ".join(filter(None, what)))
+        yield from _columns(path if entries else f"{path}={_text(value)}", "; ".join(filter(None, what)))
         for key, entry in entries.items():
             yield f"    {path}.{key}={_text(entry)}"
 
@@ -91,14 +91,13 @@ def _at(values: Any, path: str, default: Any) -> Any:
 
 
 def _columns(left: str, right: str) -> list[str]:
+    left = f"  {left}"
     width = min(max(shutil.get_terminal_size((MAX_WIDTH, 24)).columns, MIN_WIDTH), MAX_WIDTH)
     wrapped = textwrap.wrap(right, width - COMMENT_COLUMN) or [""]
-    if len(left) >= COMMENT_COLUMN:
-        return [
-            *textwrap.wrap(left, width, initial_indent="  ", subsequent_indent="    "),
-            *(" " * COMMENT_COLUMN + line for line in wrapped),
-        ]
-    return [f"{left:{COMMENT_COLUMN}}{wrapped[0]}".rstrip(), *(" " * COMMENT_COLUMN + line for line in wrapped[1:])]
+    rest = [" " * COMMENT_COLUMN + line for line in wrapped]
+    if len(left) < COMMENT_COLUMN:
+        return [f"{left:{COMMENT_COLUMN}}{wrapped[0]}".rstrip(), *rest[1:]]
+    return [*textwrap.wrap(left, width, subsequent_indent="    "), *rest]
 
 
 def _text(value: Any) -> str:

@@ -112,7 +112,7 @@ def test_what_cannot_be_resumed_is_refused_with_the_reason(tmp_path: Path) -> No
 
 def test_a_run_of_an_older_version_is_refused_with_the_new_names(tmp_path: Path) -> None:
     config = OmegaConf.load(interrupted(tmp_path) / "config.yaml")
-    config.tracker.readout, config.mapper.density = config.tracker.pop("readout_time"), config.mapper.pop("kernel")
+    config.tracker.readout, config.mapper.density = config.tracker.pop("readout_time"), "exact"
     OmegaConf.save(config, tmp_path / "config.yaml")
     with pytest.raises(GraphError, match=r"an older version: tracker.readout is tracker.readout_time now"):
         resumed_config(tmp_path, ())
