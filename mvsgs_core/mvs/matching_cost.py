@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from mvsgs_core.mvs.torch_backend import Windows
+    from mvsgs_core.mvs.windows import Windows
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from torch import Tensor
 from mvsgs_core.devices import TorchTwin
 from mvsgs_core.mvs.interface import TILE, ChooseOptions, MatchingImages, SmoothingConfig, SurfaceEstimate
 from mvsgs_core.mvs.matching_cost import CostConfig, make_cost
+from mvsgs_core.mvs.windows import Windows
 
 _MANY = 1e9
 
@@ -40,7 +41,7 @@ class TorchBackend(TorchTwin):
     ) -> np.ndarray:  # fmt: skip
         """(H, D, W) costs of `count` surfaces (H, W)."""
         reference = self._on(images.reference)
-        windows = Windows(reference, radius, config)
+        windows = Windows(reference, radius, config.noise, config.contrast)
         match = make_cost(windows, config)
         views = list(zip(self._on(images.neighbors), self._on(images.warps), strict=True))
         best = min(config.top_k, len(views))
@@ -77,7 +78,7 @@ class TorchBackend(TorchTwin):
     def view_correlation(
         self, images: MatchingImages, inverse_depth: np.ndarray, radius: int, cost: CostConfig
     ) -> np.ndarray:
-        windows = Windows(self._on(images.reference), radius, cost)
+        windows = Windows(self._on(images.reference), radius, cost.noise, cost.contrast)
         surface = self._on(inverse_depth)
         found = []
         for image, warp in zip(self._on(images.neighbors), self._on(images.warps), strict=True):
@@ -99,39 +100,6 @@ class TorchBackend(TorchTwin):
                 total += _path(volume, gray, start, interval, shift, reverse, p1, p2, smoothing)
             total += _path(*sideways, 0, reverse, p1, p2, smoothing).permute(2, 1, 0)
         return _select(total / smoothing.paths, smoothing.temperature)
-
-
-class Windows:
-    """Adaptive windows of a reference (Yoon and Kweon 2006): normalized weights (taps, H, W), mean and variance."""
-
-    def __init__(self, image: Tensor, radius: int, config: CostConfig) -> None:
-        self.radius, self.noise = radius, config.noise
-        side = range(-radius, radius + 1)
-        far = [-0.5 * (dy * dy + dx * dx) / (radius + 1) ** 2 for dy in side for dx in side]
-        self.taps = self.taps_of(image)  # (taps, H, W) gray levels
-        inside = self.taps_of(torch.ones_like(image))
-        distance = torch.tensor(far, device=image.device)
-        weight = torch.exp(distance[:, None, None] - (self.taps - image).abs() / config.contrast) * inside
-        self.weight = weight / weight.sum(dim=0)
-        self.weighted = self.weight * self.taps
-        self.mean = self.weighted.sum(dim=0)
-        square = (self.weighted * self.taps).sum(dim=0)
-        self.variance = (square - self.mean**2).clamp(min=0.0) + config.noise
-
-    def taps_of(self, image: Tensor) -> Tensor:
-        """(taps, H, W): each pixel's window of an image (H, W), 0 outside."""
-        side = 2 * self.radius + 1
-        height, width = image.shape
-        columns = torch.nn.functional.unfold(image[None, None], side, padding=self.radius)
-        return columns.reshape(side * side, height, width)
-
-    def correlate(self, samples: Tensor) -> tuple[Tensor, Tensor]:
-        """(H, W) ZNCC against what a neighbor shows in each window, (taps, H, W); and the mean of that."""
-        total = (self.weight * samples).sum(dim=0)
-        square = (self.weight * samples * samples).sum(dim=0)
-        product = (self.weighted * samples).sum(dim=0)
-        variance = (square - total**2).clamp(min=0.0) + self.noise
-        return (product - self.mean * total) / torch.sqrt(self.variance * variance), total
 
 
 def _sample(image: Tensor, warp: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
