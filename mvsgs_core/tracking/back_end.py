@@ -1,4 +1,4 @@
-"""The whole map put right: edges between keyframes that see the same, matched again, and global bundle adjustment."""
+"""The whole map at once: edges between keyframes that see the same, matched again, and global bundle adjustment."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mvsgs_core.tracking.local_map import LocalMap
 
 @dataclass(frozen=True)
 class BackEndConfig:
-    edges: int = 6  # by proximity, at most, from each keyframe
-    rematch: float = 1.0  # pixels: edges that the map contradicts by more are matched again
+    max_edges: int = 6  # by proximity, from each keyframe
+    max_error: float = 1.0  # pixels: edges that the map contradicts by more are matched again
     steps: int = 10  # of each global bundle adjustment
     robust_scales: tuple[float, ...] = (4.0, 1.0, 0.5)  # pixels, one bundle adjustment each
 
@@ -37,7 +37,7 @@ class BackEnd:
         """Adds edges from one keyframe to those that see the same; returns how many were matched."""
         others = [i for i in self.local_map.members(segment) if i != index]
         matched = 0
-        for other in self.local_map.nearby(index, others, self.config.edges, apart=1):
+        for other in self.local_map.nearby(index, others, self.config.max_edges, apart=1):
             if (index, other) not in self.graph.edges:
                 matched += 1
                 self.local_map.match_edge(index, other, enough=0.0)
@@ -50,7 +50,7 @@ class BackEnd:
             edge = self.graph.edges[source, to]
             expected, inside = self.graph.predict(source, to)
             seen = (edge.weight > 0) & inside
-            if seen.sum() and np.median(np.linalg.norm(expected - edge.target.T, axis=1)[seen]) < self.config.rematch:
+            if seen.sum() and np.median(np.linalg.norm(expected - edge.target.T, axis=1)[seen]) < self.config.max_error:
                 continue
             matched += 1
             self.local_map.match_edge(source, to)

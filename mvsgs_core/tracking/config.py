@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 
 from mvsgs_core.tracking.back_end import BackEndConfig
 from mvsgs_core.tracking.estimation.focal import FocalConfig
+from mvsgs_core.tracking.estimation.rolling_shutter import check_readout_time
 from mvsgs_core.tracking.front_end import FrontEndConfig
 from mvsgs_core.tracking.initializer import InitializationConfig
+from mvsgs_core.tracking.keyframe_choice import KeyframeChoiceConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.places.covisibility import CovisibilityConfig
 from mvsgs_core.tracking.places.loop_closure import LoopConfig
@@ -17,24 +19,30 @@ from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    area: int = 320 * 240  # pixels of the tracker's image, same aspect as the input
-    flow: str = "lucas_kanade"  # mvsgs_core.tracking.matching.flow.FLOWS, or module:Class
-    tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not told
-    loops: bool = True  # look for old keyframes by appearance
-    readout_time: float | None = None  # seconds of a rolling shutter, 0 for a global one; None: estimated
-    texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
-    matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is told
-    threads: int = 1
-    device: str = "cpu"  # of the local and global bundle adjustment, see Solver; single frames stay on the CPU
-    front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
+    """Raises ValueError where a value is none that can be."""
+
+    area: int = 320 * 240  # pixels of the tracker's own image, aspect kept; enlarges at most to twice the size
+    flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
+    readout_time: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
+    loops: bool = True  # old keyframes are looked for by appearance
+    tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
+    min_texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
+    min_matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is warned of
+    device: str = "cpu"  # of bundle adjustment: cpu (C++), cuda or cuda:0 (PyTorch), auto (CUDA if there is one)
+    threads: int | None = None  # of the C++ kernels; null: 1
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
+    front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
+    keyframe_choice: KeyframeChoiceConfig = field(default_factory=KeyframeChoiceConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
-    focal: FocalConfig = field(default_factory=FocalConfig)
+    covisibility: CovisibilityConfig = field(default_factory=CovisibilityConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
+    back_end: BackEndConfig = field(default_factory=BackEndConfig)
     relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
-    back_end: BackEndConfig = field(default_factory=BackEndConfig)
-    covisibility: CovisibilityConfig = field(default_factory=CovisibilityConfig)
+    focal: FocalConfig = field(default_factory=FocalConfig)
+
+    def __post_init__(self) -> None:
+        check_readout_time(self.readout_time)
 
 
 __all__ = ["TrackerConfig"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mvsgs_core.tracking.front_end import FrontEndConfig, Step
+from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.features import match_features
 
@@ -32,10 +32,10 @@ class Measured:
 class Diagnosis:
     """Collects what happens to frames before a start. Shares of the width are of the tracker's image."""
 
-    def __init__(self, front_end: FrontEndConfig, texture: float) -> None:
-        """texture: fraction of the cells that must be textured for an image to be of any use."""
-        self.front_end = front_end
-        self.texture = texture
+    def __init__(self, lost_fraction: float, min_texture: float) -> None:
+        """As of FrontEndConfig and TrackerConfig."""
+        self.lost_fraction = lost_fraction
+        self.min_texture = min_texture
         self.blank = Measured()  # frames without texture: fraction of the cells that are textured
         self.lost = Measured()  # frames that could not be followed: fraction of the points that survived
         self.jumped = (
@@ -52,7 +52,7 @@ class Diagnosis:
         """A frame after the first, and whether the reference's points could not be found in it."""
         if not lost:
             self.followed.add(step.flow / frame.size[1])
-        elif frame.cells.textured.mean() < self.texture:
+        elif frame.cells.textured.mean() < self.min_texture:
             self.no_texture(frame)
         else:
             self.lost.add(step.fraction)
@@ -77,7 +77,7 @@ class Diagnosis:
         if self.blank.frames > frames / 2:
             return (
                 f"no texture: {self.blank.frames} of {frames} frames have hardly any, "
-                f"{100 * self.blank.median:.1f} % of the image in the median ({100 * self.texture:.0f} % are needed)"
+                f"{100 * self.blank.median:.1f} % of the image in the median ({100 * self.min_texture:.0f} % are needed)"
             )
         if self.lost.frames > frames / 4:
             jump = f"by {100 * self.jumped.median:.0f} % of the width, " if self.jumped.frames else ""
@@ -85,7 +85,7 @@ class Diagnosis:
             return (
                 f"steps too wide: {self.lost.frames} of {frames} frames could not be followed from the one before "
                 f"(median displacement {jump}{found}; {100 * self.lost.median:.0f} % of the matches survive, "
-                f"{100 * self.front_end.lost_fraction:.0f} % are needed): more frames a second, or smaller steps, help"
+                f"{100 * self.lost_fraction:.0f} % are needed): more frames a second, or smaller steps, help"
             )
         if self.attempts:
             kind = max(self.attempts, key=lambda k: self.attempts[k][0])

@@ -1,8 +1,8 @@
-"""Follows the camera from frame to frame against the newest keyframe, and says which frames become keyframes."""
+"""Follows the camera from frame to frame against a reference keyframe, mostly the newest."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,9 +18,7 @@ from mvsgs_core.tracking.places.localization import Localization, localize
 @dataclass(frozen=True)
 class FrontEndConfig:
     still_flow: float = 0.001  # of the width: median flow below which a frame did not move and is skipped
-    keyframe_flow: float = 0.05  # of the width: median flow since the last keyframe that makes one
-    keyframe_fraction: float = 0.5  # of the textured points: fewer found make a keyframe
-    feature_fraction: float = 0.5  # fewer found, and features are tried
+    feature_fraction: float = 0.5  # of the textured points: fewer found, and features are tried
     lost_fraction: float = 0.2  # fewer found: the frame is lost
     lost_inliers: float = 0.5  # of the matches, within 2 pixels of one pose: fewer, and the frame is lost
 
@@ -29,15 +27,22 @@ class FrontEndConfig:
 class Step:
     """One frame against the reference keyframe."""
 
-    matches: Matches
+    reference: int
+    matches: Matches  # of the reference's points
     fraction: float  # of the textured points that were found
     flow: float  # pixels, median since the reference
     still: bool  # nothing moved since the last frame: nothing was done
-    localization: Localization | None  # None before the start
+    localization: Localization | None  # None where no pose was asked for
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(4, 4) cam_from_world, where one was asked for."""
+        assert self.localization is not None
+        return self.localization.cam_from_world
 
 
 class FrontEnd:
-    """Holds the reference keyframe's points as they are carried along."""
+    """Holds the reference keyframe's points as they are propagated from frame to frame."""
 
     def __init__(self, graph: KeyframeGraph, matcher: Matcher, config: FrontEndConfig, threads: int) -> None:
         self.graph = graph
@@ -67,16 +72,14 @@ class FrontEnd:
         self.propagated = np.where(alive[:, None], matches.target, near)
         self.last, self.pose = image, pose
 
-    def follow(self, image: TrackingImage, started: bool) -> Step:
-        """Finds the reference's points in the next frame, and, once started, its pose."""
+    def follow(self, image: TrackingImage, with_pose: bool) -> Step:
+        """Finds the reference's points in the next frame, and its pose where there is a map."""
         assert self.reference is not None
         assert self.last is not None
         field = self.between.field(self.last, image)
         moved = float(np.median(np.hypot(field[..., 0], field[..., 1])))
         if moved < self.config.still_flow * image.size[1] and self.step is not None and self._same(image):
-            return Step(
-                self.step.matches, self.step.fraction, self.step.flow, True, self.step.localization if started else None
-            )
+            return replace(self.step, still=True, localization=self.step.localization if with_pose else None)
         self._set_velocity(image, field)
         guess = self.propagated + sample_field(field, self.propagated)
         matches, fraction = self.matcher.match(self.reference, image, guess, self.config.feature_fraction)
@@ -85,11 +88,11 @@ class FrontEnd:
         if alive.any():
             flow = float(np.median(np.linalg.norm(matches.target[alive] - self.reference.cells.points[alive], axis=1)))
         found: Localization | None = None
-        if started:
+        if with_pose:
             start = self.pose if self.pose is not None else self.graph.keyframes[self.reference.index].cam_from_world
             found = localize(self.graph, self.reference.index, matches, start, self.solver)
             guess, _ = self.graph.predict_pose(self.reference.index, found.cam_from_world)
-        step = Step(matches, fraction, flow, False, found)
+        step = Step(self.reference.index, matches, fraction, flow, False, found)
         if self.is_lost(step):
             image.velocity = None
         else:
@@ -106,11 +109,6 @@ class FrontEnd:
         found = step.localization
         return found is not None and (bool(found.failure) or found.inliers < self.config.lost_inliers)
 
-    def wants_keyframe(self, step: Step, flow: float) -> bool:
-        """flow: fraction of the width that the image must have moved."""
-        assert self.reference is not None
-        return step.flow > flow * self.reference.size[1] or step.fraction < self.config.keyframe_fraction
-
     def _set_velocity(self, image: TrackingImage, field: np.ndarray) -> None:
         """Image velocity from the flow since the last frame, for the rolling shutter."""
         assert self.last is not None
@@ -126,7 +124,7 @@ class FrontEnd:
                 frame.__dict__.pop("cell_shutter", None)
 
     def _same(self, image: TrackingImage) -> bool:
-        """Whether the last image still explains this one: a covered lens does not move either."""
+        """Whether the last image shows the same: a covered lens does not move either."""
         assert self.last is not None
         change = np.abs(self.last.half.astype(np.int16) - image.half)
         return float(np.mean(change)) < 6.0

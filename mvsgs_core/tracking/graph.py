@@ -60,9 +60,9 @@ class Edge:
 class KeyframeGraph:
     """Keyframes in the order of their indices, and directed edges by their positions in that order."""
 
-    def __init__(self, intrinsics: np.ndarray) -> None:
+    def __init__(self, intrinsics: np.ndarray, device: str = "cpu") -> None:
         self.intrinsics = np.asarray(intrinsics, dtype=np.float64)  # (4,) at the tracker's size
-        self.device = "cpu"  # of the bundle adjustments of several keyframes, see Solver
+        self.device = device  # of the bundle adjustments of several keyframes, see Solver
         self.readout_time = 0.0  # seconds that the camera needs for an image, from the first row to the last
         self.keyframes: dict[int, Keyframe] = {}  # by frame index
         self.edges: dict[tuple[int, int], Edge] = {}  # by frame indices

@@ -17,11 +17,11 @@ from mvsgs_core.tracking.matching.matcher import Matcher
 
 @dataclass(frozen=True)
 class InitializationConfig:
-    keyframes: int = 6  # before a start is tried
-    limit: int = 10  # keyframes held; the oldest goes first
+    min_keyframes: int = 6  # before an initialization is tried
+    max_keyframes: int = 10  # that wait for one; the oldest goes first
     flow: float = 0.035  # of the width: median flow between them; falls to a third while the camera is slow
     patience: int = 40  # frames without a keyframe over which it falls
-    back: int = 5  # keyframes that each is matched with
+    recent: int = 5  # keyframes before that each is matched with
     min_fraction: float = 0.25  # of the textured points that an edge must have found
     criteria: ReconstructionCriteria = field(default_factory=ReconstructionCriteria)
     forced: ReconstructionCriteria = field(
@@ -32,7 +32,7 @@ class InitializationConfig:
 
 
 class Initializer:
-    """The keyframes of a segment that has not started."""
+    """The keyframes of a segment that has no map yet."""
 
     def __init__(
         self, graph: KeyframeGraph, matcher: Matcher, config: InitializationConfig, threads: int, diagnosis: Diagnosis
@@ -42,13 +42,12 @@ class Initializer:
         self.config = config
         self.threads = threads
         self.waiting: list[int] = []
-        self.attempts = 0
         self.diagnosis = diagnosis
 
     @property
     def reason(self) -> str:
-        """Why there is no start yet."""
-        return self.diagnosis.reason(self.config.keyframes)
+        """Why there is no map yet."""
+        return self.diagnosis.reason(self.config.min_keyframes)
 
     def flow(self, since: int) -> float:
         """Fraction of the width that makes a keyframe, so many frames after the last one."""
@@ -75,9 +74,8 @@ class Initializer:
 
         focal: how the graph's focal length is found too; None where it is known.
         """
-        if len(self.waiting) < (3 if forced else self.config.keyframes):
+        if len(self.waiting) < (3 if forced else self.config.min_keyframes):
             return False
-        self.attempts += 1
         criteria = self.config.forced if forced else self.config.criteria
         if focal is None:
             start = reconstruct(self.graph, self.waiting, criteria, self.threads)
@@ -85,7 +83,7 @@ class Initializer:
             start = reconstruct_with_unknown_focal(self.graph, self.waiting, criteria, focal, self.threads)
         if start.failure:
             self.diagnosis.failed(start.failure)
-            if len(self.waiting) >= self.config.limit:
+            if len(self.waiting) >= self.config.max_keyframes:
                 self.graph.remove(self.waiting.pop(0))
             return False
         for n, index in enumerate(self.waiting):
@@ -101,7 +99,7 @@ class Initializer:
         points = image.cells.points.astype(np.float64)
         newest = earlier[-1]
         near = self.graph.keyframes[newest].points.astype(np.float64)
-        for index in reversed(earlier[-self.config.back :]):
+        for index in reversed(earlier[-self.config.recent :]):
             old = self.graph.keyframes[index].image
             forward = matches
             if index != newest:

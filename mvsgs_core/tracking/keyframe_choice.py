@@ -7,9 +7,10 @@ Where the camera moves so fast that the next one may be lost, or that most frame
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from mvsgs_core.held_out import is_held_out
-from mvsgs_core.tracking.front_end import FrontEndConfig, Step
+from mvsgs_core.tracking.front_end import Step
 
 LATE_FLOW = 2.0  # of the flow that makes a keyframe: the next frame may have moved by so much, and not further
 LATE_FRACTION = 0.8  # of the fraction of points below which a keyframe is made: the next frame must still find so many
@@ -18,29 +19,39 @@ LAST = 0.25  # of the flow that makes a keyframe: what is enough at the end of t
 HELD_OUT = "keyframes that were to be held out"
 
 
+@dataclass(frozen=True)
+class KeyframeChoiceConfig:
+    max_flow: float = 0.05  # of the width: a larger median flow since the last keyframe makes another
+    min_fraction: float = 0.5  # of the textured points: fewer found make a keyframe
+
+
 class KeyframeChoice:
     """Follows how fast the frames move away from their reference keyframe."""
 
-    def __init__(self, config: FrontEndConfig) -> None:
+    def __init__(self, config: KeyframeChoiceConfig) -> None:
         self.config = config
         self._before = (-1, 0.0, 1.0)  # reference of the last frame, its flow in pixels, its fraction of points found
 
-    def wants(self, index: int, reference: int, step: Step, width: int, limit: float) -> bool:
-        """Whether frame `index` becomes a keyframe. limit: flow since the reference, as a fraction of the width."""
+    def moved(self, step: Step, width: int, limit: float) -> bool:
+        """Whether the image has changed enough since the reference. limit: largest flow, as a fraction of the width."""
+        return step.flow > limit * width or step.fraction < self.config.min_fraction
+
+    def wants(self, index: int, step: Step, width: int, limit: float) -> bool:
+        """Whether frame `index` becomes a keyframe. limit: as of `moved`."""
         known, flow, fraction = self._before
-        flow, fraction = (flow, fraction) if known == reference else (0.0, 1.0)
-        self._before = (reference, step.flow, step.fraction)
-        if step.flow <= limit * width and step.fraction >= self.config.keyframe_fraction:
+        flow, fraction = (flow, fraction) if known == step.reference else (0.0, 1.0)
+        self._before = (step.reference, step.flow, step.fraction)
+        if not self.moved(step, width, limit):
             return False
         if not is_held_out(index):
             return True
         late = 2.0 * step.flow - flow > LATE_FLOW * limit * width
-        return late or 2.0 * step.fraction - fraction < LATE_FRACTION * self.config.keyframe_fraction
+        return late or 2.0 * step.fraction - fraction < LATE_FRACTION * self.config.min_fraction
 
     def shows_new(self, step: Step, width: int) -> bool:
         """Whether the last frame of a stream shows enough that its reference does not."""
-        lost = 1.0 - LAST * (1.0 - self.config.keyframe_fraction)
-        return step.flow > LAST * self.config.keyframe_flow * width or step.fraction < lost
+        lost = 1.0 - LAST * (1.0 - self.config.min_fraction)
+        return step.flow > LAST * self.config.max_flow * width or step.fraction < lost
 
 
 def newest(indices: Iterable[int]) -> int | None:
@@ -49,4 +60,4 @@ def newest(indices: Iterable[int]) -> int | None:
     return next((index for index in order if not is_held_out(index)), order[0] if order else None)
 
 
-__all__ = ["HELD_OUT", "KeyframeChoice", "newest"]
+__all__ = ["HELD_OUT", "KeyframeChoice", "KeyframeChoiceConfig", "newest"]

@@ -14,7 +14,7 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
-from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
+from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, KeyframeChoiceConfig, newest
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from mvsgs_core.tracking.matching.flow import Matches, make_flow
 from mvsgs_core.tracking.matching.matcher import Matcher
@@ -28,6 +28,7 @@ class PosedConfig:
     flow: str = "lucas_kanade"
     readout_time: float = 0.0  # seconds of a rolling shutter, 0 for a global one: it is not estimated here
     threads: int = 1
+    keyframe_choice: KeyframeChoiceConfig = field(default_factory=KeyframeChoiceConfig)
     front_end: FrontEndConfig = field(default_factory=lambda: FrontEndConfig(still_flow=0.0))
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
 
@@ -62,11 +63,11 @@ class PosedTracker:
         if self.front_end.reference is None:
             return self._first(frame, pose)
         with self.stats.time("front end"):
-            step = self.front_end.follow(frame, started=False)
+            step = self.front_end.follow(frame, with_pose=False)
         if self.front_end.is_lost(step):
             return self._insert(frame, pose, {})
         reference, width = self.front_end.reference.index, frame.size[1]
-        if not self.choice.wants(index, reference, step, width, self.config.front_end.keyframe_flow):
+        if not self.choice.wants(index, step, width, self.config.keyframe_choice.max_flow):
             if self._complete == [reference] and is_held_out(reference) and not is_held_out(index):
                 self.graph.remove(reference)  # the first frame of all: this one is as good
                 return self._first(frame, pose)
@@ -134,7 +135,7 @@ class PosedTracker:
         self.graph.readout_time = self.config.readout_time
         self.flow = make_flow(self.config.flow)
         matcher = Matcher(self.flow)
-        self.choice = KeyframeChoice(self.config.front_end)
+        self.choice = KeyframeChoice(self.config.keyframe_choice)
         self.front_end = FrontEnd(self.graph, matcher, self.config.front_end, self.config.threads)
         self.local_map = LocalMap(self.graph, matcher, self.config.local_map, self.config.threads)
 

@@ -65,6 +65,15 @@ def adjust(graph: Graph, solver: Solver) -> Solution:
     )
 
 
+def resolve_device(name: str) -> str:
+    """What `Solver.device` takes for a setting: auto is CUDA if there is one. Raises ValueError where there is none."""
+    if name == "cpu":
+        return name
+    from mvsgs_core.tracking.estimation.torch_adjustment import find_device  # torch takes a second to load
+
+    return find_device(name)
+
+
 def reproject(
     cam_from_world: np.ndarray,
     inverse_depth: np.ndarray,
@@ -91,4 +100,4 @@ def _f64(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-__all__ = ["DROID_GLOBAL", "DROID_LOCAL", "ROBUST", "Graph", "Solution", "Solver", "adjust", "reproject"]
+__all__ = ["DROID_GLOBAL", "DROID_LOCAL", "ROBUST", "Graph", "Solution", "Solver", "adjust", "reproject", "resolve_device"]

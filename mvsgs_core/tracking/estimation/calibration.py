@@ -22,7 +22,6 @@ class Calibration:
     graph: KeyframeGraph
     config: FocalConfig
     stats: Stats
-    given: np.ndarray  # (4,) intrinsics that came with the frames, at the tracker's size
     pixels: float  # the focal length that came with the frames, at their own size
     settled: bool  # from the start on, where the intrinsics are no guess
     readout_time: float | None  # seconds; None: to be estimated
@@ -30,6 +29,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         self.graph.readout_time = self.readout_time or 0.0
+        self.given = self.graph.intrinsics  # (4,) that came with the frames, at the tracker's size
         self.guessed = not self.settled
 
     @property

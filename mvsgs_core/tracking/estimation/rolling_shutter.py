@@ -67,14 +67,13 @@ def rectified(image: np.ndarray, frame: TrackingImage, readout_time: float) -> n
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def checked_readout_time(readout_time: float | None) -> float | None:
-    """A readout time that the user gave, None where it is to be estimated. Raises ValueError where it can't be one."""
+def check_readout_time(readout_time: float | None) -> None:
+    """Raises ValueError for what can't be a readout time; None is to be estimated."""
     if readout_time is not None and not 0.0 <= readout_time <= MAX_READOUT_TIME:
         raise ValueError(
             f"tracker.readout_time={readout_time:g}: it is the seconds from the first row to the last, "
             f"0 to {MAX_READOUT_TIME:g} (25 milliseconds are 0.025), 0 for a global shutter"
         )
-    return readout_time
 
 
-__all__ = ["MAX_ESTIMATED", "MAX_READOUT_TIME", "checked_readout_time", "estimate_readout_time", "rectified"]
+__all__ = ["MAX_ESTIMATED", "MAX_READOUT_TIME", "check_readout_time", "estimate_readout_time", "rectified"]

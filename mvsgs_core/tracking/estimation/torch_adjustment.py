@@ -6,6 +6,7 @@ gives the same result every time.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,15 +46,19 @@ def adjust_with_torch(graph: Graph, solver: Solver, device: str) -> Solution:
     Raises ValueError where CUDA is asked for and missing.
     """
     with torch.no_grad():
-        return _Adjuster(graph, solver, find_device(device)).run()
+        found = find_device(device)
+        return _Adjuster(graph, solver, torch.device("cpu" if found == "torch" else found)).run()
 
 
-def find_device(name: str) -> torch.device:
-    """A PyTorch device by the name that `Solver.device` has. Raises ValueError where it is missing."""
-    chosen = torch.device("cpu" if name == "torch" else name)
-    if chosen.type == "cuda" and not torch.cuda.is_available():
+def find_device(name: str) -> str:
+    """The device that a setting means: auto is CUDA if there is one, else the CPU. Raises ValueError for none."""
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if not re.fullmatch(r"cpu|torch|cuda(:\d+)?", name):
+        raise ValueError(f"bundle adjustment on {name}: there are cpu, cuda, cuda:0 and auto")
+    if name.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(f"bundle adjustment on {name}: PyTorch sees no CUDA device here; use tracker.device=cpu")
-    return chosen
+    return name
 
 
 class _Adjuster:

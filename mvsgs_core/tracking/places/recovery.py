@@ -67,7 +67,7 @@ class Recovery:
             image = self._images.get(record.index)
             if image is None:
                 continue
-            step = follower.follow(image, True)
+            step = follower.follow(image, with_pose=True)
             if follower.is_lost(step) or step.localization is None:
                 continue
             if self.config.criteria.accept(self.graph, start, step.matches, step.localization):

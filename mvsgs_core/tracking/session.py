@@ -1,0 +1,366 @@
+"""The tracker at work on a stream: its parts, made whole with the first frame, and what it does in each phase.
+
+    INITIALIZING --- the first keyframes are solved ---> TRACKING --- a frame can't be followed ---> RELOCALIZING, LOST
+    RELOCALIZING --- found in the map, or followed again ---> TRACKING
+    RELOCALIZING --- patience is over ---> INITIALIZING, a segment of its own, which a loop may join later
+
+Semi-dense matches (flow.py) of the newest keyframe give each frame's pose; keyframes join a graph (local_map.py) that
+dense bundle adjustment keeps consistent; loops (loop_closure.py) correct or join.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.held_out import is_held_out
+from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.back_end import BackEnd
+from mvsgs_core.tracking.config import TrackerConfig
+from mvsgs_core.tracking.diagnosis import Diagnosis
+from mvsgs_core.tracking.estimation.calibration import REESTIMATED_AT, Calibration
+from mvsgs_core.tracking.estimation.focal import FocalConfig
+from mvsgs_core.tracking.frames import FrameRecord
+from mvsgs_core.tracking.front_end import FrontEnd, Step
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage, tracking_size
+from mvsgs_core.tracking.initializer import Initializer
+from mvsgs_core.tracking.keyframe_choice import KeyframeChoice, newest
+from mvsgs_core.tracking.local_map import LocalMap
+from mvsgs_core.tracking.matching.flow import make_flow
+from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.places.covisibility import CovisibleKeyframes
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
+from mvsgs_core.tracking.places.loop_closure import LoopCloser
+from mvsgs_core.tracking.places.recovery import Recovery
+from mvsgs_core.tracking.places.relocalization import Relocalizer
+from mvsgs_core.tracking.places.retrieval import Retrieval
+from mvsgs_core.tracking.publish import Publisher, Update
+from mvsgs_core.trajectory import TrackingState
+
+
+class Session:
+    def __init__(
+        self, config: TrackerConfig, stats: Stats, size: tuple[int, int], intrinsics: np.ndarray, guessed: bool
+    ) -> None:
+        """size (height, width), intrinsics (4,): of the frames as they come; guessed: the focal length is to be found."""
+        threads = config.threads or 1
+        self.config, self.stats = config, stats
+        self.phase = Phase.INITIALIZING
+        self.segment = 0
+        self.records: list[FrameRecord] = []
+        self.size = tracking_size(*size, config.area)
+        self.intrinsics = scale_intrinsics(intrinsics, size, self.size)
+        self.graph = KeyframeGraph(self.intrinsics, config.device)
+        self.calibration = Calibration(
+            self.graph, config.focal, stats, float(intrinsics[0]), not guessed, config.readout_time, threads
+        )
+        self.matcher = Matcher(make_flow(config.flow))
+        self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, threads)
+        self.choice = KeyframeChoice(config.keyframe_choice)
+        self.diagnosis = Diagnosis(config.front_end.lost_fraction, config.min_texture)
+        self.initializer = Initializer(self.graph, self.matcher, config.initialization, threads, self.diagnosis)
+        self.local_map = LocalMap(self.graph, self.matcher, config.local_map, threads)
+        self.covisible_keyframes = CovisibleKeyframes(self.graph, self.local_map, config.covisibility, threads)
+        self.back_end = BackEnd(self.graph, self.local_map, config.back_end, threads)
+        retrieval = Retrieval()
+        self.loops = LoopCloser(self.graph, self.local_map, retrieval, config.loop)
+        self.relocalizer = Relocalizer(self.graph, self.matcher, retrieval, config.relocalization)
+        self.recovery = Recovery(self.graph, self.matcher, config.recovery, config.front_end)
+        self.publisher = Publisher(self.graph, config.tolerance, lambda index: self.graph.keyframes[index].segment)
+        self._since = 0  # frames since the last keyframe
+        self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
+
+    def add(self, frame: TrackingImage) -> Update:
+        """The next frame of the stream."""
+        record = FrameRecord(frame.index, frame.timestamp, TrackingState.NOT_INITIALIZED)
+        self.records.append(record)
+        self._since += 1
+        update = self._handle(frame, record)
+        self.stats.count(f"frames while {self.phase}")
+        return update
+
+    @property
+    def pending(self) -> set[int]:
+        """Frames that may still become keyframes that are published: their images are needed until then."""
+        waiting = set(self.initializer.waiting) | set(self.publisher.held)
+        if self.phase is not Phase.INITIALIZING:
+            return waiting | set(self._tail)
+        last = self.front_end.last  # the end of the stream may force an initialization with it
+        return waiting | (set() if last is None else {last.index})
+
+    @property
+    def members(self) -> list[int]:
+        """Keyframes of the segment that the camera is in, in order."""
+        return self.local_map.members(self.segment)
+
+    def last_keyframes(self) -> Iterator[Update]:
+        """The stream has ended: an initialization by force if there was none, else a keyframe of the last frames."""
+        if self.phase is Phase.INITIALIZING:
+            yield from self._force_initialization()
+        else:
+            yield from self._end_with_a_keyframe()
+        if self.phase is not Phase.INITIALIZING:
+            self.calibration.estimate_readout_time(self.members[-40:])
+        if self.publisher.held:
+            yield Update(TrackingState.TRACKED, self._settle())
+
+    def _handle(self, frame: TrackingImage, record: FrameRecord) -> Update:
+        """The phase decides what becomes of a frame, and what becomes of it decides the next phase."""
+        if self.front_end.reference is None:
+            return self._begin_segment(frame, record)
+        initializing = self.phase is Phase.INITIALIZING
+        with self.stats.time("front end"):
+            step = self.front_end.follow(frame, with_pose=not initializing)
+        followed = not self.front_end.is_lost(step)
+        if initializing:
+            self.diagnosis.saw(self.front_end.reference, frame, step, not followed)
+        if step.still:
+            return self._stand_still(record)
+        if followed:
+            self.relocalizer.found()
+        if initializing:
+            return self._initialize(frame, step, record) if followed else self._initialize_anew(frame, record)
+        return self._track(frame, step, record) if followed else self._lose(frame, record)
+
+    def _stand_still(self, record: FrameRecord) -> Update:
+        self.stats.skip("frames that did not move")
+        last = self.records[-2]
+        record.state, record.same_as = last.state, last.index if last.same_as is None else last.same_as
+        return Update(record.state)
+
+    # INITIALIZING
+
+    def _begin_segment(self, frame: TrackingImage, record: FrameRecord) -> Update:
+        """The first keyframe of a segment, if the image has any texture."""
+        self.phase = Phase.INITIALIZING
+        record.state = TrackingState.NOT_INITIALIZED
+        if not self._has_texture(frame):
+            self.diagnosis.no_texture(frame)
+            return Update(record.state)
+        self.recovery.keep(frame)
+        self.initializer.add(frame, self.segment)
+        self._refer_to(frame, None)
+        return Update(record.state)
+
+    def _initialize(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
+        """Keyframes are collected until they can be solved; those of a later segment are looked for in the map too."""
+        self.recovery.keep(frame)
+        limit = self.initializer.flow(self._since)
+        if not self.choice.wants(frame.index, step, frame.size[1], limit):
+            only = self.initializer.waiting == [step.reference]
+            if only and is_held_out(step.reference) and not is_held_out(frame.index):  # this one is as good
+                self.initializer.abandon()
+                return self._begin_segment(frame, record)
+            return Update(record.state)
+        with self.stats.time("start"):
+            self.initializer.add(frame, self.segment, step.matches)
+            self._refer_to(frame, None)
+            waiting = list(self.initializer.waiting)
+            initialized = self.initializer.initialize(focal=self._unknown_focal())
+        if initialized:
+            return self._begin_tracking(waiting, record)
+        place = self.relocalizer.relocalize(frame) if self.segment > 0 else None
+        return Update(record.state) if place is None else self._resume(frame, record, place)
+
+    def _initialize_anew(self, frame: TrackingImage, record: FrameRecord) -> Update:
+        """The keyframes that wait can't be followed: they go, unless the camera is found in an earlier segment."""
+        if not self._has_texture(frame):
+            return Update(record.state)
+        place = self._search_map(frame)
+        if place is not None:
+            return self._resume(frame, record, place)
+        self.initializer.abandon()
+        return self._begin_segment(frame, record)
+
+    def _begin_tracking(self, keyframes: list[int], record: FrameRecord) -> Update:
+        """The first keyframes of a segment are solved."""
+        self.phase = Phase.TRACKING
+        self.calibration.estimate_readout_time(keyframes)
+        self.local_map.adjust_window(keyframes[-1])
+        self.calibration.refine(keyframes)
+        self.front_end.pose = self.graph.keyframes[keyframes[-1]].cam_from_world
+        if self.config.loops:
+            for index in keyframes:
+                self.loops.add(index)
+        self.stats.count("keyframes", len(keyframes))
+        record.state = TrackingState.TRACKED
+        return Update(record.state, self._publish(keyframes))
+
+    def _force_initialization(self) -> Iterator[Update]:
+        """The stream ended before there was a map: what was collected, with weaker criteria."""
+        frame, step = self.front_end.last, self.front_end.step
+        if frame is None:
+            return
+        if step is not None and frame.index not in self.graph.keyframes:
+            self.initializer.add(frame, self.segment, step.matches)
+        waiting = list(self.initializer.waiting)
+        if self.initializer.initialize(True, self._unknown_focal()):
+            self.stats.warn(f"the start was forced at the end of the stream: {self.initializer.reason}")
+            yield self._begin_tracking(waiting, self._record(frame.index))
+        else:
+            self.initializer.abandon()
+
+    # TRACKING
+
+    def _track(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
+        """A frame whose pose is known; perhaps a keyframe."""
+        self.phase = Phase.TRACKING
+        record.state = TrackingState.TRACKED
+        record.follow(self.graph, step.reference, step.matches, step.pose)
+        width = frame.size[1]
+        limit = self.covisible_keyframes.limit(step.reference, self.config.keyframe_choice.max_flow)
+        wanted = self.choice.wants(frame.index, step, width, limit)
+        if self.choice.moved(step, width, limit) and self._reuse_keyframe(frame, step):
+            return Update(record.state)
+        if not wanted:
+            self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
+            return Update(record.state)
+        return self._add_keyframe(frame, step, record) or self._lose(frame, record)
+
+    def _add_keyframe(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update | None:
+        """A tracked frame becomes a keyframe; None, and it is none, where the map contradicts its pose."""
+        with self.stats.time("local map"):
+            self.local_map.insert(frame, step.pose, self.segment, {step.reference: step.matches})
+        with self.stats.time("local bundle adjustment"):
+            solution = self.local_map.adjust_window(frame.index)
+        if solution.failure:
+            self.stats.warn(f"local bundle adjustment failed: {solution.failure}")
+        if self.local_map.agreement(frame.index) < self.config.front_end.lost_inliers:
+            self.graph.remove(frame.index)
+            self.stats.count("keyframes taken back")
+            return None
+        if self.graph.keyframes[frame.index].triangulated.mean() < 0.3 * frame.cells.textured.mean():
+            record.state = TrackingState.DEGENERATE
+            self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
+        self.stats.count("keyframes")
+        self.covisible_keyframes.made(frame.index)
+        if len(self.graph.keyframes) in REESTIMATED_AT:
+            self.calibration.estimate_readout_time(self.members[-12:])
+        self.calibration.refine(self.members)
+        if self.config.loops:
+            self._close_loops(frame.index)
+        for index in self.members[: -self.config.local_map.window]:
+            self.graph.keyframes[index].image.release()
+        self._refer_to(frame, self.graph.keyframes[frame.index].cam_from_world)
+        correction = self.publisher.corrections()
+        return Update(record.state, self._publish([frame.index]), correction)
+
+    def _reuse_keyframe(self, frame: TrackingImage, step: Step) -> bool:
+        """An old keyframe sees this: it becomes the reference, and no further one is made."""
+        with self.stats.time("covisible keyframes"):
+            known = self.covisible_keyframes.find(frame, step.pose, step.reference)
+        if known is None:
+            return False
+        self._follow_place(frame, known)
+        self.stats.skip("keyframes spared by covisible ones")
+        return True
+
+    def _close_loops(self, index: int) -> None:
+        with self.stats.time("loops"):
+            closure = self.loops.search(index)
+            self.loops.add(index)
+        if closure is not None:
+            self.stats.count("loops")
+            if closure.failure:
+                self.stats.warn(f"a loop could not be closed: {closure.failure}")
+            if closure.moved:
+                self.stats.count("loops that moved the map")
+                self.back_end.pending = self.config.back_end.steps
+            if closure.joined is not None:
+                self.segment = self.graph.keyframes[index].segment
+                self.stats.count("segments joined")
+        with self.stats.time("background bundle adjustment"):
+            self.back_end.work(self.segment)
+
+    def _end_with_a_keyframe(self) -> Iterator[Update]:
+        """The last frames show what no keyframe does: one of them becomes one."""
+        tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[1], t[0].size[1])}
+        last = newest(tail)
+        if last is not None:
+            update = self._add_keyframe(*tail[last], self._record(last))
+            if update is not None:
+                yield update
+
+    # LOST and RELOCALIZING
+
+    def _lose(self, frame: TrackingImage, record: FrameRecord) -> Update:
+        """A frame of the map that could not be followed."""
+        record.state = TrackingState.LOST
+        record.forget()
+        if self._has_texture(frame):
+            return self._relocalize(frame, record)
+        self.phase = Phase.LOST
+        return Update(record.state)
+
+    def _relocalize(self, frame: TrackingImage, record: FrameRecord) -> Update:
+        """The map is searched for the camera; when patience is over, a new segment begins."""
+        self.phase = Phase.RELOCALIZING
+        place = self._search_map(frame)
+        if place is not None:
+            return self._resume(frame, record, place)
+        if not self.relocalizer.hopeless:
+            return Update(record.state)
+        self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self.graph.keyframes.values()))
+        held = self._settle() if self.publisher.held else ()
+        return replace(self._begin_segment(frame, record), keyframes=held)
+
+    def _search_map(self, frame: TrackingImage) -> PlaceMatch | None:
+        self.recovery.keep(frame)
+        with self.stats.time("relocalization"):
+            return self.relocalizer.lost(frame)
+
+    def _resume(self, frame: TrackingImage, record: FrameRecord, place: PlaceMatch) -> Update:
+        """Tracking goes on from a keyframe that was found in a frame; a segment that has no map yet is given up."""
+        self.initializer.abandon()
+        self.phase = Phase.TRACKING
+        self.segment = self.graph.keyframes[place.index].segment
+        self._follow_place(frame, place)
+        self.relocalizer.found()
+        self.stats.count("relocalized")
+        record.state = TrackingState.TRACKED
+        record.follow(self.graph, place.index, place.matches, place.localization.cam_from_world)
+        return Update(record.state)
+
+    # In all phases
+
+    def _has_texture(self, frame: TrackingImage) -> bool:
+        """Whether the image is of any use; counted where it is not."""
+        enough = bool(frame.cells.textured.mean() >= self.config.min_texture)
+        if not enough:
+            self.stats.count("frames without texture")
+        return enough
+
+    def _refer_to(self, keyframe: TrackingImage, pose: np.ndarray | None) -> None:
+        """A new keyframe is followed from here on. pose (4, 4): its own, if there is a map."""
+        self.front_end.refer_to(keyframe)
+        self.front_end.pose = pose
+        self._tail = {}
+        self._since = 0
+
+    def _follow_place(self, frame: TrackingImage, place: PlaceMatch) -> None:
+        """An earlier keyframe is followed from here on, whose points were found in this frame."""
+        keyframe = self.graph.keyframes[place.index].image
+        self.front_end.resume(keyframe, frame, place.matches, place.localization.cam_from_world)
+        self._tail = {}
+
+    def _publish(self, keyframes: list[int]) -> tuple[int, ...]:
+        return self.publisher.publish_all(keyframes, self.calibration.settled)
+
+    def _settle(self) -> tuple[int, ...]:
+        """Keyframes that were held back, with the focal length as far as it is known."""
+        self.calibration.settle(list(self.publisher.held))
+        return self._publish([])
+
+    def _unknown_focal(self) -> FocalConfig | None:
+        return None if self.calibration.settled else self.config.focal
+
+    def _record(self, index: int) -> FrameRecord:
+        return next(record for record in reversed(self.records) if record.index == index)
+
+
+__all__ = ["Session"]
