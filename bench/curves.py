@@ -24,7 +24,7 @@ _MIDDLE = "{scale: 2, step: 0.5, hypotheses: 15, radius: 3, p1: 0.1, p2: 0.8}"
 _FINE = "{scale: 1, step: 0.35, hypotheses: 11, radius: 3, p1: 0.05, p2: 0.4}"
 CURVES: dict[str, dict[str, str]] = {  # parameter: label of each point and its value
     "tracker.area": {"19k": "19200", "38k": "38400"},
-    "tracker.window": {"6": "6", "20": "20"},
+    "tracker.local_map.window": {"6": "6", "20": "20"},
     "mvs.area": {"9k": "9600", "19k": "19200"},
     "mvs.neighbors.count": {"2": "2", "6": "6"},
     "mvs.stages": {"3 stages": f"[{_COARSEST},{_MIDDLE},{_FINE}]"},

@@ -9,7 +9,17 @@ from launch.refusal import GraphError
 from nodes.runtime.parameters import nested_in
 
 RENAMED: Mapping[str, str] = {
-    "tracker.keyframe_share": "tracker.keyframe_fraction",
+    "tracker.keyframe_flow": "tracker.keyframe_choice.max_flow",
+    "tracker.keyframe_share": "tracker.keyframe_choice.min_fraction",
+    "tracker.still_flow": "tracker.front_end.still_flow",
+    "tracker.start_keyframes": "tracker.initialization.min_keyframes",
+    "tracker.window": "tracker.local_map.window",
+    "tracker.recent": "tracker.local_map.recent",
+    "tracker.proximity": "tracker.local_map.proximity",
+    "tracker.steps": "tracker.local_map.steps",
+    "tracker.global_edges": "tracker.back_end.max_edges",
+    "tracker.known_flow": "tracker.covisibility.max_flow",
+    "tracker.known_from": "tracker.covisibility.min_keyframes",
     "tracker.readout": "tracker.readout_time",
     "tracker.unroll": "tracker.rectify_rolling_shutter",
     "mvs.neighbors": "mvs.neighbors.count",

@@ -20,10 +20,11 @@ class DroidTracker(TrackerNode):
         pass
 
     config: Config
+    core: DroidSlam
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
-        self._tracker = DroidSlam(self.config)
+        self.core = DroidSlam(self.config)
         self._report()
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
@@ -32,20 +33,16 @@ class DroidTracker(TrackerNode):
             self.stats.warn(
                 "the focal length is a guess, which this tracker takes for true: tracker=dense estimates it"
             )
-        yield from self._send(self._tracker.add(frame.index, frame.timestamp, frame.image, frame.intrinsics))
-
-    @property
-    def _core(self) -> DroidSlam:
-        return self._tracker
+        yield from self._send(self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics))
 
     def _keyframe(self, index: int) -> Keyframe:
-        frame, coarse = self._frames[index], self._tracker.coarse_map(index)
+        frame, coarse = self._frames[index], self.core.coarse_map(index)
         return Keyframe(
             index=index,
             timestamp=frame.timestamp,
             image=frame.image,
             intrinsics=frame.intrinsics,
-            world_from_cam=geometry.inverse(self._tracker.keyframe(index).cam_from_world),
+            world_from_cam=geometry.inverse(self.core.keyframe(index).cam_from_world),
             scale=1.0,
             inverse_depth=coarse.inverse_depth,
             inverse_depth_weight=coarse.weight,

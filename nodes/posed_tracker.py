@@ -9,8 +9,8 @@ import numpy as np
 
 from msgs import Frame, GroundTruth, Keyframe, TrackingState, Trajectory
 from mvsgs_core.tracking.coarse_depth import coarse_map
-from mvsgs_core.tracking.estimation.rolling_shutter import checked_readout_time, rectified
-from mvsgs_core.tracking.front_end import FrontEndConfig
+from mvsgs_core.tracking.estimation.rolling_shutter import check_readout_time, rectified
+from mvsgs_core.tracking.keyframe_choice import KeyframeChoiceConfig
 from mvsgs_core.tracking.local_map import LocalMapConfig
 from mvsgs_core.tracking.posed import PosedConfig
 from mvsgs_core.tracking.posed import PosedTracker as Core
@@ -39,16 +39,14 @@ class PosedTracker(Node):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c = self.config
-        checked_readout_time(c.readout_time)
+        check_readout_time(c.readout_time)
         self._tracker = Core(
             PosedConfig(
                 area=c.area,
                 flow=c.flow,
                 readout_time=c.readout_time,
                 threads=c.threads or 1,
-                front_end=FrontEndConfig(
-                    still_flow=0.0, keyframe_flow=c.keyframe_flow, keyframe_fraction=c.keyframe_fraction
-                ),
+                keyframe_choice=KeyframeChoiceConfig(c.keyframe_flow, c.keyframe_fraction),
                 local_map=LocalMapConfig(recent=c.recent, proximity=c.proximity, steps=c.steps),
             )
         )

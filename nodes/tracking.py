@@ -6,12 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, Protocol
 
-import numpy as np
-
 from msgs import Frame, Keyframe, Poses, Trajectory
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.publish import Correction
-from mvsgs_core.tracking.tracker import Update
+from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.publish import Update
 from mvsgs_core.trajectory import Trajectory as CameraTrajectory
 from nodes import Node
 
@@ -19,14 +17,14 @@ from nodes import Node
 class CoreTracker(Protocol):
     """The part of a tracker of the core that is the same for all."""
 
+    stats: Stats
+    nothing: str  # why no frame has a pose, once the stream has ended; empty where one has
+
     @property
-    def stats(self) -> Stats: ...
+    def phase(self) -> Phase: ...
 
     @property
     def pending(self) -> set[int]: ...  # frames that may still be sent as keyframes
-
-    @property
-    def nothing(self) -> str: ...  # why no frame has a pose, once the stream has ended; empty where one has
 
     def finish(self) -> Iterator[Update]: ...
 
@@ -34,16 +32,14 @@ class CoreTracker(Protocol):
 
 
 class TrackerNode(Node, ABC):
-    """A subclass makes the tracker in `_make_tracker`, feeds it in its own `on_frame` and describes a keyframe."""
+    """A subclass makes the tracker of the core, feeds it in its own `on_frame` and describes a keyframe."""
+
+    core: CoreTracker
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
         self._frames: dict[int, Frame] = {}  # those that may still be sent as keyframes
         self._revision = 0
-
-    @property
-    @abstractmethod
-    def _core(self) -> CoreTracker: ...
 
     @abstractmethod
     def _keyframe(self, index: int) -> Keyframe: ...
@@ -59,39 +55,24 @@ class TrackerNode(Node, ABC):
         return 0.0
 
     def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
-        for update in self._core.finish():
+        for update in self.core.finish():
             yield from self._send(update)
-        trajectory = self._core.trajectory()
         self._report()
-        if self._core.nothing:
-            self.stats.nothing(self._core.nothing)
-        yield Trajectory(
-            index=trajectory.index,
-            timestamp=trajectory.timestamp,
-            world_from_cam=trajectory.world_from_cam,
-            keyframe=trajectory.keyframe,
-            state=trajectory.state,
-            segment=trajectory.segment,
-            focal_factor=self._focal_factor,
-            readout_time=self._readout_time,
-        )
+        if self.core.nothing:
+            self.stats.nothing(self.core.nothing)
+        found = {"focal_factor": self._focal_factor, "readout_time": self._readout_time}
+        yield Trajectory(**vars(self.core.trajectory()) | found)
 
     def _send(self, update: Update) -> Iterator[Keyframe | Poses]:
         for index in update.keyframes:
             yield self._keyframe(index)
         if update.correction is not None:
-            yield self._poses(update.correction)
-        for index in self._frames.keys() - self._core.pending:
+            self._revision += 1
+            yield Poses(self._revision, **vars(update.correction))
+        for index in self._frames.keys() - self.core.pending:
             del self._frames[index]
-        self.stats.values["tracking"] = update.state.name.lower()
+        self.stats.values["tracking"] = self.core.phase.value
         self._report()
 
-    def _poses(self, correction: Correction) -> Poses:
-        self._revision += 1
-        return Poses(
-            self._revision, correction.index, correction.world_from_cam, correction.scale.astype(np.float64),
-            correction.segment,
-        )  # fmt: skip
-
     def _report(self) -> None:
-        self.stats.include(self._core.stats)
+        self.stats.include(self.core.stats)

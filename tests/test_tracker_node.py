@@ -14,7 +14,7 @@ from mvsgs_core.datasets.synthetic import FPS, Synthetic
 from mvsgs_core.image_metrics import psnr
 from nodes import Node, handlers, outputs
 from nodes.posed_tracker import PosedTracker
-from nodes.tracker import Tracker, spread
+from nodes.tracker import Tracker, in_milliseconds
 from tests.support.sequences import synthetic
 
 
@@ -154,8 +154,7 @@ def test_what_was_taken_out_of_the_keyframes_is_told() -> None:
     node = Tracker(Tracker.Config(readout_time=0.5 / FPS))
     for n, frame in enumerate(frames):
         if n == 30:  # as the tracker does when it knows better
-            assert node._tracker.graph is not None
-            node._tracker.graph.readout_time = 0.4 / FPS
+            node.core.session.graph.readout_time = 0.4 / FPS
         list(node.on_frame(frame))
     list(node.on_end())
     early, late = 0.5 / FPS, 0.4 / FPS
@@ -164,7 +163,7 @@ def test_what_was_taken_out_of_the_keyframes_is_told() -> None:
     assert (
         published == f"{1e3 * np.mean(node._readout_times):.1f} ms in the mean, {1e3 * late:.1f} to {1e3 * early:.1f}"
     )
-    assert spread([0.02, 0.02]) == "20.0 ms"
+    assert in_milliseconds([0.02, 0.02]) == "20.0 ms"
 
 
 def run_posed(order: list[Frame | GroundTruth]) -> list[msgs.Message]:

@@ -26,17 +26,10 @@ GROWTH = 1.1  # memory of a process at the end over that after it has settled
 PERIOD = 0.2  # s between samples
 MAX_BYTES = 4e6  # of the frames that wait to be scored: reached long before the end
 OVERRIDES = (
-    "device=cpu", "screen=off", "tracker.area=6912", "tracker.known_from=12", "mvs.area=6912", "mapper.iterations=2",
-    "mapper.refinement=20", "mapper.checkpoint=5", f"evaluator.max_bytes={MAX_BYTES:g}", "evaluator.max_frames=20",
-    "evaluator.lpips=off",
-)  # fmt: skip
-
-
-@dataclass
-class Samples:
-    """Over the time of a run: (time.monotonic() in s, MB), resident by node and on disk."""
-
-    memory: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    "device=cpu", "screen=off", "tracker.area=6912", "tracker.covisibility.min_keyframes=12", "mvs.area=6912",
+    "mapper.iterations=2", "mapper.refinement=20", "mapper.checkpoint=5", f"evaluator.max_bytes={MAX_BYTES:g}",
+    "evaluator.max_frames=20", "evaluator.lpips=off",
+)
     folder: list[tuple[float, float]] = field(default_factory=list)  # the output
     unnamed: list[tuple[float, float]] = field(default_factory=list)  # files without a name that the processes hold
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from bench import plots
 from bench.table import Row
+from mvsgs_core.tracking.keyframe_choice import KeyframeChoiceConfig
 from mvsgs_core.tracking.tracker import TrackerConfig
 
 TIME_NOISE, ERROR_NOISE = 1.05, 1.15  # a setting beats the default if it is that many times faster and more exact
@@ -31,8 +32,8 @@ def settings() -> dict[tuple[str, str], TrackerConfig]:
     """By setting and label; ("default", "") is what there is without a word."""
     base = TrackerConfig()
 
-    def front_end(flow: float) -> TrackerConfig:
-        return replace(base, front_end=replace(base.front_end, keyframe_flow=flow))
+    def keyframe_flow(flow: float) -> TrackerConfig:
+        return replace(base, keyframe_choice=KeyframeChoiceConfig(max_flow=flow))
 
     def local(**changes: int) -> TrackerConfig:
         return replace(base, local_map=replace(base.local_map, **changes))
@@ -42,9 +43,9 @@ def settings() -> dict[tuple[str, str], TrackerConfig]:
         ("size", "192x144"): replace(base, area=192 * 144),
         ("size", "256x192"): replace(base, area=256 * 192),
         ("size", "512x384"): replace(base, area=512 * 384),
-        ("keyframe flow", "0.035"): front_end(0.035),
-        ("keyframe flow", "0.08"): front_end(0.08),
-        ("keyframe flow", "0.12"): front_end(0.12),
+        ("keyframe flow", "0.035"): keyframe_flow(0.035),
+        ("keyframe flow", "0.08"): keyframe_flow(0.08),
+        ("keyframe flow", "0.12"): keyframe_flow(0.12),
         ("edges", "1 recent, 0 near"): local(recent=1, proximity=0),
         ("edges", "2 recent, 2 near"): local(recent=2, proximity=2),
         ("edges", "6 recent, 6 near"): local(recent=6, proximity=6),

@@ -46,25 +46,25 @@ def close_loop(items: Sequence[Item], drift: float = 0.25) -> Closed:
     tracker = Tracker(TrackerConfig(loops=False))
     for item in items:
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
-    graph = tracker.graph
-    assert graph is not None
+    session = tracker.session
+    graph = session.graph
     order = sorted(graph.keyframes)
     place = {index: n for n, index in enumerate(order)}
     for a, b in [pair for pair in graph.edges if abs(place[pair[0]] - place[pair[1]]) > len(order) // 4]:
         del graph.edges[a, b]
     _let_drift(graph, order, drift)
     for index in order:
-        tracker.publisher.publish(index)
+        session.publisher.publish(index)
     before = {index: graph.world_from_cam(index) for index in order}
     units = {item.index: _unit(graph, item) for item in items if item.index in place}
     error = _error(graph, order, items)
     for index in order[:-1]:
-        tracker.loops.add(index)
-    closure = tracker.loops.search(order[-1])
+        session.loops.add(index)
+    closure = session.loops.search(order[-1])
     if closure is None or not closure.moved:
         return Closed(before, units, None, error, error)
-    tracker.back_end.adjust(graph.keyframes[order[0]].segment)
-    return Closed(before, units, tracker.publisher.corrections(True), error, _error(graph, order, items))
+    session.back_end.adjust(graph.keyframes[order[0]].segment)
+    return Closed(before, units, session.publisher.corrections(True), error, _error(graph, order, items))
 
 
 @dataclass(frozen=True)

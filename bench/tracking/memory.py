@@ -39,8 +39,7 @@ def follow(frames: int, every: int = 100) -> list[Sample]:
         before = before or _resident()
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
         if number % every == 0:
-            assert tracker.graph is not None
-            samples.append(Sample(number, len(tracker.graph.keyframes), _resident() - before))
+            samples.append(Sample(number, len(tracker.session.graph.keyframes), _resident() - before))
     return samples
 
 

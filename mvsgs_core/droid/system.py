@@ -26,6 +26,7 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.networks.droid import DroidNet
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT
+from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Publisher, Update
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
@@ -85,6 +86,11 @@ class DroidSlam:
         if kept and every and self.frontend.started and len(self.video) % every == 0:
             self._adjust_globally(self.constants.backend_steps[-1:])
         return self._publish(self.frontend.settled)
+
+    @property
+    def phase(self) -> Phase:
+        """What the tracker is doing."""
+        return Phase.TRACKING if self.framing is not None and self.frontend.started else Phase.INITIALIZING
 
     @property
     def pending(self) -> set[int]:

@@ -77,7 +77,8 @@ class Diagnosis:
         if self.blank.frames > frames / 2:
             return (
                 f"no texture: {self.blank.frames} of {frames} frames have hardly any, "
-                f"{100 * self.blank.median:.1f} % of the image in the median ({100 * self.min_texture:.0f} % are needed)"
+                f"{100 * self.blank.median:.1f} % of the image in the median "
+                f"({100 * self.min_texture:.0f} % are needed)"
             )
         if self.lost.frames > frames / 4:
             jump = f"by {100 * self.jumped.median:.0f} % of the width, " if self.jumped.frames else ""

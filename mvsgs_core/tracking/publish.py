@@ -1,4 +1,4 @@
-"""What the outside was published of each keyframe, so that only what changed is published again."""
+"""What was published of each keyframe, so that only what changed is published again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mvsgs_core.trajectory import TrackingState
 
 
 class Tracked(Protocol):
-    """A keyframe as far as it is published."""
+    """What is published of a keyframe."""
 
     @property
     def inverse_depth(self) -> np.ndarray: ...
@@ -25,7 +25,7 @@ class Tracked(Protocol):
 
 
 class Keyframes(Protocol):
-    """What tells of keyframes by their index: a tracker's graph, or DROID-SLAM's video."""
+    """Keyframes by their index: a tracker's graph, or DROID-SLAM's video."""
 
     @property
     def keyframes(self) -> Mapping[int, Tracked]: ...
@@ -62,7 +62,7 @@ class _Published:
 
 
 class Publisher:
-    """tolerance: of the median depth (positions), radians (rotations) and fraction (scales) that counts as a change.
+    """tolerance: what counts as a change, as a fraction of the median depth (positions), radians, fraction (scales).
 
     segment_of: the part of the map that a keyframe belongs to; None where the tracker has only one.
     """
@@ -72,17 +72,15 @@ class Publisher:
         self.tolerance = tolerance
         self.segment_of = segment_of
         self.held: list[int] = []  # keyframes that are not published yet
-        self.highest_segment = 0  # that was ever published: a number is not given twice
+        self.highest_segment = 0  # that was ever published: no number is given twice
         self._published: dict[int, _Published] = {}
 
     def publish(self, index: int) -> None:
         """A keyframe was sent as it is now, with scale 1."""
-        keyframe = self.graph.keyframes[index]
-        self._published[index] = _Published(
-            self.graph.world_from_cam(index), 1.0, keyframe.inverse_depth.copy(), keyframe.triangulated.copy(),
-            self._segment(index),
-        )  # fmt: skip
-        self.highest_segment = max(self.highest_segment, self._segment(index))
+        keyframe, segment = self.graph.keyframes[index], self._segment(index)
+        known, pose = keyframe.triangulated.copy(), self.graph.world_from_cam(index)
+        self._published[index] = _Published(pose, 1.0, keyframe.inverse_depth.copy(), known, segment)
+        self.highest_segment = max(self.highest_segment, segment)
 
     @property
     def published(self) -> set[int]:
@@ -101,27 +99,25 @@ class Publisher:
     def corrections(self, everything: bool = False) -> Correction | None:
         """Keyframes that moved noticeably, or joined another segment, since they were last published; else None."""
         moved = []
-        for index, published in self._published.items():
+        for index, last in self._published.items():
             if index not in self.graph.keyframes:
                 continue
-            pose, scale = self.graph.world_from_cam(index), self._scale(index, published)
-            shift = (
-                np.linalg.norm(pose[:3, 3] - published.world_from_cam[:3, 3]) / self.graph.keyframes[index].median_depth
-            )
-            turn = np.linalg.norm(pose[:3, :3] - published.world_from_cam[:3, :3]) / np.sqrt(2.0)
-            moves = max(shift, turn, abs(np.log(scale / published.scale))) > self.tolerance
-            if everything or moves or published.segment != self._segment(index):
-                moved.append((index, pose, scale))
+            pose, scale, segment = self.graph.world_from_cam(index), self._scale(index, last), self._segment(index)
+            depth = self.graph.keyframes[index].median_depth
+            shift = np.linalg.norm(pose[:3, 3] - last.world_from_cam[:3, 3]) / depth
+            turn = np.linalg.norm(pose[:3, :3] - last.world_from_cam[:3, :3]) / np.sqrt(2.0)
+            moves = max(shift, turn, abs(np.log(scale / last.scale))) > self.tolerance
+            if everything or moves or last.segment != segment:
+                last.world_from_cam, last.scale, last.segment = pose, scale, segment
+                moved.append(index)
         if not moved:
             return None
-        for index, pose, scale in moved:
-            self._published[index].world_from_cam, self._published[index].scale = pose, scale
-            self._published[index].segment = self._segment(index)
+        last_of = [self._published[index] for index in moved]
         return Correction(
-            np.array([m[0] for m in moved], np.int64),
-            np.stack([m[1] for m in moved]),
-            np.array([m[2] for m in moved], np.float64),
-            None if self.segment_of is None else np.array([self._segment(m[0]) for m in moved], np.int32),
+            np.array(moved, np.int64),
+            np.stack([last.world_from_cam for last in last_of]),
+            np.array([last.scale for last in last_of], np.float64),
+            None if self.segment_of is None else np.array([last.segment for last in last_of], np.int32),
         )
 
     def _segment(self, index: int) -> int:

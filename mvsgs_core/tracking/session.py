@@ -47,7 +47,7 @@ class Session:
     def __init__(
         self, config: TrackerConfig, stats: Stats, size: tuple[int, int], intrinsics: np.ndarray, guessed: bool
     ) -> None:
-        """size (height, width), intrinsics (4,): of the frames as they come; guessed: the focal length is to be found."""
+        """size (height, width), intrinsics (4,): of the frames as they come; guessed: the focal length is."""
         threads = config.threads or 1
         self.config, self.stats = config, stats
         self.phase = Phase.INITIALIZING

@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.devices import resolve_device
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.config import TrackerConfig
-from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, resolve_device
+from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, check_device
 from mvsgs_core.tracking.frames import solve_trajectory
 from mvsgs_core.tracking.graph import Keyframe
 from mvsgs_core.tracking.image import TrackingImage
@@ -33,6 +34,7 @@ class Tracker:
         """clock: what the stages are timed with, in seconds. Raises ValueError where there is no such device."""
         config = config or TrackerConfig()
         self.config = replace(config, device=resolve_device(config.device))
+        check_device(self.config.device)
         self.stats = Stats(clock=clock)
         self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
         self._session: Session | None = None  # from the first frame on
@@ -94,7 +96,7 @@ class Tracker:
         return session.add(frame)
 
     def finish(self) -> Iterator[Update]:
-        """The stream has ended: its last keyframes, global bundle adjustment, every frame's pose and what to warn of."""
+        """The stream has ended: last keyframes, global bundle adjustment, every frame's pose, and what to warn of."""
         session = self._session
         if session is None:
             return

@@ -65,13 +65,12 @@ def adjust(graph: Graph, solver: Solver) -> Solution:
     )
 
 
-def resolve_device(name: str) -> str:
-    """What `Solver.device` takes for a setting: auto is CUDA if there is one. Raises ValueError where there is none."""
-    if name == "cpu":
-        return name
-    from mvsgs_core.tracking.estimation.torch_adjustment import find_device  # torch takes a second to load
+def check_device(device: str) -> None:
+    """Raises ValueError where `Solver.device` is none that is here."""
+    if device != "cpu":
+        from mvsgs_core.tracking.estimation.torch_adjustment import find_device  # torch takes a second to load
 
-    return find_device(name)
+        find_device(device)
 
 
 def reproject(
@@ -100,4 +99,13 @@ def _f64(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-__all__ = ["DROID_GLOBAL", "DROID_LOCAL", "ROBUST", "Graph", "Solution", "Solver", "adjust", "reproject", "resolve_device"]
+__all__ = [
+    "DROID_GLOBAL",
+    "DROID_LOCAL",
+    "Graph",
+    "Solution",
+    "Solver",
+    "adjust",
+    "check_device",
+    "reproject",
+]

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvsgs_core.devices import torch_device
 from mvsgs_core.tracking.estimation.problem import Graph, Solution, Solver
 
 _DENSE = 2**25  # elements of the coupling that are dense at a time: 256 MB
@@ -46,19 +47,16 @@ def adjust_with_torch(graph: Graph, solver: Solver, device: str) -> Solution:
     Raises ValueError where CUDA is asked for and missing.
     """
     with torch.no_grad():
-        found = find_device(device)
-        return _Adjuster(graph, solver, torch.device("cpu" if found == "torch" else found)).run()
+        return _Adjuster(graph, solver, find_device(device)).run()
 
 
-def find_device(name: str) -> str:
-    """The device that a setting means: auto is CUDA if there is one, else the CPU. Raises ValueError for none."""
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if not re.fullmatch(r"cpu|torch|cuda(:\d+)?", name):
+def find_device(name: str) -> torch.device:
+    """A PyTorch device by the name that `Solver.device` has. Raises ValueError where it is missing."""
+    if not re.fullmatch(r"torch|cuda(:\d+)?", name):
         raise ValueError(f"bundle adjustment on {name}: there are cpu, cuda, cuda:0 and auto")
-    if name.startswith("cuda") and not torch.cuda.is_available():
+    if name != "torch" and not torch.cuda.is_available():
         raise ValueError(f"bundle adjustment on {name}: PyTorch sees no CUDA device here; use tracker.device=cpu")
-    return name
+    return torch.device(torch_device(name))
 
 
 class _Adjuster:

@@ -28,7 +28,7 @@ def test_a_second_round_makes_few_keyframes_and_is_as_accurate() -> None:
     assert tracker.stats.skipped["keyframes spared by covisible ones"] >= 5
     assert np.isfinite(trajectory.world_from_cam).all(), "frames that see what old keyframes see have poses"
     assert (trajectory.state == TrackingState.TRACKED).all()
-    assert tracker.publisher.published == set(trajectory.index[trajectory.keyframe].tolist()), (
+    assert tracker.session.publisher.published == set(trajectory.index[trajectory.keyframe].tolist()), (
         "no keyframe that was published is taken back"
     )
     error, length = ate(trajectory, items)

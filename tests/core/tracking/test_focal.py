@@ -10,6 +10,7 @@ import pytest
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.datasets.synthetic import Synthetic
+from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.tracker import Tracker, Update
 from mvsgs_core.trajectory import Trajectory
 from tests.support.sequences import ate
@@ -72,7 +73,7 @@ def test_keyframes_wait_until_the_focal_length_is_settled() -> None:
         update = tracker.add(item.index, item.timestamp, item.image, GUESS, guessed=True)
         if update.keyframes:
             break
-        assert tracker.pending >= set(tracker.graph.keyframes if tracker.graph else ()), "an image that is still needed"
+        assert tracker.pending >= set(tracker.session.graph.keyframes), "an image that is still needed"
     settled = tracker.focal_factor
     assert len(update.keyframes) >= 8
     for later in room(1.3)[item.index + 1 :]:
@@ -91,7 +92,7 @@ def test_a_known_focal_length_is_left_alone() -> None:
     tracker = Tracker()
     for item in room(0.5)[:40]:
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
-    assert tracker.started
+    assert tracker.phase is Phase.TRACKING
     assert tracker.focal_factor == 1.0
 
 
@@ -101,9 +102,9 @@ def test_the_check_in_the_end_says_both_focal_lengths_and_how_sure_it_is() -> No
     wrong = GUESS * [1.25, 1.25, 1.0, 1.0]
     for item in room(1.3):
         tracker.add(item.index, item.timestamp, item.image, wrong, guessed=True)
-        if tracker.graph is not None and not tracker.calibration.settled and tracker.started:
-            tracker.graph.intrinsics = wrong * 1.0  # as if nothing better had been found
-            tracker.calibration.settled = True
+        if not tracker.session.calibration.settled and tracker.phase is Phase.TRACKING:
+            tracker.session.graph.intrinsics = wrong * 1.0  # as if nothing better had been found
+            tracker.session.calibration.settled = True
     list(tracker.finish())
     values = tracker.stats.values
     true = 1.3 * SIZE[1]

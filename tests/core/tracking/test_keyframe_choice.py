@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from mvsgs_core.held_out import is_held_out
-from mvsgs_core.tracking.front_end import FrontEndConfig, Step
-from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
+from mvsgs_core.tracking.front_end import Step
+from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, KeyframeChoiceConfig, newest
 from mvsgs_core.tracking.matching.flow import Matches
 from tests.support.sequences import synthetic, track, tracked_room
 
@@ -16,14 +16,14 @@ WIDTH, LIMIT = 320, 0.05  # a keyframe after 16 pixels
 
 
 def step(flow: float, fraction: float = 0.9) -> Step:
-    return Step(Matches(np.zeros((0, 2)), np.zeros(0)), fraction, flow, False, None)
+    return Step(0, Matches(np.zeros((0, 2)), np.zeros(0)), fraction, flow, False, None)
 
 
 def chosen(flows: list[float], fractions: list[float] | None = None, first: int = 1) -> list[int]:
     """Frames that are wanted as keyframes, all of them seen from one reference."""
-    choice = KeyframeChoice(FrontEndConfig())
+    choice = KeyframeChoice(KeyframeChoiceConfig())
     steps = [step(f, s) for f, s in zip(flows, fractions or [0.9] * len(flows))]
-    return [n for n, s in enumerate(steps, start=first) if choice.wants(n, 0, s, WIDTH, LIMIT)]
+    return [n for n, s in enumerate(steps, start=first) if choice.wants(n, s, WIDTH, LIMIT)]
 
 
 def test_a_held_out_frame_leaves_its_place_to_the_next() -> None:

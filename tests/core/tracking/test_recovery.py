@@ -67,8 +67,8 @@ def test_only_the_newest_images_of_frames_without_a_pose_are_kept() -> None:
     tracker, _, _ = track(
         items, TrackerConfig(recovery=RecoveryConfig(max_images=5), relocalization=RelocalizationConfig(patience=100))
     )
-    assert len(tracker.recovery._images) == 5
-    assert min(tracker.recovery._images) >= 40
+    assert len(tracker.session.recovery._images) == 5
+    assert min(tracker.session.recovery._images) >= 40
 
 
 def test_frames_before_the_start_are_verified_or_have_no_pose() -> None:
@@ -76,10 +76,10 @@ def test_frames_before_the_start_are_verified_or_have_no_pose() -> None:
     before = 12
     items = list(open_dataset("tum", path=shared("data/kitti_piece")))
     tracker = Tracker()
-    tracker.set_up(items[0].image.shape[0], items[0].image.shape[1], items[0].intrinsics, False)
+    session = tracker.begin(items[0].image.shape[:2], items[0].intrinsics)
     for item in items[:before]:  # as a start leaves them that was given up
-        tracker.records.append(FrameRecord(item.index, item.timestamp, TrackingState.NOT_INITIALIZED))
-        tracker.recovery.keep(TrackingImage.of(item.index, item.timestamp, item.image, tracker.size, False))
+        session.records.append(FrameRecord(item.index, item.timestamp, TrackingState.NOT_INITIALIZED))
+        session.recovery.keep(TrackingImage.of(item.index, item.timestamp, item.image, session.size, False))
     for item in items[before:]:
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
     list(tracker.finish())

@@ -73,5 +73,4 @@ def test_poses_are_right_once_it_is_taken_out() -> None:
 
 def test_the_synthetic_camera_has_a_global_shutter() -> None:
     tracker, _, _ = tracked_room()
-    assert tracker.graph is not None
-    assert tracker.graph.readout_time == 0.0
+    assert tracker.session.graph.readout_time == 0.0

@@ -24,7 +24,7 @@ from tests.support.sequences import tracked_room
 def matches_of(reference: int, frame: int) -> tuple[Matches, np.ndarray]:
     """Noisy matches of a keyframe's points in another keyframe's image, and the pose that all of them give."""
     tracker, _, _ = tracked_room()
-    graph = tracker.graph
+    graph = tracker.session.graph
     assert graph is not None
     expected, inside = graph.predict(reference, frame)
     noise = np.random.default_rng(1).normal(0, 0.5, expected.shape)
@@ -36,7 +36,7 @@ def matches_of(reference: int, frame: int) -> tuple[Matches, np.ndarray]:
 
 def test_a_few_points_give_the_pose_of_all() -> None:
     tracker, _, _ = tracked_room()
-    graph = tracker.graph
+    graph = tracker.session.graph
     assert graph is not None
     reference, frame = sorted(graph.keyframes)[4:6]
     matches, pose = matches_of(reference, frame)
@@ -62,8 +62,7 @@ def test_a_camera_that_goes_to_and_fro_needs_no_memory_but_its_frames_kilobyte()
             item = items[order[n % len(order)]]
             tracker.add(n, n / 20.0, item.image, item.intrinsics)
             if n in (4 * len(order), 12 * len(order)):
-                assert tracker.graph is not None
-                keyframes.append(len(tracker.graph.keyframes))
+                keyframes.append(len(tracker.session.graph.keyframes))
                 gc.collect()
                 sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
@@ -74,7 +73,7 @@ def test_a_camera_that_goes_to_and_fro_needs_no_memory_but_its_frames_kilobyte()
 
 def test_a_frame_needs_a_kilobyte() -> None:
     tracker, _, _ = tracked_room()
-    graph = tracker.graph
+    graph = tracker.session.graph
     assert graph is not None
     reference, frame = sorted(graph.keyframes)[4:6]
     matches, pose = matches_of(reference, frame)

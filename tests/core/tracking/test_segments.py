@@ -51,7 +51,7 @@ def test_a_lost_segment_is_joined_by_a_loop() -> None:
     assert joined_at is not None
     assert second <= moved | {joined_at}, "the second segment must be published where it lies in the first"
     assert all(last_published[index] == 0 for index in second), "receivers must hear of the join"
-    assert tracker.publisher.highest_segment == 1  # so that a later loss does not give the number again
+    assert tracker.session.publisher.highest_segment == 1  # so that a later loss does not give the number again
     assert set(trajectory.segment[trajectory.keyframe]) == {0}
     assert set(trajectory.segment[np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))]) == {
         0

@@ -10,6 +10,7 @@ import torch
 
 from mvsgs_core.tracking.estimation import torch_adjustment
 from mvsgs_core.tracking.estimation.bundle_adjustment import DROID_LOCAL, Graph, Solution, Solver, adjust
+from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.tracker import Tracker, TrackerConfig
 from tests.support.keyframe_graphs import noisy
 from tests.support.sequences import synthetic
@@ -103,7 +104,7 @@ def test_a_tracker_on_torch_finds_the_same_path() -> None:
         tracker = Tracker(TrackerConfig(area=160 * 120, device=device))
         for item in synthetic(frames=80)[:30]:
             tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
-        assert tracker.started
+        assert tracker.phase is Phase.TRACKING
         list(tracker.finish())
         paths.append(tracker.trajectory().world_from_cam)
     np.testing.assert_allclose(paths[0], paths[1], atol=1e-5)

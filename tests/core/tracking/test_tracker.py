@@ -31,7 +31,7 @@ def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:
 def test_every_choice_of_flow_without_weights_starts_and_tracks(flow: str) -> None:
     items = synthetic(frames=80)[:28]
     tracker, trajectory, updates = track(items, TrackerConfig(flow=flow))
-    assert any(update.keyframes for update in updates[: len(items)]), tracker.initializer.reason
+    assert any(update.keyframes for update in updates[: len(items)]), tracker.session.initializer.reason
     assert tracker.stats.warnings == []
     assert (trajectory.state == TrackingState.TRACKED).all()
     error, length = ate(trajectory, items)
