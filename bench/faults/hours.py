@@ -29,7 +29,14 @@ OVERRIDES = (
     "device=cpu", "screen=off", "tracker.area=6912", "tracker.covisibility.min_keyframes=12", "mvs.area=6912",
     "mapper.iterations=2", "mapper.refinement=20", "mapper.checkpoint=5", f"evaluator.max_bytes={MAX_BYTES:g}",
     "evaluator.max_frames=20", "evaluator.lpips=off",
-)
+)  # fmt: skip
+
+
+@dataclass
+class Samples:
+    """Over the time of a run: (time.monotonic() in s, MB), resident by node and on disk."""
+
+    memory: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     folder: list[tuple[float, float]] = field(default_factory=list)  # the output
     unnamed: list[tuple[float, float]] = field(default_factory=list)  # files without a name that the processes hold
 
