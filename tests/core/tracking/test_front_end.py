@@ -1,0 +1,126 @@
+"""A camera is followed from frame to frame: its pose against true keyframes, frames that rest, frames that are lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
+from mvsgs_core.tracking.image import TrackingImage
+from tests.support.true_maps import exact_matches, image, matcher, pose_error, shuffled, true_graph, true_pose
+
+
+def front_end(*keyframes: int) -> FrontEnd:
+    """On a true map, its first keyframe the reference."""
+    made = FrontEnd(true_graph(*keyframes), matcher(), FrontEndConfig(), 1)
+    made.refer_to(image(keyframes[0]))
+    return made
+
+
+def at(number: int, seconds: float) -> TrackingImage:
+    view = image(number)
+    view.timestamp = seconds
+    return view
+
+
+def test_poses_are_found_frame_by_frame() -> None:
+    made = front_end(0)
+    steps = {number: made.follow(image(number), with_pose=True) for number in (2, 4, 6)}
+    for number, step in steps.items():
+        distance, angle = pose_error(step.pose, true_pose(number))
+        assert distance < 0.005, "meters"
+        assert angle < 0.005
+        assert step.reference == 0
+        assert step.fraction > 0.7
+        assert not made.is_lost(step)
+        expected, _ = made.graph.predict_pose(0, true_pose(number))
+        found = np.linalg.norm(expected - step.matches.target, axis=1)[step.matches.alive]
+        assert np.median(found) < 0.3, "pixels"
+    assert steps[2].flow < steps[4].flow < steps[6].flow
+    assert made.pose is not None
+    np.testing.assert_array_equal(made.pose, steps[6].pose)
+
+
+def test_points_are_propagated_from_frame_to_frame() -> None:
+    """Step by step a point is followed to where a search from the reference alone does not find it."""
+    made = front_end(0)
+    for number in range(3, 16, 3):
+        step = made.follow(image(number), with_pose=False)
+    assert step.localization is None
+    assert step.flow > 30.0, "pixels"
+    expected, _ = made.graph.predict_pose(0, true_pose(15))
+    assert np.median(np.linalg.norm(expected - made.propagated, axis=1)[step.matches.alive]) < 0.5
+
+
+def test_a_camera_that_rests_is_seen_to() -> None:
+    made = front_end(0)
+    first = made.follow(image(2), with_pose=True)
+    assert not first.still
+    again = made.follow(image(2, index=3), with_pose=True)
+    assert again.still
+    assert again.matches is first.matches
+    np.testing.assert_array_equal(again.pose, first.pose)
+    assert made.follow(image(2, index=4), with_pose=False).localization is None
+
+
+def test_a_covered_lens_does_not_rest() -> None:
+    made = front_end(0)
+    made.follow(image(2), with_pose=True)
+    black = TrackingImage.of(3, 0.15, np.zeros((240, 320, 3), np.uint8), (240, 320), False)
+    step = made.follow(black, with_pose=True)
+    assert not step.still
+    assert made.is_lost(step)
+
+
+def test_a_lost_frame_leaves_things_as_they_were() -> None:
+    made = front_end(0)
+    made.follow(image(2), with_pose=True)
+    last, points, pose = made.last, made.propagated, made.pose
+    step = made.follow(shuffled(2, 3), with_pose=True)
+    assert made.is_lost(step)
+    assert made.last is last
+    assert made.propagated is points
+    assert made.pose is pose
+    assert not made.is_lost(made.follow(image(4), with_pose=True)), "it goes on from the last frame that was followed"
+
+
+def test_a_frame_is_lost_by_too_few_points_or_a_pose_that_they_do_not_agree_on() -> None:
+    made = front_end(0)
+    step = made.follow(image(2), with_pose=True)
+    assert step.localization is not None
+    for localization in (replace(step.localization, inliers=0.4), replace(step.localization, failure="singular")):
+        assert made.is_lost(replace(step, localization=localization))
+    assert made.is_lost(replace(step, fraction=0.1))
+    few = np.where(np.cumsum(step.matches.alive) < 30, step.matches.weight, 0.0)
+    assert made.is_lost(replace(step, matches=replace(step.matches, weight=few)))
+    assert not made.is_lost(step)
+
+
+def test_tracking_resumes_from_another_keyframe() -> None:
+    made = front_end(0, 12)
+    for number in (4, 8):
+        made.follow(image(number), with_pose=True)
+    made.resume(image(12), image(8), exact_matches(made.graph, 12, true_pose(8)), true_pose(8))
+    assert made.reference is not None
+    assert made.reference.index == 12
+    step = made.follow(image(6), with_pose=True)
+    assert step.reference == 12
+    assert step.fraction > 0.7
+    assert max(pose_error(step.pose, true_pose(6))) < 0.005
+
+
+def test_the_images_velocity_is_that_of_the_flow() -> None:
+    made = front_end(0)
+    made.refer_to(at(0, 1.0))
+    later = at(2, 1.1)
+    step = made.follow(later, with_pose=True)
+    assert later.velocity is not None
+    assert later.velocity.shape == (30, 40, 2)
+    moved = (step.matches.target - made.graph.keyframes[0].points)[step.matches.alive]
+    np.testing.assert_allclose(np.median(later.velocity, axis=(0, 1)), np.median(moved, axis=0) / 0.1, atol=3.0)
+    assert made.reference is not None
+    assert made.reference.velocity is later.velocity, "it has none of its own yet"
+    slow = at(4, 2.0)
+    made.follow(slow, with_pose=True)
+    assert slow.velocity is None, "a second later nothing is known of it"

@@ -1,0 +1,111 @@
+"""Before there is a map: keyframes are tied to each other, solved together, and go where they can't be."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mvsgs_core import geometry
+from mvsgs_core.tracking.diagnosis import Diagnosis
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.initializer import InitializationConfig, Initializer
+from mvsgs_core.tracking.matching.flow import Matches
+from tests.support.true_maps import exact_matches, image, item, matcher, true_graph, true_pose
+
+FRAMES = (0, 4, 8, 12)
+CONFIG = InitializationConfig(min_keyframes=4, max_keyframes=5)
+
+
+def initializer(config: InitializationConfig = CONFIG) -> Initializer:
+    graph = KeyframeGraph(item(0).intrinsics)
+    return Initializer(graph, matcher(), config, 1, Diagnosis(0.2, 0.05))
+
+
+def moving(config: InitializationConfig = CONFIG, frames: tuple[int, ...] = FRAMES) -> Initializer:
+    """With keyframes of the room's round, each matched exactly with the one before."""
+    made, true = initializer(config), true_graph(*frames)
+    made.add(image(frames[0]), 3)
+    for before, index in pairwise(frames):
+        made.add(image(index), 3, exact_matches(true, before, true_pose(index)))
+    return made
+
+
+def resting(count: int) -> Initializer:
+    """With the same view again and again."""
+    made = initializer()
+    made.add(image(0, 0), 0)
+    for index in range(1, count):
+        view = image(0, index)
+        made.add(view, 0, unmoved(view))
+    return made
+
+
+def unmoved(view: TrackingImage) -> Matches:
+    return Matches(view.cells.points.astype(np.float64), view.cells.textured.astype(np.float64))
+
+
+def test_keyframes_are_tied_both_ways_to_those_before() -> None:
+    made = moving(InitializationConfig(min_keyframes=9, recent=2))
+    near = {(a, b) for a in FRAMES for b in FRAMES if a != b and abs(a - b) <= 8}
+    assert set(made.graph.edges) == near
+    true = true_graph(*FRAMES)
+    for source, to in near:
+        edge = made.graph.edges[source, to]
+        expected, _ = true.predict_pose(source, true_pose(to))
+        seen = edge.weight > 0
+        assert np.median(np.linalg.norm(expected - edge.target.T, axis=1)[seen]) < 0.5, (source, to)
+
+
+def test_enough_keyframes_are_solved_and_become_the_map() -> None:
+    made = moving()
+    assert made.waiting == list(FRAMES)
+    assert made.initialize()
+    assert made.waiting == []
+    graph = made.graph
+    assert {keyframe.segment for keyframe in graph.keyframes.values()} == {3}
+    found = np.stack([graph.world_from_cam(index) for index in FRAMES])
+    true = np.stack([geometry.inverse(true_pose(index)) for index in FRAMES])
+    scale, rotation, shift = geometry.umeyama(found[:, :3, 3], true[:, :3, 3])
+    length = np.linalg.norm(true[-1, :3, 3] - true[0, :3, 3])
+    errors = np.linalg.norm(scale * found[:, :3, 3] @ rotation.T + shift - true[:, :3, 3], axis=1)
+    assert errors.max() < 0.02 * length
+    depths = true_graph(*FRAMES)
+    for index in FRAMES:
+        keyframe = graph.keyframes[index]
+        ratio = scale * depths.keyframes[index].inverse_depth / keyframe.inverse_depth
+        assert keyframe.triangulated.mean() > 0.3
+        assert abs(np.median(ratio[keyframe.triangulated]) - 1.0) < 0.03
+
+
+def test_fewer_keyframes_are_not_tried() -> None:
+    made = moving(frames=FRAMES[:3])
+    assert not made.initialize()
+    assert made.waiting == list(FRAMES[:3])
+    assert made.diagnosis.attempts == {}
+    assert made.initialize(forced=True), "the end of the stream does with three"
+
+
+def test_a_resting_camera_gives_no_map_and_the_oldest_keyframe_goes() -> None:
+    made = resting(5)
+    assert not made.initialize()
+    assert made.waiting == [1, 2, 3, 4]
+    assert sorted(made.graph.keyframes) == [1, 2, 3, 4]
+    assert all({a, b} <= {1, 2, 3, 4} for a, b in made.graph.edges)
+    assert list(made.diagnosis.attempts) == ["no parallax"]
+    np.testing.assert_array_equal(made.graph.keyframes[4].cam_from_world, np.eye(4))
+
+
+def test_what_is_abandoned_leaves_nothing_behind() -> None:
+    made = moving()
+    made.abandon()
+    assert made.waiting == []
+    assert made.graph.keyframes == {}
+    assert made.graph.edges == {}
+
+
+@pytest.mark.parametrize(("since", "flow"), [(0, 0.035), (20, 0.0175), (400, 0.035 / 3)])
+def test_a_slow_camera_makes_keyframes_earlier(since: int, flow: float) -> None:
+    assert initializer().flow(since) == pytest.approx(flow)
