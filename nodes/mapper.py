@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
@@ -22,6 +20,7 @@ from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
+from mvsgs_core.mapping.self_check import why_nothing
 from nodes import Node
 
 _SLICE = 0.05  # seconds of optimization in one on_idle
@@ -70,33 +69,27 @@ class Mapper(Node):
         if config.resume is not None:
             checkpoint_info(config.resume)
 
-    @property
-    def mapper(self) -> OnlineMapper:
-        return self.atlas.current
-
-    def on_fused_keyframe(self, view: FusedKeyframe) -> Iterator[Preview]:
-        self._provisional.came(view.index)
-        if not self._is_new_view(view):
-            return
-        # sent on its way before its segment was joined: by keyframe and not by number, as the pose is corrected so, too
-        segment = self.atlas.segment_of.get(view.index, view.segment)
-        self._settle()
-        self.atlas.enter(segment)
-        self.atlas.came(view.index, view.timestamp)
-        known = len(self.mapper.views)
-        self.mapper.add_keyframe(
-            RGBDKeyframe(
-                index=view.index, image=view.image, intrinsics=view.intrinsics, world_from_cam=view.world_from_cam,
-                depth=view.depth, scale=view.scale, confidence=view.confidence, normals=view.normals,
-                unfiltered=view.unfiltered, timestamp=view.timestamp,
+    def on_fused_keyframe(self, fused: FusedKeyframe) -> Iterator[Preview]:
+        self._provisional.came(fused.index)
+        if self._replay and not self._replay.view(fused.index, fused.world_from_cam, fused.scale):
+            self._pass_over(
+                "keyframes that do not fit" if self._replay.problem else "keyframes that the checkpoint has"
             )
+            return
+        self._settle()
+        added = self.atlas.add(
+            RGBDKeyframe(
+                index=fused.index, image=fused.image, intrinsics=fused.intrinsics, world_from_cam=fused.world_from_cam,
+                depth=fused.depth, scale=fused.scale, confidence=fused.confidence, normals=fused.normals,
+                unfiltered=fused.unfiltered, timestamp=fused.timestamp,
+            ),
+            fused.segment,
         )  # fmt: skip
-        self._save_image(view)
+        self._save_image(fused)
+        if self._checkpoints is not None and added is not None:
+            self._checkpoints.added(added)
+        self._keep()
         self._report()
-        if self._checkpoints is not None:
-            for added in self.mapper.views[known:]:
-                self._checkpoints.added(added)
-            self._checkpoints.keep(self.atlas)
         yield from self._preview()
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Preview]:
@@ -114,21 +107,18 @@ class Mapper(Node):
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
         self._provisional.correct(poses.index, poses.world_from_cam, poses.scale, poses.segment)
         if self._replay and not self._replay.poses(poses.revision, poses.index, poses.world_from_cam, poses.scale):
-            self._say_what_does_not_fit()
+            self._pass_over()
             return
         self._settle()  # the map must not depend on when they come
         self.atlas.revision = max(self.atlas.revision, poses.revision)
-        self.atlas.correct(poses.index, poses.world_from_cam, poses.scale)
-        if poses.segment is not None:
-            self.atlas.segment_of.update(zip(poses.index.tolist(), poses.segment.tolist()))
-            self.atlas.join()
+        self.atlas.correct(poses.index, poses.world_from_cam, poses.scale, poses.segment)
         yield from ()
 
     def on_idle(self) -> list[Preview] | None:
         deadline = time.perf_counter() + _SLICE
-        if not self.mapper.step():
+        if not self.atlas.step():
             return None
-        while time.perf_counter() < deadline and self.mapper.step():
+        while time.perf_counter() < deadline and self.atlas.step():
             pass
         self._keep()
         self._report()
@@ -136,19 +126,13 @@ class Mapper(Node):
 
     def on_end(self) -> Iterator[SplatMap | Preview]:
         self._settle(realtime=False)
-        self.atlas.stream_ended = True
-        self._choose_largest()
-        self.stats.values["segments_apart"] = max(0, len(self.atlas.parts) - 1)  # beside the map that is shown
+        self.atlas.finish()
         yield self._map(refined=False)
-        while self.atlas.refined < self.config.refinement:
-            self.mapper.refine(self.atlas.refined, self.config.refinement)
-            self.atlas.refined += 1
+        while self.atlas.refine():
             self._keep()
         self._report()
         self._check()
-        if not len(self.mapper.state):
-            self.stats.nothing(self._why_nothing())
-        elif self._checkpoints is not None:
+        if self._checkpoints is not None and len(self.atlas.current.state):
             self.stats.values["map_bytes"] = self._checkpoints.finish(self.atlas)
         yield from self._preview(due=True)  # who watches is left with the map as it is now
         yield self._map(refined=True)
@@ -160,22 +144,16 @@ class Mapper(Node):
         if self._checkpoints is not None:
             self._checkpoints.last(self.atlas)
 
-    def _is_new_view(self, view: FusedKeyframe) -> bool:
-        if self._replay is None or self._replay.view(view.index, view.world_from_cam, view.scale):
-            return True
-        self.stats.skip(
-            "keyframes that the checkpoint has" if not self._replay.problem else "keyframes that do not fit"
-        )
-        self._say_what_does_not_fit()
-        return False
-
-    def _say_what_does_not_fit(self) -> None:
+    def _pass_over(self, counted: str = "") -> None:
+        """A message that is not taken in, as the checkpoint has it or the stream does not fit, which is said."""
+        if counted:
+            self.stats.skip(counted)
         if self._replay is not None and self._replay.problem:
             self.stats.warn(self._replay.problem)
 
     def _settle(self, realtime: bool = True) -> None:
         """Does the pending iterations. realtime: where the mapper is, it is left for the next keyframe to cancel."""
-        while not (realtime and self.config.realtime) and self.mapper.step():
+        while not (realtime and self.config.realtime) and self.atlas.step():
             self._keep()
 
     def _keep(self) -> None:
@@ -184,51 +162,25 @@ class Mapper(Node):
         if self._checkpoints is not None:
             self._checkpoints.keep(self.atlas)
 
-    def _why_nothing(self) -> str:
-        counts = self.stats.counts
-        views, refused = int(counts.get("views", 0)), int(counts.get("refused_views", 0))
-        if not views and not refused:
-            return "the mapper made no splat: no keyframe with depth came to it"
-        if not views:
-            return f"the mapper made no splat: all {refused} keyframes were refused ({self.stats.warnings[0]})"
-        blind = int(counts.get("views_without_depth", 0))
-        if blind == views:
-            return f"the mapper made no splat: none of {views} keyframes had a pixel with depth after the filters"
-        return (
-            f"the mapper has no splat left: {views} keyframes, {views - blind} of them with depth, gave "
-            f"{int(counts.get('inserted', 0))} splats; all of them faded out"
-        )
-
-    def _save_image(self, view: FusedKeyframe) -> None:
+    def _save_image(self, fused: FusedKeyframe) -> None:
         """A disk that is full costs images, not the map."""
         if not self.config.save_images or self.config.output is None:
             return
         try:
-            write_image(Path(self.config.output) / keyframe_images.FOLDER, view.index, view.image)
+            write_image(Path(self.config.output) / keyframe_images.FOLDER, fused.index, fused.image)
             self.stats.count("images_saved")
         except OSError as error:
             self.stats.skip("images_not_saved")
             self.stats.warn(f"images of keyframes cannot be saved: {error.strerror or error}")
 
-    def _choose_largest(self) -> None:
-        parts = list(self.atlas.parts.values())
-        if len(parts) < 2:
-            return
-        self.atlas.current = self.atlas.largest
-        total = sum(len(mapper.views) for mapper in parts)
-        self.stats.warn(
-            f"tracking was lost: the map shows the largest of {len(parts)} parts, "
-            f"{len(self.mapper.views)} of {total} keyframes"
-        )
-
     def _report(self) -> None:
-        self.stats.values["splats"] = len(self.mapper.state)
-        self.stats.values["iterations"] = self.mapper.iterations
-        self.stats.values["iterations_pending"] = self.mapper.schedule.pending
-        self.stats.values["image_bytes"] = self.mapper.keyframes.image_bytes
+        self.stats.values |= self.atlas.current.figures
 
     def _check(self) -> None:
-        found = self.mapper.self_check()
+        mapper = self.atlas.current
+        if not len(mapper.state):
+            self.stats.nothing(why_nothing(self.stats))
+        found = mapper.self_check()
         if found is None:
             return
         self.stats.values |= {"keyframe_psnr": found.psnr, "image_noise": found.noise}
@@ -236,7 +188,7 @@ class Mapper(Node):
             self.stats.warn(found.warning)
 
     def _map(self, refined: bool) -> SplatMap:
-        final = self.mapper.snapshot()
+        final = self.atlas.current.snapshot()
         arrays = {name: value.numpy() for name, value in final.splats.tensors().items()}
         return SplatMap(
             refined=refined, iterations=final.iterations, kernel=final.kernel, origin=final.origin, **arrays,
@@ -249,22 +201,11 @@ class Mapper(Node):
         return self.config.preview_period > 0 and Preview not in self.unread
 
     def _preview(self, due: bool = False) -> Iterator[Preview]:
-        now = time.monotonic()
+        now, mapper = time.monotonic(), self.atlas.current
         due |= now - self._last_preview >= self.config.preview_period
-        if not self._previewing or not due or not self.mapper.views or not len(self.mapper.state):
+        if not self._previewing or not due or not mapper.views or not len(mapper.state):
             return
         self._last_preview = now
-        view = self.mapper.views[-1]
         with self.stats.time("provisional"):
-            segments = {segment for segment, part in self.atlas.parts.items() if part is self.mapper}
-            provisional = self._provisional.splats(self.mapper, segments)
-        arrays = preview_arrays(self.mapper, self.config.preview_splats, provisional)
-        origin = np.zeros(3) if self.mapper.frame.origin is None else self.mapper.frame.origin
-        poses = np.stack([view.world_from_cam for view in self.mapper.views])
-        poses[:, :3, 3] -= origin
-        yield Preview(
-            index=view.index, iterations=self.mapper.iterations, world_from_cam=poses[-1],
-            intrinsics=view.intrinsics, image=view.image.cpu().numpy(), **arrays,
-            keyframes=np.array([view.index for view in self.mapper.views], dtype=np.int64), keyframe_poses=poses,
-            origin=origin,
-        )  # fmt: skip
+            provisional = self._provisional.splats(mapper, self.atlas.segments)
+        yield Preview(**preview_arrays(mapper, self.config.preview_splats, provisional))

@@ -90,7 +90,7 @@ def test_an_idle_slice_ends_soon_and_says_when_there_is_nothing_to_do() -> None:
     assert node.on_idle() == []
     while node.on_idle() is not None:
         pass
-    assert node.mapper.iterations == 4
+    assert node.atlas.current.iterations == 4
 
 
 def test_poses_move_the_map() -> None:
@@ -100,9 +100,9 @@ def test_poses_move_the_map() -> None:
         pass
     moved = pose_on_arc(0.5)
     moved[:3, 3] += [1.0, 2.0, 3.0]
-    before = node.mapper.snapshot().splats.means
+    before = node.atlas.current.snapshot().splats.means
     assert list(node.on_poses(Poses(1, np.array([0]), moved[None], np.array([1.0])))) == []
-    after = node.mapper.snapshot()
+    after = node.atlas.current.snapshot()
     np.testing.assert_allclose((after.splats.means - before).numpy(), [[1.0, 2.0, 3.0]] * len(before), atol=1e-4)
     np.testing.assert_allclose(after.world_from_cam[0], moved)
 
@@ -127,7 +127,7 @@ def test_the_maps_of_segments_that_a_loop_joins_become_one() -> None:
     moved[:, :3, 3] += [0.5, 0.0, 0.0]
     joined = np.zeros(3, np.int32)
     list(node.on_poses(Poses(1, np.array([2, 3, 4]), moved, np.full(3, 2.0), joined)))
-    assert len(node.mapper.state) == sum(parts)
+    assert len(node.atlas.current.state) == sum(parts)
     list(node.on_fused_keyframe(view_message(4, 0.8, segment=1)))  # on its way when its segment was joined
     list(node.on_fused_keyframe(view_message(5, 1.0, segment=0)))
     before, after = list(node.on_end())
@@ -239,17 +239,19 @@ def test_a_keyframe_without_depth_yet_is_in_the_preview_and_not_in_the_map() -> 
     list(node.on_fused_keyframe(view_message(0, 0.0)))
     (preview,) = node.on_keyframe(keyframe_message(7, 1.0))
     assert isinstance(preview, Preview)
-    assert len(preview.means) > len(node.mapper.state)
+    assert len(preview.means) > len(node.atlas.current.state)
     (moved,) = [*node.on_poses(poses_of(7, 1.0)), *node.on_keyframe(keyframe_message(7, 1.0))][-1:]
     assert isinstance(moved, Preview)
     (after,) = node.on_fused_keyframe(view_message(7, 1.0))
     assert isinstance(after, Preview)
-    assert len(after.means) == len(node.mapper.state)
+    assert len(after.means) == len(node.atlas.current.state)
     list(plain.on_fused_keyframe(view_message(0, 0.0)))
     list(plain.on_poses(poses_of(7, 1.0)))
     list(plain.on_fused_keyframe(view_message(7, 1.0)))
     for name in PARAMETERS:  # keyframes that came for the preview leave the map as it is
-        torch.testing.assert_close(getattr(node.mapper.state.splats, name), getattr(plain.mapper.state.splats, name))
+        torch.testing.assert_close(
+            getattr(node.atlas.current.state.splats, name), getattr(plain.atlas.current.state.splats, name)
+        )
 
 
 def poses_of(index: int, t: float) -> Poses:

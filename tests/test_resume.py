@@ -143,7 +143,7 @@ def test_a_stream_of_which_nothing_is_in_the_map_is_not_taken(tmp_path: Path) ->
     abort_after(Mapper(settings(output=str(tmp_path))), 3)
     node = Mapper(settings(output=str(tmp_path), resume=str(tmp_path)))
     list(node.on_fused_keyframe(view_message(7, 0.9)))
-    assert len(node.mapper.views) == 3
+    assert len(node.atlas.current.views) == 3
     assert any("none of its keyframes came up to frame 2" in text for text in node.stats.warnings)
 
 
@@ -159,27 +159,27 @@ def test_corrections_that_the_checkpoint_has_are_not_taken_twice(tmp_path: Path)
     list(first.on_poses(correction(2, 0.1)))
     first.on_abort("power")
     node = Mapper(settings(output=str(tmp_path), resume=str(tmp_path)))
-    before = node.mapper.snapshot().splats.means
+    before = node.atlas.current.snapshot().splats.means
     list(node.on_fused_keyframe(view_message(0, 0.0)))
     list(node.on_poses(correction(1, 0.3)))
-    assert node.mapper.snapshot().world_from_cam[0, 0, 3] == pytest.approx(pose_on_arc(0.0)[0, 3] + 0.1)
+    assert node.atlas.current.snapshot().world_from_cam[0, 0, 3] == pytest.approx(pose_on_arc(0.0)[0, 3] + 0.1)
     list(node.on_poses(correction(2, 0.1)))
-    assert (node.mapper.snapshot().splats.means == before).all()
+    assert (node.atlas.current.snapshot().splats.means == before).all()
     list(node.on_poses(correction(3, 0.2)))
-    assert node.mapper.snapshot().world_from_cam[0, 0, 3] == pytest.approx(pose_on_arc(0.0)[0, 3] + 0.2)
+    assert node.atlas.current.snapshot().world_from_cam[0, 0, 3] == pytest.approx(pose_on_arc(0.0)[0, 3] + 0.2)
     assert not node.stats.warnings
 
 
 def test_a_refinement_that_was_cut_off_goes_on_where_it_was(tmp_path: Path) -> None:
     def run(output: Path, cut: int | None, **changes: Any) -> SplatMap | None:
-        node, rests = Mapper(settings(output=str(output), **changes)), []
+        node, rests = Mapper(settings(output=str(output), refinement=9, **changes)), []
 
         def rest() -> None:
             rests.append(None)
             if cut is not None and node.atlas.refined == cut:
                 raise Cut
 
-        node.config.refinement, node.rest = 9, rest
+        node.rest = rest  # type: ignore[method-assign]
         for k in range(3):
             list(node.on_fused_keyframe(view_message(k, k / 8)))
         try:

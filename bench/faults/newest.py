@@ -48,7 +48,7 @@ def _live(sent: list[Keyframe | FusedKeyframe | Poses]) -> list[Row]:
         elif isinstance(message, Poses):
             list(mapper.on_poses(message))
         else:
-            known, start = len(mapper.mapper.state), time.perf_counter()
+            known, start = len(mapper.atlas.current.state), time.perf_counter()
             for preview in mapper.on_keyframe(message):
                 delays.append(time.perf_counter() - start)
                 covered.append(_coverage(preview, message, len(preview.means)))

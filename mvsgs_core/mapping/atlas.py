@@ -1,4 +1,8 @@
-"""The mapping of one stream: a mapper for each part between which tracking was lost, and how far it has come."""
+"""The maps of one stream: a mapper for each segment, the parts between which tracking was lost, and their joins.
+
+Segments share no frame of reference. Where a loop joined two, so are their maps; of those that stay apart at the end
+of the stream, the one with the most keyframes is refined.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +13,18 @@ import numpy as np
 
 from mvsgs_core.mapping.checkpoints.state import copy_of
 from mvsgs_core.mapping.keyframe_checks import NO_POSE, is_pose
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.stats import Stats
 
 
 @dataclass
 class Atlas:
-    """The mappers of a stream's segments, which share log and corrections, and how far the stream has come."""
+    """The mappers of a stream's segments, which share log and corrections, and how far the stream has come.
+
+    `add` and `correct` as the messages come, `step` while any iteration is pending, `finish` at the stream's end, then
+    `refine` until it is done.
+    """
 
     current: OnlineMapper  # the one that is gone on with
     parts: dict[int, OnlineMapper] = field(default_factory=dict)  # by segment
@@ -31,6 +40,66 @@ class Atlas:
         """The part with the most keyframes; the current one where there is none yet."""
         return max(self.parts.values(), key=lambda part: len(part.views), default=self.current)
 
+    @property
+    def segments(self) -> set[int]:
+        """Of the current part: one, or those whose first keyframe is still to come there."""
+        return {segment for segment, part in self.parts.items() if part is self.current}
+
+    def add(self, keyframe: RGBDKeyframe, segment: int) -> TrainingView | None:
+        """Maps a new keyframe of that segment; returns what is trained on, None where it was refused.
+
+        Where the map was being refined already, that begins anew after it.
+        """
+        # sent on its way before its segment was joined: by keyframe and not by number, as the pose is corrected so, too
+        self.enter(self.segment_of.get(keyframe.index, segment))
+        self.came(keyframe.index, keyframe.timestamp)
+        known = len(self.current.views)
+        self.current.add_keyframe(keyframe)
+        return self.current.views[-1] if len(self.current.views) > known else None
+
+    def step(self) -> bool:
+        """One pending iteration of the current part; False when none is."""
+        return self.current.step()
+
+    def finish(self) -> None:
+        """The stream has ended: of parts that stayed apart, the largest is gone on with."""
+        self.stream_ended = True
+        parts, log = list(self.parts.values()), self.current.log
+        log.values["segments_apart"] = max(0, len(parts) - 1)  # beside the map that is shown
+        if len(parts) < 2:
+            return
+        self.current = self.largest
+        total = sum(len(part.views) for part in parts)
+        log.warn(
+            f"tracking was lost: the map shows the largest of {len(parts)} parts, "
+            f"{len(self.current.views)} of {total} keyframes"
+        )
+
+    def refine(self) -> bool:
+        """One iteration of the final refinement; False when it is done."""
+        total = self.current.config.refinement
+        if self.refined >= total:
+            return False
+        self.current.refine(self.refined, total)
+        self.refined += 1
+        return True
+
+    def correct(
+        self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray, segment: np.ndarray | None = None
+    ) -> None:
+        """Corrected poses as in `OnlineMapper.correct`, for each part's keyframes; what is no pose is counted once.
+
+        segment (K,): to which their keyframes belong now; maps of segments that became one are joined.
+        """
+        usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
+        if not usable.all():
+            self.current.log.refuse("poses", int((~usable).sum()), NO_POSE)
+        for part in self.parts.values() or [self.current]:
+            part.correct(index[usable], world_from_cam[usable], scale[usable])
+        if segment is not None:
+            self.segment_of.update(zip(index.tolist(), segment.tolist()))
+            self.join()
+
     def enter(self, segment: int) -> None:
         """Goes on with the map of this part of the stream, or begins it."""
         if not self.parts:
@@ -41,14 +110,6 @@ class Atlas:
             before = self.current
             self.parts[segment] = OnlineMapper(before.config, before.log, before.corrections)
         self.current = self.parts[segment]
-
-    def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> None:
-        """Corrected poses as in `OnlineMapper.correct`, for each part's keyframes; what is no pose is counted once."""
-        usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
-        if not usable.all():
-            self.current.log.refuse("poses", int((~usable).sum()), NO_POSE)
-        for part in self.parts.values() or [self.current]:
-            part.correct(index[usable], world_from_cam[usable], scale[usable])
 
     def join(self) -> None:
         """Joins the maps of segments whose keyframes now belong to another one; the tracker joins whole segments."""
@@ -66,7 +127,7 @@ class Atlas:
             self.current.log.count("segments_joined")
 
     def came(self, index: int, seconds: float) -> None:
-        """A new keyframe; where the map was being refined already, that begins anew after it."""
+        """How far the stream has come: the newest keyframe and its timestamp."""
         self.newest_view = max(self.newest_view, index)
         self.stream_seconds = seconds if math.isfinite(seconds) else self.stream_seconds
         self.stream_ended, self.refined = False, 0

@@ -69,6 +69,14 @@ class OnlineMapper:
         """Of the scene, in the mapper's unit."""
         return self.keyframes.median_depth
 
+    @property
+    def figures(self) -> dict[str, int]:
+        """For the live display and the report."""
+        return {
+            "splats": len(self.state), "iterations": self.iterations, "iterations_pending": self.schedule.pending,
+            "image_bytes": self.keyframes.image_bytes,
+        }  # fmt: skip
+
     def add_keyframe(self, keyframe: RGBDKeyframe) -> int:
         """Takes in a keyframe and adds splats where the map does not show it; returns their number.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -13,27 +15,42 @@ from mvsgs_core.rasterizer.splats import Splats
 CHUNK = 16384  # splats whose covariances are made at once: on the way they take several times their size
 
 
-def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None = None) -> dict[str, np.ndarray]:
-    """`render` (H, W, 3) uint8 and, for at most `limit` splats spread over the map, relative to its origin in world
-    units: `means` (N, 3), `covariances` (N, 3, 3), `colors` (N, 3) uint8, `opacities` (N,).
+def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None = None) -> dict[str, Any]:
+    """What a preview shows, in world units, relative to the map's origin.
 
-    provisional: fewer than `limit`, in the mapper's frame and unit, all of which are shown beside the map's.
+    Of the newest keyframe `index`, `world_from_cam` (4, 4), `intrinsics` (4,), its `image` and the `render` from its
+    pose (H, W, 3) uint8; for at most `limit` splats spread over the map `means` (N, 3), `covariances` (N, 3, 3),
+    `colors` (N, 3) uint8, `opacities` (N,); all `keyframes` (K,) and `keyframe_poses` (K, 4, 4); `origin` (3,) and the
+    number of `iterations`.
+
+    provisional: fewer than `limit`, in the mapper's frame and unit, all of which are shown beside the map's. The map
+    has keyframes and splats.
     """
-    render = mapper.render(mapper.views[-1]).color
+    newest, origin, unit = mapper.views[-1], mapper.frame.origin, mapper.frame.length
+    assert origin is not None
     final = mapper.state.detached()
     more = 0 if provisional is None else len(provisional)
     stride = max(1, -(-len(final) // max(1, limit - more)))
     shown = {name: value[::stride] for name, value in final.tensors().items()}
     if provisional is not None:
         shown = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in shown.items()}
-    unit = mapper.frame.length
     shapes = zip(shown["quaternions"].split(CHUNK), shown["log_scales"].split(CHUNK))
+    poses = np.stack([view.world_from_cam for view in mapper.views])
+    poses[:, :3, 3] -= origin
     return {
-        "render": _bytes(render),
+        "index": newest.index,
+        "iterations": mapper.iterations,
+        "world_from_cam": poses[-1],
+        "intrinsics": newest.intrinsics,
+        "image": newest.image.cpu().numpy(),
+        "render": _bytes(mapper.render(newest).color),
         "means": (shown["means"] * unit).cpu().numpy(),
         "covariances": torch.cat([_covariances(q, s, unit) for q, s in shapes]).cpu().numpy(),
         "colors": _bytes(0.5 + C0 * shown["sh"][:, 0]),
         "opacities": torch.sigmoid(shown["opacity_logits"]).cpu().numpy(),
+        "keyframes": np.array([view.index for view in mapper.views], dtype=np.int64),
+        "keyframe_poses": poses,
+        "origin": origin,
     }
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core.image_metrics import psnr
+from mvsgs_core.stats import Stats
 
 MIN_PSNR = 25.0  # dB; a static map of sharp, steady images is above this
 MAX_EXPOSURE_GAIN = 1.5  # dB that one gain and offset an image and channel may bring before exposure is to blame
@@ -68,6 +69,22 @@ def check(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> SelfCheck | None:
         float(np.median([psnr(render, image) for render, image in pairs])),
         float(np.median([psnr(_fitted(render, image), image) for render, image in pairs])),
         float(np.median([noise_of(image) for _, image in pairs])),
+    )
+
+
+def why_nothing(log: Stats) -> str:
+    """Why a map has no splat: what was counted on the way."""
+    views, refused = int(log.counts.get("views", 0)), int(log.counts.get("refused_views", 0))
+    if not views and not refused:
+        return "the mapper made no splat: no keyframe with depth came to it"
+    if not views:
+        return f"the mapper made no splat: all {refused} keyframes were refused ({log.warnings[0]})"
+    blind = int(log.counts.get("views_without_depth", 0))
+    if blind == views:
+        return f"the mapper made no splat: none of {views} keyframes had a pixel with depth after the filters"
+    return (
+        f"the mapper has no splat left: {views} keyframes, {views - blind} of them with depth, gave "
+        f"{int(log.counts.get('inserted', 0))} splats; all of them faded out"
     )
 
 
