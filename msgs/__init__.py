@@ -24,71 +24,63 @@ from mvsgs_core.trajectory import TrackingState as TrackingState
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One image of the stream, undistorted."""
+class _Image:
+    """What every message with an image of the stream has."""
 
     index: int
     timestamp: float  # seconds
     image: Annotated[np.ndarray, "uint8 H W 3"]
     intrinsics: Annotated[np.ndarray, "float64 4"]
+
+
+@dataclass(frozen=True)
+class _PosedImage(_Image):
+    """What every message of a keyframe has."""
+
+    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
+    scale: float  # the map's scale that pose and depths are in, see Poses; 1 when first sent
+
+
+@dataclass(frozen=True)
+class Frame(_Image):
+    """One image of the stream, undistorted."""
+
     intrinsics_guessed: bool = False  # the focal length is a guess, to be estimated by the tracker if it can
 
 
 @dataclass(frozen=True)
-class GroundTruth:
+class GroundTruth(_Image):
     """What only the evaluator may see: the frame to score renders against, and the true pose and depth if known."""
 
-    index: int
-    timestamp: float  # seconds
-    image: Annotated[np.ndarray, "uint8 H W 3"]
-    intrinsics: Annotated[np.ndarray, "float64 4"]
     world_from_cam: Annotated[np.ndarray, "float64 4 4"] | None
     depth: Annotated[np.ndarray, "float32 H W"] | None  # in the unit of the true poses
 
 
 @dataclass(frozen=True)
-class Keyframe:
+class Keyframe(_PosedImage):
     """A frame that the tracker keeps, with its pose and coarse inverse depth on the tracker's grid.
 
     The image is as a global shutter would have taken it, where the tracker knows the camera's rolling one.
     """
 
-    index: int
-    timestamp: float  # seconds
-    image: Annotated[np.ndarray, "uint8 H W 3"]
-    intrinsics: Annotated[np.ndarray, "float64 4"]
-    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
-    scale: float  # the map's scale that pose and depths are in, see Poses; 1 when first sent
     inverse_depth: Annotated[np.ndarray, "float32 h w"]
     inverse_depth_weight: Annotated[np.ndarray, "float32 h w"]  # confidence, 0 to 1
     segment: int  # part of the map; poses of two segments share no frame of reference
 
 
 @dataclass(frozen=True)
-class Depth:
+class Depth(_PosedImage):
     """A keyframe with its multi-view stereo depth."""
 
-    index: int
-    timestamp: float  # seconds
-    image: Annotated[np.ndarray, "uint8 H W 3"]
-    intrinsics: Annotated[np.ndarray, "float64 4"]
-    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
-    scale: float
     depth: Annotated[np.ndarray, "float32 h w"]
     confidence: Annotated[np.ndarray, "float32 h w"]  # 0 to 1
     segment: int
 
 
 @dataclass(frozen=True)
-class FusedKeyframe:
+class FusedKeyframe(_PosedImage):
     """A keyframe with its refined and filtered depth: what the mapper adds to the map."""
 
-    index: int
-    timestamp: float  # seconds
-    image: Annotated[np.ndarray, "uint8 H W 3"]
-    intrinsics: Annotated[np.ndarray, "float64 4"]
-    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
-    scale: float
     depth: Annotated[np.ndarray, "float32 h w"]  # 0 where filtered out
     confidence: Annotated[np.ndarray, "float32 h w"]  # 0 to 1
     normals: Annotated[np.ndarray, "float32 h w 3"]  # camera frame, toward the camera; 0 where depth is 0

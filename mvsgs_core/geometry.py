@@ -22,12 +22,17 @@ def skew(v: np.ndarray) -> np.ndarray:
     return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*v.shape[:-1], 3, 3)
 
 
-def so3_exp(omega: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
+def _angles(omega: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Squared angles (..., 1, 1) of rotation vectors, where they are so small that series are used, and angles or 1."""
     theta2 = np.sum(omega * omega, axis=-1)[..., None, None]
     theta = np.sqrt(theta2)
     small = theta < 1e-4
-    safe = np.where(small, 1.0, theta)
+    return theta2, small, np.where(small, 1.0, theta)
+
+
+def so3_exp(omega: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
+    theta2, small, safe = _angles(omega)
     a = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
     b = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
     k = skew(omega)
@@ -48,10 +53,7 @@ def so3_log(rotation: np.ndarray) -> np.ndarray:
 def se3_exp(xi: np.ndarray) -> np.ndarray:
     """Poses (..., 4, 4) of twists (..., 6) = (translation, rotation)."""
     rho, omega = xi[..., :3], xi[..., 3:]
-    theta2 = np.sum(omega * omega, axis=-1)[..., None, None]
-    theta = np.sqrt(theta2)
-    small = theta < 1e-4
-    safe = np.where(small, 1.0, theta)
+    theta2, small, safe = _angles(omega)
     b = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
     c = np.where(small, 1.0 / 6.0 - theta2 / 120.0, (safe - np.sin(safe)) / safe**3)
     k = skew(omega)
@@ -66,10 +68,7 @@ def se3_exp(xi: np.ndarray) -> np.ndarray:
 def se3_log(pose: np.ndarray) -> np.ndarray:
     """Twists (..., 6) = (translation, rotation) of poses (..., 4, 4)."""
     omega = so3_log(pose[..., :3, :3])
-    theta2 = np.sum(omega * omega, axis=-1)[..., None, None]
-    theta = np.sqrt(theta2)
-    small = theta < 1e-4
-    safe = np.where(small, 1.0, theta)
+    _, small, safe = _angles(omega)
     half = 0.5 * safe
     c = np.where(small, 1.0 / 12.0, (1.0 - half * np.cos(half) / np.sin(half)) / safe**2)
     k = skew(omega)

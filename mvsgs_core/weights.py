@@ -33,97 +33,56 @@ class Weights:
     files: tuple[str, ...]  # names under which it is looked for, the first being ours
     network: str
     license: str
-    size: int | None  # bytes
-    sha256: str | None
-    url: str | None  # direct download; None: only by hand, from `page`
-    page: str
+    page: str  # where it can be had by hand
+    size: int | None = None  # bytes
+    sha256: str | None = None
+    url: str | None = None  # direct download; None: only by hand
 
 
 REGISTRY = {
     w.name: w
     for w in (
         Weights(
-            "lpips_squeeze_trunk",
-            ("lpips_squeezenet1_1_features.pth",),
-            "SqueezeNet 1.1 features for LPIPS",
-            "BSD-2",
-            2_899_197,
-            "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
-            None,
+            "lpips_squeeze_trunk", ("lpips_squeezenet1_1_features.pth",), "SqueezeNet 1.1 features for LPIPS", "BSD-2",
             "https://github.com/delldu/LPIPS",
+            2_899_197, "435cedb387e95bc8291893f61a3a64f0345b8c23a05139aceef43947efb3d52d",
         ),
         Weights(
-            "lpips_squeeze_head",
-            ("lpips_v0.1/squeeze.pth", "squeeze.pth"),
-            "LPIPS v0.1 linear heads, SqueezeNet",
-            "BSD-2",
-            10_811,
-            "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76",
+            "lpips_squeeze_head", ("lpips_v0.1/squeeze.pth", "squeeze.pth"), "LPIPS v0.1 linear heads, SqueezeNet",
+            "BSD-2", "https://github.com/richzhang/PerceptualSimilarity",
+            10_811, "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76",
             "https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1/squeeze.pth",
-            "https://github.com/richzhang/PerceptualSimilarity",
         ),
         Weights(
-            "raft_small",
-            ("raft-small.pth",),
-            "RAFT, small model",
-            "BSD-3",
-            3_984_814,
-            "c7d41b9cc88442bb8aa911dbb33086dac55a226394b142937ff22d5578717332",
-            None,
+            "raft_small", ("raft-small.pth",), "RAFT, small model", "BSD-3",
             "https://github.com/princeton-vl/RAFT (download_models.sh)",
+            3_984_814, "c7d41b9cc88442bb8aa911dbb33086dac55a226394b142937ff22d5578717332",
         ),
         Weights(
-            "itermvs",
-            ("itermvs_blendedmvs.ckpt", "model_000015.ckpt"),
-            "IterMVS, trained on BlendedMVS",
-            "MIT",
-            4_177_299,
-            "8563268624cf203750212a0e0bfa4825a5af05c0005a225ef02f138258b0fc42",
-            "https://github.com/FangjinhuaWang/IterMVS/raw/main/checkpoints/blendedmvs/model_000015.ckpt",
+            "itermvs", ("itermvs_blendedmvs.ckpt", "model_000015.ckpt"), "IterMVS, trained on BlendedMVS", "MIT",
             "https://github.com/FangjinhuaWang/IterMVS",
+            4_177_299, "8563268624cf203750212a0e0bfa4825a5af05c0005a225ef02f138258b0fc42",
+            "https://github.com/FangjinhuaWang/IterMVS/raw/main/checkpoints/blendedmvs/model_000015.ckpt",
         ),
         Weights(
-            "droid",
-            ("droid.pth",),
-            "DROID-SLAM",
-            "BSD-3",
-            None,
-            None,
-            None,
+            "droid", ("droid.pth",), "DROID-SLAM", "BSD-3",
             "https://github.com/princeton-vl/DROID-SLAM (Google Drive link in its README)",
         ),
         Weights(
-            "mvsformer",
-            ("mvsformer.pth",),
-            "MVSFormer, Twins backbone",
-            "Apache-2.0",
-            None,
-            None,
-            None,
+            "mvsformer", ("mvsformer.pth",), "MVSFormer, Twins backbone", "Apache-2.0",
             "https://github.com/ewrfcas/MVSFormer (OneDrive link in its README)",
         ),
         Weights(
-            "mvsformer_p",
-            ("mvsformer-p.pth",),
-            "MVSFormer-P, frozen DINO backbone",
-            "Apache-2.0",
-            None,
-            None,
-            None,
+            "mvsformer_p", ("mvsformer-p.pth",), "MVSFormer-P, frozen DINO backbone", "Apache-2.0",
             "https://github.com/ewrfcas/MVSFormer (OneDrive link in its README)",
         ),
         Weights(
-            "vfuse",
-            ("vfuse.pth",),
-            "V-FUSE (released for other MVS networks, none for MVSFormer)",
+            "vfuse", ("vfuse.pth",), "V-FUSE (released for other MVS networks, none for MVSFormer)",
             "none stated: all rights reserved",
-            None,
-            None,
-            None,
             "https://github.com/nburgdorfer/V-FUSE (SharePoint link in its README)",
         ),
     )
-}
+}  # fmt: skip
 
 
 def folders() -> list[Path]:

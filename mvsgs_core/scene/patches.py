@@ -42,9 +42,6 @@ def quad(corner: Vector, along_u: Vector, along_v: Vector) -> np.ndarray:
     return np.stack([np.stack([c, c + u]), np.stack([c + v, c + u + v])])
 
 
-BOX_SIDES = ("front", "back", "left", "right", "top", "bottom")
-
-
 def box_faces(low: Vector, high: Vector) -> dict[str, np.ndarray]:
     """Outward quads of an axis-aligned box by side; v runs down on the sides, "front" is the -y side."""
     (x0, y0, z0), (x1, y1, z1) = low, high
