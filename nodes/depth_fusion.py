@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from msgs import Depth, FusedKeyframe, Poses
+from msgs import Depth, FusedKeyframe
 from mvsgs_core import camera
-from mvsgs_core.fusion.fusion import DepthFusion as Fusion
-from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
+from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig, OnlineFusion
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
-from nodes import Node
+from nodes.windowed import WindowedNode
 
 
-class FusionNode(Node, ABC):
+class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
     """What every fusion of depth maps does with messages; a subclass makes the fusion itself from its Config."""
+
+    step = "fusion"
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        self._fusion = self._make_fusion()
         self._depths: dict[int, Depth] = {}  # not sent yet
-        self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
-
-    @abstractmethod
-    def _make_fusion(self) -> Fusion: ...
 
     def on_depth(self, depth: Depth) -> Iterator[FusedKeyframe]:
         self._depths[depth.index] = depth
@@ -40,19 +33,10 @@ class FusionNode(Node, ABC):
             scale=depth.scale,
             segment=depth.segment,
         )
-        if depth.index in self._poses:  # corrected before its depth came
-            view = view.moved(*self._poses[depth.index])
-        yield from self._timed(self._fusion.add(view))
-
-    def on_poses(self, poses: Poses) -> Iterator[Poses]:
-        """Takes corrections in and passes them on, so that they reach the mapper between the same keyframes."""
-        for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
-            self._poses[int(i)] = (pose, float(scale))
-        self._fusion.move(self._poses)
-        yield poses
+        yield from self._messages(self._core.add(self._corrected(view)))
 
     def on_end(self) -> Iterator[FusedKeyframe]:
-        yield from self._timed(self._fusion.flush())
+        yield from self._messages(self._core.flush())
         if self.stats.counts.get("keyframes") and not self.stats.counts["pixels kept"]:
             self.stats.nothing(self._why_nothing())
 
@@ -68,14 +52,6 @@ class FusionNode(Node, ABC):
             f"all depth of {keyframes} was rejected, by these filters, of the pixels with stereo depth: "
             f"{', '.join(shares)} (a pixel can fail more than one)"
         )
-
-    def _timed(self, fused: Iterator[FusedDepth]) -> Iterator[FusedKeyframe]:
-        while True:
-            with self.stats.time("fusion"):
-                found = next(fused, None)
-            if found is None:
-                return
-            yield self._message(found)
 
     def _message(self, found: FusedDepth) -> FusedKeyframe:
         message = self._depths.pop(found.view.index)
@@ -110,5 +86,5 @@ class DepthFusion(FusionNode):
 
     config: Config
 
-    def _make_fusion(self) -> Fusion:
-        return Fusion(self.config)
+    def _make_core(self) -> OnlineFusion:
+        return OnlineFusion(self.config)

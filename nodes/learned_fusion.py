@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mvsgs_core.fusion.fusion import DepthFusion as Fusion
-from mvsgs_core.fusion.learned import LearnedFusion as LearnedCore
-from mvsgs_core.fusion.learned import VFuseConfig
+from mvsgs_core.fusion.learned import LearnedOnlineFusion, VFuseConfig
 from mvsgs_core.networks.checkpoints import RANDOM
 from nodes.depth_fusion import FusionNode
 
@@ -20,7 +18,7 @@ class LearnedFusion(FusionNode):
 
     config: Config
 
-    def _make_fusion(self) -> Fusion:
+    def _make_core(self) -> LearnedOnlineFusion:
         if self.config.weights == RANDOM:
             self.stats.warn("V-FUSE runs untrained, with random weights: its refinement is noise")
-        return LearnedCore(self.config)
+        return LearnedOnlineFusion(self.config)

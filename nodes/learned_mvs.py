@@ -18,7 +18,7 @@ class LearnedMvs(StereoNode):
 
     config: Config
 
-    def _make_stereo(self) -> LearnedStereo:
+    def _make_core(self) -> LearnedStereo:
         c = self.config
         if c.weights == RANDOM:
             self.stats.warn(f"{c.network} runs untrained, with random weights: its depth is noise")

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from msgs import Depth, Keyframe, Poses
+from msgs import Depth, Keyframe
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth, OnlineStereo
-from nodes import Node
+from nodes.windowed import WindowedNode
 
 
-class StereoNode(Node, ABC):
+class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
     """What every multi-view stereo does with messages; a subclass makes the stereo itself from its Config."""
+
+    step = "stereo"
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        self._stereo = self._make_stereo()
         self._keyframes: dict[int, Keyframe] = {}  # without depth yet
-        self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
-
-    @abstractmethod
-    def _make_stereo(self) -> OnlineStereo: ...
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
         passed_over = self.config.resume_after is not None and keyframe.index <= self.config.resume_after
@@ -33,7 +29,7 @@ class StereoNode(Node, ABC):
         else:
             self._keyframes[keyframe.index] = keyframe
         with self.stats.time("prepare"):
-            view = self._stereo.prepare(
+            view = self._core.prepare(
                 keyframe.index,
                 keyframe.image,
                 keyframe.intrinsics,
@@ -43,27 +39,10 @@ class StereoNode(Node, ABC):
                 keyframe.scale,
                 keyframe.segment,
             )
-        if keyframe.index in self._poses:  # corrected before it came
-            view = view.moved(*self._poses[keyframe.index])
-        yield from self._timed(self._stereo.add(view, wanted=not passed_over))
-
-    def on_poses(self, poses: Poses) -> Iterator[Poses]:
-        """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
-        for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
-            self._poses[int(i)] = (pose, float(scale))
-        self._stereo.move(self._poses)
-        yield poses
+        yield from self._messages(self._core.add(self._corrected(view), wanted=not passed_over))
 
     def on_end(self) -> Iterator[Depth]:
-        yield from self._timed(self._stereo.flush())
-
-    def _timed(self, depths: Iterator[CascadeDepth]) -> Iterator[Depth]:
-        while True:
-            with self.stats.time("stereo"):
-                found = next(depths, None)
-            if found is None:
-                return
-            yield self._message(found)
+        yield from self._messages(self._core.flush())
 
     def _message(self, found: CascadeDepth) -> Depth:
         keyframe = self._keyframes.pop(found.view.index)
@@ -102,5 +81,5 @@ class Mvs(StereoNode):
 
     config: Config
 
-    def _make_stereo(self) -> Cascade:
+    def _make_core(self) -> Cascade:
         return Cascade(self.config)

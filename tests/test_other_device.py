@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bench import networks
-from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
+from mvsgs_core.fusion.fusion import FusionConfig, OnlineFusion
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import load, save
 from mvsgs_core.mapping.checkpoints.files import FOLDER, KEYFRAMES, state_file
@@ -70,7 +70,7 @@ def test_fusion_equals_that_of_the_cpu() -> None:
     results = []
     with PretendDevice():
         for device in (DEVICE, "torch"):
-            fusion = DepthFusion(FusionConfig(device=device, threads=1, round_trip=True))
+            fusion = OnlineFusion(FusionConfig(device=device, threads=1, round_trip=True))
             found = [one for k in range(5) for one in fusion.add(view(k, 0.1 * k, 0.005))]
             results.append([one.depth for one in [*found, *fusion.flush()]])
     assert len(results[0]) == 5

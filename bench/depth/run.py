@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.depth.data import Scene
-from mvsgs_core.fusion.fusion import DepthFusion, FusedDepth, FusionConfig
+from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig, OnlineFusion
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth
 from mvsgs_core.mvs.keyframe import StereoKeyframe
@@ -37,7 +37,7 @@ class Score:
 
 def run(views: list[StereoKeyframe], cascade: CascadeConfig, fusion: FusionConfig) -> Run:
     """Stereo and fusion of views in stream order."""
-    stereo_node, fusion_node = Cascade(cascade), DepthFusion(fusion)
+    stereo_node, fusion_node = Cascade(cascade), OnlineFusion(fusion)
     begin = time.process_time()
     stereo: list[CascadeDepth] = []
     fused: list[FusedDepth] = []

@@ -32,7 +32,7 @@ from bench.table import Row, main
 from bench.tracking.__main__ import run as track
 from mvsgs_core import weights
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
+from mvsgs_core.fusion.fusion import FusionConfig, OnlineFusion
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth, OnlineStereo
 from mvsgs_core.mvs.learned import LearnedStereo, LearnedStereoConfig
 from mvsgs_core.tracking.tracker import TrackerConfig
@@ -82,7 +82,7 @@ def run(scene: Scene, images: Sequence[np.ndarray], stereo: OnlineStereo) -> Map
     start = time.process_time()
     found += stereo.flush()
     seconds += time.process_time() - start
-    fusion = DepthFusion(FusionConfig(threads=1))
+    fusion = OnlineFusion(FusionConfig(threads=1))
     fused = [f for one in found for f in fusion.add(depth_view(one))] + list(fusion.flush())
     return Maps([f.result.depth for f in found], [f.depth for f in fused], seconds / max(1, len(found)))
 

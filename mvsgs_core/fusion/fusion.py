@@ -57,7 +57,7 @@ class FusedDepth:
     problem: str = ""  # a limit that had to be relaxed, or why nothing is kept
 
 
-class DepthFusion:
+class OnlineFusion:
     """Feeds on depth maps in stream order; `add` and `flush` yield each keyframe's exactly once, in order."""
 
     def __init__(self, config: FusionConfig | None = None) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.devices import torch_device
-from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig
+from mvsgs_core.fusion.fusion import FusionConfig, OnlineFusion
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.vfuse import FusionInput, VFuse, check_choices
@@ -27,7 +27,7 @@ class VFuseConfig(FusionConfig):
     confidence_mode: Literal["swr", "single", "pns", "pns_swr", "pkrn"] = "swr"  # see networks.vfuse_confidence
 
 
-class LearnedFusion(DepthFusion):
+class LearnedOnlineFusion(OnlineFusion):
     """Raises ValueError for an unknown center or confidence mode, and what `checkpoints.make` raises."""
 
     def __init__(self, config: VFuseConfig) -> None:

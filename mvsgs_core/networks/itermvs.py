@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mvsgs_core.networks.posed_views import check_range, homogeneous_pixels, projections
+
 GROUPS, HIDDEN, BINS, INITIAL_SAMPLES, RADIUS, ITERATIONS = 8, 32, 256, 32, 4, 4
 MULTIPLE = 32  # sizes of images that every level divides without rest
 # samples around the current depth by feature level, in bins
@@ -216,13 +218,11 @@ class IterMvs(nn.Module):
         images_rgb (V, 3, H, W) in 0..255; cam_from_world (V, 4, 4) and cameras (V, 3, 3) float64 at full size;
         depth_range (near, far). Raises ValueError for a bad range or a size that is no multiple of 32.
         """
-        near, far = depth_range
-        if not 0 < near < far < float("inf"):
-            raise ValueError(f"depth range {depth_range}: it needs 0 < near < far")
+        near, far = check_range(depth_range)
         if images_rgb.shape[2] % MULTIPLE or images_rgb.shape[3] % MULTIPLE:
             raise ValueError(f"IterMVS needs sizes that are multiples of {MULTIPLE}, got {tuple(images_rgb.shape[2:])}")
         features = self.feature_net(images_rgb / 127.5 - 1)
-        projections = {level: _projections(cam_from_world, cameras, 0.5**level) for level in (1, 2, 3)}
+        at_level = {level: projections(cam_from_world, cameras, 0.5**level) for level in (1, 2, 3)}
         net, update = self.iter_mvs, self.iter_mvs.update
 
         def depth_at(position: Tensor) -> Tensor:
@@ -230,7 +230,7 @@ class IterMvs(nn.Module):
 
         steps = torch.linspace(0, 1, INITIAL_SAMPLES, device=images_rgb.device)[:, None, None]
         samples = depth_at(steps.expand(-1, *features[3].shape[2:]))
-        weights, scores = net.evaluation.start(features[3], projections[3], samples)
+        weights, scores = net.evaluation.start(features[3], at_level[3], samples)
         hidden = update.start(scores)
         position = update.position(hidden)
         for _ in range(iterations):
@@ -238,7 +238,7 @@ class IterMvs(nn.Module):
                 level: depth_at((position + position.new_tensor(o)[:, None, None] / BINS).clamp(0, 1))
                 for level, o in _OFFSETS.items()
             }
-            found = net.evaluation.look_up(features, projections, around, weights)
+            found = net.evaluation.look_up(features, at_level, around, weights)
             hidden = update.gru(hidden, torch.cat([position[None], found])[None])
             position = update.position(hidden)
         confidence = torch.sigmoid(_resize(update.confidence_head(hidden), 1))
@@ -250,15 +250,6 @@ def _resize(x: Tensor, factor: float) -> Tensor:
     if factor == 1:
         return x
     return F.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
-
-
-def _projections(cam_from_world: Tensor, cameras: Tensor, scale: float) -> Tensor:
-    """(V, 4, 4): K [R | t], K scaled without a half-pixel shift, as the released weights were trained."""
-    k = cameras.clone()
-    k[:, :2] *= scale
-    projections = cam_from_world.clone()
-    projections[:, :3] = k @ cam_from_world[:, :3]
-    return projections
 
 
 def _correlate(reference: Tensor, source: Tensor, projections: Tensor, view: int, samples: Tensor) -> Tensor:
@@ -275,9 +266,8 @@ def _warp(source: Tensor, source_from_reference: Tensor, samples: Tensor) -> Ten
     """
     n, h, w = samples.shape
     height, width = source.shape[1:]
-    y, x = torch.meshgrid(torch.arange(h).double(), torch.arange(w).double(), indexing="ij")
-    pixels = torch.stack([x * (width / w), y * (height / h), torch.ones_like(x)]).reshape(3, -1).to(samples.device)
-    rays = source_from_reference[:3, :3] @ pixels
+    pixels = homogeneous_pixels(h, w, samples.device)
+    rays = source_from_reference[:3, :3] @ (pixels * pixels.new_tensor([[width / w], [height / h], [1.0]]))
     points = rays[:, None] * samples.double().reshape(1, n, -1) + source_from_reference[:3, 3, None, None]
     # behind the camera, or so near that the division means nothing: far outside, so that the sampler gives 0
     front = points[2] > 1e-6

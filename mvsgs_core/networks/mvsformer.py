@@ -16,6 +16,7 @@ from mvsgs_core.networks.dino import PATCH, DinoDecoder, DinoSmall
 from mvsgs_core.networks.droid import normalize_images
 from mvsgs_core.networks.mvsformer_features import PyramidDecoder, PyramidEncoder
 from mvsgs_core.networks.mvsformer_stage import Stage, StageOutput
+from mvsgs_core.networks.posed_views import check_range, projections
 from mvsgs_core.networks.twins import TwinsDecoder, TwinsSmall
 
 HYPOTHESES = (32, 16, 8, 4)
@@ -80,9 +81,7 @@ class MvsFormer(nn.Module):
         images_rgb (V, 3, H, W) in 0..255; cam_from_world (V, 4, 4) and cameras (V, 3, 3) float64 at full size;
         depth_range (near, far), which matters much (MVSFormer's known weakness). Raises ValueError for a bad range.
         """
-        near, far = depth_range
-        if not 0 < near < far < float("inf"):
-            raise ValueError(f"depth range {depth_range}: it needs 0 < near < far")
+        near, far = check_range(depth_range)
         features = self.features(images_rgb)
         outputs: list[StageOutput] = []
         for k, stage in enumerate(self.fusions):
@@ -91,8 +90,9 @@ class MvsFormer(nn.Module):
                 hypotheses = _uniform(near, far, h, w, features[0])
             else:
                 hypotheses = narrow(outputs[-1], INTERVAL_RATIOS[k - 1], HYPOTHESES[k], near)
-            projections = _projections(cam_from_world, cameras, 0.5 ** (3 - k))
-            outputs.append(stage(features[k], projections, hypotheses, temperatures[k]))
+            outputs.append(
+                stage(features[k], projections(cam_from_world, cameras, 0.5 ** (3 - k)), hypotheses, temperatures[k])
+            )
         size = features[-1].shape[2:]
         confidences = [F.interpolate(o.confidence[None, None], size=size, mode="nearest")[0, 0] for o in outputs]
         return MvsOutput(outputs[-1].depth, torch.stack(confidences).mean(dim=0), outputs)
@@ -113,12 +113,3 @@ def narrow(previous: StageOutput, ratio: float, count: int, near: float) -> Tens
     inverse = ends[0] + (ends[1] - ends[0]) * t
     inverse = F.interpolate(inverse[None], scale_factor=2, mode="bilinear", align_corners=True)[0]
     return 1 / inverse.clamp(min=_FARTHEST / near)
-
-
-def _projections(cam_from_world: Tensor, cameras: Tensor, scale: float) -> Tensor:
-    """(V, 4, 4): K [R | t], K scaled without a half-pixel shift, as the released weights were trained."""
-    k = cameras.clone()
-    k[:, :2] *= scale
-    projections = cam_from_world.clone()
-    projections[:, :3] = k @ cam_from_world[:, :3]
-    return projections

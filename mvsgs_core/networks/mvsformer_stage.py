@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mvsgs_core.networks.mvsformer_features import ConvBn
+from mvsgs_core.networks.posed_views import homogeneous_pixels
 
 GROUPS = 8
 
@@ -104,9 +105,7 @@ def warp(source: Tensor, source_from_reference: Tensor, hypotheses: Tensor) -> T
     source_from_reference: (4, 4) float64, pixels times depth of the reference to those of the source.
     """
     d, h, w = hypotheses.shape
-    y, x = torch.meshgrid(torch.arange(h).double(), torch.arange(w).double(), indexing="ij")
-    pixels = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1).to(source.device)
-    rays = source_from_reference[:3, :3] @ pixels
+    rays = source_from_reference[:3, :3] @ homogeneous_pixels(h, w, source.device)
     points = rays[:, None] * hypotheses.double().reshape(1, d, -1) + source_from_reference[:3, 3, None, None]
     xy = points[:2] / (points[2] + 1e-6)
     grid = torch.stack([xy[0] / ((w - 1) / 2) - 1, xy[1] / ((h - 1) / 2) - 1], dim=-1).to(source)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mvsgs_core.networks.posed_views import homogeneous_pixels
 from mvsgs_core.networks.vfuse_confidence import check_mode, confidence_of
 
 PLANES = 8
@@ -197,16 +198,6 @@ def check_choices(center: str, confidence: str) -> None:
     check_mode(confidence)
 
 
-def _pixels(height: int, width: int, device: torch.device) -> Tensor:
-    """(3, H * W) float64 homogeneous, in raster order."""
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=torch.float64, device=device),
-        torch.arange(width, dtype=torch.float64, device=device),
-        indexing="ij",
-    )
-    return torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1)
-
-
 def splat_views(views: FusionInput) -> tuple[Tensor, Tensor]:
     """Depths and confidences (V, H, W) of all views seen from the reference; 0 where nothing lands.
 
@@ -215,7 +206,7 @@ def splat_views(views: FusionInput) -> tuple[Tensor, Tensor]:
     """
     _, h, w = views.depths.shape
     depths, confidences = [views.depths[0]], [views.confidences[0]]
-    pixels = _pixels(h, w, views.cameras.device)
+    pixels = homogeneous_pixels(h, w, views.cameras.device)
     for view in range(1, len(views.depths)):
         z = views.depths[view].double().reshape(-1)
         points = torch.linalg.inv(views.cameras[view]) @ pixels * z
@@ -236,7 +227,7 @@ def splat_views(views: FusionInput) -> tuple[Tensor, Tensor]:
 def _look_up(views: FusionInput, view: int, planes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Depth z of the planes' points in a source view, and that view's own depth and confidence there; (M, H, W)."""
     m, h, w = planes.shape
-    rays = torch.linalg.inv(views.cameras[0]) @ _pixels(h, w, views.cameras.device)
+    rays = torch.linalg.inv(views.cameras[0]) @ homogeneous_pixels(h, w, views.cameras.device)
     points = rays[:, None] * planes.double().reshape(1, m, -1)
     move = views.cam_from_world[view] @ torch.linalg.inv(views.cam_from_world[0])
     points = move[:3, :3] @ points.reshape(3, -1) + move[:3, 3:]

@@ -9,7 +9,7 @@ import pytest
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.fusion.backend import NativeFusionBackend
-from mvsgs_core.fusion.fusion import DepthFusion, FusionConfig, fuse
+from mvsgs_core.fusion.fusion import FusionConfig, OnlineFusion, fuse
 from mvsgs_core.fusion.interface import FuseOptions
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
@@ -124,7 +124,7 @@ def test_few_agreeing_neighbors_count_against_a_depth_only_where_others_see_anot
 
 
 def test_fewer_neighbors_than_asked_for_is_said() -> None:
-    fusion = DepthFusion(CONFIG)
+    fusion = OnlineFusion(CONFIG)
     assert list(fusion.add(view(0, 0.0))) == []
     (alone,) = fusion.flush()
     assert "no neighbor" in alone.problem
@@ -132,7 +132,7 @@ def test_fewer_neighbors_than_asked_for_is_said() -> None:
 
 
 def test_scale_corrections_scale_stored_depth() -> None:
-    fusion = DepthFusion(CONFIG)
+    fusion = OnlineFusion(CONFIG)
     for i in range(2):
         list(fusion.add(view(i, 0.1 * i)))
     doubled = {i: (look(0.2 * i), 2.0) for i in range(2)}

@@ -1,0 +1,60 @@
+"""What stereo and fusion share as nodes: their core holds the newest keyframes, whose poses the tracker corrects."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from msgs import Poses
+from mvsgs_core.keyframe_window import WindowedKeyframe
+from nodes import Node
+
+
+class WindowedCore(Protocol):
+    def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None: ...
+
+
+Core = TypeVar("Core", bound=WindowedCore)
+Found = TypeVar("Found")  # what the core finds of a keyframe
+Sent = TypeVar("Sent")  # the message of it
+K = TypeVar("K", bound=WindowedKeyframe)
+
+
+class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
+    """A subclass makes the core from its Config, feeds it, and makes messages of what it finds."""
+
+    step: ClassVar[str]  # name of the core's work in the times of the report
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        self._core = self._make_core()
+        self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
+
+    @abstractmethod
+    def _make_core(self) -> Core: ...
+
+    @abstractmethod
+    def _message(self, found: Found) -> Sent: ...
+
+    def on_poses(self, poses: Poses) -> Iterator[Poses]:
+        """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
+        for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
+            self._poses[int(i)] = (pose, float(scale))
+        self._core.move(self._poses)
+        yield poses
+
+    def _corrected(self, keyframe: K) -> K:
+        """With its newest pose, where that came before the keyframe."""
+        return keyframe.moved(*self._poses[keyframe.index]) if keyframe.index in self._poses else keyframe
+
+    def _messages(self, found: Iterator[Found]) -> Iterator[Sent]:
+        """One message a result; the time is that of the core alone."""
+        while True:
+            with self.stats.time(self.step):
+                one = next(found, None)
+            if one is None:
+                return
+            yield self._message(one)
