@@ -18,13 +18,11 @@ counts them in `Render.backward.refused`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from mvsgs_core.rasterizer import cpu, kernels, reference, spherical_harmonics
+from mvsgs_core.rasterizer import cpu, differentiable, kernels, reference, spherical_harmonics
 from mvsgs_core.rasterizer.interface import Render, RenderSettings
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -101,7 +99,7 @@ def rasterize(
         weights=weights,
         threads=threads or 0,
     )
-    render = _backend(backend, splats.means.device)(splats, settings)
+    render = _render(backend, splats, settings)
     if exposure is not None:
         if tuple(exposure.shape) != (3, 4):
             raise ValueError(f"exposure is {tuple(exposure.shape)}: expected (3, 4)")
@@ -110,18 +108,18 @@ def rasterize(
     return render
 
 
-def _backend(name: str, device: torch.device) -> Callable[[Splats, RenderSettings], Render]:
-    if name == "auto":
-        name = "cpu" if device.type == "cpu" else "triton"
-    if name == "reference":
-        return reference.render
-    if name == "cpu":
-        return cpu.render
-    if name == "triton":
+def _render(backend: str, splats: Splats, settings: RenderSettings) -> Render:
+    if backend == "auto":
+        backend = "cpu" if splats.means.device.type == "cpu" else "triton"
+    if backend == "reference":
+        return reference.render(splats, settings)
+    if backend == "cpu":
+        return differentiable.render(cpu, splats, settings)
+    if backend == "triton":
         from mvsgs_core.rasterizer.triton import backend as triton_backend
 
-        return triton_backend.render
-    raise ValueError(f"backend {name!r}: choose one of {', '.join(BACKENDS)}")
+        return differentiable.render(triton_backend, splats, settings)
+    raise ValueError(f"backend {backend!r}: choose one of {', '.join(BACKENDS)}")
 
 
 def _pose(world_from_cam: Tensor | np.ndarray, delta: Tensor | None) -> Tensor:

@@ -37,27 +37,20 @@ def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
 
 
 class _ImageLoss(torch.autograd.Function):
-    """Weighted L1 + ssim_weight (1 - SSIM), with the gradient made in the forward pass."""
+    """A loss whose gradient by the image was made with it."""
 
     @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, target: Tensor, pixel_weight: Tensor | None, l1_weight: float, ssim_weight: float,
-        threads: int,
-    ) -> Tensor:  # fmt: skip
-        gradient = torch.empty(image.shape)
-        l1, similarity = native.load("rasterizer").image_loss(
-            image.detach().contiguous().numpy(), target.detach().contiguous().numpy(),
-            None if pixel_weight is None else pixel_weight.numpy(), l1_weight, ssim_weight, gradient.numpy(), threads,
-        )  # fmt: skip
+    def forward(ctx: Any, image: Tensor, loss: Tensor, gradient: Tensor) -> Tensor:
         ctx.save_for_backward(gradient)
-        return torch.tensor(l1 + ssim_weight * (1.0 - similarity), dtype=torch.float32)
+        return loss
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, on_loss: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        scaled = gradient if float(on_loss) == 1.0 else gradient * on_loss  # most often it is the loss itself
-        return scaled, None, None, None, None, None
+        if on_loss.device.type == "cpu" and float(on_loss) == 1.0:  # most often it is the loss itself
+            return gradient, None, None
+        return gradient * on_loss, None, None
 
 
 def chosen_backend(image: Tensor) -> str:
@@ -89,11 +82,16 @@ def image_loss(
         raise ValueError(f"pixel_weight is {tuple(pixel_weight.shape)}: expected {tuple(image.shape[:2])}")
     weight = None if pixel_weight is None else pixel_weight.detach().to(image.dtype).contiguous()
     chosen = chosen_backend(image) if backend == "auto" else backend
-    if chosen == "cpu":
-        loss: Tensor = _ImageLoss.apply(image, target.float(), weight, l1_weight, ssim_weight, threads or 0)
+    if chosen in ("cpu", "triton"):
+        x, y = image.detach().contiguous(), target.detach().float().contiguous()
+        if chosen == "cpu":
+            made = _cpu_loss(x, y, weight, l1_weight, ssim_weight, threads or 0)
+        else:
+            from mvsgs_core.rasterizer.triton.ssim import loss_with_gradient
+
+            made = loss_with_gradient(x, y, weight, l1_weight, ssim_weight)
+        loss: Tensor = _ImageLoss.apply(image, *made)
         return loss
-    if chosen == "triton":
-        return _triton_image_loss(image, target.float(), weight, l1_weight, ssim_weight)
     if chosen != "reference":
         raise ValueError(f"backend {backend!r}: choose one of auto, cpu, triton, reference")
     target = target.detach().to(image)
@@ -104,18 +102,15 @@ def image_loss(
     return weighted + ssim_weight * (1.0 - ssim_reference(image, target))
 
 
-def _triton_image_loss(
-    image: Tensor, target: Tensor, weight: Tensor | None, l1_weight: float, ssim_weight: float
-) -> Tensor:
-    try:
-        from mvsgs_core.rasterizer.triton.ssim import ImageLoss
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            "the loss on a GPU needs the package triton, which comes with torch's CUDA builds: take "
-            "backend='reference' or device=cpu"
-        ) from error
-    loss: Tensor = ImageLoss.apply(image, target, weight, l1_weight, ssim_weight)
-    return loss
+def _cpu_loss(
+    image: Tensor, target: Tensor, weight: Tensor | None, l1_weight: float, ssim_weight: float, threads: int
+) -> tuple[Tensor, Tensor]:
+    gradient = torch.empty(image.shape)
+    l1, similarity = native.load("rasterizer").image_loss(
+        image.numpy(), target.numpy(), None if weight is None else weight.numpy(), l1_weight, ssim_weight,
+        gradient.numpy(), threads,
+    )  # fmt: skip
+    return torch.tensor(l1 + ssim_weight * (1.0 - similarity), dtype=torch.float32), gradient
 
 
 def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:

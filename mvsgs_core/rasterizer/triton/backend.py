@@ -1,4 +1,4 @@
-"""The rasterizer for GPUs in Triton: no CUDA compiler needed, no float atomics, the same result every time.
+"""The GPU back end: no float atomics, the same result every time.
 
 Project (with the pairs counted), sort by depth, list the pairs, sort by tile, blend; backward: blend, sum up by splat,
 project. The host waits once a view, for the number of pairs.
@@ -10,23 +10,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import triton
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, means2d_leaf
-from mvsgs_core.rasterizer.splats import Splats
-
-try:
-    import triton
-
-    from mvsgs_core.rasterizer.triton.blend import SUMS, TILE, blend, blend_backward
-    from mvsgs_core.rasterizer.triton.lists import Lists, emit, sort_by_tile
-    from mvsgs_core.rasterizer.triton.projection import FOOTPRINT, ROW, project
-    from mvsgs_core.rasterizer.triton.projection_backward import project_backward
-except ModuleNotFoundError as error:
-    raise ImportError(
-        "the triton back end needs the package triton, which comes with torch's CUDA builds: take backend='cpu'"
-    ) from error
+from mvsgs_core.rasterizer.differentiable import Images, Rendered
+from mvsgs_core.rasterizer.interface import RenderSettings
+from mvsgs_core.rasterizer.triton.blend import SUMS, TILE, blend, blend_backward
+from mvsgs_core.rasterizer.triton.lists import Lists, emit, sort_by_tile
+from mvsgs_core.rasterizer.triton.projection import FOOTPRINT, ROW, project
+from mvsgs_core.rasterizer.triton.projection_backward import project_backward
 
 BLOCK = 64  # splats of a program
 MAX_PAIRS = 1 << 31  # places are 32-bit integers
@@ -93,90 +85,54 @@ def projected(parameters: list[Tensor], settings: RenderSettings) -> Pass:
     return Pass(camera, rows, radii, lists, int(left_out))
 
 
-class _Rasterize(torch.autograd.Function):
-    """(means2d, pose, fields of Splats) -> color, depth, opacity; the rest of a `Render` is left in `extra`."""
+def forward(settings: RenderSettings, parameters: list[Tensor]) -> tuple[Images, Rendered]:
+    """See `BackEnd`. Raises ValueError for other than float32, and for too many pairs."""
+    means = parameters[0]
+    if means.dtype != torch.float32:
+        raise ValueError(f"the triton back end takes float32 splats, got {means.dtype}")
+    passed = projected(parameters, settings)
+    lists = passed.lists
+    height, width = settings.size
+    tiles_y, tiles_x = tile_grid(settings.size)
+    color = means.new_empty(height, width, 3)
+    depth, opacity = means.new_empty(2, height, width).unbind(0)
+    weights = means.new_zeros(2, len(lists.pair_splats) if settings.weights else 1)
+    blend[(tiles_y * tiles_x,)](
+        passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
+        weights[1], *settings.background, height, width, tiles_x, EXACT=settings.exact, WEIGHTS=settings.weights,
+        ROW=ROW, **LAUNCH_TILE,
+    )  # fmt: skip
+    weight_sum = weight_max = None
+    if settings.weights:
+        weight_sum = lists.sums(weights[0][:, None])[:, 0]
+        weight_max = lists.sums(weights[1][:, None], maximum=True)[:, 0]
+    return (color, depth, opacity), Rendered(passed.radii, passed.refused, weight_sum, weight_max, passed)
 
-    @staticmethod
-    def forward(
-        ctx: Any, settings: RenderSettings, extra: dict[str, Any], means2d: Tensor, pose: Tensor, *splats: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        parameters = [tensor.detach().contiguous() for tensor in splats]
-        passed = projected(parameters, settings)
-        lists = passed.lists
-        height, width = settings.size
-        tiles_y, tiles_x = tile_grid(settings.size)
-        color = means2d.new_empty(height, width, 3)
-        depth, opacity = means2d.new_empty(2, height, width).unbind(0)
-        weights = means2d.new_zeros(2, len(lists.pair_splats) if settings.weights else 1)
-        blend[(tiles_y * tiles_x,)](
-            passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
-            weights[1], *settings.background, height, width, tiles_x, EXACT=settings.exact, WEIGHTS=settings.weights,
-            ROW=ROW, **LAUNCH_TILE,
+
+def backward(
+    settings: RenderSettings, kept: Pass, parameters: list[Tensor], images: Images,
+    on_images: tuple[Tensor, Tensor | None, Tensor | None], on_splats: list[Tensor], on_means2d: Tensor,
+    wants_pose: bool,
+) -> tuple[Tensor | None, None]:  # fmt: skip
+    """See `BackEnd`."""
+    lists, count = kept.lists, len(parameters[0])
+    height, width = settings.size
+    tiles_y, tiles_x = tile_grid(settings.size)
+    sums = on_means2d.new_zeros(len(lists.pair_splats), SUMS)
+    blend_backward[(tiles_y * tiles_x,)](
+        kept.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, *images,
+        *(torch.zeros_like(image) if g is None else g for image, g in zip(images, on_images)), sums, height, width,
+        tiles_x, EXACT=settings.exact, DEPTH=any(g is not None for g in on_images[1:]), SUMS=SUMS, ROW=ROW,
+        **LAUNCH_TILE,
+    )  # fmt: skip
+    programs = triton.cdiv(count, BLOCK)
+    on_pose = torch.zeros(max(1, programs), 12, dtype=torch.float64, device=sums.device)
+    if count:
+        project_backward[(programs,)](
+            *parameters, kept.camera, kept.rows, lists.sums(sums), lists.pairs, *on_splats, on_means2d, on_pose,
+            count, width, height, *settings.intrinsics, POSE=wants_pose, SUMS=SUMS,
+            **of_projection(settings, parameters[4].shape[1]),
         )  # fmt: skip
-        extra.update(passed=passed)
-        if settings.weights:
-            extra["weight_sum"] = lists.sums(weights[0][:, None])[:, 0]
-            extra["weight_max"] = lists.sums(weights[1][:, None], maximum=True)[:, 0]
-        ctx.passed, ctx.settings = passed, settings
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*parameters, color, depth, opacity)
-        return color, depth, opacity
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        *parameters, color, depth, opacity = ctx.saved_tensors
-        passed, settings = ctx.passed, ctx.settings
-        lists, count = passed.lists, len(parameters[0])
-        height, width = settings.size
-        tiles_y, tiles_x = tile_grid(settings.size)
-        outputs = (color, depth, opacity)
-        on_color, on_depth, on_opacity = (
-            torch.zeros_like(output) if gradient is None else gradient.contiguous()
-            for output, gradient in zip(outputs, gradients)
-        )
-        sums = color.new_zeros(len(lists.pair_splats), SUMS)
-        exact = settings.exact
-        blend_backward[(tiles_y * tiles_x,)](
-            passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, *outputs, on_color, on_depth,
-            on_opacity, sums, height, width, tiles_x, EXACT=exact, DEPTH=any(g is not None for g in gradients[1:]),
-            SUMS=SUMS, ROW=ROW, **LAUNCH_TILE,
-        )  # fmt: skip
-        results = [torch.empty_like(parameter) for parameter in parameters]
-        on_means2d = color.new_empty(count, 2)
-        programs = triton.cdiv(count, BLOCK)
-        wants_pose = ctx.needs_input_grad[3]
-        on_pose = torch.zeros(max(1, programs), 12, dtype=torch.float64, device=color.device)
-        if count:
-            project_backward[(programs,)](
-                *parameters, passed.camera, passed.rows, lists.sums(sums), lists.pairs, *results, on_means2d, on_pose,
-                count, width, height, *settings.intrinsics, POSE=wants_pose, SUMS=SUMS,
-                **of_projection(settings, parameters[4].shape[1]),
-            )  # fmt: skip
-        pose = None
-        if wants_pose:
-            pose = torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(settings.pose.device)
-        *shared, on_betas = results
-        return (None, None, on_means2d, pose, *shared, on_betas if exact else None)
-
-
-def render(splats: Splats, settings: RenderSettings) -> Render:
-    """See `rasterizer.rasterize`. Raises ValueError for other than float32."""
-    if splats.means.dtype != torch.float32:
-        raise ValueError(f"the triton back end takes float32 splats, got {splats.means.dtype}")
-    means2d = means2d_leaf(splats, settings)
-    extra: dict[str, Any] = {}
-    color, depth, opacity = _Rasterize.apply(settings, extra, means2d, settings.pose, *splats.tensors().values())
-    passed: Pass = extra["passed"]
-    return Render(
-        color=color,
-        depth=depth,
-        opacity=opacity,
-        visible=passed.radii > 0,
-        radii=passed.radii,
-        means2d=means2d,
-        weight_sum=extra.get("weight_sum"),
-        weight_max=extra.get("weight_max"),
-        refused=passed.refused,
-        backward=Backward(),
-    )
+    if not wants_pose:
+        return None, None
+    return torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(settings.pose.device), None

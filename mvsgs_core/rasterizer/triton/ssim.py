@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 ROWS, COLUMNS = 16, 128  # of a program's block: 26 source rows are read for 16
 RADIUS = tl.constexpr(5)
@@ -133,32 +131,21 @@ def loss_gradient(  # type: ignore[no-untyped-def]
     tl.store(sums + program, tl.sum(tl.sum(weight * tl.abs(difference), axis=1), axis=0))
 
 
-class ImageLoss(torch.autograd.Function):
-    """Weighted L1 + ssim_weight (1 - SSIM) of images (H, W, 3), with the gradient made in the forward pass."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, target: Tensor, pixel_weight: Tensor | None, l1_weight: float, ssim_weight: float
-    ) -> Tensor:
-        x, y = image.detach().contiguous(), target.detach().contiguous()
-        height, length = x.shape[0], 3 * x.shape[1]
-        grid = (triton.cdiv(height, ROWS), triton.cdiv(length, COLUMNS))
-        taps = window(x.device)
-        gradient = torch.empty_like(x)
-        on_a, on_p, on_r = x.new_empty(3, height, length).unbind(0)
-        similar, different = x.new_empty(2, grid[0] * grid[1]).unbind(0)
-        block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "enable_fp_fusion": True}
-        similarity[grid](x, y, taps, on_a, on_p, on_r, similar, height, length, **block)
-        per_value = 1.0 / x.numel()
-        loss_gradient[grid](
-            x, y, x if pixel_weight is None else pixel_weight, taps, on_a, on_p, on_r, gradient, different,
-            height, length, l1_weight, per_value, -ssim_weight * per_value, WEIGHTED=pixel_weight is not None, **block,
-        )  # fmt: skip
-        ctx.save_for_backward(gradient)
-        return per_value * different.sum() + ssim_weight * (1.0 - per_value * similar.sum())
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, on_loss: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * on_loss, None, None, None, None
+def loss_with_gradient(
+    image: Tensor, target: Tensor, pixel_weight: Tensor | None, l1_weight: float, ssim_weight: float
+) -> tuple[Tensor, Tensor]:
+    """Weighted L1 + ssim_weight (1 - SSIM) of images (H, W, 3), a scalar, and its gradient by `image` (H, W, 3)."""
+    height, length = image.shape[0], 3 * image.shape[1]
+    grid = (triton.cdiv(height, ROWS), triton.cdiv(length, COLUMNS))
+    taps = window(image.device)
+    gradient = torch.empty_like(image)
+    on_a, on_p, on_r = image.new_empty(3, height, length).unbind(0)
+    similar, different = image.new_empty(2, grid[0] * grid[1]).unbind(0)
+    block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "enable_fp_fusion": True}
+    similarity[grid](image, target, taps, on_a, on_p, on_r, similar, height, length, **block)
+    per_value = 1.0 / image.numel()
+    loss_gradient[grid](
+        image, target, image if pixel_weight is None else pixel_weight, taps, on_a, on_p, on_r, gradient, different,
+        height, length, l1_weight, per_value, -ssim_weight * per_value, WEIGHTED=pixel_weight is not None, **block,
+    )  # fmt: skip
+    return per_value * different.sum() + ssim_weight * (1.0 - per_value * similar.sum()), gradient

@@ -1,0 +1,86 @@
+"""A back end's forward and backward pass behind PyTorch's autograd."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, means2d_leaf
+from mvsgs_core.rasterizer.splats import Splats
+
+Images = tuple[Tensor, Tensor, Tensor]  # color (H, W, 3), depth (H, W), opacity (H, W)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a forward pass gives beside the images; see `Render`."""
+
+    radii: Tensor
+    refused: int
+    weight_sum: Tensor | None
+    weight_max: Tensor | None
+    kept: Any  # what the backward pass reads again, beside parameters and images
+
+
+class BackEnd(Protocol):
+    """A module with these two functions; `parameters` are the fields of `Splats` in their order, contiguous."""
+
+    def forward(self, settings: RenderSettings, parameters: list[Tensor]) -> tuple[Images, Rendered]:
+        """Raises ValueError for a dtype or device that the back end does not take."""
+
+    def backward(
+        self, settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images,
+        on_images: tuple[Tensor, Tensor | None, Tensor | None], on_splats: list[Tensor], on_means2d: Tensor,
+        wants_pose: bool,
+    ) -> tuple[Tensor | None, int | None]:  # fmt: skip
+        """Fills on_splats and on_means2d from the gradients of the images, None: 0; returns that of the pose, and how
+        many splats were refused, None: not counted."""
+
+
+class _Rasterize(torch.autograd.Function):
+    """(means2d, pose, fields of Splats) -> color, depth, opacity; the rest of the forward pass goes into `rest`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, back_end: BackEnd, settings: RenderSettings, rest: list[Rendered], report: Backward,
+        means2d: Tensor, pose: Tensor, *splats: Tensor,
+    ) -> Images:  # fmt: skip
+        parameters = [tensor.detach().contiguous() for tensor in splats]
+        images, rendered = back_end.forward(settings, parameters)
+        rest.append(rendered)
+        ctx.back_end, ctx.settings, ctx.kept, ctx.report = back_end, settings, rendered.kept, report
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*parameters, *images)
+        return images
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        *parameters, color, depth, opacity = ctx.saved_tensors
+        on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous() for g in gradients)
+        on_images = (torch.zeros_like(color) if on_color is None else on_color, on_depth, on_opacity)
+        on_splats = [torch.empty_like(parameter) for parameter in parameters]
+        on_means2d = color.new_empty(len(parameters[0]), 2)
+        on_pose, ctx.report.refused = ctx.back_end.backward(
+            ctx.settings, ctx.kept, parameters, (color, depth, opacity), on_images, on_splats, on_means2d,
+            ctx.needs_input_grad[5],
+        )  # fmt: skip
+        *shared, on_betas = on_splats
+        return (None, None, None, None, on_means2d, on_pose, *shared, on_betas if ctx.settings.exact else None)
+
+
+def render(back_end: BackEnd, splats: Splats, settings: RenderSettings) -> Render:
+    """See `rasterizer.rasterize`. Raises ValueError for a dtype or device that the back end does not take."""
+    means2d, rest, report = means2d_leaf(splats, settings), list[Rendered](), Backward()
+    color, depth, opacity = _Rasterize.apply(
+        back_end, settings, rest, report, means2d, settings.pose, *splats.tensors().values()
+    )
+    (rendered,) = rest
+    return Render(
+        color, depth, opacity, rendered.radii > 0, rendered.radii, means2d, rendered.weight_sum, rendered.weight_max,
+        rendered.refused, report,
+    )  # fmt: skip
