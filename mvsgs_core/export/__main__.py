@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 from mvsgs_core.export import keyframe_images
@@ -21,27 +20,23 @@ from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.splat import write_splat, write_spz
 
-Options = argparse.Namespace
 BESIDE = Path()  # --images without a folder: those beside the map
-Writer = Callable[[Path, Snapshot, Options], str]  # writes a map and says what is in the file
 
 
-def splats(write: Callable[[Path, Snapshot, Options], None]) -> Writer:
-    """A writer of a file of splats."""
-
-    def writer(out: Path, final: Snapshot, options: Options) -> str:
-        write(out, final, options)
-        return f"{len(final.splats)} splats, {out.stat().st_size} bytes"
-
-    return writer
+def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
+    if out.suffix == ".ply":
+        write_ply(out, final, fold=options.fold)
+    else:
+        {".splat": write_splat, ".spz": write_spz}[out.suffix](out, final)
+    return f"{len(final.splats)} splats, {out.stat().st_size} bytes"
 
 
-def mesh(out: Path, final: Snapshot, options: Options) -> str:
+def mesh(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     vertices, triangles = write_mesh(out, final, cameras_of_map(options), options.voxel)
     return f"{vertices} vertices, {triangles} triangles"
 
 
-def colmap(out: Path, final: Snapshot, options: Options) -> str:
+def colmap(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     if options.images is not None and options.trajectory is not None:
         raise ValueError("--images are those of the keyframes, of which a --trajectory knows nothing")
     images = options.map.with_name(keyframe_images.FOLDER) if options.images is BESIDE else options.images
@@ -49,24 +44,22 @@ def colmap(out: Path, final: Snapshot, options: Options) -> str:
     return f"{written.images} images, {written.points} points, {written.observations} observations"
 
 
-FORMATS: dict[str, Writer] = {  # by the suffix of OUT, of which a folder has none
-    ".ply": splats(lambda out, final, options: write_ply(out, final, fold=options.fold)),
-    ".splat": splats(lambda out, final, options: write_splat(out, final)),
-    ".spz": splats(lambda out, final, options: write_spz(out, final)),
-    ".glb": mesh, ".obj": mesh, ".stl": mesh, ".off": mesh, "": colmap,
+FORMATS = {  # by the suffix of OUT, of which a folder has none: writes the map, returns what is in the file
+    ".ply": splats, ".splat": splats, ".spz": splats, ".glb": mesh, ".obj": mesh, ".stl": mesh, ".off": mesh,
+    "": colmap,
 }  # fmt: skip
 
 
-def export(options: Options) -> str:
+def export(options: argparse.Namespace) -> str:
     """Does what the command line asks; returns one line that says what was written. Raises ValueError, OSError."""
     if not (math.isfinite(options.scale) and options.scale > 0):
         raise ValueError("--scale must be positive")
     out: Path = options.out
-    writer = mesh if options.mesh else FORMATS.get(out.suffix)
-    if writer is None:
+    write = mesh if options.mesh else FORMATS.get(out.suffix)
+    if write is None:
         raise ValueError(f"no format {out.suffix!r}; there are: {', '.join(filter(None, FORMATS))}, a folder")
     final, left_out = read_map(options)
-    return f"{out}: {writer(out, final.scaled(options.scale), options)}{left_out}"
+    return f"{out}: {write(out, final.scaled(options.scale), options)}{left_out}"
 
 
 def main(arguments: list[str] | None = None) -> int:
