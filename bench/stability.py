@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,63 +48,68 @@ def cloud(count: int, seed: int = 0) -> Splats:
     )  # fmt: skip
 
 
-def spread(low: float, high: float, count: int) -> torch.Tensor:
-    return torch.linspace(low, high, count)
-
-
-def near_plane() -> Splats:
-    splats = cloud(200)
-    splats.means[:, 2] = torch.cat([spread(-2.0, 0.0, 100), torch.logspace(-6, -2, 100)])
+def near_plane(splats: Splats) -> None:
+    splats.means[:, 2] = torch.cat([torch.linspace(-2.0, 0.0, 100), torch.logspace(-6, -2, 100)])
     splats.means[:, :2] *= 0.3 * splats.means[:, 2:].abs()  # inside of the image where in front
-    return splats
 
 
-def scales() -> Splats:
-    splats = cloud(200)
+def scales(splats: Splats) -> None:
     splats.log_scales = torch.log(torch.logspace(-12, 6, 200))[:, None].repeat(1, 3)
-    return splats
 
 
-def aspects() -> Splats:
-    splats = cloud(200)
+def aspects(splats: Splats) -> None:
     splats.log_scales[:, 0] = 2.0
     splats.log_scales[:, 1:] = 2.0 - np.log(1e5)
-    return splats
 
 
-def opacities() -> Splats:
-    splats = cloud(200)
-    splats.opacity_logits = torch.logit(spread(0.0, 1.0, 200))  # the ends are -Inf and Inf
-    return splats
+def opacities(splats: Splats) -> None:
+    splats.opacity_logits = torch.logit(torch.linspace(0.0, 1.0, 200))  # the ends are -Inf and Inf
 
 
-def betas() -> Splats:
-    splats = cloud(200)
+def betas(splats: Splats) -> None:
     splats.betas = torch.logspace(-1, np.log10(20.0), 200)
-    return splats
 
 
-def coincident() -> Splats:
-    splats = cloud(200)
+def coincident(splats: Splats) -> None:
     splats.means[:] = splats.means[0]
-    return splats
 
 
-def one_tile() -> Splats:
-    splats = cloud(10_000)
-    splats.means[:, :2] = splats.means[:, :2] * 0.01
-    return splats
+def one_tile(splats: Splats) -> None:
+    splats.means[:, :2] *= 0.01
 
 
-def not_finite() -> Splats:
-    splats = cloud(200)
+def not_finite(splats: Splats) -> None:
     splats.means[0, 0], splats.log_scales[1, 2], splats.quaternions[2] = torch.nan, torch.inf, torch.zeros(4)
     splats.sh[3, 0, 1], splats.opacity_logits[4] = -torch.inf, torch.nan
-    return splats
 
 
-def once(name: str, splats: Splats, size: tuple[int, int] = SIZE, kernel: str = "gaussian", origin: float = 0.0) -> Row:
-    """One render, backward pass and step."""
+def far_away(splats: Splats) -> None:
+    splats.means[:, 0] += 1e6
+
+
+CHANGES: dict[str, tuple[Callable[[Splats], None], dict[str, Any]]] = {  # of 200 splats; how they are rendered
+    "splats at and behind the near plane": (near_plane, {}),
+    "scales from 1e-12 to 1e6": (scales, {}),
+    "aspect 1:1e5": (aspects, {}),
+    "opacity 0 to 1": (opacities, {}),
+    "coincident splats": (coincident, {}),
+    "zero splats": (lambda splats: None, {"count": 0}),
+    "10,000 splats on one tile": (one_tile, {"count": 10_000}),
+    "NaN and Inf in the splats themselves": (not_finite, {}),
+    "beta from 0.1 to 20, exact": (betas, {"kernel": "exact"}),
+    "beta from 0.1 to 20, ges_scale": (betas, {"kernel": "ges_scale"}),
+    "one pixel": (lambda splats: None, {"size": (1, 1)}),
+    "world origin 1e6 away, float32 means": (far_away, {"origin": 1e6}),
+}
+
+
+def once(
+    name: str, change: Callable[[Splats], None], count: int = 200, size: tuple[int, int] = SIZE,
+    kernel: str = "gaussian", origin: float = 0.0,
+) -> Row:  # fmt: skip
+    """One render, backward pass and step of ordinary splats that were changed."""
+    splats = cloud(count)
+    change(splats)
     state = MapState(splats.sh.shape[1], torch.device("cpu"))
     state.append(splats, torch.zeros(len(splats), dtype=torch.int64))
     pose = np.eye(4)
@@ -188,23 +194,7 @@ def with_bad_depths(view: RGBDKeyframe) -> RGBDKeyframe:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     torch.set_num_threads(1)
-    cases: dict[str, Callable[[], Splats]] = {
-        "splats at and behind the near plane": near_plane,
-        "scales from 1e-12 to 1e6": scales,
-        "aspect 1:1e5": aspects,
-        "opacity 0 to 1": opacities,
-        "coincident splats": coincident,
-        "zero splats": lambda: cloud(0),
-        "10,000 splats on one tile": one_tile,
-        "NaN and Inf in the splats themselves": not_finite,
-    }
-    rows = [once(name, make()) for name, make in cases.items()]
-    rows.append(once("beta from 0.1 to 20, exact", betas(), kernel="exact"))
-    rows.append(once("beta from 0.1 to 20, ges_scale", betas(), kernel="ges_scale"))
-    rows.append(once("one pixel", cloud(200), size=(1, 1)))
-    far = cloud(200)
-    far.means[:, 0] += 1e6
-    rows.append(once("world origin 1e6 away, float32 means", far, origin=1e6))
+    rows = [once(name, change, **how) for name, (change, how) in CHANGES.items()]
     config = MapperConfig(iterations=40, threads=1)
     views = [box_view(k, 0.2 * k) for k in range(4)]
     rows.append(mapped("mapper, nothing wrong", views, config, GOOD))

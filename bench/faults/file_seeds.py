@@ -187,21 +187,26 @@ def _bag_messages(store: Any, ros: int) -> list[tuple[str, Any]]:
     return [("/camera/camera_info", info), *(("/camera/image_raw", message) for message in raw)]
 
 
+def _write_bag(writer: Writer1 | Writer2, ros: int) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
+    with writer:
+        connections: dict[str, Any] = {}
+        for seconds, (topic, message) in enumerate(_bag_messages(store, ros)):
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], seconds * 10**9, serialize(message, kind))
+
+
 def _bag(compression: str) -> Callable[[Path], None]:
     """ROS 1; `compression`: "", "bz2" or "lz4"."""
 
     def make(folder: Path) -> None:
-        store = get_typestore(Stores.ROS1_NOETIC)
         writer = Writer1(folder / "walk.bag")
         if compression:
             writer.set_compression(Writer1.CompressionFormat[compression.upper()])
-        with writer:
-            connections: dict[str, Any] = {}
-            for seconds, (topic, message) in enumerate(_bag_messages(store, 1)):
-                kind = message.__msgtype__
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
-                writer.write(connections[topic], seconds * 10**9, store.serialize_ros1(message, kind))
+        _write_bag(writer, 1)
 
     return make
 
@@ -210,17 +215,10 @@ def _bag2(plugin: str, mode: str) -> Callable[[Path], None]:
     """ROS 2; `plugin`: "SQLITE3" or "MCAP"; `mode` of zstd: "NONE", "MESSAGE", "FILE" or "STORAGE"."""
 
     def make(folder: Path) -> None:
-        store = get_typestore(Stores.ROS2_HUMBLE)
         writer = Writer2(folder / "walk", version=9, storage_plugin=StoragePlugin[plugin])
         if mode != "NONE":
             writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
-        with writer:
-            connections: dict[str, Any] = {}
-            for seconds, (topic, message) in enumerate(_bag_messages(store, 2)):
-                kind = message.__msgtype__
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
-                writer.write(connections[topic], seconds * 10**9, store.serialize_cdr(message, kind))
+        _write_bag(writer, 2)
 
     return make
 
