@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -38,7 +38,7 @@ class Evaluator(Node):
         input: str = ""  # what was mapped, for the report
         max_frames: int = 200  # frames scored at most, keyframes, held-out and others evenly; 0: no scoring
         max_bytes: float = 2e9  # of images and depth maps that wait on disk to be scored
-        lpips: str = "auto"  # "auto": if its weights are found, "off", "on": an error if they are not
+        lpips: Literal["auto", "on", "off"] = "auto"  # auto: if its weights are found; on: an error if they are not
 
     config: Config
 
@@ -51,13 +51,11 @@ class Evaluator(Node):
         self.folder = folder
         self._lpips = self._load_lpips()
         given = {"lpips": self._lpips.compare} if self._lpips else {}
-        self.evaluation = Evaluation(self.config.max_frames, given, folder, self.config.max_bytes)
+        self.evaluation = Evaluation(self.config.max_frames, self.config.max_bytes, given, folder)
         self.report: dict[str, Any] = {}
 
     @classmethod
     def check(cls, config: Config) -> None:
-        if config.lpips not in ("auto", "on", "off"):
-            raise ValueError(f"lpips={config.lpips!r}: it is auto, on or off")
         if config.lpips == "on":
             weights.find("lpips_squeeze_trunk")
             weights.find("lpips_squeeze_head")

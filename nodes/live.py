@@ -16,7 +16,7 @@ class LiveSource(Node, ABC):
 
     @dataclass
     class Config(SizedSelection):
-        stop: int | None = None  # end after so many frames from the first one on; null: until its end or Ctrl-C
+        pass
 
     config: Config
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedWriter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mcap.writer import CompressionType, Writer
 
@@ -29,7 +29,7 @@ class Recorder(Node):
     @dataclass
     class Config:
         path: str = "recording.mcap"  # file; must not exist
-        compression: str = "lz4"  # lz4, zstd (smaller, slower) or none
+        compression: Literal["lz4", "zstd", "none"] = "lz4"  # zstd: smaller, slower
 
     config: Config
 
@@ -40,8 +40,6 @@ class Recorder(Node):
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        if self.config.compression not in COMPRESSION:
-            raise ValueError(f"compression={self.config.compression}: must be one of {', '.join(COMPRESSION)}")
         self._file: BufferedWriter | None = None
         self._channels: dict[str, int] = {}  # by message type
         self._counts: Counter[str] = Counter()

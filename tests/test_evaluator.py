@@ -14,6 +14,7 @@ from msgs import FusedKeyframe, GroundTruth, SplatMap, TrackingState, Trajectory
 from mvsgs_core import geometry
 from mvsgs_core.evaluation.scoring import render_frame
 from nodes.evaluator import Evaluator
+from nodes.runtime.parameters import build
 from tests.support.full_disk import full_after
 
 H, W, N, SCALE = 24, 32, 12, 0.5  # the estimate's unit is 2 true units
@@ -365,7 +366,7 @@ def test_a_full_disk_costs_frames_and_not_the_report(tmp_path: Path) -> None:
 )
 def test_parameters_that_mean_nothing_are_refused_before_a_run(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
-        Evaluator.check(Evaluator.Config(**wrong))
+        Evaluator.check(build(Evaluator.Config, wrong))
     Evaluator.check(Evaluator.Config())
 
 

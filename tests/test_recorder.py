@@ -21,6 +21,7 @@ from mvsgs_core.datasets.mcap_file import MAGIC
 from nodes import free_inputs, handlers, is_source, outputs
 from nodes.player import Player
 from nodes.recorder import Recorder
+from nodes.runtime.parameters import ParameterError, build
 from tests.support.example_messages import MESSAGES, assert_equal, example
 
 
@@ -112,8 +113,8 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     recorded(tmp_path / "a.mcap", 1)
     with pytest.raises(FileExistsError):
         recorded(tmp_path / "a.mcap", 1)
-    with pytest.raises(ValueError, match="must be one of lz4, zstd, none"):
-        Recorder(Recorder.Config(compression="gzip"))
+    with pytest.raises(ParameterError, match="compression=gzip: must be 'lz4' or 'zstd' or 'none'"):
+        build(Recorder.Config, {"compression": "gzip"})
 
 
 def test_other_tools_can_read_what_is_in_it(tmp_path: Path) -> None:

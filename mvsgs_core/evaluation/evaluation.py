@@ -49,10 +49,10 @@ class FinishedMap:
 class Evaluation:
     """Feed it with `add_*` in any order; `report()` needs at least a track."""
 
-    max_frames: int = 200  # frames scored at most, of each kind as many; 0: none, and no depth maps
+    max_frames: int  # frames scored at most, of each kind as many; 0: none, and no depth maps
+    max_bytes: float  # of frames that wait on disk
     given: Mapping[str, scoring.Compare] = field(default_factory=dict)  # image metrics made at run time, by key
-    folder: Path | None = None  # where frames wait on disk
-    max_bytes: float = 2e9  # there
+    folder: Path | None = None  # where they wait
     started: float | None = None
     mapped: float | None = None
     trajectory: Trajectory | None = None
