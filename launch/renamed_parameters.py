@@ -3,58 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, get_type_hints
+from typing import Any, get_origin, get_type_hints
 
 from launch.refusal import GraphError
 from nodes.runtime.parameters import nested_in
 
-RENAMED: Mapping[str, str] = {
-    "tracker.keyframe_flow": "tracker.keyframe_choice.max_flow",
-    "tracker.keyframe_share": "tracker.keyframe_choice.min_fraction",
-    "tracker.still_flow": "tracker.front_end.still_flow",
-    "tracker.start_keyframes": "tracker.initialization.min_keyframes",
-    "tracker.window": "tracker.local_map.window",
-    "tracker.recent": "tracker.local_map.recent",
-    "tracker.proximity": "tracker.local_map.proximity",
-    "tracker.steps": "tracker.local_map.steps",
-    "tracker.global_edges": "tracker.back_end.max_edges",
-    "tracker.known_flow": "tracker.covisibility.max_flow",
-    "tracker.known_from": "tracker.covisibility.min_keyframes",
-    "tracker.readout": "tracker.readout_time",
-    "tracker.unroll": "tracker.rectify_rolling_shutter",
-    "mvs.neighbors": "mvs.neighbors.count",
-    "mvs.best_views": "mvs.cost.top_k",
-    "mvs.paths": "mvs.smoothing.paths",
-    "mvs.range_margin": "mvs.ranges.margin",
-    "mvs.least_cells": "mvs.ranges.min_cells",
-    "mvs.skip_cells": "mvs.pruning.outside_cells",
-    "depth_fusion.least_views": "depth_fusion.min_views",
-    "depth_fusion.rim": "depth_fusion.discontinuity_radius",
-    "mapper.density": "mapper.training.kernel",
-    "mapper.kernel": "mapper.training.kernel",
-    "mapper.betas": "mapper.training.betas",
-    "mapper.loss": "mapper.training.loss",
-    "mapper.exposure": "mapper.training.exposure",
-    "mapper.refine_poses": "mapper.training.refine_poses",
-    "mapper.selective": "mapper.training.selective",
-    "mapper.skip_converged": "mapper.convergence.skip",
-    "mapper.unexplored": "mapper.insertion.unexplored",
-    "mapper.unexplored_psnr": "mapper.insertion.unexplored_psnr",
-    "mapper.voxel": "mapper.insertion.voxel",
-    "mapper.map_voxel": "mapper.insertion.map_voxel",
-    "mapper.map_voxel_error": "mapper.insertion.map_voxel_error",
-    "mapper.fill": "mapper.insertion.fill",
-    "mapper.density_control": "mapper.density_control.mode",
-    "mapper.max_splats": "mapper.density_control.max_splats",
-}
-CONSTANTS: Mapping[str, str] = {  # of tracker=droid: of a node that has them in a group
-    "tracker.stride": "tracker.constants.stride",
-    "tracker.filter_threshold": "tracker.constants.filter_threshold",
-    "tracker.keyframe_threshold": "tracker.constants.keyframe_threshold",
-    "tracker.warmup": "tracker.constants.warmup",
-    "tracker.window": "tracker.constants.frontend_window",
-    "tracker.backend_every": "tracker.constants.backend_every",
-}
+RENAMED: tuple[tuple[str, str], ...] = (  # what it was, what it is with a node that takes it
+    ("tracker.keyframe_flow", "tracker.keyframe_choice.max_flow"),
+    ("tracker.keyframe_share", "tracker.keyframe_choice.min_fraction"),
+    ("tracker.still_flow", "tracker.front_end.still_flow"),
+    ("tracker.start_keyframes", "tracker.initialization.min_keyframes"),
+    ("tracker.window", "tracker.local_map.window"),
+    ("tracker.recent", "tracker.local_map.recent"),
+    ("tracker.proximity", "tracker.local_map.proximity"),
+    ("tracker.steps", "tracker.local_map.steps"),
+    ("tracker.global_edges", "tracker.back_end.max_edges"),
+    ("tracker.known_flow", "tracker.covisibility.max_flow"),
+    ("tracker.known_from", "tracker.covisibility.min_keyframes"),
+    ("tracker.readout", "tracker.readout_time"),
+    ("tracker.unroll", "tracker.rectify_rolling_shutter"),
+    ("mvs.neighbors", "mvs.neighbors.count"),
+    ("mvs.best_views", "mvs.cost.top_k"),
+    ("mvs.paths", "mvs.smoothing.paths"),
+    ("mvs.range_margin", "mvs.ranges.margin"),
+    ("mvs.least_cells", "mvs.ranges.min_cells"),
+    ("mvs.skip_cells", "mvs.pruning.outside_cells"),
+    ("depth_fusion.least_views", "depth_fusion.min_views"),
+    ("depth_fusion.rim", "depth_fusion.discontinuity_radius"),
+    ("mapper.density", "mapper.training.kernel"),
+    ("mapper.betas", "mapper.training.betas"),
+    ("mapper.loss", "mapper.training.loss"),
+    ("mapper.exposure", "mapper.training.exposure"),
+    ("mapper.refine_poses", "mapper.training.refine_poses"),
+    ("mapper.selective", "mapper.training.selective"),
+    ("mapper.skip_converged", "mapper.convergence.skip"),
+    ("mapper.unexplored", "mapper.insertion.unexplored"),
+    ("mapper.unexplored_psnr", "mapper.insertion.unexplored_psnr"),
+    ("mapper.voxel", "mapper.insertion.voxel"),
+    ("mapper.map_voxel", "mapper.insertion.map_voxel"),
+    ("mapper.map_voxel_error", "mapper.insertion.map_voxel_error"),
+    ("mapper.fill", "mapper.insertion.fill"),
+    ("mapper.density_control", "mapper.density_control.mode"),
+    ("mapper.max_splats", "mapper.density_control.max_splats"),
+    ("tracker.stride", "tracker.constants.stride"),
+    ("tracker.filter_threshold", "tracker.constants.filter_threshold"),
+    ("tracker.keyframe_threshold", "tracker.constants.keyframe_threshold"),
+    ("tracker.warmup", "tracker.constants.warmup"),
+    ("tracker.window", "tracker.constants.frontend_window"),
+    ("tracker.backend_every", "tracker.constants.backend_every"),
+)
 GONE: Mapping[str, str] = {
     "mapper.coarse_to_fine": "it gained nothing that could be measured",
     "mapper.skip_tiles": "it gained nothing that could be measured",
@@ -67,14 +64,21 @@ GONE: Mapping[str, str] = {
 
 def refuse_old_names(slot: str, config: type, given: Mapping[str, Any]) -> None:
     """Raises GraphError for those of a slot's parameters that have another name now, or are gone."""
-    renamed = {**RENAMED, **(CONSTANTS if _takes(config, ["constants"]) else {})}
-    found = [
-        f"{old} is {renamed[old]} now" if old in renamed else f"{old} is gone: {GONE[old]}"
-        for old in (*renamed, *GONE)
-        if old.startswith(f"{slot}.") and _given(given, old.split(".")[1:]) and not _takes(config, old.split(".")[1:])
-    ]
+
+    def old_name(name: str) -> bool:
+        path = _path(slot, name)
+        return path is not None and _given(given, path) and not _takes(config, path)
+
+    found = [f"{old} is {new} now" for old, new in RENAMED if old_name(old) and _takes(config, _path(slot, new) or [])]
+    found += [f"{old} is gone: {why}" for old, why in GONE.items() if old_name(old)]
     if found:
         raise GraphError("; ".join(found))
+
+
+def _path(slot: str, name: str) -> list[str] | None:
+    """The keys within a slot; None for a name of another slot."""
+    first, *path = name.split(".")
+    return path if first == slot else None
 
 
 def _given(values: Any, path: list[str]) -> bool:
@@ -87,10 +91,12 @@ def _given(values: Any, path: list[str]) -> bool:
 
 
 def _takes(config: Any, path: list[str]) -> bool:
-    """Whether the node's dataclass has that parameter after all: a node of one's own may."""
+    """Whether the node's dataclass has that parameter, or a mapping that may hold it."""
     for key in path:
-        hints = {} if config is None else get_type_hints(config)
+        hints = get_type_hints(config)
         if key not in hints:
             return False
         config = nested_in(hints[key])
-    return config is None
+        if config is None:
+            return key == path[-1] or get_origin(hints[key]) is dict
+    return False
