@@ -47,13 +47,15 @@ class LoopCloser:
         self.retrieval.add(index, self.graph.keyframes[index].image.features()[1])
 
     def search(self, index: int) -> Closure | None:
-        """Looks for old keyframes in the image of this one; the first that verifies is used."""
+        """Looks for old keyframes in the image of this one; the first that verifies is used.
+
+        What is near, in time or by at most two edges, is no loop.
+        """
         keyframe = self.graph.keyframes[index]
         order = self.local_map.members(keyframe.segment)
         place = order.index(index)
         near = set(order[max(0, place - self.config.min_gap) :]) | self.graph.neighbors(index) | {index}
         near |= {m for n in self.graph.neighbors(index) for m in self.graph.neighbors(n)}
-        near = {n for n in near if n in self.graph.keyframes and self.graph.keyframes[n].segment == keyframe.segment}
         descriptors = keyframe.image.features()[1]
         usual = set(order[max(0, place - 2) : place])
         for candidate in self.retrieval.query(descriptors, self.config.max_candidates, near, usual):

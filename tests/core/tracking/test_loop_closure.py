@@ -127,6 +127,17 @@ def test_a_closed_loop_takes_drift_of_direction_and_scale_down() -> None:
     assert ratio_after - 1.0 < 0.1 * (ratio - 1.0)
 
 
+def test_the_maps_unit_does_not_matter() -> None:
+    positions = []
+    for unit in (1.0, 1000.0):
+        true = ring()
+        true.rescale(true.keyframes, unit)
+        graph = drifted(true, 0.99, turn=0.01)
+        assert closer(graph).close(*between(true, graph, 0, COUNT - 1)).moved
+        positions.append(np.stack([graph.world_from_cam(n)[:3, 3] / unit for n in graph.keyframes]))
+    np.testing.assert_allclose(positions[0], positions[1], atol=1e-4)
+
+
 def test_edges_of_the_graph_hold_the_ring_together() -> None:
     """Two halves, each rigid by its edges: the drift between them is all in one step, and goes where nothing holds."""
     true = ring()
@@ -218,6 +229,7 @@ def test_a_round_through_the_room_is_closed_by_its_images() -> None:
     assert closure is not None
     assert (closure.source, closure.to) == (0, 298)
     assert closure.moved
+    assert {(0, 298), (298, 0)} <= graph.edges.keys()
     after, ratio_after = errors(true, graph)
     assert after < 0.25 * position
     assert ratio_after - 1.0 < 0.15 * (ratio - 1.0)
