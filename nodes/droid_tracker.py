@@ -9,7 +9,7 @@ from msgs import Frame, Keyframe, Poses
 from mvsgs_core import geometry
 from mvsgs_core.droid.config import DroidConfig
 from mvsgs_core.droid.system import DroidSlam
-from nodes.tracking import TrackerNode
+from nodes.tracking import TrackerNode, warn_of_guessed_focal
 
 
 class DroidTracker(TrackerNode):
@@ -29,10 +29,7 @@ class DroidTracker(TrackerNode):
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
         self._frames[frame.index] = frame
-        if frame.intrinsics_guessed:
-            self.stats.warn(
-                "the focal length is a guess, which this tracker takes for true: tracker=dense estimates it"
-            )
+        warn_of_guessed_focal(self.stats, frame)
         yield from self._send(self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics))
 
     def _keyframe(self, index: int) -> Keyframe:

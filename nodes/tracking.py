@@ -31,6 +31,12 @@ class CoreTracker(Protocol):
     def trajectory(self) -> CameraTrajectory: ...
 
 
+def warn_of_guessed_focal(stats: Stats, frame: Frame) -> None:
+    """For trackers that do not estimate the focal length."""
+    if frame.intrinsics_guessed:
+        stats.warn("the focal length is a guess, which this tracker takes for true: tracker=dense estimates it")
+
+
 class TrackerNode(Node, ABC):
     """A subclass makes the tracker of the core, feeds it in its own `on_frame` and describes a keyframe."""
 

@@ -1,4 +1,4 @@
-"""What can be set of the tracker, its parts' settings among it."""
+"""What can be set of the trackers, their parts' settings among it."""
 
 from __future__ import annotations
 
@@ -18,22 +18,38 @@ from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
 
 
 @dataclass(frozen=True)
-class TrackerConfig:
-    """Raises ValueError where a value is none that can be."""
+class KeyframeTrackingConfig:
+    """What a tracker takes that follows the points of keyframes, whether it finds poses or is given them."""
 
     area: int = 320 * 240  # pixels of the tracker's own image, aspect kept; enlarges at most to twice the size
     flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
+    threads: int | None = None  # of the C++ kernels; null: 1
+    keyframe_choice: KeyframeChoiceConfig = field(default_factory=KeyframeChoiceConfig)
+    local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
+
+
+@dataclass(frozen=True)
+class PosedConfig(KeyframeTrackingConfig):
+    """Raises ValueError for what can't be a readout time."""
+
+    readout_time: float = 0.0  # seconds of the camera's rolling shutter, 0 for a global one: true poses don't tell it
+
+    def __post_init__(self) -> None:
+        check_readout_time(self.readout_time)
+
+
+@dataclass(frozen=True)
+class TrackerConfig(KeyframeTrackingConfig):
+    """Raises ValueError for what can't be a readout time."""
+
     readout_time: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
     loops: bool = True  # old keyframes are looked for by appearance
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
     min_texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
     min_matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is warned of
     device: str = "cpu"  # of bundle adjustment: cpu (C++), cuda or cuda:0 (PyTorch), auto (CUDA if there is one)
-    threads: int | None = None  # of the C++ kernels; null: 1
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
     front_end: FrontEndConfig = field(default_factory=FrontEndConfig)
-    keyframe_choice: KeyframeChoiceConfig = field(default_factory=KeyframeChoiceConfig)
-    local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     covisibility: CovisibilityConfig = field(default_factory=CovisibilityConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     back_end: BackEndConfig = field(default_factory=BackEndConfig)
@@ -45,4 +61,4 @@ class TrackerConfig:
         check_readout_time(self.readout_time)
 
 
-__all__ = ["TrackerConfig"]
+__all__ = ["PosedConfig", "TrackerConfig"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,27 +10,17 @@ from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.config import PosedConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
-from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, KeyframeChoiceConfig, newest
-from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
+from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
+from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import Matches, make_flow
 from mvsgs_core.tracking.matching.matcher import Matcher
 
 FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to be apart where no match tells
-
-
-@dataclass(frozen=True)
-class PosedConfig:
-    area: int = 320 * 240  # pixels of the tracker's image
-    flow: str = "lucas_kanade"
-    readout_time: float = 0.0  # seconds of a rolling shutter, 0 for a global one: it is not estimated here
-    threads: int = 1
-    keyframe_choice: KeyframeChoiceConfig = field(default_factory=KeyframeChoiceConfig)
-    front_end: FrontEndConfig = field(default_factory=lambda: FrontEndConfig(still_flow=0.0))
-    local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
 
 
 class PosedTracker:
@@ -40,22 +30,26 @@ class PosedTracker:
     the tracker; what goes out is in the given one.
     """
 
-    def __init__(self, config: PosedConfig | None = None) -> None:
-        self.config = config or PosedConfig()
+    def __init__(self, config: PosedConfig, size: tuple[int, int], intrinsics: np.ndarray) -> None:
+        """size (height, width), intrinsics (4,): of the frames as they come."""
+        self.config = config
         self.stats = Stats()
-        self.graph: KeyframeGraph | None = None
+        self.size = tracking_size(*size, config.area)
+        self.graph = KeyframeGraph(scale_intrinsics(intrinsics, size, self.size))
+        self.graph.readout_time = config.readout_time
+        self.threads = config.threads or 1
+        self.flow = make_flow(config.flow)
+        matcher = Matcher(self.flow)
+        self.choice = KeyframeChoice(config.keyframe_choice)
+        self.front_end = FrontEnd(self.graph, matcher, FrontEndConfig(still_flow=0.0), self.threads)
+        self.local_map = LocalMap(self.graph, matcher, config.local_map, self.threads)
         self.unit = 1.0  # of the given poses' units, one of the graph's
         self._undecided = True  # about the unit: no two keyframes have told the first depth yet
         self._complete: list[int] = []  # keyframes not given out yet
         self._tail: dict[int, tuple[TrackingImage, np.ndarray, Step]] = {}  # the last two frames since
 
-    def add(
-        self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray, world_from_cam: np.ndarray
-    ) -> list[int]:
+    def add(self, index: int, timestamp: float, image: np.ndarray, world_from_cam: np.ndarray) -> list[int]:
         """The next frame with its pose (4, 4). Returns the keyframes, by index, that are complete now."""
-        if self.graph is None:
-            self._set_up(image.shape[0], image.shape[1], intrinsics)
-            assert self.graph is not None
         frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color)
         self.stats.count("frames")
         pose = geometry.inverse(world_from_cam)
@@ -66,14 +60,13 @@ class PosedTracker:
             step = self.front_end.follow(frame, with_pose=False)
         if self.front_end.is_lost(step):
             return self._insert(frame, pose, {})
-        reference, width = self.front_end.reference.index, frame.size[1]
-        if not self.choice.wants(index, step, width, self.config.keyframe_choice.max_flow):
-            if self._complete == [reference] and is_held_out(reference) and not is_held_out(index):
-                self.graph.remove(reference)  # the first frame of all: this one is as good
+        if not self.choice.wants(index, step, frame.size[1], self.config.keyframe_choice.max_flow):
+            if self._complete == [step.reference] and is_held_out(step.reference) and not is_held_out(index):
+                self.graph.remove(step.reference)  # the first frame of all: this one is as good
                 return self._first(frame, pose)
             self._tail = {i: self._tail[i] for i in sorted(self._tail)[-1:]} | {index: (frame, pose, step)}
             return []
-        return self._insert(frame, pose, {reference: step.matches})
+        return self._insert(frame, pose, {step.reference: step.matches})
 
     @property
     def pending(self) -> set[int]:
@@ -83,21 +76,17 @@ class PosedTracker:
     def finish(self) -> list[int]:
         """The stream has ended: the last keyframes, one of them of the last frames if they show something new."""
         complete: list[int] = []
-        if self.graph is not None:
-            width = self.size[1]
-            tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[2], width)}
-            last = newest(tail)
-            if last is not None:
-                frame, pose, step = tail[last]
-                assert self.front_end.reference is not None
-                complete = self._insert(frame, pose, {self.front_end.reference.index: step.matches})
-            self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.graph.keyframes))
+        tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[2], self.size[1])}
+        last = newest(tail)
+        if last is not None:
+            frame, pose, step = tail[last]
+            complete = self._insert(frame, pose, {step.reference: step.matches})
+        self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.graph.keyframes))
         complete, self._complete, self._tail = complete + self._complete, [], {}
         return complete
 
     def keyframe(self, index: int) -> Keyframe:
         """A keyframe in the unit of the given poses."""
-        assert self.graph is not None
         keyframe = self.graph.keyframes[index]
         pose = keyframe.cam_from_world.copy()
         pose[:3, 3] *= self.unit
@@ -110,7 +99,6 @@ class PosedTracker:
 
     def _insert(self, frame: TrackingImage, pose: np.ndarray, matches: dict[int, Matches]) -> list[int]:
         """A frame becomes a keyframe; returns those that are complete now. matches: of the reference's points."""
-        assert self.graph is not None
         if self._undecided:
             pose = self._decide_unit(pose, matches)
         with self.stats.time("triangulation"):
@@ -118,7 +106,7 @@ class PosedTracker:
             members = self.local_map.members(0)
             recent = set(members[-self.config.local_map.window :])
             around = {n for i in recent for n in self.graph.neighbors(i)}
-            solver = Solver(steps=self.config.local_map.steps, threads=self.config.threads)
+            solver = Solver(steps=self.config.local_map.steps, threads=self.threads)
             solution = self.graph.optimize(recent | around, set(), recent, solver)
         if solution.failure:
             self.stats.warn(f"triangulation failed: {solution.failure}")
@@ -129,18 +117,7 @@ class PosedTracker:
         complete, self._complete, self._tail = self._complete, [frame.index], {}
         return complete
 
-    def _set_up(self, height: int, width: int, intrinsics: np.ndarray) -> None:
-        self.size = tracking_size(height, width, self.config.area)
-        self.graph = KeyframeGraph(scale_intrinsics(intrinsics, (height, width), self.size))
-        self.graph.readout_time = self.config.readout_time
-        self.flow = make_flow(self.config.flow)
-        matcher = Matcher(self.flow)
-        self.choice = KeyframeChoice(self.config.keyframe_choice)
-        self.front_end = FrontEnd(self.graph, matcher, self.config.front_end, self.config.threads)
-        self.local_map = LocalMap(self.graph, matcher, self.config.local_map, self.config.threads)
-
     def _first(self, frame: TrackingImage, pose: np.ndarray) -> list[int]:
-        assert self.graph is not None
         ones = np.ones(len(frame.cells.points))
         self.graph.add(Keyframe(frame, pose, ones, 0.0 * ones, 0))
         self.front_end.refer_to(frame)
@@ -153,7 +130,6 @@ class PosedTracker:
 
         pose (4, 4): of the second; returned in the new unit, as all keyframes' are from then on.
         """
-        assert self.graph is not None
         assert self.front_end.reference is not None
         first = self.graph.keyframes[self.front_end.reference.index]
         baseline = float(np.linalg.norm((pose @ self.graph.world_from_cam(first.index))[:3, 3]))
@@ -181,4 +157,4 @@ class PosedTracker:
         return pose
 
 
-__all__ = ["PosedConfig", "PosedTracker"]
+__all__ = ["PosedTracker"]

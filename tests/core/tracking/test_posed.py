@@ -6,18 +6,20 @@ import numpy as np
 import pytest
 
 from mvsgs_core.held_out import is_held_out
+from mvsgs_core.tracking.config import PosedConfig
 from mvsgs_core.tracking.posed import PosedTracker
 from tests.support.sequences import synthetic
 
 
 def depths(factor: float, count: int = 40) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """By keyframe: its depths, which of them are triangulated, and its position, poses being `factor` times larger."""
-    tracker = PosedTracker()
+    items = synthetic(frames=80)[:count]
+    tracker = PosedTracker(PosedConfig(), (240, 320), items[0].intrinsics)
     complete: list[int] = []
-    for item in synthetic(frames=80)[:count]:
+    for item in items:
         pose = np.array(item.world_from_cam)
         pose[:3, 3] *= factor
-        complete += tracker.add(item.index, item.timestamp, item.image, item.intrinsics, pose)
+        complete += tracker.add(item.index, item.timestamp, item.image, pose)
     complete += tracker.finish()
     keyframes = {index: tracker.keyframe(index) for index in complete}
     return {
