@@ -11,6 +11,9 @@ import numpy as np
 
 from mvsgs_core.mapping.deformation import Similarity
 
+FAR = 1e6  # median depths from the origin, and between scales: float32 has no detail left there
+MAX_DEPTH = 1e18  # in the world's unit: squares of it are finite in float32
+
 
 @dataclass
 class FrameOfReference:
@@ -23,6 +26,26 @@ class FrameOfReference:
     def length(self) -> float:
         """World units in one of the mapper's."""
         return self.unit or 1.0
+
+    def begin(self, world_from_cam: np.ndarray, median_depth: float) -> bool:
+        """Takes what is missing yet from a keyframe, 0 where its depth is not known; whether the unit is new."""
+        return self.adopt(FrameOfReference(world_from_cam[:3, 3].copy(), median_depth or None))
+
+    def adopt(self, other: FrameOfReference) -> bool:
+        """Takes what is missing yet from another frame; whether the unit is new."""
+        if self.origin is None:
+            self.origin = other.origin
+        if self.unit is not None or other.unit is None:
+            return False
+        self.unit = other.unit
+        return True
+
+    def holds(self, world_from_cam: np.ndarray, depth: float = 0.0) -> bool:
+        """Whether a camera and what it sees at `depth`, world units, are where float32 has detail."""
+        if self.unit is None:
+            return depth < MAX_DEPTH
+        position = self.local(world_from_cam)[:3, 3]
+        return bool(depth < MAX_DEPTH and np.abs(position).max() < FAR and depth / self.unit < FAR)
 
     def local(self, world_from_cam: np.ndarray) -> np.ndarray:
         """The pose (4, 4) in this frame."""

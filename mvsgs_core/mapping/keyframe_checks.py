@@ -10,15 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from mvsgs_core.mapping.frame_of_reference import FAR
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.stats import Stats
 
 MIN_SIDE = 8  # pixels of an image
 FOCAL = (0.05, 100.0)  # focal lengths over the image's larger side: 170 degrees to half a degree
 OFF_CENTER = 1.0  # image sizes that the principal point may lie outside of the image
-FAR = 1e6  # median depths from the origin, and between scales: float32 has no detail left there
 NO_POSE = "a corrected pose that is not finite, or none at all, was refused"
-MAX_DEPTH = 1e18  # of depths, in the world's unit: their squares are finite in float32
 
 
 def checked_keyframe(view: RGBDKeyframe, log: Stats) -> RGBDKeyframe | None:
@@ -48,11 +47,6 @@ def is_pose(world_from_cam: np.ndarray, scale: float) -> bool:
     if np.abs(rotation).max() > 2.0 or not np.array_equal(world_from_cam[3], [0.0, 0.0, 0.0, 1.0]):
         return False
     return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0)
-
-
-def is_near(position: np.ndarray, depth: float = 0.0) -> bool:
-    """Whether a camera (3,), in median depths from the origin, and what it sees are where float32 has detail."""
-    return bool(np.abs(position).max() < FAR and depth < FAR)
 
 
 def _problem(view: RGBDKeyframe) -> str:

@@ -39,12 +39,15 @@ class KeyframeStore:
         self.with_image.append(view)
         return self._bound_images()
 
-    def take_over(self, other: KeyframeStore) -> None:
-        """The other's keyframes too."""
+    def take_over(self, other: KeyframeStore, scale: float) -> None:
+        """The other's keyframes too, whose unit is `scale` of this one's."""
 
         def index(view: TrainingView) -> int:
             return view.index
 
+        for view in other.views:
+            view.rescale(scale)
+            view.fixed = view.fixed and not self.views  # one holds the frame of reference
         self.views = sorted(self.views + other.views, key=index)
         self.with_image = sorted(self.with_image + other.with_image, key=index)
         self._bound_images()

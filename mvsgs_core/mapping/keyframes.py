@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mvsgs_core import camera
+from mvsgs_core.mapping.deformation import Similarity
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,14 @@ class TrainingView:
         self.pose_delta[:3, 3] *= factor
         self.pose_moments[0, :3] /= factor
         self.pose_moments[1, :3] /= factor**2
+
+    def place(self, world_from_cam: np.ndarray, local_from_cam: np.ndarray, scale: float) -> Similarity:
+        """A corrected pose and scale; returns how what was seen from it moves, in the mapper's frame."""
+        moved = Similarity.between(self.local_from_cam, local_from_cam, scale / self.scale)
+        self.world_from_cam, self.local_from_cam = world_from_cam, local_from_cam
+        self.rescale(scale / self.scale)
+        self.scale = scale
+        return moved
 
     def record(self, loss: float) -> None:
         """Takes in the loss of an iteration."""

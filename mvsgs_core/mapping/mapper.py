@@ -15,7 +15,7 @@ from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
 from mvsgs_core.mapping.densifier import Densifier, checked_depth
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
-from mvsgs_core.mapping.keyframe_checks import MAX_DEPTH, NO_POSE, checked_keyframe, is_near, is_pose
+from mvsgs_core.mapping.keyframe_checks import NO_POSE, checked_keyframe, is_pose
 from mvsgs_core.mapping.keyframe_store import KeyframeStore
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.mapping.map_state import MapState
@@ -143,17 +143,14 @@ class OnlineMapper:
         moved: dict[int, Similarity] = {}
         by_index = {view.index: view for view in self.views}
         for key, pose, s in zip(index.tolist(), np.asarray(world_from_cam, dtype=np.float64), scale.tolist()):
-            if not is_pose(pose, s) or (self.frame.unit is not None and not is_near(self.frame.local(pose)[:3, 3])):
+            if not is_pose(pose, s) or not self.frame.holds(pose):
                 self.log.refuse("poses", 1, NO_POSE)
                 continue
             self.corrections[key] = (pose, s)
             view = by_index.get(key)
             if view is None:
                 continue
-            similarity = Similarity.between(view.local_from_cam, self.frame.local(pose), s / view.scale)
-            view.world_from_cam, view.local_from_cam = pose, self.frame.local(pose)
-            view.rescale(s / view.scale)
-            view.scale = s
+            similarity = view.place(pose, self.frame.local(pose), s)
             if similarity.moves(max(view.median_depth, 1e-6)):
                 moved[key] = similarity
                 view.begin_anew()
@@ -171,20 +168,14 @@ class OnlineMapper:
         """
         if other.frame.origin is None:
             return
-        if self.frame.origin is None:
-            self.frame.origin = other.frame.origin
-        if self.frame.unit is None and other.frame.unit is not None:
-            self.frame.unit = other.frame.unit
+        if self.frame.adopt(other.frame):
             self.keyframes.place_anew(self.frame.local)
         change = self.frame.from_other(other.frame)
         with self.log.time("joining"):
             move_with_anchors(other.state, dict.fromkeys(other.state.anchors.unique().tolist(), change))
             self.state.take_over(other.state)
         other.keyframes.place_anew(self.frame.local)
-        for view in other.views:
-            view.rescale(change.scale)
-            view.fixed = view.fixed and not self.views  # one holds the frame of reference
-        self.keyframes.take_over(other.keyframes)
+        self.keyframes.take_over(other.keyframes, change.scale)
         self.schedule.reset()
         self.schedule.add_budget(other.schedule.drop())
         self.trainer.iterations += other.trainer.iterations
@@ -205,21 +196,15 @@ class OnlineMapper:
 
     def _placed(self, keyframe: RGBDKeyframe, depth: np.ndarray, pose: np.ndarray, scale: float) -> TrainingView | None:
         """To train on, in the mapper's frame, which the first ones begin; None where it is too far away from it."""
-        frame = self.frame
         median = _median(depth)
         if median == 0 and keyframe.unfiltered is not None:  # the filters kept nothing: doubtful depth gives the scale
             median = _median(keyframe.unfiltered) * scale / keyframe.scale
-        if median >= MAX_DEPTH or (
-            frame.unit is not None and not is_near(frame.local(pose)[:3, 3], median / frame.unit)
-        ):
+        if not self.frame.holds(pose, median):
             return None
-        if frame.origin is None:
-            frame.origin = pose[:3, 3].copy()
-        if frame.unit is None and median > 0:
-            frame.unit = median
-            self.keyframes.place_anew(frame.local)
-        view = training_view(keyframe, frame.local(pose), self.config.max_pixels, self.state.device)
-        view.world_from_cam, view.scale, view.median_depth = pose, scale, median / frame.length
+        if self.frame.begin(pose, median):
+            self.keyframes.place_anew(self.frame.local)
+        view = training_view(keyframe, self.frame.local(pose), self.config.max_pixels, self.state.device)
+        view.world_from_cam, view.scale, view.median_depth = pose, scale, median / self.frame.length
         view.fixed = not self.views
         if view.valid is not None:
             self.log.refuse(

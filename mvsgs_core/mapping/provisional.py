@@ -16,7 +16,6 @@ from mvsgs_core import camera
 from mvsgs_core.mapping.densifier import SOLID
 from mvsgs_core.mapping.filling import continued_depth, fill_points
 from mvsgs_core.mapping.insertion import Points, depth_colors, splats_from_points
-from mvsgs_core.mapping.keyframe_checks import is_near
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mvs.coarse import enlarge_inverse_depth
@@ -102,9 +101,9 @@ class Provisional:
         for waiting in reversed(self._waiting):
             if waiting.segment not in segments:
                 continue
-            local = mapper.frame.local(waiting.world_from_cam)
-            if not is_near(local[:3, 3]):
+            if not mapper.frame.holds(waiting.world_from_cam):
                 continue
+            local = mapper.frame.local(waiting.world_from_cam)
             if waiting.points is None and (not parts or time.perf_counter() < deadline):
                 waiting.points = _points(waiting, local, mapper)
             if waiting.points is None:
