@@ -65,14 +65,14 @@ class PlainScreen(Screen):
     def start(self, graph: Graph, nodes: dict[str, NodeStatus], processes: dict[str, psutil.Process]) -> None:
         super().start(graph, nodes, processes)
         self._next = PLAIN_SECONDS
-        self._told: set[str] = set()
+        self._printed: set[str] = set()
 
     def refresh(self) -> None:
         super().refresh()
         if self._nodes and self.seconds >= self._next:
             self._next = self.seconds + PLAIN_SECONDS
-            news = [text for status in self._nodes.values() if (text := brief(status)) not in self._told]
-            self._told.update(news)
+            news = [text for status in self._nodes.values() if (text := brief(status)) not in self._printed]
+            self._printed.update(news)
             if any(news):
                 self.note(f"{self.seconds:6.1f} s  {'; '.join(filter(None, news))}")
 

@@ -20,7 +20,7 @@ from nodes.live import LiveSource
 
 POLL = 0.5  # s at most between two looks at whether the stream goes on
 RETRY = 0.5  # s between two attempts to open a device that was lost
-SILENT = 2.0  # s without a picture after which a user is told, if the camera may be silent that long
+SILENT = 2.0  # s without a picture after which a user is warned, if the camera may be silent that long
 
 
 class CameraError(RuntimeError):
@@ -99,14 +99,14 @@ class _Feed:
     def newest(self, timeout_s: float) -> tuple[np.ndarray, float] | None:
         """The newest picture that was not taken yet and its time; None when none comes in time."""
         began = time.monotonic()
-        told = self._taken == 0  # the first picture may take its time
+        warned = self._taken == 0  # the first picture may take its time
         with self._fresh:
             while self._newest is None:
                 waited = time.monotonic() - began
                 if waited >= timeout_s:
                     return None
-                if not told and waited >= min(SILENT, timeout_s / 2):
-                    told = True
+                if not warned and waited >= min(SILENT, timeout_s / 2):
+                    warned = True
                     self._warn(f"camera {self._config.path} gives no picture: it is waited for up to {timeout_s:g} s")
                 self._fresh.wait(min(timeout_s - waited, POLL, timeout_s / 4))
             shot, self._newest = self._newest, None

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from launch.compose import compose
 from launch.jobs import Job, run
 from msgs import Frame, GroundTruth
+from mvsgs_core.datasets import formats
 from mvsgs_core.datasets.bag import Bag
 from mvsgs_core.datasets.images import Images
 from mvsgs_core.datasets.seven_scenes import SevenScenes
@@ -54,6 +55,12 @@ def test_every_choice_lists_all_options_of_its_format() -> None:
     synthetic = set(OmegaConf.load(ROOT / "launch/conf/dataset/synthetic.yaml").options)
     explicit = {p.name for p in inspect.signature(Synthetic).parameters.values() if p.kind is not p.VAR_KEYWORD}
     assert synthetic == (explicit | {f.name for f in dataclasses.fields(Difficulties)}) - own
+
+
+def test_every_format_has_a_choice_of_its_name() -> None:
+    files = {file.stem: OmegaConf.load(file) for file in (ROOT / "launch/conf/dataset").glob("*.yaml")}
+    readers = {name: config for name, config in files.items() if config._target_ == "nodes.reader.Reader"}
+    assert {name: config.name for name, config in readers.items()} == {name: name for name in formats()}
 
 
 @pytest.mark.parametrize("device", ["cuda:63", "cuda:first"])

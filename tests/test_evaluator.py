@@ -146,7 +146,7 @@ def test_frames_are_rendered_with_the_focal_length_that_the_tracker_found(evalua
     poses, index, none = _poses(), np.arange(N), np.zeros(N, np.int32)
     list(evaluator.on_trajectory(Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, 1.25)))
     list(evaluator.on_splat_map(_splat_map(True)))
-    for view in evaluator.evaluation.views():
+    for view in evaluator.evaluation.scored_frames():
         np.testing.assert_array_equal(view.intrinsics, INTRINSICS * [1.25, 1.25, 1.0, 1.0])
     evaluator.evaluation.close()
 
@@ -157,7 +157,7 @@ def test_the_rolling_shutter_that_the_tracker_took_out_is_applied_to_renders(eva
     track = Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, readout_time=0.02)
     list(evaluator.on_trajectory(track))
     list(evaluator.on_splat_map(_splat_map(True)))
-    finished, view = evaluator.evaluation.maps[True], evaluator.evaluation.views()[5]
+    finished, view = evaluator.evaluation.maps[True], evaluator.evaluation.scored_frames()[5]
     assert view.shutter is not None
     assert view.shutter.readout_time == 0.02
     moved = geometry.se3_log(geometry.inverse(poses[4]) @ poses[6])
@@ -176,7 +176,7 @@ def test_frames_between_keyframes_are_rendered_at_an_exposure_between_theirs(eva
     splat_map = _splat_map(True)
     splat_map.exposures[1, :, :3] *= 0.5  # of frame 3; those of frames 0 and 6 are the identity
     list(evaluator.on_splat_map(splat_map))
-    finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.views()
+    finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.scored_frames()
     for frame, gain in ((0, 1.0), (2, 2 / 3), (3, 0.5), (5, 5 / 6), (6, 1.0)):
         view = views[frame]
         color = render_frame(finished.splats, finished.kernel, view, (H, W)).color

@@ -116,11 +116,11 @@ class Evaluation:
             "notes": notes + self._frames.notes(),
         }
 
-    def views(self, refined: bool = True) -> list[scoring.ScoredFrame]:
+    def scored_frames(self, refined: bool = True) -> list[scoring.ScoredFrame]:
         """All frames with a pose in the main part of the map whose image is there, in the order of the stream."""
         finished, tracked = self.maps[refined], self.trajectory
         assert tracked is not None
-        views = []
+        frames = []
         main = tracked.main()
         near = NEAR * finished.typical_depth()
         from_world = np.eye(4)
@@ -133,7 +133,7 @@ class Evaluation:
             photograph = photographs[index]
             focal = 1.0 if photograph.as_mapped else tracked.focal_factor
             rolling = tracked.readout_time and not photograph.as_mapped
-            views.append(
+            frames.append(
                 scoring.ScoredFrame(
                     index,
                     bool(tracked.keyframe[k]),
@@ -145,7 +145,7 @@ class Evaluation:
                     None if exposures is None else exposures[k],
                 )
             )
-        return views
+        return frames
 
     def _exposures(self, finished: FinishedMap, main: np.ndarray) -> np.ndarray | None:
         """Color affines (N, 3, 4) of the track's frames, from the map's keyframes; None where the mapper had none."""
@@ -173,8 +173,8 @@ class Evaluation:
             which = "after" if refined else "before"
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
-        views = scoring.choose(self.views(refined), self.max_frames)
-        scores = [scoring.score_frame(finished.splats, finished.kernel, v, self.given) for v in views]
+        chosen = scoring.choose(self.scored_frames(refined), self.max_frames)
+        scores = [scoring.score_frame(finished.splats, finished.kernel, frame, self.given) for frame in chosen]
         self.scores[refined] = scores
         held_out = sum(score.held_out for score in scores)
         few = f"{held_out} of the {len(scores)} frames scored are held out: their mean and their worst say little"

@@ -23,12 +23,12 @@ def comparisons(evaluation: Evaluation) -> list[Row]:
         return []
     refined = True in evaluation.maps
     finished = evaluation.maps[refined]
-    views = {v.index: v for v in evaluation.views(refined)}
+    frames = {frame.index: frame for frame in evaluation.scored_frames(refined)}
     rows = []
     for name, score in _picks(scores):
         figures = f"{metrics.listed(metrics.IMAGE, score.figures)}, {100 * score.coverage:.1f} % covered"
         caption = f"{name}: {score.index} ({score.kind}), {figures}"
-        rows.append((caption, scoring.comparison(finished.splats, finished.kernel, views[score.index])))
+        rows.append((caption, scoring.comparison(finished.splats, finished.kernel, frames[score.index])))
     return rows
 
 

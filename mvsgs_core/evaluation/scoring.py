@@ -66,51 +66,51 @@ class Score:
 
 
 class Rendered(NamedTuple):
-    color: np.ndarray  # (H, W, 3) float32 in 0..1, as the view's exposure and shutter show it
+    color: np.ndarray  # (H, W, 3) float32 in 0..1, as the frame's exposure and shutter show it
     depth: np.ndarray  # (H, W) float32, 0 where nothing is rendered
     opacity: np.ndarray  # (H, W) float32 in 0..1
 
 
-def render_frame(splats: Splats, kernel: str, view: ScoredFrame, size: tuple[int, int]) -> Rendered:
-    """What the map shows from the view, at (height, width)."""
-    exposure = None if view.exposure is None else torch.from_numpy(view.exposure)
+def render_frame(splats: Splats, kernel: str, frame: ScoredFrame, size: tuple[int, int]) -> Rendered:
+    """What the map shows from the frame, at (height, width)."""
+    exposure = None if frame.exposure is None else torch.from_numpy(frame.exposure)
     with torch.inference_mode():
         render = rasterize(
-            splats, view.world_from_cam, view.intrinsics, size, exposure=exposure, kernel=kernel, near=view.near
+            splats, frame.world_from_cam, frame.intrinsics, size, exposure=exposure, kernel=kernel, near=frame.near
         )
     color, depth = render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
-    if view.shutter is not None:
-        color = apply_rolling_shutter(color, depth, view.intrinsics, view.shutter)
+    if frame.shutter is not None:
+        color = apply_rolling_shutter(color, depth, frame.intrinsics, frame.shutter)
     return Rendered(color, depth, render.opacity.cpu().numpy())
 
 
-def score_frame(splats: Splats, kernel: str, view: ScoredFrame, given: Mapping[str, Compare] | None = None) -> Score:
+def score_frame(splats: Splats, kernel: str, frame: ScoredFrame, given: Mapping[str, Compare] | None = None) -> Score:
     """Scores one frame by metrics.IMAGE; given: those of them that are made at run time, by key. Nothing is fitted to
     its photograph, exposure neither."""
-    photograph = view.photograph().astype(np.float32) / 255.0
-    color, _, opacity = render_frame(splats, kernel, view, photograph.shape[:2])
+    photograph = frame.photograph().astype(np.float32) / 255.0
+    color, _, opacity = render_frame(splats, kernel, frame, photograph.shape[:2])
     compare = {m.key: (given or {}).get(m.key, m.of) for m in metrics.IMAGE}
     figures = {key: None if of is None else of(color, photograph) for key, of in compare.items()}
-    return Score(view.index, view.keyframe, figures, float((opacity > 0.5).mean()))
+    return Score(frame.index, frame.keyframe, figures, float((opacity > 0.5).mean()))
 
 
-def choose(views: list[ScoredFrame], limit: int) -> list[ScoredFrame]:
-    """All views, in the order of the stream, or where there are more than `limit` as many of each kind, spread evenly
+def choose(frames: list[ScoredFrame], limit: int) -> list[ScoredFrame]:
+    """All frames, in the order of the stream, or where there are more than `limit` as many of each kind, spread evenly
     over the run, and its last ones: the last, and of many the last few, for the end of a stream is where maps fail."""
-    if len(views) <= limit:
-        return views
+    if len(frames) <= limit:
+        return frames
     last = min(ENDING, max(1, limit // 20))
-    chosen, rest = views[-last:], views[:-last]
+    chosen, rest = frames[-last:], frames[:-last]
     groups = [
-        [v for v in rest if v.keyframe],
-        [v for v in rest if not v.keyframe and is_held_out(v.index)],
-        [v for v in rest if not v.keyframe and not is_held_out(v.index)],
+        [f for f in rest if f.keyframe],
+        [f for f in rest if not f.keyframe and is_held_out(f.index)],
+        [f for f in rest if not f.keyframe and not is_held_out(f.index)],
     ]
     for k, group in enumerate(groups):
         wanted = (limit - len(chosen)) // (len(groups) - k)
         places = np.linspace(0, max(len(group) - 1, 0), min(wanted, len(group)))
         chosen += [group[i] for i in np.unique(places.round().astype(int))]
-    return sorted(chosen, key=lambda v: v.index)
+    return sorted(chosen, key=lambda f: f.index)
 
 
 def summarize(scores: Iterable[Score]) -> dict[str, Any]:
@@ -151,10 +151,10 @@ def _mean(scores: Sequence[Score]) -> dict[str, float | int | None]:
     return means | {"count": len(scores)}
 
 
-def comparison(splats: Splats, kernel: str, view: ScoredFrame, width: int = 400) -> dict[str, np.ndarray]:
-    """Pictures (h, w, 3) uint8 of a view for the report: photograph, render, error, rendered depth."""
-    photograph = view.photograph()
-    color, depth, _ = render_frame(splats, kernel, view, photograph.shape[:2])
+def comparison(splats: Splats, kernel: str, frame: ScoredFrame, width: int = 400) -> dict[str, np.ndarray]:
+    """Pictures (h, w, 3) uint8 of a frame for the report: photograph, render, error, rendered depth."""
+    photograph = frame.photograph()
+    color, depth, _ = render_frame(splats, kernel, frame, photograph.shape[:2])
     size = (max(1, round(photograph.shape[0] * width / photograph.shape[1])), width)
     error = np.abs(color - photograph.astype(np.float32) / 255.0).mean(axis=2)
     pictures = {

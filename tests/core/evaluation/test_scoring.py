@@ -62,7 +62,7 @@ def test_of_no_frame_nothing_is_said() -> None:
     assert found["frames"] == []
 
 
-def test_coverage_is_the_share_of_pixels_that_the_map_shows() -> None:
+def test_coverage_is_the_fraction_of_pixels_that_the_map_shows() -> None:
     """A wall of opaque splats over the left half of the image, and one too faint to count over all of it."""
     x, y = np.meshgrid(np.linspace(-1.1, 0.0, 40), np.linspace(-0.9, 0.9, 40))
     count = x.size + 1
