@@ -20,7 +20,7 @@ from nodes.runtime.parameters import ParameterError, build, did_you_mean, parame
 
 # A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have. Where
 # some slot is their origin, an edge that misses them is an error all the same: corrections would be lost in silence.
-OPTIONAL_MESSAGES = (msgs.Poses, msgs.Trajectory)
+OPTIONAL_MESSAGES = (msgs.Poses, msgs.TrackerPhase, msgs.Trajectory)
 
 
 @dataclass(frozen=True)

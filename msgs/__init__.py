@@ -103,6 +103,15 @@ class Poses:
 
 
 @dataclass(frozen=True)
+class TrackerPhase:
+    """What the tracker does from a frame on, where it changes; it begins with "initializing". For who watches."""
+
+    index: int
+    timestamp: float  # seconds
+    phase: str  # initializing, tracking, relocalizing (searching the map for the camera) or lost
+
+
+@dataclass(frozen=True)
 class Trajectory:
     """Every frame that the tracker saw, sent once at the end; poses agree with the last Poses."""
 
@@ -163,5 +172,17 @@ class End:
     stats: Mapping[str, Any] = field(default_factory=dict)
 
 
-Message = Frame | GroundTruth | Keyframe | Depth | FusedKeyframe | Poses | Trajectory | SplatMap | Preview | End
+Message = (
+    Frame
+    | GroundTruth
+    | Keyframe
+    | Depth
+    | FusedKeyframe
+    | Poses
+    | TrackerPhase
+    | Trajectory
+    | SplatMap
+    | Preview
+    | End
+)
 TYPES: dict[str, type] = {t.__name__: t for t in get_args(Message)}

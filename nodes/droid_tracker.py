@@ -1,14 +1,14 @@
-"""Frame -> Keyframe, Poses, Trajectory: DROID-SLAM (mvsgs_core.droid); needs its published weights."""
+"""Frame -> Keyframe, Poses, TrackerPhase, Trajectory: DROID-SLAM (mvsgs_core.droid); needs its published weights."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
-from msgs import Frame, Keyframe, Poses
+from msgs import Frame, Keyframe
 from mvsgs_core import geometry
 from mvsgs_core.droid.config import DroidConfig
 from mvsgs_core.droid.system import DroidSlam
+from mvsgs_core.tracking.publish import Update
 from nodes.tracking import TrackerNode, warn_of_guessed_focal
 
 
@@ -27,10 +27,9 @@ class DroidTracker(TrackerNode):
         self.core = DroidSlam(self.config)
         self._report()
 
-    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
-        self._frames[frame.index] = frame
+    def _add(self, frame: Frame) -> Update:
         warn_of_guessed_focal(self.stats, frame)
-        yield from self._send(self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics))
+        return self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics)
 
     def _keyframe(self, index: int) -> Keyframe:
         frame, coarse = self._frames[index], self.core.coarse_map(index)

@@ -1,17 +1,17 @@
-"""Frame -> Keyframe, Poses, Trajectory: the weight-free tracker (mvsgs_core.tracking)."""
+"""Frame -> Keyframe, Poses, TrackerPhase, Trajectory: the weight-free tracker (mvsgs_core.tracking)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from msgs import Frame, Keyframe, Poses
+from msgs import Frame, Keyframe
 from mvsgs_core import geometry
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import rectified
+from mvsgs_core.tracking.publish import Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
 from nodes.tracking import TrackerNode
 
@@ -31,10 +31,9 @@ class Tracker(TrackerNode):
         self.core = CoreTracker(self.config)
         self._readout_times: list[float] = []  # seconds, what was taken out of each keyframe's image
 
-    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
-        self._frames[frame.index] = frame
+    def _add(self, frame: Frame) -> Update:
         guessed = frame.intrinsics_guessed
-        yield from self._send(self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed))
+        return self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed)
 
     @property
     def _focal_factor(self) -> float:

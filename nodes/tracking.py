@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, Protocol
 
-from msgs import Frame, Keyframe, Poses, Trajectory
+from msgs import Frame, Keyframe, Poses, TrackerPhase, Trajectory
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
@@ -38,7 +38,7 @@ def warn_of_guessed_focal(stats: Stats, frame: Frame) -> None:
 
 
 class TrackerNode(Node, ABC):
-    """A subclass makes the tracker of the core, feeds it in its own `on_frame` and describes a keyframe."""
+    """A subclass makes the tracker of the core, gives it frames and describes a keyframe."""
 
     core: CoreTracker
 
@@ -46,6 +46,10 @@ class TrackerNode(Node, ABC):
         super().__init__(config)
         self._frames: dict[int, Frame] = {}  # those that may still be sent as keyframes
         self._revision = 0
+        self._phase = Phase.INITIALIZING  # that was sent last
+
+    @abstractmethod
+    def _add(self, frame: Frame) -> Update: ...
 
     @abstractmethod
     def _keyframe(self, index: int) -> Keyframe: ...
@@ -59,6 +63,13 @@ class TrackerNode(Node, ABC):
     def _readout_time(self) -> float:
         """Seconds of the rolling shutter that was taken out of the keyframes' images."""
         return 0.0
+
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackerPhase]:
+        self._frames[frame.index] = frame
+        yield from self._send(self._add(frame))
+        if self.core.phase != self._phase:
+            self._phase = self.core.phase
+            yield TrackerPhase(frame.index, frame.timestamp, self._phase.value)
 
     def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
         for update in self.core.finish():

@@ -1,4 +1,4 @@
-"""Preview -> nothing: the map as it grows in a web browser, by viser."""
+"""Preview, TrackerPhase -> nothing: the map as it grows in a web browser, by viser."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
-from msgs import Preview
+from msgs import Preview, TrackerPhase
 from mvsgs_core.geometry import quaternion_from_rotation
 from nodes import Node
 
@@ -49,7 +49,10 @@ class Viewer(Node):
         self.unit: float | None = None  # map units in one unit of the page
         self._frustums: dict[int, viser.CameraFrustumHandle] = {}  # by keyframe
         self._splats: viser.GaussianSplatHandle | None = None
-        self._status = self.server.gui.add_markdown("waiting for the first keyframe")
+        self._phase = "initializing"  # what the tracker does
+        self._shown = "waiting for the first keyframe"
+        self._status = self.server.gui.add_markdown("")
+        self._show_status()
         blank = np.zeros((2, 2, 3), np.uint8)
         self._photo = self.server.gui.add_image(blank, label="photo", format="jpeg")
         self._render = self.server.gui.add_image(blank, label="render", format="jpeg")
@@ -66,20 +69,27 @@ class Viewer(Node):
             self._show_path()
             self._photo.image, self._render.image = _thumbnail(preview.image), _thumbnail(preview.render)
             self._iterations = preview.iterations
-            self._status.content = (
-                f"keyframe **{preview.index}**, {len(preview.means)} splats, {preview.iterations} iterations"
-            )
+            self._shown = f"keyframe **{preview.index}**, {len(preview.means)} splats, {preview.iterations} iterations"
+            self._show_status()
         self.stats.count("previews")
+        yield from ()
+
+    def on_tracker_phase(self, message: TrackerPhase) -> Iterator[None]:
+        self._phase = message.phase
+        self._show_status()
         yield from ()
 
     def on_end(self) -> Iterator[None]:
         if self.config.keep_open:
-            self._status.content += f": {self._ending()}"
+            self._status.content = f"{self._shown}: {self._ending()}"
             logging.info("the run is over; %s stays open until its button Close is pressed", self.url)
             self.stats.values["kept_open"] = True  # the launcher waits for nothing else
             self.closed.wait()
         self.server.stop()
         yield from ()
+
+    def _show_status(self) -> None:
+        self._status.content = f"tracker: **{self._phase}**; {self._shown}"
 
     def _ending(self) -> str:
         """What is shown once nothing more comes: the map as the mapper left it, or an earlier state of it."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import msgs
-from msgs import Frame, GroundTruth, Keyframe, Poses, TrackingState, Trajectory
+from msgs import Frame, GroundTruth, Keyframe, Poses, TrackerPhase, TrackingState, Trajectory
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
 from mvsgs_core.image_metrics import psnr
 from nodes import Node, handlers, outputs
@@ -31,7 +31,7 @@ def of_type(sent: list[msgs.Message], kind: type) -> list:  # type: ignore[type-
 
 def test_contracts() -> None:
     assert handlers(Tracker).keys() == {Frame}
-    assert set(outputs(Tracker)) == {Keyframe, Poses, Trajectory}
+    assert set(outputs(Tracker)) == {Keyframe, Poses, TrackerPhase, Trajectory}
     assert handlers(PosedTracker).keys() == {Frame, GroundTruth}
     assert set(outputs(PosedTracker)) == {Keyframe, Trajectory}
 
@@ -72,6 +72,29 @@ def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
     assert trajectory.segment.dtype == np.int32
     assert node.stats.counts["frames"] == len(frames)
     assert "front end" in node.stats.seconds
+
+
+def test_changes_of_the_trackers_phase_are_sent() -> None:
+    """A hand before the lens: nothing to search with; then noise, which is searched for in the map."""
+    frames, _ = messages()
+    black, noise = (
+        np.zeros_like(frames[0].image),
+        np.random.default_rng(0).integers(0, 256, frames[0].image.shape, np.uint8),
+    )
+    for start, image in ((32, black), (36, noise)):
+        frames[start : start + 3] = [replace(frame, image=image) for frame in frames[start : start + 3]]
+    node, phases = Tracker(), []
+    for frame in frames[:42]:
+        phases += of_type(list(node.on_frame(frame)), TrackerPhase)
+        assert node.stats.values["tracking"] == (phases[-1].phase if phases else "initializing")
+    assert [(p.index, p.phase) for p in phases[1:]] == [
+        (32, "lost"), (35, "tracking"), (36, "relocalizing"), (39, "tracking"),
+    ]  # fmt: skip
+    assert phases[0].phase == "tracking"
+    counts = node.stats.counts
+    assert counts["frames while lost"] == counts["frames while relocalizing"] == 3
+    assert counts["frames while initializing"] == phases[0].index
+    assert sum(n for name, n in counts.items() if name.startswith("frames while ")) == 42
 
 
 def test_a_stream_too_short_for_a_start_is_forced_to_one_and_says_so() -> None:

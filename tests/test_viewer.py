@@ -23,7 +23,7 @@ import zstandard
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from msgs import Preview
+from msgs import Preview, TrackerPhase
 from nodes import handlers, outputs
 from nodes.viewer import Viewer
 from tests.support.shared_data import ROOT
@@ -84,7 +84,7 @@ def page(url: str) -> str:
 
 
 def test_reads_previews_and_sends_nothing() -> None:
-    assert handlers(Viewer) == {Preview: "on_preview"}
+    assert handlers(Viewer) == {Preview: "on_preview", TrackerPhase: "on_tracker_phase"}
     assert outputs(Viewer) == ()
 
 
@@ -103,6 +103,15 @@ def test_browser_gets_splats_frustums_and_pictures(viewer: Viewer) -> None:
     for name in ("GaussianSplats", "/splats", "/keyframes/4", "/keyframes/9", "/path", "photo", "render"):
         assert name in got, name
     assert "keyframe **9**, 50 splats, 90 iterations" in got
+
+
+def test_the_trackers_phase_is_shown(viewer: Viewer) -> None:
+    assert "tracker: **initializing**; waiting for the first keyframe" in received(viewer)
+    assert list(viewer.on_tracker_phase(TrackerPhase(7, 0.35, "tracking"))) == []
+    show(viewer, preview(9))
+    assert "tracker: **tracking**; keyframe **9**" in received(viewer)
+    assert list(viewer.on_tracker_phase(TrackerPhase(30, 1.5, "relocalizing"))) == []
+    assert "tracker: **relocalizing**; keyframe **9**" in received(viewer)
 
 
 def test_map_is_shown_at_unit_distance_whatever_its_scale(viewer: Viewer) -> None:

@@ -8,6 +8,7 @@ import pytest
 from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.tracking.matching.flow import FLOWS
+from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.tracker import TrackerConfig
 from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import ate, synthetic, track, tracked_room
@@ -91,6 +92,8 @@ def test_a_covered_lens_is_lost_and_found_again() -> None:
     assert len({int(s) for s in trajectory.segment[trajectory.segment >= 0]}) == 1
     assert not any(update.keyframes for update in updates[50:62])
     assert any("lost" in warning for warning in tracker.stats.warnings)
+    assert tracker.stats.counts["frames while lost"] == 12
+    assert tracker.phase is Phase.TRACKING
     error, length = ate(trajectory, items)
     assert error < 0.01 * length
 
@@ -109,6 +112,8 @@ def test_a_jump_to_an_unseen_place_starts_a_segment_of_its_own() -> None:
         error, length = ate(trajectory, items, trajectory.segment == segment)
         assert error < 0.02 * length
     assert any("2 segments" in warning for warning in tracker.stats.warnings)
+    patience = tracker.config.relocalization.patience
+    assert tracker.stats.counts["frames while relocalizing"] == patience - 1, "the next one begins a segment"
 
 
 def test_a_room_without_texture_is_not_tracked_and_says_so() -> None:
