@@ -9,6 +9,7 @@ from msgs import Depth, Keyframe, Poses
 from mvsgs_core import camera
 from mvsgs_core.mvs.coarse import enlarge_inverse_depth
 from nodes import Node
+from nodes.mvs import depth_message
 
 
 class CoarseDepth(Node):
@@ -25,17 +26,7 @@ class CoarseDepth(Node):
         with self.stats.time("enlarge"):
             depth, confidence = enlarge_inverse_depth(keyframe.inverse_depth, keyframe.inverse_depth_weight, size)
         self.stats.count("keyframes")
-        yield Depth(
-            index=keyframe.index,
-            timestamp=keyframe.timestamp,
-            image=keyframe.image,
-            intrinsics=keyframe.intrinsics,
-            world_from_cam=keyframe.world_from_cam,
-            scale=keyframe.scale,
-            depth=depth,
-            confidence=confidence,
-            segment=keyframe.segment,
-        )
+        yield depth_message(keyframe, depth, confidence)
 
     def on_poses(self, poses: Poses) -> Iterator[Poses]:
         """Passed on, so that they reach the next stage between the same keyframes."""

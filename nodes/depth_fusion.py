@@ -47,10 +47,12 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             return f"none of {keyframes} has a pixel with stereo depth"
         start = "pixels rejected: "
         rejected = {name.removeprefix(start): n for name, n in counts.items() if name.startswith(start) and n}
-        shares = [f"{name} {100 * n / known:.0f} %" for name, n in sorted(rejected.items(), key=lambda item: -item[1])]
+        fractions = [
+            f"{name} {100 * n / known:.0f} %" for name, n in sorted(rejected.items(), key=lambda item: -item[1])
+        ]
         return (
             f"all depth of {keyframes} was rejected, by these filters, of the pixels with stereo depth: "
-            f"{', '.join(shares)} (a pixel can fail more than one)"
+            f"{', '.join(fractions)} (a pixel can fail more than one)"
         )
 
     def _message(self, found: FusedDepth) -> FusedKeyframe:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,12 +32,12 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
             view = self._core.prepare(
                 keyframe.index,
                 keyframe.image,
-                keyframe.intrinsics,
-                keyframe.world_from_cam,
-                keyframe.inverse_depth,
-                keyframe.inverse_depth_weight,
-                keyframe.scale,
-                keyframe.segment,
+                intrinsics=keyframe.intrinsics,
+                world_from_cam=keyframe.world_from_cam,
+                inverse_depth=keyframe.inverse_depth,
+                weight=keyframe.inverse_depth_weight,
+                scale=keyframe.scale,
+                segment=keyframe.segment,
             )
         yield from self._messages(self._core.add(self._corrected(view), wanted=not passed_over))
 
@@ -57,19 +57,24 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
         self.stats.count("hypotheses", found.result.counts.get("hypotheses", 0.0))
         for what in ("outside the range", "outside the cells"):
             self.stats.skip(f"hypotheses {what}", found.result.counts.get(what, 0.0))
-        kept = found.result.confidence
-        self.stats.values["mean confidence"] = float(np.mean(kept))
-        return Depth(
-            index=keyframe.index,
-            timestamp=keyframe.timestamp,
-            image=keyframe.image,
-            intrinsics=keyframe.intrinsics,
-            world_from_cam=found.view.world_from_cam,
-            scale=found.view.scale,
-            depth=found.result.depth,
-            confidence=found.result.confidence,
-            segment=keyframe.segment,
-        )
+        self.stats.values["mean confidence"] = float(np.mean(found.result.confidence))
+        depth = depth_message(keyframe, found.result.depth, found.result.confidence)
+        return replace(depth, world_from_cam=found.view.world_from_cam, scale=found.view.scale)
+
+
+def depth_message(keyframe: Keyframe, depth: np.ndarray, confidence: np.ndarray) -> Depth:
+    """The keyframe with depth and confidence (H, W) in the place of its coarse inverse depth."""
+    return Depth(
+        index=keyframe.index,
+        timestamp=keyframe.timestamp,
+        image=keyframe.image,
+        intrinsics=keyframe.intrinsics,
+        world_from_cam=keyframe.world_from_cam,
+        scale=keyframe.scale,
+        depth=depth,
+        confidence=confidence,
+        segment=keyframe.segment,
+    )
 
 
 class Mvs(StereoNode):

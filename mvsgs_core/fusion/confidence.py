@@ -20,10 +20,10 @@ def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, se
     """
     around = cv2.blur(confidence, (9, 9))  # errors come in patches
     agreeing = cv2.blur((consistent >= 2).astype(np.float32), (5, 5))
-    # Windows make a near surface grow over what lies behind it: its rim, close to something farther, is doubtful.
+    # Windows make a near surface grow over what lies behind it: its edge, close to something farther, is doubtful.
     inverse = np.where(fused.depth > 0, 1.0 / np.maximum(fused.depth, 1e-9), 0.0).astype(np.float32)
     kernel = np.ones((7, 7), np.uint8)
-    rim = np.clip(1.0 - cv2.erode(inverse, kernel) / np.maximum(inverse, 1e-9), 0.0, 0.25)
+    before = np.clip(1.0 - cv2.erode(inverse, kernel) / np.maximum(inverse, 1e-9), 0.0, 0.25)
     behind = np.clip(cv2.dilate(inverse, kernel) / np.maximum(inverse, 1e-9) - 1.0, 0.0, 0.25)
     return np.stack(
         [
@@ -35,7 +35,7 @@ def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, se
             np.maximum(seeing.astype(np.float32) - consistent, 0.0),
             around,
             agreeing,
-            4.0 * rim,
+            4.0 * before,
             4.0 * behind,
             np.full_like(confidence, confidence.mean()),
             cv2.erode(confidence, np.ones((5, 5), np.uint8)),

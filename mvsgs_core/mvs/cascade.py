@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -55,30 +56,9 @@ class OnlineStereo(ABC):
         self._window = KeyframeWindow[StereoKeyframe](config.window, config.lag)
         self._previous: tuple[tuple[int, tuple[int, int]], SearchRange] | None = None  # segment and size, newest range
 
-    def prepare(
-        self,
-        index: int,
-        image: np.ndarray,
-        intrinsics: np.ndarray,
-        world_from_cam: np.ndarray,
-        inverse_depth: np.ndarray,
-        weight: np.ndarray,
-        scale: float,
-        segment: int,
-    ) -> StereoKeyframe:
-        """A keyframe for `add`: image (H, W, 3) uint8 with intrinsics (4,), the tracker's grid (h, w), its weights."""
-        return prepare_keyframe(
-            index,
-            image,
-            intrinsics,
-            world_from_cam,
-            area=self.config.area,
-            scales=self.scales,
-            inverse_depth=inverse_depth,
-            weight=weight,
-            scale=scale,
-            segment=segment,
-        )
+    def prepare(self, index: int, image: np.ndarray, **given: Any) -> StereoKeyframe:
+        """A keyframe for `add`, at this stereo's sizes; `given`: all else that `prepare_keyframe` takes."""
+        return prepare_keyframe(index, image, area=self.config.area, scales=self.scales, **given)
 
     def add(self, view: StereoKeyframe, wanted: bool = True) -> Iterator[CascadeDepth]:
         """Depth of the keyframe `lag` before this one; of all that wait if this one starts a new segment or size.

@@ -80,9 +80,9 @@ class LearnedStereo(OnlineStereo):
         self._calibration = NETWORKS[config.network].calibration if calibrate else None
         self._images: dict[int, np.ndarray] = {}  # (h, w, 3) uint8 at the network's size
 
-    def prepare(self, index: int, image: np.ndarray, *others: Any, **named: Any) -> StereoKeyframe:
+    def prepare(self, index: int, image: np.ndarray, **given: Any) -> StereoKeyframe:
         self.remember(index, image)
-        return super().prepare(index, image, *others, **named)
+        return super().prepare(index, image, **given)
 
     def remember(self, index: int, image: np.ndarray) -> None:
         """Keeps a keyframe's RGB image (H, W, 3) uint8 at the network's size while it may be needed."""

@@ -23,7 +23,7 @@ HYPOTHESES = (32, 16, 8, 4)
 INTERVAL_RATIOS = (2.67, 1.5, 1.0)  # of stages 2 to 4, half width of the range in steps of the stage before
 TEMPERATURES = (5.0, 5.0, 5.0, 1.0)
 MULTIPLE = 64  # sizes of images that both backbones and the pyramid divide without rest
-_FARTHEST = 1e-4  # inverse depths stay above this share of the nearest: the cascade itself has no such guard
+_FARTHEST = 1e-4  # inverse depths stay above this fraction of the nearest: the cascade itself has no such guard
 
 
 class MvsOutput(NamedTuple):

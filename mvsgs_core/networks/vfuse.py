@@ -1,7 +1,7 @@
 """V-FUSE (Burgdorfer and Mordohai 2023): fuses depth maps of several views through a visibility constraint volume.
 
 Written from the paper; keys and shapes are those of the official checkpoints. The default confidence `swr` is relative
-to the image (1 for its narrowest search window, 0 for its widest), so a threshold on it keeps a share of the pixels
+to the image (1 for its narrowest search window, 0 for its widest), so a threshold on it keeps a fraction of the pixels
 and is no probability; the others are in vfuse_confidence.
 """
 

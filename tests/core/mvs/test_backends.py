@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mvsgs_core.mvs.backend import NativeBackend
 from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, MatchingImages, SmoothingConfig, SurfaceEstimate
-from mvsgs_core.mvs.matching_cost import CostConfig
+from mvsgs_core.mvs.matching_cost import COSTS, CostConfig
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.native import load
 from tests.support.stereo_problems import SIZE, Problem, problem
@@ -30,10 +31,11 @@ def smoothed(
     return backend.semi_global(cost, p.images.reference, p.first, p.step, p1, p2, options)
 
 
+@pytest.mark.parametrize("name", COSTS)
 @pytest.mark.parametrize("radius", [1, 2, 3])
-def test_cost_volumes_of_both_backends_agree(radius: int) -> None:
-    p = problem()
-    native, twin = (swept(b, p, 9, radius=radius) for b in (NativeBackend(1), TorchBackend("cpu")))
+def test_cost_volumes_of_both_backends_agree(name: Any, radius: int) -> None:
+    p, config = problem(), replace(COST, name=name)
+    native, twin = (swept(b, p, 9, config, radius=radius) for b in (NativeBackend(1), TorchBackend("cpu")))
     assert native.shape == (SIZE[0], 9, SIZE[1])
     assert native.min() >= 0
     assert native.max() <= 1
@@ -57,6 +59,12 @@ def test_a_part_of_the_cost_is_the_difference_of_gray_level() -> None:
     for backend in (NativeBackend(1), TorchBackend("cpu")):
         with pytest.raises(ValueError, match="intensity_weight"):
             swept(backend, p, 1, replace(COST, intensity_weight=1.5))
+
+
+def test_a_cost_that_there_is_not_is_refused_with_those_that_there_are() -> None:
+    for backend in (NativeBackend(1), TorchBackend("cpu")):
+        with pytest.raises(ValueError, match=r"no matching cost 'ncc'; there are: .*zncc"):
+            swept(backend, problem(), 1, replace(COST, name="ncc"))  # type: ignore[arg-type]
 
 
 def test_tiles_that_are_not_needed_cost_one_and_the_others_stay() -> None:

@@ -49,9 +49,9 @@ def test_next_to_a_doubtful_pixel_all_are_doubted() -> None:
     spot[12, 16] = 0.0
     fused = Fused(depth=2.0 * flat, support=2.0 * flat, violation=0.0 * flat, own=flat)
     features = fused_confidence.features_of(fused, spot, agree, agree)
-    least = features[-1]
-    assert np.all(least[10:15, 14:19] == 0.0)
-    assert least[9, 16] == flat[9, 16]
+    lowest = features[-1]
+    assert np.all(lowest[10:15, 14:19] == 0.0)
+    assert lowest[9, 16] == flat[9, 16]
 
 
 def test_every_feature_has_a_weight() -> None:

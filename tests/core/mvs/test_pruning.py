@@ -16,7 +16,7 @@ from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, estimate_depth
 from tests.support.plane_scene import look, render, true_depth
 
 SIZE = (96, 128)
-CHOICE = PruningConfig(cell_radius=1, cell_percentile=10.0, cell_margin=1.5, min_cells=3)
+CONFIG = PruningConfig(cell_radius=1, cell_percentile=10.0, cell_margin=1.5, min_cells=3)
 
 
 def view(index: int, x: float) -> StereoKeyframe:
@@ -37,12 +37,12 @@ def test_bounds_of_a_cell_are_those_of_the_known_cells_around() -> None:
     rng = np.random.default_rng(0)
     grid = rng.uniform(0.1, 1.0, (6, 8)).astype(np.float32)
     weight = (rng.random((6, 8)) < 0.6).astype(np.float32)
-    low, high = cell_bounds(grid, weight, CHOICE)
+    low, high = cell_bounds(grid, weight, CONFIG)
     for y in range(6):
         for x in range(8):
             rows, columns = slice(max(y - 1, 0), y + 2), slice(max(x - 1, 0), x + 2)
             known = np.sort(grid[rows, columns][weight[rows, columns] > 0])
-            if len(known) < CHOICE.min_cells:
+            if len(known) < CONFIG.min_cells:
                 assert (low[y, x], high[y, x]) == (0.0, np.inf)
                 continue
             out = int(len(known) * 0.1)
@@ -55,7 +55,7 @@ def test_tiles_search_what_their_cells_leave_open() -> None:
     grid[:, 8:] = 0.8
     grid[:3, :3] = 0.0  # unknown
     reference = replace(view(0, 0.0), inverse_depth=grid, weight=np.ones_like(grid))
-    tiles = tiles_in_cells(reference, SIZE, 0.1, 0.01, 100, CHOICE)
+    tiles = tiles_in_cells(reference, SIZE, 0.1, 0.01, 100, CONFIG)
     assert tiles.shape == (SIZE[0] // TILE[0], 100, SIZE[1] // TILE[1])
     hypotheses = 0.1 + 0.01 * np.arange(100)
     far, near = tiles[6, :, 1] > 0, tiles[6, :, 7] > 0
@@ -71,7 +71,7 @@ def test_tiles_search_what_their_cells_leave_open() -> None:
 def test_cells_that_contradict_the_range_close_no_tile() -> None:
     grid = np.full((12, 16), 50.0, np.float32)
     reference = replace(view(0, 0.0), inverse_depth=grid, weight=np.ones_like(grid))
-    assert tiles_in_cells(reference, SIZE, 0.1, 0.01, 100, CHOICE).all()
+    assert tiles_in_cells(reference, SIZE, 0.1, 0.01, 100, CONFIG).all()
 
 
 def test_fewer_hypotheses_give_the_same_depth() -> None:
