@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,10 +68,7 @@ def folded(splats: Splats, kernel: str) -> Splats:
     if kernel == "gaussian":
         return splats
     shift = log_scale_shift(splats.betas) if kernel == "ges_scale" else gaussian_std_ratio(splats.betas).log()
-    return Splats(
-        splats.means, splats.log_scales + shift[:, None], splats.quaternions, splats.opacity_logits, splats.sh,
-        torch.full_like(splats.betas, 2.0),
-    )  # fmt: skip
+    return replace(splats, log_scales=splats.log_scales + shift[:, None], betas=torch.full_like(splats.betas, 2.0))
 
 
 def read_ply(path: Path) -> Snapshot:

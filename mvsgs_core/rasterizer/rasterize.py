@@ -18,6 +18,8 @@ counts them in `Render.backward.refused`.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -83,10 +85,7 @@ def rasterize(
         raise ValueError(f"an image of {size[0]}x{size[1]} pixels cannot be rendered")
     if kernel == "ges_scale":
         shift = kernels.log_scale_shift(splats.betas)
-        splats = Splats(
-            splats.means, splats.log_scales + shift[:, None], splats.quaternions, splats.opacity_logits, splats.sh,
-            splats.betas.detach(),
-        )  # fmt: skip
+        splats = replace(splats, log_scales=splats.log_scales + shift[:, None], betas=splats.betas.detach())
     settings = RenderSettings(
         pose=_pose(world_from_cam, pose_delta),
         intrinsics=_floats(intrinsics, 4, "intrinsics"),

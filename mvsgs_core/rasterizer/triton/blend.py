@@ -8,18 +8,22 @@ TRITON_INTERPRET=1 runs this on the CPU, for tests.
 
 from __future__ import annotations
 
+import math
+
 import triton
 import triton.language as tl
+
+from mvsgs_core.rasterizer import interface, kernels
 
 # A pair's sums: red, green, blue, depth, log opacity, u, v, u u, u v, v v, beta; see projection_backward.
 SUMS = 11
 
 TILE = tl.constexpr(16)
-MIN_T = tl.constexpr(1e-4)
-MAX_ALPHA = tl.constexpr(0.99)
-LOG2_MIN_ALPHA = tl.constexpr(-7.994353436858858)
+MIN_T = tl.constexpr(interface.MIN_TRANSMITTANCE)
+MAX_ALPHA = tl.constexpr(interface.MAX_ALPHA)
+LOG2_MIN_ALPHA = tl.constexpr(math.log2(kernels.MIN_ALPHA))
 HALF_LOG2E = tl.constexpr(0.7213475204444817)
-CENTER_M = tl.constexpr(1e-6)
+CENTER_M = tl.constexpr(kernels.CENTER_M)
 TINY = tl.constexpr(1e-30)
 
 

@@ -1,7 +1,7 @@
 """From the map to the image on a GPU: one program a block of splats; the same steps as csrc/rasterizer/projection.hpp.
 
 Positions in float64 relative to the camera, the rest in float32. `project` also counts the tiles that each splat's
-ellipse touches, row by row of tiles (triton_lists).
+ellipse touches, row by row of tiles (`lists`).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from mvsgs_core.rasterizer import interface, kernels
 from mvsgs_core.rasterizer.triton.harmonics import basis
 from mvsgs_core.rasterizer.triton.lists import row_span, tile_rows
 
@@ -17,22 +18,22 @@ from mvsgs_core.rasterizer.triton.lists import row_span, tile_rows
 ROW = 16  # whole x, whole y, part x, part y, pitch u, shear, pitch v, log2 opacity, red, green, blue, depth, beta / 2
 FOOTPRINT = 5  # half height, turn, 1 / pitch u, pitch v^2, reach: where the ellipse alpha = 1/255 ends on a row
 
-BLUR = tl.constexpr(0.3)
-MIN_COMPENSATION = tl.constexpr(0.005)
-MAX_VARIANCE = tl.constexpr(1e16)
-MAX_REACH = tl.constexpr(1e12)
+BLUR = tl.constexpr(interface.BLUR)
+HALF_MARGIN = tl.constexpr(0.5 * interface.CLAMP_MARGIN)
+MIN_COMPENSATION = tl.constexpr(interface.MIN_COMPENSATION)
+MAX_VARIANCE = tl.constexpr(interface.MAX_VARIANCE)
+MAX_REACH = tl.constexpr(interface.MAX_REACH)
 LOG2_MAX_REACH = tl.constexpr(40.0)
-MIN_QUATERNION = tl.constexpr(1e-8)
-MIN_BETA = tl.constexpr(0.1)
-MAX_BETA = tl.constexpr(20.0)
-LARGEST = tl.constexpr(3.4028234e38)
+MIN_QUATERNION = tl.constexpr(interface.MIN_QUATERNION)
+MIN_BETA, MAX_BETA = tl.constexpr(kernels.BETA_RANGE[0]), tl.constexpr(kernels.BETA_RANGE[1])
+MAX_FLOAT = tl.constexpr(3.4028234e38)
 TINY = tl.constexpr(1e-30)
 
 
 @triton.jit
 def finite(value):  # type: ignore[no-untyped-def]
     """False for NaN as well."""
-    return tl.abs(value) <= LARGEST
+    return tl.abs(value) <= MAX_FLOAT
 
 
 @triton.jit
@@ -49,7 +50,7 @@ def camera_of(camera):  # type: ignore[no-untyped-def]
 def slope_of(x, z, focal, center, size):  # type: ignore[no-untyped-def]
     """x / z as the Jacobian takes it: clamped to the image widened by 0.3 tan(fov); and whether it was inside."""
     raw = (x / z).to(tl.float32)
-    margin = 0.15 * size / focal
+    margin = HALF_MARGIN * size / focal
     slope = tl.minimum(tl.maximum(raw, -(center + 0.5) / focal - margin), (size - 0.5 - center) / focal + margin)
     return slope, slope == raw
 

@@ -112,7 +112,7 @@ def test_pose_delta_moves_the_camera_in_its_own_frame() -> None:
     torch.testing.assert_close(by_delta.color, by_pose.color, rtol=0, atol=1e-5)
 
 
-def test_screen_gradient_is_in_units_of_half_the_image() -> None:
+def test_the_gradient_of_means2d_is_in_units_of_half_the_image() -> None:
     splats, size = random_splats(50), (24, 48)
     _, found = gradients(copy(splats), size, backend="cpu")
     _, expected = gradients(copy(splats, torch.float64), size, backend="reference")
