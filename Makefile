@@ -56,7 +56,7 @@ lint: setup
 	$(BIN)/mypy
 
 # Every module of bench/ that ends with main(measure, ...) is a benchmark. `make bench` takes hours: it runs them all, keeps
-# the rows in bench/recorded/ and writes the tables of BENCHMARKS.md. `make bench-quick` takes minutes and says what got
+# the rows in bench/recorded/ and writes docs/benchmarks/. `make bench-quick` takes minutes and says what got
 # slower or worse than the recorded line (RECORD=1: becomes the line; `make bench` does that at the end). Some of them,
 # with arguments: make bench BENCHMARKS="curves" ARGS="--scenes room,aerial"
 BENCHMARKS ?= $(shell grep -lE '^ +main.measure' bench/*.py bench/*/__main__.py | sed 's|bench/||; s|/__main__||; s|\.py$$||')

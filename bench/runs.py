@@ -244,7 +244,7 @@ def commit() -> str:
     name = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     # the records themselves are not part of what is measured
     differs = subprocess.run(
-        [*git, "diff", "--quiet", "HEAD", "--", ".", ":!BENCHMARKS.md", ":!bench/recorded"], check=False
+        [*git, "diff", "--quiet", "HEAD", "--", ".", ":!BENCHMARKS.md", ":!bench/recorded", ":!docs"], check=False
     ).returncode
     return (name.stdout.strip() or "no commit") + ("+" if name.stdout and differs else "")
 
