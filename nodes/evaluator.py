@@ -8,7 +8,7 @@ import math
 import resource
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,8 +19,9 @@ from msgs import FusedKeyframe, GroundTruth, SplatMap, Trajectory
 from mvsgs_core import trajectory, weights
 from mvsgs_core.atomic_file import replace_text, replacing
 from mvsgs_core.evaluation import html, pictures, statistics
-from mvsgs_core.evaluation.evaluation import Evaluation, FinishedMap
+from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.lpips import Lpips
+from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.held_out import HELD_OUT_EVERY
 from mvsgs_core.mapping.exposure import IDENTITY
 from mvsgs_core.rasterizer.splats import Splats
@@ -77,7 +78,7 @@ class Evaluator(Node):
         yield from ()
 
     def on_splat_map(self, splat_map: SplatMap) -> Iterator[None]:
-        self.evaluation.add_map(_finished(splat_map), splat_map.refined)
+        self.evaluation.add_map(_snapshot(splat_map), splat_map.refined)
         yield from ()
 
     def on_end(self) -> Iterator[None]:
@@ -148,19 +149,11 @@ class Evaluator(Node):
         replace_text(folder / "report.html", document)
 
 
-def _finished(message: SplatMap) -> FinishedMap:
-    arrays = (message.means, message.log_scales, message.quaternions, message.opacity_logits, message.sh, message.betas)
-    splats = Splats(*(torch.from_numpy(np.array(a, dtype=np.float32)) for a in arrays))
-    return FinishedMap(
-        splats,
-        message.kernel,
-        message.origin,
-        message.iterations,
-        {int(i): pose for i, pose in zip(message.keyframes, message.world_from_cam)},
-        {int(i): float(s) for i, s in zip(message.keyframes, message.scale)},
-        sum(a.nbytes for a in arrays),
-        {int(i): exposure for i, exposure in zip(message.keyframes, message.exposures)},
-    )
+def _snapshot(message: SplatMap) -> Snapshot:
+    """Copies: what is kept of a message would keep all of it."""
+    arrays = {name: value.copy() for name, value in vars(message).items() if isinstance(value, np.ndarray)}
+    splats = Splats(**{f.name: torch.from_numpy(arrays.pop(f.name)) for f in fields(Splats)})
+    return Snapshot(splats, kernel=message.kernel, iterations=message.iterations, **arrays)
 
 
 def _shutter(found: trajectory.Trajectory | None) -> str:
@@ -170,8 +163,8 @@ def _shutter(found: trajectory.Trajectory | None) -> str:
     return f"The rolling shutter that the tracker took out of the keyframes is applied to renders ({taken_out}). "
 
 
-def _exposure(maps: dict[bool, FinishedMap]) -> str:
-    affines = [affine for finished in maps.values() for affine in finished.exposures.values()]
+def _exposure(maps: dict[bool, Snapshot]) -> str:
+    affines = [affine for finished in maps.values() for affine in finished.exposures]
     if not affines or np.allclose(affines, IDENTITY):
         return ""
     return "Renders have the exposures that the mapper found for keyframes, in between interpolated in time. "

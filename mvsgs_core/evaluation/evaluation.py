@@ -16,33 +16,11 @@ from mvsgs_core.evaluation.exposure import between_keyframes
 from mvsgs_core.evaluation.frames import Frames
 from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
 from mvsgs_core.evaluation.trajectory_metrics import known_poses
-from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.trajectory import Trajectory
 
 NEAR = 0.01  # of the typical depth: splats nearer to a camera are not drawn
 ENOUGH = 3  # held-out frames whose mean and worst say something
-
-
-@dataclass(frozen=True)
-class FinishedMap:
-    """The map at one moment, and the keyframe poses that it was optimized with."""
-
-    splats: Splats
-    kernel: str
-    origin: np.ndarray  # (3,) world position that the splats' means are relative to
-    iterations: int
-    keyframe_poses: dict[int, np.ndarray]
-    scale: dict[int, float]  # of each keyframe's depths, see msgs.Poses
-    bytes: int
-    exposures: dict[int, np.ndarray] = field(default_factory=dict)  # (3, 4) color affine of each keyframe
-
-    def typical_depth(self) -> float:
-        """Median distance of the splats from the middle of the keyframes, map units; the world's scale is arbitrary."""
-        positions = [pose[:3, 3] - self.origin for pose in self.keyframe_poses.values()]
-        if not positions or not len(self.splats.means):
-            return 1.0
-        center = np.median(positions, axis=0)
-        return float(np.median(np.linalg.norm(self.splats.means.numpy() - center, axis=1)))
 
 
 @dataclass
@@ -56,7 +34,7 @@ class Evaluation:
     started: float | None = None
     mapped: float | None = None
     trajectory: Trajectory | None = None
-    maps: dict[bool, FinishedMap] = field(default_factory=dict)  # by `refined`
+    maps: dict[bool, Snapshot] = field(default_factory=dict)  # by `refined`
     scores: dict[bool, list[scoring.Score]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -85,7 +63,7 @@ class Evaluation:
         """A keyframe as it is mapped, with its filtered depth, computed at the map's scale `scale`."""
         self._frames.add_keyframe(index, image, intrinsics, depth, scale)
 
-    def add_map(self, finished: FinishedMap, refined: bool) -> None:
+    def add_map(self, finished: Snapshot, refined: bool) -> None:
         self.maps[refined] = finished
         self.mapped = time.perf_counter()
 
@@ -105,7 +83,7 @@ class Evaluation:
             "frames_on_disk": {"bytes": self._frames.size},
             "map": {
                 "splats": len(final.splats.means) if final else 0,
-                "bytes": final.bytes if final else 0,
+                "bytes": sum(tensor.nbytes for tensor in final.splats.tensors().values()) if final else 0,
                 "iterations": final.iterations if final else 0,
                 "kernel": final.kernel if final else None,
             },
@@ -122,22 +100,22 @@ class Evaluation:
         assert tracked is not None
         frames = []
         main = tracked.main()
-        near = NEAR * finished.typical_depth()
-        from_world = np.eye(4)
-        from_world[:3, 3] = -finished.origin
+        near = NEAR * _typical_depth(finished)
+        place = _places(finished)
         moving = velocities(tracked.timestamp, tracked.world_from_cam, main)
         exposures = self._exposures(finished, main)
         photographs = self._frames.photographs()
         for k in np.flatnonzero(main & np.isin(tracked.index, list(photographs))):
             index = int(tracked.index[k])
             photograph = photographs[index]
+            pose = finished.world_from_cam[place[index]] if index in place else tracked.world_from_cam[k]
             focal = 1.0 if photograph.as_mapped else tracked.focal_factor
             rolling = tracked.readout_time and not photograph.as_mapped
             frames.append(
                 scoring.ScoredFrame(
                     index,
                     bool(tracked.keyframe[k]),
-                    from_world @ finished.keyframe_poses.get(index, tracked.world_from_cam[k]),
+                    finished.relative_pose(pose),
                     photograph.intrinsics * [focal, focal, 1.0, 1.0],
                     photograph.image,
                     near,
@@ -147,11 +125,11 @@ class Evaluation:
             )
         return frames
 
-    def _exposures(self, finished: FinishedMap, main: np.ndarray) -> np.ndarray | None:
+    def _exposures(self, finished: Snapshot, main: np.ndarray) -> np.ndarray | None:
         """Color affines (N, 3, 4) of the track's frames, from the map's keyframes; None where the mapper had none."""
         assert self.trajectory is not None
-        known = np.flatnonzero(main & np.isin(self.trajectory.index, list(finished.exposures)))
-        affines = np.array([finished.exposures[int(i)] for i in self.trajectory.index[known]], dtype=np.float32)
+        known, place = np.flatnonzero(main & np.isin(self.trajectory.index, finished.keyframes)), _places(finished)
+        affines = finished.exposures[[place[int(i)] for i in self.trajectory.index[known]]]
         return between_keyframes(self.trajectory.timestamp, self.trajectory.timestamp[known], affines)
 
     def photograph(self, index: int) -> np.ndarray:
@@ -218,12 +196,13 @@ class Evaluation:
         """After one scale for the whole run, the median ratio of true to estimated depth, as is usual for monocular
         depth; `scale_ratio` is that over the trajectory's scale, 1 where poses and depth maps of the truth agree."""
         finished = self.maps.get(True) or self.maps.get(False)
+        now = dict(zip(finished.keyframes.tolist(), finished.scale.tolist())) if finished else {}
 
         def maps() -> Iterator[tuple[np.ndarray, np.ndarray]]:  # read again for each use: all at once are gigabytes
             for index, scale in self._frames.filtered_depths():
                 truth, depth = self._frames.true_depth(index), self._frames.filtered_depth(index)
                 if truth is not None and depth is not None:
-                    yield depth * (finished.scale.get(index, scale) / scale if finished else 1.0), truth
+                    yield depth * (now.get(index, scale) / scale), truth
 
         ratios = [depth_ratios(depth, truth) for depth, truth in maps()]
         count = sum(len(ratio) > 0 for ratio in ratios)
@@ -239,3 +218,16 @@ class Evaluation:
 
     def close(self) -> None:
         self._frames.close()
+
+
+def _places(finished: Snapshot) -> dict[int, int]:
+    """Keyframe -> its row in the map's arrays."""
+    return {int(index): row for row, index in enumerate(finished.keyframes)}
+
+
+def _typical_depth(finished: Snapshot) -> float:
+    """Median distance of the splats from the middle of the keyframes, map units; the world's scale is arbitrary."""
+    if not len(finished.keyframes) or not len(finished.splats.means):
+        return 1.0
+    center = np.median(finished.world_from_cam[:, :3, 3] - finished.origin, axis=0)
+    return float(np.median(np.linalg.norm(finished.splats.means.numpy() - center, axis=1)))
