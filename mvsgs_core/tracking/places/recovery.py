@@ -61,7 +61,6 @@ class Recovery:
         """One run of frames without a pose, from the keyframe at its side; returns how many were found."""
         follower = FrontEnd(self.graph, self.matcher, self.front_end_config, 1)
         follower.refer_to(self.graph.keyframes[start].image)
-        follower.pose = self.graph.keyframes[start].cam_from_world
         found = 0
         for record in run:
             image = self._images.get(record.index)

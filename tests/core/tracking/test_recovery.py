@@ -127,19 +127,24 @@ def test_frames_between_true_keyframes_get_their_true_poses(keyframes: tuple[int
 
 def test_what_no_keyframe_sees_stays_without_a_pose() -> None:
     lost = recovery(100)
-    seen = records([100, 101, 102, 103, 104], [100])
-    images = {101: image(101), 102: image(220, 102), 103: image(103), 104: image(104)}
-    for number in (101, 102, 103):
-        lost.keep(images[number])  # nothing was kept of 104
+    seen = records([100, 101, 102, 103, 104, 105], [100])
+    for frame in (image(101), image(220, 102), image(103), image(104)):  # nothing was kept of 105
+        lost.keep(frame)
     seen[4].same_as = 103
     assert lost.fill_in(seen) == 2
-    assert [r.reference for r in seen] == [None, 100, None, 100, None]
+    assert [r.reference for r in seen] == [None, 100, None, 100, None, None]
     assert lost.fill_in(seen) == 0, "what has a pose keeps it"
 
 
-def test_poses_that_do_not_meet_the_criteria_are_none() -> None:
-    strict = RecoveryConfig(criteria=PoseCriteria(min_matches=10_000))
-    lost = Recovery(true_graph(100), matcher(), strict, FrontEndConfig())
+@pytest.mark.parametrize(
+    ("config", "front_end"),
+    [
+        (RecoveryConfig(criteria=PoseCriteria(min_matches=10_000)), FrontEndConfig()),
+        (RecoveryConfig(), FrontEndConfig(lost_fraction=0.999)),
+    ],
+)
+def test_poses_that_are_uncertain_or_of_lost_frames_are_none(config: RecoveryConfig, front_end: FrontEndConfig) -> None:
+    lost = Recovery(true_graph(100), matcher(), config, front_end)
     seen = records([100, 101], [100])
     lost.keep(image(101))
     assert lost.fill_in(seen) == 0
