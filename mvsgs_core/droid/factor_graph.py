@@ -15,7 +15,7 @@ from mvsgs_core.droid.proximity import Pair
 from mvsgs_core.droid.video import Video
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solution
 
-_MOTION_LIMIT = 64.0  # cells, of what the update operator is told
+_MOTION_LIMIT = 64.0  # cells, of the motion that the update operator gets
 _FAR = 1e4  # cells: coordinates beyond are all the same to a lookup, and no risk to single precision
 _SOURCES_AT_ONCE = 8  # keyframes whose edges a global update revises together
 _INACTIVE_REACH = 3  # keyframes before the first free one that inactive edges may touch

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -10,8 +10,7 @@ from torch import Tensor
 from mvsgs_core.droid.networks import Networks
 
 
-@dataclass(frozen=True)
-class Encoded:
+class Encoded(NamedTuple):
     features: Tensor  # (128, h, w)
     hidden: Tensor  # (128, h, w)
     context: Tensor  # (128, h, w)

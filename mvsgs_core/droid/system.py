@@ -71,15 +71,7 @@ class DroidSlam:
             return Update(self._states[-1])
         pose, inverse_depth = self.frontend.start_values()
         self.video.frames.append(
-            VideoFrame(
-                index,
-                timestamp,
-                pose,
-                np.full(self.framing.grid, inverse_depth),
-                encoded.features,
-                encoded.hidden,
-                encoded.context,
-            )
+            VideoFrame(index, timestamp, pose, np.full(self.framing.grid, inverse_depth), *encoded)
         )
         kept = self.frontend.advance()
         every = self.constants.backend_every
@@ -109,7 +101,7 @@ class DroidSlam:
                 f"{self.constants.filter_threshold:g} cells or more (filter_threshold) since the one before"
             )
             self.stats.warn(self.nothing)
-            self._trajectory = self._collect(None)
+            self._trajectory = self._collect({})
             yield Update(TrackingState.NOT_INITIALIZED)
             return
         self.nothing = ""
@@ -180,23 +172,23 @@ class DroidSlam:
         poses = {frame.index: pose for frame, pose in zip(others, found)}
         return poses | {index: frame.cam_from_world for index, frame in own.items()}
 
-    def _collect(self, cam_from_world: dict[int, np.ndarray] | None) -> Trajectory:
-        count = len(self.frames)
-        poses = np.full((count, 4, 4), np.nan)
-        states = np.array(self._states, np.uint8).reshape(count)
-        if cam_from_world is not None:
+    def _collect(self, cam_from_world: dict[int, np.ndarray]) -> Trajectory:
+        """By frame: of all of them, or of none where there was no start."""
+        poses, states = np.full((len(self.frames), 4, 4), np.nan), np.array(self._states, np.uint8)
+        keyframes: dict[int, VideoFrame] = {}
+        if cam_from_world:
+            keyframes = self.video.keyframes
             poses = geometry.inverse(np.stack([cam_from_world[frame.index] for frame in self.frames]))
             states[states == TrackingState.NOT_INITIALIZED] = TrackingState.TRACKED
             unknown = ~np.isfinite(poses).all(axis=(1, 2))
             poses[unknown], states[unknown] = np.nan, TrackingState.LOST
-        keyframes = self.video.keyframes if cam_from_world is not None else {}
         return Trajectory(
             index=np.array([frame.index for frame in self.frames], np.int64),
             timestamp=np.array([frame.timestamp for frame in self.frames], np.float64),
             world_from_cam=poses,
             keyframe=np.array([frame.index in keyframes for frame in self.frames], bool),
             state=states,
-            segment=np.where(np.isfinite(poses).all(axis=(1, 2)), 0, -1).astype(np.int32),
+            segment=np.where(np.isnan(poses[:, 0, 0]), -1, 0).astype(np.int32),
         )
 
 

@@ -20,7 +20,7 @@ from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import Matches, make_flow
 from mvsgs_core.tracking.matching.matcher import Matcher
 
-FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to be apart where no match tells
+FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to be apart where no match says it
 
 
 class PosedTracker:
@@ -44,7 +44,7 @@ class PosedTracker:
         self.front_end = FrontEnd(self.graph, matcher, FrontEndConfig(still_flow=0.0), self.threads)
         self.local_map = LocalMap(self.graph, matcher, config.local_map, self.threads)
         self.unit = 1.0  # of the given poses' units, one of the graph's
-        self._undecided = True  # about the unit: no two keyframes have told the first depth yet
+        self._undecided = True  # about the unit: no two keyframes have given the first depth yet
         self._complete: list[int] = []  # keyframes not given out yet
         self._tail: dict[int, tuple[TrackingImage, np.ndarray, Step]] = {}  # the last two frames since
 

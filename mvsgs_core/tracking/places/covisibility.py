@@ -1,7 +1,7 @@
 """Covisible keyframe reuse: where an old keyframe sees what the camera sees, it is followed and none is added.
 
 So a camera that stays in a room stops to grow the graph: keyframes fill the space of views once, then only gaps in it.
-Nothing is removed afterwards, so every keyframe that was ever told keeps its corrections.
+Nothing is removed afterwards, so every keyframe that was ever published keeps its corrections.
 """
 
 from __future__ import annotations

@@ -35,12 +35,12 @@ class Closure:
     failure: str = ""
 
 
+@dataclass
 class LoopCloser:
-    def __init__(self, graph: KeyframeGraph, local_map: LocalMap, retrieval: Retrieval, config: LoopConfig) -> None:
-        self.graph = graph
-        self.local_map = local_map
-        self.retrieval = retrieval
-        self.config = config
+    graph: KeyframeGraph
+    local_map: LocalMap
+    retrieval: Retrieval
+    config: LoopConfig
 
     def add(self, index: int) -> None:
         """A keyframe that may be found again."""

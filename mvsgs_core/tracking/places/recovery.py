@@ -19,15 +19,13 @@ class RecoveryConfig:
     criteria: PoseCriteria = field(default_factory=PoseCriteria)
 
 
+@dataclass
 class Recovery:
-    def __init__(
-        self, graph: KeyframeGraph, matcher: Matcher, config: RecoveryConfig, front_end: FrontEndConfig
-    ) -> None:
-        self.graph = graph
-        self.matcher = matcher
-        self.config = config
-        self.front_end_config = front_end
-        self._images: dict[int, TrackingImage] = {}
+    graph: KeyframeGraph
+    matcher: Matcher
+    config: RecoveryConfig
+    front_end: FrontEndConfig  # how they are followed
+    _images: dict[int, TrackingImage] = field(default_factory=dict, init=False)
 
     def keep(self, frame: TrackingImage) -> None:
         """The image of a frame that has no pose (yet)."""
@@ -59,7 +57,7 @@ class Recovery:
 
     def _follow(self, start: int, run: Iterable[FrameRecord]) -> int:
         """One run of frames without a pose, from the keyframe at its side; returns how many were found."""
-        follower = FrontEnd(self.graph, self.matcher, self.front_end_config, 1)
+        follower = FrontEnd(self.graph, self.matcher, self.front_end, 1)
         follower.refer_to(self.graph.keyframes[start].image)
         found = 0
         for record in run:

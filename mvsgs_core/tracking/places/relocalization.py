@@ -19,16 +19,13 @@ class RelocalizationConfig:
     criteria: PoseCriteria = field(default_factory=PoseCriteria)
 
 
+@dataclass
 class Relocalizer:
-    def __init__(
-        self, graph: KeyframeGraph, matcher: Matcher, retrieval: Retrieval, config: RelocalizationConfig
-    ) -> None:
-        """retrieval: holds the keyframes that may be found; some may have left the graph."""
-        self.graph = graph
-        self.matcher = matcher
-        self.retrieval = retrieval
-        self.config = config
-        self.lost_frames = 0  # in a row
+    graph: KeyframeGraph
+    matcher: Matcher
+    retrieval: Retrieval  # of the keyframes that may be found; some may have left the graph
+    config: RelocalizationConfig
+    lost_frames: int = field(default=0, init=False)  # in a row
 
     @property
     def hopeless(self) -> bool:
