@@ -182,7 +182,8 @@ def _build_slot(
         reads = {key: value for key, value in reads.items() if key in {t.__name__ for t in inputs}}
     refuse_old_names(name, node.Config, given)
     given = {key: getattr(settings, key) for key in FROM_SETTINGS if key in accepted} | given
-    parameters = plain_values(build(node.Config, given, name))
+    built = build(node.Config, given, name)
+    parameters = plain_values(built) | _completed(name, node, built)
     if parameters.get("device") == "auto":
         parameters["device"] = device.resolved
     typed: dict[type, str] = {}
@@ -193,6 +194,25 @@ def _build_slot(
             raise GraphError(f"{name}.reads.{message}={sender}: must be the name of the slot that sends it")
         typed[msgs.TYPES[message]] = sender
     return Slot(name, node, parameters, typed, build(Placement, placement, name))
+
+
+def _completed(name: str, node: type[nodes.Node], config: Any) -> dict[str, Any]:
+    """The parameters that are mappings of known keys, with all of them."""
+    try:
+        known = node.keys_of(config)
+    except ValueError as error:
+        raise GraphError(f"{name}: {error}") from error
+    completed = {}
+    for parameter, keys in known.items():
+        given, defaults = getattr(config, parameter), {key.name: key.default for key in keys}
+        for key in given:
+            if key not in defaults:
+                raise GraphError(
+                    f"{name}.{parameter}.{key}: there is no such key{did_you_mean(key, defaults)}; "
+                    f"there are: {', '.join(defaults)}"
+                )
+        completed[parameter] = defaults | given
+    return completed
 
 
 def load_node(slot: str, target: str) -> type[nodes.Node]:

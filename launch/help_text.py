@@ -9,14 +9,14 @@ from __future__ import annotations
 import json
 import shutil
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, replace
 from pathlib import Path
 from typing import Any
 
 from launch.field_comments import field_comments
 from launch.graph import Graph, Placement, Settings, Slot
-from nodes.runtime.parameters import parameters, plain_values, type_name
+from nodes.runtime.parameters import Parameter, parameters, plain_values, type_name
 
 HEADER = """\
 Maps a video, a photo sequence or a live camera with Gaussian splats.
@@ -49,9 +49,14 @@ def help_text(graph: Graph, choices: Mapping[str, Any], folders: Sequence[Path])
     for name, slot in graph.slots.items():
         choice = choices.get(name)
         lines += ["", f"{name}={choice}: {slot.target}", *_about(folders, name, choice), *_of_node(slot)]
-    lines += ["", "== Keys of no slot: key=value ==", "", *_of(Settings, "", plain_values(graph.settings))]
-    lines += ["", "== What every slot takes besides: slot.key=value ==", "", *_of(Placement, "slot", {})]
-    return "\n".join([*lines, EDGES])
+    lines += ["", "== Keys of no slot: key=value ==", "", *_of(parameters(Settings), "", plain_values(graph.settings))]
+    lines += [
+        "",
+        "== What every slot takes besides: slot.key=value ==",
+        "",
+        *_of(parameters(Placement, "slot"), "slot", {}),
+    ]
+    return "\n".join(lines)
 
 
 def _about(folders: Sequence[Path], slot: str, choice: Any) -> Iterator[str]:
@@ -65,21 +70,22 @@ def _about(folders: Sequence[Path], slot: str, choice: Any) -> Iterator[str]:
 
 
 def _of_node(slot: Slot) -> Iterator[str]:
-    yield from _of(slot.node.Config, slot.name, slot.config)
+    declared = list(parameters(slot.node.Config, slot.name))
+    for mapping, keys in slot.node.keys_of(slot.parameters).items():
+        at = next(i for i, parameter in enumerate(declared) if parameter.name == mapping)
+        declared[at : at + 1] = [replace(key, path=f"{slot.name}.{mapping}.{key.name}") for key in keys]
+    yield from _of(declared, slot.name, slot.config)
 
 
-def _of(config: type, where: str, values: Mapping[str, Any]) -> Iterator[str]:
+def _of(declared: Iterable[Parameter], where: str, values: Mapping[str, Any]) -> Iterator[str]:
     """A line for each parameter: path and value, type, comment, and the default where the value is another."""
-    for parameter in parameters(config, where):
+    for parameter in declared:
         path, default = parameter.path, parameter.default
         value = _at(values, path.removeprefix(f"{where}."), default)
         what = [type_name(parameter.annotation), field_comments(parameter.owner).get(parameter.name, "")]
-        entries = value if isinstance(value, Mapping) else {}
-        if default is not MISSING and value != default and not entries:
+        if default is not MISSING and value != default:
             what.append(f"(default: {_text(default)})")
-        yield from _columns(path if entries else f"{path}={_text(value)}", "; ".join(filter(None, what)))
-        for key, entry in entries.items():
-            yield f"    {path}.{key}={_text(entry)}"
+        yield from _columns(f"{path}={_text(value)}", "; ".join(filter(None, what)))
 
 
 def _at(values: Any, path: str, default: Any) -> Any:

@@ -34,12 +34,13 @@ from __future__ import annotations
 
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from typing import Any, ClassVar
 
 import msgs
 from mvsgs_core.stats import Stats
+from nodes.runtime.parameters import Parameter
 
 
 class Node:
@@ -63,6 +64,11 @@ class Node:
     @classmethod
     def check(cls, config: Any) -> None:
         """Nothing to check."""
+
+    @classmethod
+    def keys_of(cls, config: Any) -> Mapping[str, Sequence[Parameter]]:
+        """Of a parameter that is a mapping: the keys that it takes, with their defaults. Others take any."""
+        return {}
 
     def run(self) -> Iterator[Any]:
         """Sources only: yields messages until the stream ends."""

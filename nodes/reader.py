@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 from msgs import Frame, GroundTruth
-from mvsgs_core.datasets import Item, Sequence, check, open_dataset
+from mvsgs_core import datasets
+from mvsgs_core.datasets import Item, check, open_dataset, options_of
 from mvsgs_core.datasets.options import FileOptions
 from nodes import Node
+from nodes.runtime.parameters import Parameter, parameter_names, parameters
 
 
 class Reader(Node):
@@ -30,6 +32,12 @@ class Reader(Node):
     @classmethod
     def check(cls, config: Config) -> None:
         check(config.name, **_options(config))
+
+    @classmethod
+    def keys_of(cls, config: Config) -> Mapping[str, Sequence[Parameter]]:
+        shared = parameter_names(FileOptions)
+        own = [parameter for kind in options_of(config.name) for parameter in parameters(kind)]
+        return {"options": [parameter for parameter in own if parameter.name not in shared]}
 
     def run(self) -> Iterator[Frame | GroundTruth]:
         sequence = open_dataset(self.config.name, **_options(self.config))
@@ -51,7 +59,7 @@ class Reader(Node):
         finally:  # also when the run is interrupted
             self._pass_warnings_on(sequence)
 
-    def _pass_warnings_on(self, sequence: Sequence) -> None:
+    def _pass_warnings_on(self, sequence: datasets.Sequence) -> None:
         self.stats.warnings.include(sequence.warnings)
 
 

@@ -13,7 +13,7 @@ import ast
 import importlib
 import inspect
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import yaml
 import nodes
 from launch.compose import CONF
 from launch.graph import Placement, Settings, load_node
-from nodes.runtime.parameters import parameters
+from nodes.runtime.parameters import Parameter, build, parameter_names, parameters
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -62,13 +62,16 @@ def _given_again() -> Iterator[str]:
         content = yaml.safe_load(file.read_text())
         if content["_target_"] is not None:
             node = load_node(file.parent.name, content["_target_"])
-            yield from _equal(file, content, node.Config)
-            yield from _equal(file, content, Placement)
-    yield from _equal(CONF / "config.yaml", yaml.safe_load((CONF / "config.yaml").read_text()), Settings)
+            own = {key: value for key, value in content.items() if key in parameter_names(node.Config)}
+            yield from _equal(file, content, parameters(node.Config))
+            yield from _equal(file, content, parameters(Placement))
+            for mapping, keys in node.keys_of(build(node.Config, own)).items():
+                yield from _equal(file, content.get(mapping, {}), keys)
+    yield from _equal(CONF / "config.yaml", yaml.safe_load((CONF / "config.yaml").read_text()), parameters(Settings))
 
 
-def _equal(file: Path, content: Mapping[str, Any], config: type) -> Iterator[str]:
-    for parameter in parameters(config):
+def _equal(file: Path, content: Mapping[str, Any], declared: Iterable[Parameter]) -> Iterator[str]:
+    for parameter in declared:
         value: Any = content
         for key in parameter.path.split("."):
             value = value.get(key, MISSING) if isinstance(value, Mapping) else MISSING

@@ -10,6 +10,7 @@ import pytest
 from launch.graph import Settings
 from mvsgs_core.mapping.config import MapperConfig
 from nodes import Node
+from nodes.runtime.parameters import parameters
 from tests import count_configuration
 
 
@@ -31,7 +32,7 @@ def test_what_is_written_twice_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_p
     ]
     monkeypatch.setattr(count_configuration, "ROOT", tmp_path)
     file = tmp_path / "config.yaml"
-    assert list(count_configuration._equal(file, {"seed": 1, "supervise": {"dead": 60.0}}, Settings)) == [
+    assert list(count_configuration._equal(file, {"seed": 1, "supervise": {"dead": 60.0}}, parameters(Settings))) == [
         "config.yaml: supervise.dead: 60.0 is the default"
     ]
     (tmp_path / "nodes").mkdir()

@@ -46,6 +46,24 @@ def test_parameters_are_the_choice_files_then_the_command_lines_then_the_default
     assert isinstance(slot.config["gain"], float)
 
 
+def test_a_data_set_s_options_are_its_own_and_all_in_the_configuration() -> None:
+    given = compose(["dataset.options.frames=33"]).slots["dataset"].config["options"]
+    assert given["frames"] == 33
+    assert (given["scene"], given["rest_start"]) == ("room", 40)
+    assert compose(["dataset=tum"]).slots["dataset"].config["options"] == {
+        "camera": None, "crop": None, "max_difference": 0.02,
+    }  # fmt: skip
+    for wrong, why in (
+        ("tum dataset.options.frames=3", "there are: crop, camera"),
+        ("tum dataset.options.cam=1", "camera"),
+    ):
+        choice, option = wrong.split()
+        with pytest.raises(GraphError, match=why):
+            compose([f"dataset={choice}", option])
+    with pytest.raises(GraphError, match="dataset: no dataset 'tun'"):
+        compose(["dataset=tum", "dataset.name=tun"])
+
+
 def test_output_and_device_reach_the_nodes_that_have_them(tmp_path: Path) -> None:
     graph = fake(f"output={tmp_path}", "device=cpu", "source.device=auto")
     assert graph.slots["sink"].config["output"] == str(tmp_path)

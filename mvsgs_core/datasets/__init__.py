@@ -86,6 +86,13 @@ def open_dataset(name: str, **options: Any) -> Sequence:
     return sequence
 
 
+def options_of(name: str) -> tuple[type, ...]:
+    """The dataclasses whose fields are a format's options. Raises ValueError for an unknown format."""
+    reader = _reader(name, {})
+    found: tuple[type, ...] = getattr(reader, "OPTIONS", (reader,))
+    return found
+
+
 def _files() -> list[str]:
     return [module.name for module in pkgutil.iter_modules(__path__)]
 

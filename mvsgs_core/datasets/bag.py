@@ -37,15 +37,14 @@ _NOT_COLOR = ("depth", "infra", "disparity", "mask")
 class Bag(FileReader):
     """Images of one topic, undistorted, with the time stamps of their headers.
 
-    topic: of the images; null takes the only color one. info_topic: of the calibration; null takes the camera_info
-    beside the images. intrinsics (or "auto") and distortion replace it; where there is none, or an empty one, the lens
-    is the guess of "auto", for the tracker to estimate. size, crop: see `Framing`.
+    intrinsics (or "auto") and distortion replace its calibration; where there is none, or an empty one, the lens is the
+    guess of "auto", for the tracker to estimate.
     Damaged messages are left out and counted. Raises ImportError without rosbags, FileNotFoundError and ValueError,
     which say what was expected, BadFileError for a bag that cannot be read or holds no image that can be.
     """
 
-    topic: str | None = None
-    info_topic: str | None = None
+    topic: str | None = None  # of the images; null: the only color one
+    info_topic: str | None = None  # of their calibration; null: camera_info beside the images
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -34,13 +34,11 @@ class Images(ImageSequence):
     intrinsics: [fx, fy, cx, cy] in pixels of the images, "auto" for EXIF or a guess, null for what is found: a COLMAP
     model, a transforms.json, Strecha's .camera files, whose poses then are the ground truth, or EXIF headers, in this
     order; where there is none of them it is the guess of "auto", for the tracker to estimate.
-    model: path of a COLMAP model's folder, a transforms.json or a folder of .camera files that lies elsewhere.
-    rate: images per second, for the timestamps. crop: see `Framing`.
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
-    model: str | Path | None = None
-    rate: float = 30.0
+    model: str | Path | None = None  # COLMAP model folder, transforms.json or folder of .camera files, if elsewhere
+    rate: float = 30.0  # images per second, for the timestamps
 
     def _find(self) -> Found:
         if self.rate <= 0:

@@ -66,8 +66,9 @@ def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 @dataclass(kw_only=True, eq=False)
 class FileReader(FileOptions):
-    """Base of the readers of files. crop: see `Framing`. Raises ValueError for options that make no sense."""
+    """Base of the readers of files. Raises ValueError for options that make no sense."""
 
+    # pixels to cut off after undistortion; null: zoom to hide the border that it leaves
     crop: int | None = None
 
     def __post_init__(self) -> None:

@@ -39,15 +39,14 @@ _DEPTH = DepthFormat(per_unit=1000.0, invalid=(0, 65535))
 @dataset
 @dataclass(kw_only=True, eq=False)
 class SevenScenes(ImageSequence):
-    """A sequence of 7-Scenes.
+    """A sequence of 7-Scenes; `intrinsics` replaces the color camera's.
 
-    sequence: name of the seq-XX folder in `path`; null takes `path` itself or the first one in it.
-    registered: gives color its own camera, and depth and poses as of that one; false takes the published camera of
-    the depth sensor (585 pixels) for both, as many published results do. `intrinsics` replaces the color camera's.
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
-    sequence: str | None = None
+    sequence: str | None = None  # seq-01, seq-02, ... in `path`; null: `path` itself or the first one in it
+    # color has a camera of its own, depth and poses are moved to it; false: the published camera of the depth sensor
+    # (585 pixels) for both, as many published results have it
     registered: bool = True
 
     def _find(self) -> Found:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,45 +19,47 @@ SUB_FRAMES = 8  # averaged over one exposure
 STRIP = 8  # rows that are read out at once
 
 
+@dataclass(kw_only=True, eq=False)
+class Film:
+    """What is filmed, without what makes it hard."""
+
+    scene: Literal["room", "aerial"] = "room"
+    frames: int = 120  # length of the stream, at 20 a second
+    size: tuple[int, int] = (240, 320)  # height, width
+    start: int = 0  # first frame of the stream
+    stop: int | None = None  # frame to stop before; null: the end
+    stride: int = 1  # every which frame
+    seed: int = 0  # of textures, relief and noise
+    loop: bool = False  # the last frame leads on to the first
+    threads: int = 0  # of the renderer; 0: what OpenMP gives
+
+
 @dataset
 class Synthetic:
     """A sequence through the room or over the landscape."""
 
-    def __init__(
-        self,
-        scene: str = "room",
-        frames: int = 120,
-        size: tuple[int, int] = (240, 320),
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        seed: int = 0,
-        loop: bool = False,
-        threads: int = 0,
-        **difficulties: Any,
-    ) -> None:
-        """scene: "room" or "aerial"; frames: length of the stream at 20 a second; size: (height, width).
+    OPTIONS = (Film, Difficulties)
 
-        loop: the last frame leads on to the first. threads: 0 takes what OpenMP gives.
-        `difficulties`: the fields of `scene.difficulties.Difficulties`. Raises ValueError for a bad option, with
-        the valid ones.
-        """
-        known = [f.name for f in fields(Difficulties)]
-        unknown = sorted(set(difficulties) - set(known))
+    def __init__(self, **options: Any) -> None:
+        """options: the fields of `Film` and of `Difficulties`. Raises ValueError for a bad one, with the valid ones."""
+        own, known = ({f.name for f in fields(kind)} for kind in self.OPTIONS)
+        unknown = sorted(options.keys() - own - known)
         if unknown:
-            own = ["scene", "frames", "size", "start", "stop", "stride", "seed", "loop", "threads"]
-            raise ValueError(f"synthetic: no option {', '.join(unknown)}; there are: {', '.join(own + known)}")
+            there = ", ".join(f.name for kind in self.OPTIONS for f in fields(kind))
+            raise ValueError(f"synthetic: no option {', '.join(unknown)}; there are: {there}")
+        film = Film(**{k: v for k, v in options.items() if k in own})
+        scene, frames, seed, loop = film.scene, film.frames, film.seed, film.loop
         if scene not in SCENES:
             raise ValueError(f"synthetic: no scene {scene!r}; there are: {', '.join(SCENES)}")
-        if frames < 1 or stride < 1 or start < 0 or len(size) != 2 or min(size) < 8:
+        if frames < 1 or film.stride < 1 or film.start < 0 or len(film.size) != 2 or min(film.size) < 8:
             raise ValueError(
                 "synthetic: frames and stride at least 1, start at least 0, size two numbers of at least 8"
             )
-        self.difficulties = Difficulties(**{k: v for k, v in difficulties.items() if v is not None})
+        self.difficulties = Difficulties(**{k: v for k, v in options.items() if k in known and v is not None})
         self.warnings: list[str] = []
-        self.size = (int(size[0]), int(size[1]))
+        self.size = (int(film.size[0]), int(film.size[1]))
         self.seed = seed
-        self.threads = threads
+        self.threads = film.threads
         self.intrinsics = np.array(
             [FOCAL * self.size[1], FOCAL * self.size[1], (self.size[1] - 1) / 2, (self.size[0] - 1) / 2]
         )
@@ -69,7 +71,7 @@ class Synthetic:
         self.path = DifficultPath(self.stage.path, d)
         self.sensor = Sensor(d, seed)
         lost = np.random.default_rng([seed, 5]).random(frames) < d.drop
-        self.numbers = [n for n in range(frames)[start:stop:stride] if not lost[n]]
+        self.numbers = [n for n in range(frames)[film.start : film.stop : film.stride] if not lost[n]]
 
     def __len__(self) -> int:
         return len(self.numbers)

@@ -39,17 +39,15 @@ _DEPTH = DepthFormat(per_unit=5000.0)
 class Tum(ImageSequence):
     """A folder in TUM RGB-D layout, undistorted.
 
-    camera: freiburg1, freiburg2, freiburg3; null reads it off `camera.txt`, the folder's name or the header of
-    groundtruth.txt. intrinsics, distortion: of any other camera, instead.
-    max_difference: seconds between an image and the pose or depth map that goes with it. Between two poses that are
-    near enough it is interpolated, else the nearest one counts; a depth map goes to the one image nearest to it.
-    crop: null zooms in on the undistorted image until no pixel is empty; a number keeps the published focal length,
-    resizes to `size` plus that border and cuts it off (size=[384, 512], crop=8: the usual protocol).
+    intrinsics, distortion: of another camera than these three. Between two poses that are near enough it is
+    interpolated, else the nearest one counts; a depth map goes to the one image nearest to it. size=[384, 512] with
+    crop=8 is the usual protocol.
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
+    # freiburg1, freiburg2, freiburg3; null: from camera.txt, the folder's name or the header of groundtruth.txt
     camera: str | None = None
-    max_difference: float = 0.02
+    max_difference: float = 0.02  # seconds between an image and its pose or depth map
 
     def _find(self) -> Found:
         folder = LAYOUT.folder(self.path)

@@ -33,7 +33,7 @@ class Video(FileReader):
     """Frames of a video file, undistorted, with the container's timestamps.
 
     intrinsics: [fx, fy, cx, cy] in pixels of the video's frames, or "auto": 65 degrees across the longer side, for the
-    tracker to estimate. A video says nothing of its camera, so null is refused. size, crop: see `Framing`.
+    tracker to estimate. A video says nothing of its camera, so null is refused.
     Frames of another shape than the first are left out and counted, those of another size scaled to it.
     Raises FileNotFoundError and ValueError, which say what was expected, BadFileError for a file that has no frame.
     """
