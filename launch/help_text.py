@@ -50,12 +50,8 @@ def help_text(graph: Graph, choices: Mapping[str, Any], folders: Sequence[Path])
         choice = choices.get(name)
         lines += ["", f"{name}={choice}: {slot.target}", *_about(folders, name, choice), *_of_node(slot)]
     lines += ["", "== Keys of no slot: key=value ==", "", *_of(parameters(Settings), "", plain_values(graph.settings))]
-    lines += [
-        "",
-        "== What every slot takes besides: slot.key=value ==",
-        "",
-        *_of(parameters(Placement, "slot"), "slot", {}),
-    ]
+    lines += ["", "== What every slot takes besides: slot.key=value ==", ""]
+    lines += [*_of(parameters(Placement, "slot"), "slot", {}), "", EDGES]
     return "\n".join(lines)
 
 

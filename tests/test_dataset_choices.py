@@ -16,13 +16,12 @@ from mvsgs_core.datasets import formats
 from mvsgs_core.datasets.bag import Bag
 from mvsgs_core.datasets.images import Images
 from mvsgs_core.datasets.seven_scenes import SevenScenes
-from mvsgs_core.datasets.synthetic import Synthetic
+from mvsgs_core.datasets.synthetic import Film
 from mvsgs_core.datasets.tum import Tum
 from mvsgs_core.datasets.video import Video
 from mvsgs_core.scene.difficulties import Difficulties
 from nodes.reader import Reader
 from tests.support.dataset_folders import write_photos
-from tests.support.shared_data import ROOT
 
 
 @pytest.mark.parametrize(
@@ -46,15 +45,15 @@ def test_options_of_a_choice_reach_the_reader(tmp_path: Path) -> None:
     assert [m.timestamp for m in reader.run() if isinstance(m, Frame)][:2] == pytest.approx([0.0, 0.2])
 
 
-def test_every_choice_lists_all_options_of_its_format() -> None:
+def test_every_choice_has_all_options_of_its_format() -> None:
+    def options(choice: str) -> set[str]:
+        return set(compose([f"dataset={choice}"]).slots["dataset"].config["options"])
+
     own = {"path", "start", "stop", "stride", "size", "intrinsics", "distortion"}
     for name, reader in {"tum": Tum, "seven_scenes": SevenScenes, "images": Images, "video": Video, "bag": Bag}.items():
-        parameters = set(inspect.signature(reader).parameters)
-        listed = set(OmegaConf.load(ROOT / f"launch/conf/dataset/{name}.yaml").options)
-        assert listed == parameters - own
-    synthetic = set(OmegaConf.load(ROOT / "launch/conf/dataset/synthetic.yaml").options)
-    explicit = {p.name for p in inspect.signature(Synthetic).parameters.values() if p.kind is not p.VAR_KEYWORD}
-    assert synthetic == (explicit | {f.name for f in dataclasses.fields(Difficulties)}) - own
+        assert options(name) == set(inspect.signature(reader).parameters) - own
+    film = {field.name for kind in (Film, Difficulties) for field in dataclasses.fields(kind)}
+    assert options("synthetic") == film - own
 
 
 def test_every_format_has_a_choice_of_its_name() -> None:
