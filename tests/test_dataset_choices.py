@@ -22,6 +22,7 @@ from mvsgs_core.datasets.video import Video
 from mvsgs_core.scene.difficulties import Difficulties
 from nodes.reader import Reader
 from tests.support.dataset_folders import write_photos
+from tests.support.shared_data import ROOT
 
 
 @pytest.mark.parametrize(
