@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench import pieces
-from bench.runs import Matrix, Run, figure, folder
+from bench.runs import QUICK, Matrix, Run, figure, folder
 from bench.table import Row, main
 from mvsgs_core.evaluation.metrics import at
 
@@ -105,7 +105,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     seeds, overrides = [int(s) for s in options.seeds.split(",")], list(options.overrides)
     if options.quick:
         scenes, variants, seeds = scenes[:1], variants[:1], seeds[:1]
-        overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
+        overrides += QUICK
     made = pieces.Pieces.of(options, folder(options, "ablation"))
     matrices = {
         f"{scene}/{variant}": Matrix([scene], [variant], seeds, overrides, options.jobs)

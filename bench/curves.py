@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench import pieces, plots
-from bench.runs import Matrix, Run, Setting, figure, folder, stage_seconds
+from bench.runs import QUICK, Matrix, Run, Setting, figure, folder, stage_seconds
 from bench.table import Row, main
 from mvsgs_core.evaluation.metrics import at
 
@@ -125,7 +125,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     repeats = options.repeats
     if options.quick:
         scenes, curves, repeats = scenes[:1], {"mapper.iterations": {"5": "5"}}, 1
-        overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
+        overrides += QUICK
     seeds = [int(s) for s in options.seeds.split(",")]
     made = pieces.Pieces.of(options, folder(options, "curves"))
     matrices = {

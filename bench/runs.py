@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
 SHARED = Path(os.environ.get("MVSGS_SHARED", ROOT.parent / "shared"))
 DATA = SHARED / "data"
+QUICK = ("dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50")  # overrides of a quick run
 
 
 @dataclass(frozen=True)

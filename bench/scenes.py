@@ -7,13 +7,11 @@ bench/conf. Figures of the paper stand beside ours where the scene is the paper'
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-from bench import plots
-from bench.runs import Matrix, Run, available_scenes, choices, figure, folder, said
+from bench import pieces, plots
+from bench.runs import QUICK, Matrix, Run, available_scenes, choices, figure, folder, said
 from bench.table import Row, main
 from mvsgs_core.evaluation import metrics, svg
 
@@ -91,16 +89,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", help=f"comma separated; default: those whose data are here; known: {known}")
     parser.add_argument("--variants", default="full", help=f"comma separated: {', '.join(choices('variant'))}")
     parser.add_argument("--seeds", default="0", help="comma separated")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at once; times mean little above 1")
-    parser.add_argument("--output", type=Path, help="folder of the runs; default: in runs")
-    parser.add_argument("--collect", action="store_true", help="only read the runs that are in the folder")
-    parser.add_argument("overrides", nargs="*", help="of every run: mapper.iterations=30")
+    pieces.arguments(parser, "mapper.iterations=30", jobs=True)
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     overrides = list(options.overrides)
     if options.quick:
-        overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
+        overrides += QUICK
     matrix = Matrix(
         options.scenes.split(",") if options.scenes else ["room"] if options.quick else available_scenes(),
         options.variants.split(","),
@@ -108,11 +103,10 @@ def measure(options: argparse.Namespace) -> list[Row]:
         overrides,
         options.jobs,
     )
-    output = folder(options, "scenes")
-    gather: Callable[[Path], list[Run]] = matrix.collect if options.collect else matrix.run
-    runs = gather(output)
-    plots.write(output / "time_against_error.svg", time_against_error(runs))
-    return rows(runs)
+    made = pieces.Pieces.of(options, folder(options, "scenes"))
+    runs = made.runs({"runs": matrix})
+    plots.write(made.output / "time_against_error.svg", time_against_error(runs))
+    return rows(runs) + made.rows()
 
 
 if __name__ == "__main__":

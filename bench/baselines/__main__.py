@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 from bench import pieces
 from bench.baselines.colmap_poses import Model
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
-from bench.runs import Matrix, figure, folder, stage_seconds
+from bench.runs import QUICK, Matrix, figure, folder, stage_seconds
 from bench.table import Row, main
 from bench.tracking.baselines import Baseline, solve
 from launch.placement import available_cores
@@ -36,7 +36,7 @@ from nodes.reader import Reader
 from nodes.runtime.parameters import parameter_names
 
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end
-QUICK = "room"  # scene of a quick run: in 30 frames of the real ones COLMAP puts no two images together
+QUICK_SCENE = "room"  # scene of a quick run: in 30 frames of the real ones COLMAP puts no two images together
 EVENLY = 100  # frames that COLMAP gets, about, besides our keyframes and every 5th
 
 
@@ -251,15 +251,15 @@ def measure(options: argparse.Namespace) -> list[Row]:
     scenes = options.scenes.split(",")
     overrides = list(options.overrides)
     if options.quick:
-        scenes, options.longest = [QUICK], 1.0
-        overrides += ["dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50"]
+        scenes, options.longest = [QUICK_SCENE], 1.0
+        overrides += QUICK
     made = pieces.Pieces.of(options, folder(options, "baselines"))
     rows = [row for scene in scenes for row in compare(scene, options, overrides, made)]
     return rows + made.rows()
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", default="redkitchen,tum_fr1_xyz", help=f"comma separated; --quick: {QUICK}")
+    parser.add_argument("--scenes", default="redkitchen,tum_fr1_xyz", help=f"comma separated; --quick: {QUICK_SCENE}")
     parser.add_argument("--longest", type=float, default=8.0, help="times our optimization's time, for the offline one")
     parser.add_argument("--threads", type=int, help="of COLMAP and of the offline optimization; default: all cores")
     pieces.arguments(parser, "dataset.stop=100")
