@@ -35,7 +35,7 @@ def instruction_sets() -> tuple[str, ...]:
 
 @functools.cache
 def load(name: str) -> ModuleType:
-    """The kernel module `name` ("rasterizer", "tracking", "mvs"), for example `load("rasterizer").rasterize(...)`.
+    """The kernel module `name` ("rasterizer", "tracking", "mvs"), for example `load("rasterizer").forward(...)`.
 
     Raises ImportError, saying what to run, if the kernels were not built.
     """
