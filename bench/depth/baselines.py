@@ -42,7 +42,7 @@ def baseline_rows(scene: Scene, found: Run, align: bool) -> list[Row]:
         cut = [np.where(c >= limit, d, 0).astype(np.float32) for c, d in zip(unsure, plain, strict=True)]
         swept = score(cut, scene, align)
         ratio = (1.0 - swept.inliers) / max(1.0 - reference.inliers, 1e-6)
-        rows.append(Row(f"{scene.name}: plane sweep inliers at completeness {swept.completeness:.2f}", swept.inliers))
+        rows.append(Row(f"{scene.name}: plane sweep inliers, as complete as {name}", swept.inliers))
         rows.append(at_least(f"{scene.name}: outliers of the plane sweep over ours, {name}", ratio, "", 2.0))
     pairwise = score(pair, scene, align)
     rows.append(Row(f"{scene.name}: SGBM inliers", pairwise.inliers))

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from bench import compare, figures, pivot, record
+from bench import compare, curves, figures, pivot, record
+from bench.runs import choices
 from bench.table import Row, timed
 
 
@@ -200,3 +201,10 @@ def test_compare_exits_with_one_for_regressions_only(tmp_path: Path, capsys: pyt
     assert "REGRESSION  psnr: 25 dB -> 20 dB" in printed
     assert "the row is missing" in printed
     assert compare.run([str(now), "--recorded", str(tmp_path / "empty")]) == 0
+
+
+def test_what_is_recorded_of_variants_and_curves_can_be_run() -> None:
+    variants = {row["name"].split(": ")[1] for row in record.Record.load("ablation").rows}
+    assert variants - {"full"} <= set(choices("variant"))
+    known = {f"{curve} {label}" for curve, points in curves.CURVES.items() for label in points}
+    assert {row["name"].split(": ")[1] for row in record.Record.load("curves").rows} - {"default"} <= known
