@@ -43,10 +43,9 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
     depth = _get(report, "depth") or {}
     if errors := metrics.listed(metrics.DEPTH, depth):
         lines.append(f"depth       {errors}, {depth.get('count')} keyframes")
-    splats = _get(report, "map") or {}
-    if splats.get("splats") is not None:
-        size = metrics.at("map.bytes").text(splats.get("bytes"))
-        lines.append(f"map         {splats['splats']} splats, {size}")
+    splats = _get(report, "map", "splats")  # without an evaluator the map is a word, not figures
+    if splats is not None:
+        lines.append(f"map         {splats} splats, {metrics.at('map.bytes').text(_get(report, 'map', 'bytes'))}")
     times = _get(report, "time") or {}
     if times.get("wall") is not None:
         wall, pace = metrics.at("time.wall"), metrics.at("time.keyframes_per_second")
