@@ -60,9 +60,8 @@ def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: S
             poses[k], segment[k], state[k] = poses[other], segment[other], state[other]
             continue
         if record.reference is None or record.reference not in graph.keyframes:
-            state[k] = (
-                TrackingState.NOT_INITIALIZED if state[k] == TrackingState.NOT_INITIALIZED else TrackingState.LOST
-            )
+            if state[k] != TrackingState.NOT_INITIALIZED:
+                state[k] = TrackingState.LOST
             continue
         reference = graph.keyframes[record.reference]
         relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)

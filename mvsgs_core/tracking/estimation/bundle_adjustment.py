@@ -52,17 +52,7 @@ def adjust(graph: Graph, solver: Solver) -> Solution:
         tolerance=solver.tolerance,
         threads=solver.threads,
     )
-    return Solution(
-        cam_from_world=result["poses"],
-        inverse_depth=result["inverse_depth"],
-        information=result["information"],
-        focal_factor=result["focal_factor"],
-        initial_cost=result["initial_cost"],
-        cost=result["cost"],
-        steps=result["steps"],
-        smallest_pivot=result["smallest_pivot"],
-        failure=result["failure"],
-    )
+    return Solution(cam_from_world=result.pop("poses"), **result)
 
 
 def check_device(device: str) -> None:

@@ -45,12 +45,12 @@ class Calibration:
             failure = refine_focal(self.graph, members, self.threads)
             if failure:
                 self.stats.warn(f"the focal length could not be adjusted: {failure}")
-            elif len(members) >= self.config.keyframes:
+            elif len(members) >= self.config.min_keyframes:
                 rise = observability(self.graph, members, self.config.probe, self.threads)
                 if rise > self.config.certain and self._sensible():
                     self.settled = True
                     self._report(members)
-            if not self.settled and len(members) >= self.config.limit:
+            if not self.settled and len(members) >= self.config.max_keyframes:
                 self.settle(members)
 
     def settle(self, members: list[int]) -> None:
@@ -73,7 +73,7 @@ class Calibration:
 
     def check(self, members: list[int]) -> None:
         """At the end: whether the whole stream agrees with the focal length that the keyframes went out with."""
-        if not self.guessed or len(members) < self.config.keyframes:
+        if not self.guessed or len(members) < self.config.min_keyframes:
             return
         factor = focal_of_all(self.graph, members, self.threads)
         if factor is None:

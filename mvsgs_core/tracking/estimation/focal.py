@@ -1,4 +1,4 @@
-"""The focal length where it was only guessed: an unknown of the start-up and of bundle adjustment until it is certain.
+"""The focal length where it was only guessed: an unknown of initialization and bundle adjustment until it is certain.
 
 Turning makes it observable: a camera that only shifts gives the same images with every focal length and depths scaled
 to match. So what is found is believed where a focal length that is off by some percent fits the matches clearly worse.
@@ -25,12 +25,12 @@ MIN_KEYFRAMES = 4  # ... where it has so many
 class FocalConfig:
     factors: tuple[float, ...] = (1.0, 1.35, 0.75, 1.8, 0.55)  # on the guess: 100 to 40 degrees around one of 65
     bounds: tuple[float, float] = (0.35, 3.0)  # on the guess: what lies outside is no solution
-    keyframes: int = 12  # before anything is certain
-    limit: int = 30  # keyframes that wait for it at most
+    min_keyframes: int = 12  # before anything is certain
+    max_keyframes: int = 30  # that wait for it
     probe: float = 0.1  # fraction by which the focal length is made wrong ...
     certain: float = 0.03  # ... and that of the cost which it must then rise by to be certain,
     usable: float = 0.002  # or, at the limit, to be better than the guess
-    doubt: float = 0.03  # standard deviation, as a fraction, above which it is told
+    doubt: float = 0.03  # standard deviation, as a fraction, above which it is warned of
     drift: float = 0.01  # fraction by which the whole stream may contradict what was used, beyond its own uncertainty
 
 

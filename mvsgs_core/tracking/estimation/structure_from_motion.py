@@ -1,4 +1,4 @@
-"""Start-up: poses and depths of the first keyframes from nothing but their matches.
+"""Structure from motion: poses and depths of the first keyframes from nothing but their matches.
 
 Two starts from essential matrices and one from identity poses are bundle adjusted; the lowest cost wins, if the
 cameras moved enough against the depths for it to mean anything.
@@ -19,7 +19,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 
 @dataclass(frozen=True)
 class ReconstructionCriteria:
-    """When a start counts as one. Pixels at the tracker's size."""
+    """When a reconstruction counts as one. Pixels at the tracker's size."""
 
     certain_cost: float = 0.2  # below, no other start is tried
     max_cost: float = 0.7  # robust cost (Cauchy, 1 pixel) a match
@@ -30,14 +30,12 @@ class ReconstructionCriteria:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A start-up attempt; `failure` is empty where it may be used, else the kind of reason, a colon, the figures."""
+    """`failure` is empty where it may be used, else the kind of reason, a colon, the figures."""
 
     cam_from_world: np.ndarray  # (K, 4, 4)
     inverse_depth: np.ndarray  # (K, M), median 1
     information: np.ndarray  # (K, M)
     cost: float  # a match
-    parallax: float  # pixels
-    baseline: float  # over the median depth
     failure: str
     focal_factor: float = 1.0  # on the graph's focal length, where it was free
 
@@ -49,44 +47,19 @@ def reconstruct(
     everything = set(order)
     problem = graph.problem(order, everything - {order[0]}, everything)
     k, m = problem.inverse_depth.shape
-    matched = float(np.sum(problem.information[:, 0] > 0))
+    none = Reconstruction(problem.cam_from_world, np.ones((k, m)), np.zeros((k, m)), np.inf, "")
     turned = _rotation_error(problem, threads, free_focal)
     if turned < criteria.min_turn_error:
-        ones = np.ones((k, m))
         reason = (
             f"no parallax: a camera that only turned explains the matches to {turned:.1f} pixels, "
             f"{criteria.min_turn_error:.1f} or more are parallax"
         )
-        return Reconstruction(problem.cam_from_world, ones, 0.0 * ones, np.inf, turned, 0.0, reason)
+        return replace(none, failure=reason)
     starts = [np.tile(np.eye(4), (k, 1, 1)), *_essential_starts(graph, order)]
-    best: Solution | None = None
-    for poses in starts:
-        attempt: Solution | None = None
-        current = replace(problem, cam_from_world=poses, inverse_depth=np.ones((k, m)))
-        for scale, steps in ((8.0, 12), (3.0, 8), (1.0, 12)):
-            held = np.full((k, m), 0.05 if scale > 1.0 else 0.0)  # keeps depths from running away at first
-            current = replace(current, prior=np.ones((k, m)), prior_weight=held)
-            last = free_focal and scale == 1.0
-            solver = Solver(steps=2 * steps if last else steps, robust_scale=scale, lm=1e-3, threads=threads)
-            attempt = adjust(replace(current, free_focal=last), solver)
-            if attempt.failure:
-                break
-            current = replace(current, cam_from_world=attempt.cam_from_world, inverse_depth=attempt.inverse_depth)
-        if attempt is not None and not attempt.failure and (best is None or attempt.cost < best.cost):
-            best = attempt
-            if best.cost < criteria.certain_cost * matched:
-                break
+    matched = float(np.sum(_matched(problem)))
+    best = _best_of(problem, starts, criteria.certain_cost * matched, threads, free_focal)
     if best is None:
-        nothing = np.ones((k, m))
-        return Reconstruction(
-            starts[0],
-            nothing,
-            0.0 * nothing,
-            np.inf,
-            0.0,
-            0.0,
-            "no start could be solved: every bundle adjustment failed",
-        )
+        return replace(none, failure="no start could be solved: every bundle adjustment failed")
     poses, depths = best.cam_from_world, best.inverse_depth
     known = best.information * depths**2 > 10.0
     scale = float(np.median(depths[known])) if known.sum() > 50 else float(np.median(depths))
@@ -96,7 +69,7 @@ def reconstruct(
     centers = geometry.inverse(poses)[:, :3, 3]
     baseline = float(np.max(np.linalg.norm(centers[:, None] - centers[None], axis=-1)))
     intrinsics = graph.intrinsics * [best.focal_factor, best.focal_factor, 1.0, 1.0]
-    parallax = _parallax(poses, depths, problem.pixels, intrinsics, problem.source, problem.to, problem.information)
+    parallax = _parallax(replace(problem, cam_from_world=poses, inverse_depth=depths, intrinsics=intrinsics))
     cost = best.cost / max(matched, 1.0)
     failure = ""
     if not np.isfinite(cost) or cost > criteria.max_cost:
@@ -106,10 +79,32 @@ def reconstruct(
             f"too little parallax: {parallax:.1f} pixels of {criteria.min_parallax:.1f} needed, cameras {baseline:.3f} "
             f"of the depth apart, {criteria.min_baseline:.3f} needed"
         )
-    elif known.sum() < 0.3 * np.mean(problem.information[:, 0] > 0) * k * m:
+    elif known.sum() < 0.3 * np.mean(_matched(problem)) * k * m:
         failure = f"too few points could be triangulated: {known.sum()} of {k * m}"
-    information = best.information * scale**2
-    return Reconstruction(poses, depths, information, cost, parallax, baseline, failure, best.focal_factor)
+    return Reconstruction(poses, depths, best.information * scale**2, cost, failure, best.focal_factor)
+
+
+def _best_of(
+    problem: Graph, starts: list[np.ndarray], certain_cost: float, threads: int, free_focal: bool
+) -> Solution | None:
+    """The solution of lowest cost from several poses (K, 4, 4) and unit depths; the first that is certain ends it."""
+    best: Solution | None = None
+    ones = np.ones_like(problem.inverse_depth)
+    for poses in starts:
+        current = replace(problem, cam_from_world=poses, inverse_depth=ones, prior=ones)
+        for scale, steps in ((8.0, 12), (3.0, 8), (1.0, 12)):
+            held = np.full_like(ones, 0.05 if scale > 1.0 else 0.0)  # keeps depths from running away at first
+            last = free_focal and scale == 1.0
+            solver = Solver(steps=2 * steps if last else steps, robust_scale=scale, lm=1e-3, threads=threads)
+            attempt = adjust(replace(current, prior_weight=held, free_focal=last), solver)
+            if attempt.failure:
+                break
+            current = replace(current, cam_from_world=attempt.cam_from_world, inverse_depth=attempt.inverse_depth)
+        if not attempt.failure and (best is None or attempt.cost < best.cost):
+            best = attempt
+            if best.cost < certain_cost:
+                break
+    return best
 
 
 def _rotation_error(problem: Graph, threads: int, free_focal: bool) -> float:
@@ -129,27 +124,27 @@ def _rotation_error(problem: Graph, threads: int, free_focal: bool) -> float:
         intrinsics = far.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]
         far = replace(far, cam_from_world=solution.cam_from_world, intrinsics=intrinsics)
     pixels, z = reproject(far.cam_from_world, far.inverse_depth, far.pixels, far.intrinsics, far.source, far.to)
-    seen = (far.information[:, 0] > 0) & (z > 0.05)
-    distance = np.linalg.norm(pixels - far.target, axis=1)
-    return max((float(np.median(d[s])) for d, s in zip(distance, seen) if s.sum() > 30), default=0.0)
+    return _largest_median(np.linalg.norm(pixels - far.target, axis=1), _matched(far) & (z > 0.05))
 
 
-def _parallax(
-    poses: np.ndarray,
-    depths: np.ndarray,
-    pixels: np.ndarray,
-    intrinsics: np.ndarray,
-    source: np.ndarray,
-    to: np.ndarray,
-    information: np.ndarray,
-) -> float:
+def _parallax(problem: Graph) -> float:
     """Largest median, over the edges, of the distance between a point's projection and that at infinity."""
-    full, z = reproject(poses, depths, pixels, intrinsics, source, to)
-    far, z_far = reproject(poses, np.zeros_like(depths), pixels, intrinsics, source, to)
-    seen = (information[:, 0] > 0) & (z > 0.05) & (z_far > 0.05)
-    distance = np.linalg.norm(full - far, axis=1)
-    medians = [float(np.median(d[s])) for d, s in zip(distance, seen) if s.sum() > 30]
-    return max(medians, default=0.0)
+    at_infinity = replace(problem, inverse_depth=np.zeros_like(problem.inverse_depth))
+    (full, z), (far, z_far) = (
+        reproject(p.cam_from_world, p.inverse_depth, p.pixels, p.intrinsics, p.source, p.to)
+        for p in (problem, at_infinity)
+    )
+    return _largest_median(np.linalg.norm(full - far, axis=1), _matched(problem) & (z > 0.05) & (z_far > 0.05))
+
+
+def _matched(problem: Graph) -> np.ndarray:
+    """(E, M) bool: points that were found."""
+    return problem.information[:, 0] > 0
+
+
+def _largest_median(distance: np.ndarray, seen: np.ndarray) -> float:
+    """Of distances (E, M), over the edges that see enough of them."""
+    return max((float(np.median(d[s])) for d, s in zip(distance, seen) if s.sum() > 30), default=0.0)
 
 
 def _essential_starts(graph: KeyframeGraph, order: list[int]) -> list[np.ndarray]:

@@ -1,7 +1,7 @@
 """Where the points of one image lie in another: one interface, several methods.
 
 `LucasKanade` is the tracker's own: subpixel, needs a guess. `DenseInverseSearch` gives guesses from frame to frame,
-`FeatureFlow` where motion is large; both are off by a pixel or more and know of no lost point, which no start-up
+`FeatureFlow` where motion is large; both are off by a pixel or more and know of no lost point, which no initialization
 survives: as flows of the tracker they come refined and verified (`RefinedFlow`). Another one (a network) is named in
 the configuration as "module:Class".
 """

@@ -8,7 +8,7 @@ import numpy as np
 
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
 from mvsgs_core.tracking.image import TrackingImage
-from tests.support.true_maps import exact_matches, image, matcher, pose_error, shuffled, true_graph, true_pose
+from tests.support.true_maps import exact_matches, image, item, matcher, pose_error, shuffled, true_graph, true_pose
 
 
 def front_end(*keyframes: int) -> FrontEnd:
@@ -62,6 +62,13 @@ def test_a_camera_that_rests_is_seen_to() -> None:
     assert again.matches is first.matches
     np.testing.assert_array_equal(again.pose, first.pose)
     assert made.follow(image(2, index=4), with_pose=False).localization is None
+
+
+def test_a_light_that_is_switched_on_is_no_rest() -> None:
+    made = front_end(0)
+    made.follow(image(2), with_pose=True)
+    brighter = np.clip(item(2).image.astype(int) + 20, 0, 255).astype(np.uint8)
+    assert not made.follow(TrackingImage.of(3, 0.15, brighter, (240, 320), False), with_pose=True).still
 
 
 def test_a_covered_lens_does_not_rest() -> None:
