@@ -123,33 +123,19 @@ def frequency_mask(image: Tensor, frequency: float) -> Tensor:
     return edge_response(image, frequency) >= 0.5
 
 
-def photometric_loss(
-    image: Tensor,
-    target: Tensor,
-    frequency: float,
-    *,
-    l1: float,
-    ssim: float,
-    masked: float,
-    threads: int | None = None,
-) -> Tensor:
-    """l1 L1 + ssim (1 - SSIM) + masked mean |m image - m target|, a scalar, in one pass; (H, W, 3) images.
+def photometric_loss(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
+    """L1, SSIM (1 - SSIM) and the masked L1, mean |m image - m target|, which one kernel computes together.
 
-    Means are over all pixels, the masked one too. The gradient goes to `image` only, none through the mask m.
+    Means are over all pixels, the masked one too. The gradient goes to the render's color, none through the mask m.
     """
-    extra = None
-    if masked > 0.0:
-        extra = masked * frequency_mask(image.detach(), frequency).to(image.dtype)
-    return image_loss(image, target, l1_weight=l1, ssim_weight=ssim, pixel_weight=extra, threads=threads)
-
-
-def photometric_terms(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
-    """L1, SSIM and the masked L1, which one kernel computes together."""
-    return photometric_loss(
-        inputs.render.color, inputs.target, inputs.frequency, l1=weights["l1"], ssim=weights["ssim"],
-        masked=weights["frequency"], threads=inputs.threads,
+    image, extra = inputs.render.color, None
+    if weights["frequency"] > 0.0:
+        extra = weights["frequency"] * frequency_mask(image.detach(), inputs.frequency).to(image.dtype)
+    return image_loss(
+        image, inputs.target, l1_weight=weights["l1"], ssim_weight=weights["ssim"], pixel_weight=extra,
+        threads=inputs.threads,
     )  # fmt: skip
 
 
 # Each gives its part of the sum, weighted: a scalar; None where its weight is 0. The first is never None.
-TERMS: tuple[Callable[[LossInputs, dict[str, float]], Tensor | None], ...] = (photometric_terms,)
+TERMS: tuple[Callable[[LossInputs, dict[str, float]], Tensor | None], ...] = (photometric_loss,)

@@ -56,10 +56,6 @@ class MapState:
         return state
 
     @property
-    def bytes(self) -> int:
-        return sum(value.nbytes for value in self.tensors().values())
-
-    @property
     def device(self) -> torch.device:
         return self.steps.device
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import torch
 
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info, read_state
 from mvsgs_core.mapping.checkpoints.images import read_image
-from mvsgs_core.mapping.checkpoints.state import VIEWS, Arrays
+from mvsgs_core.mapping.checkpoints.state import Arrays, keyframe_rows
 
 
 @dataclass(frozen=True)
@@ -40,27 +39,13 @@ def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
     meta, raw = read_state(file)
     try:
         found = [
-            keyframe
+            KeptKeyframe(
+                row["index"], row["timestamp"], row["intrinsics"], row["world_from_cam"], int(part["segment"]),
+                file.parent / KEYFRAMES, row["file"],
+            )
             for k, part in enumerate(meta["mappers"])
-            for keyframe in _of_part(part, Arrays(raw).of(f"map{k}").of("views"), file.parent / KEYFRAMES)
-        ]
-    except (KeyError, TypeError, IndexError) as error:
+            for row in keyframe_rows(Arrays(raw).of(f"map{k}").of("views"), part["images"])
+        ]  # fmt: skip
+    except (KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(f"{file} is no checkpoint of a mapper: {error!r}") from error
     return sorted(found, key=lambda keyframe: keyframe.index)
-
-
-def _of_part(part: dict[str, object], arrays: Arrays, folder: Path) -> Iterator[KeptKeyframe]:
-    names = part["images"]
-    segment = part["segment"]
-    if not isinstance(names, list) or type(segment) is not int:
-        raise TypeError("images or segment are missing")
-    count = len(names)
-    columns = {
-        name: arrays.take(name, VIEWS[name][0], (count, *VIEWS[name][1]), nan=name == "timestamp")
-        for name in ("index", "timestamp", "world_from_cam", "intrinsics")
-    }
-    for k in range(count):
-        yield KeptKeyframe(
-            int(columns["index"][k]), float(columns["timestamp"][k]), columns["intrinsics"][k].copy(),
-            columns["world_from_cam"][k].copy(), segment, folder, str(names[k]),
-        )  # fmt: skip

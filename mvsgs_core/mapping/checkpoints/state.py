@@ -105,7 +105,7 @@ def unpack(
     if not isinstance(meta, dict):
         raise ValueError("a mapper's part is no object")
     device = torch.device(resolve_device(config.device))
-    views = _views(arrays.of("views"), meta.get("images"), device, images)
+    views = [_view(row, device, images) for row in keyframe_rows(arrays.of("views"), meta.get("images"))]
     state = _splats(arrays.of("splats"), (config.sh_degree + 1) ** 2, [view.index for view in views], device)
     mapper = OnlineMapper(config, log, corrections, state, views)
     mapper.schedule.restore(_object(meta.get("schedule")), len(mapper.keyframes.with_image))
@@ -145,7 +145,8 @@ def _splats(arrays: Arrays, sh_bases: int, keyframes: list[int], device: torch.d
     return MapState.of({name: torch.from_numpy(value.copy()) for name, value in found.items()}, device)
 
 
-def _views(arrays: Arrays, images: Any, device: torch.device, folder: Path) -> list[TrainingView]:
+def keyframe_rows(arrays: Arrays, images: Any) -> list[dict[str, Any]]:
+    """The values of each keyframe's TrainingView, and the `file` of its image. Raises ValueError for damage."""
     count = len(arrays.take("index", np.int64, (None,)))
     columns = {
         name: arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN)
@@ -156,19 +157,18 @@ def _views(arrays: Arrays, images: Any, device: torch.device, folder: Path) -> l
         raise ValueError("keyframes have sizes, scales or counts that none has")
     if not (isinstance(images, list) and len(images) == count and all(isinstance(name, str) for name in images)):
         raise ValueError("not every keyframe's image is named")
-    views = []
-    for k, name in enumerate(images):
-        row: dict[str, Any] = {key: v[k].copy() if v.ndim > 1 else v[k].item() for key, v in columns.items()}
-        image, valid = read_image(folder, name, device)
-        first, second = torch.from_numpy(row.pop("exposure_moments")).to(device)
-        views.append(
-            TrainingView(
-                **row | {"image_size": tuple(row["image_size"].tolist())}
-                | {"exposure": torch.from_numpy(row["exposure"]).to(device)},
-                exposure_moments=(first.clone(), second.clone()), image=image, valid=valid,
-            )
-        )  # fmt: skip
-    return views
+    return [
+        {name: v[k].copy() if v.ndim > 1 else v[k].item() for name, v in columns.items()} | {"file": file}
+        for k, file in enumerate(images)
+    ]
+
+
+def _view(row: dict[str, Any], device: torch.device, folder: Path) -> TrainingView:
+    row["image"], row["valid"] = read_image(folder, row.pop("file"), device)
+    row["image_size"] = tuple(row["image_size"].tolist())
+    row["exposure"] = torch.from_numpy(row["exposure"]).to(device)
+    row["exposure_moments"] = tuple(torch.from_numpy(moment.copy()).to(device) for moment in row["exposure_moments"])
+    return TrainingView(**row)
 
 
 def _copied(view: TrainingView) -> TrainingView:

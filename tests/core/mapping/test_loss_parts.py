@@ -9,6 +9,7 @@ import torch
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping import losses
 from mvsgs_core.rasterizer import kernels
+from tests.support.loss_inputs import inputs_of
 from tests.support.shared_data import shared
 
 
@@ -43,11 +44,11 @@ def test_differences_of_gaussians(golden: dict[str, np.ndarray]) -> None:
 
 def test_terms_and_psnr(golden: dict[str, np.ndarray]) -> None:
     image, target = as_image(golden["image"]), as_image(golden["gt"])
-    terms = [dict.fromkeys(("l1", "ssim", "masked"), 0.0) | {name: 1.0} for name in ("l1", "ssim", "masked")]
+    terms = [dict.fromkeys(("l1", "ssim", "frequency"), 0.0) | {name: 1.0} for name in ("l1", "ssim", "frequency")]
     last = len(golden["freq"]) - 1
     for i, frequency in enumerate(golden["freq"]):
         l1, one_minus_ssim, masked = (
-            losses.photometric_loss(image, target, float(frequency), **t).item() for t in terms
+            losses.photometric_loss(inputs_of(image, target, float(frequency)), t).item() for t in terms
         )
         wanted = golden["l1_ssim_maskl1"][i]
         assert l1 == pytest.approx(wanted[0], abs=1e-5)

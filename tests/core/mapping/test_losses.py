@@ -8,11 +8,10 @@ import torch
 
 from mvsgs_core.mapping import losses
 from mvsgs_core.rasterizer import kernels
-from mvsgs_core.rasterizer.interface import Backward, Render
-from tests.support.rasterizer_scenes import random_splats
+from tests.support.loss_inputs import inputs_of
 from tests.support.shared_data import shared
 
-GES = {"l1": 0.3, "ssim": 0.2, "masked": 0.5}
+GES = {"l1": 0.3, "ssim": 0.2, "frequency": 0.5}
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +35,7 @@ def test_mask_and_loss_have_the_released_codes_values(golden: dict[str, np.ndarr
         sure = np.abs(wanted - 0.5) > (0.03 if ends else 1e-4)
         mask = losses.frequency_mask(image, float(frequency)).numpy()
         assert (mask[sure] == golden["mask"][i].astype(bool)[sure]).all()
-        loss = losses.photometric_loss(image, target, float(frequency), **GES).item()
+        loss = losses.photometric_loss(inputs_of(image, target, float(frequency)), GES).item()
         assert loss == pytest.approx(golden["loss"][i], abs=1e-3 if ends else 1e-5)
 
 
@@ -46,7 +45,7 @@ def test_gradient_has_the_released_codes_values(
     golden: dict[str, np.ndarray], frequency: int, dtype: torch.dtype
 ) -> None:
     image = as_image(golden["image"]).to(dtype).requires_grad_()
-    losses.photometric_loss(image, as_image(golden["gt"]), float(frequency), **GES).backward()  # type: ignore[no-untyped-call]
+    losses.photometric_loss(inputs_of(image, as_image(golden["gt"]), float(frequency)), GES).backward()  # type: ignore[no-untyped-call]
     assert image.grad is not None
     wanted = golden[f"dloss_dimage_f{frequency}"].transpose(1, 2, 0)
     assert np.abs(image.grad.numpy() - wanted).max() <= 1e-4 * np.abs(wanted).max()
@@ -67,7 +66,7 @@ def test_scale_factor_has_the_released_codes_values() -> None:
 @pytest.mark.parametrize("frequency", [0.0, 30.0, 50.0, 100.0])
 def test_image_without_edges_stays_finite(frequency: float) -> None:
     flat = torch.full((20, 30, 3), 0.4).requires_grad_()
-    loss = losses.photometric_loss(flat, torch.zeros(20, 30, 3), frequency, **GES)
+    loss = losses.photometric_loss(inputs_of(flat, torch.zeros(20, 30, 3), frequency), GES)
     loss.backward()  # type: ignore[no-untyped-call]
     assert bool(torch.isfinite(loss))
     assert flat.grad is not None
@@ -96,7 +95,7 @@ def test_frequency_of_an_online_view() -> None:
 
 def test_without_the_mask_it_is_l1_and_ssim() -> None:
     image, target = torch.rand(24, 32, 3), torch.rand(24, 32, 3)
-    plain = losses.photometric_loss(image, target, 10.0, l1=0.8, ssim=0.0, masked=0.0)
+    plain = losses.photometric_loss(inputs_of(image, target, 10.0), {"l1": 0.8, "ssim": 0.0, "frequency": 0.0})
     assert plain.item() == pytest.approx(0.8 * (image - target).abs().mean().item(), rel=1e-5)
 
 
@@ -110,19 +109,13 @@ def test_std_ratio_by_integration(beta: float) -> None:
     assert ratio == pytest.approx(np.sqrt(variance), rel=1e-3)
 
 
-def render_of(color: torch.Tensor) -> Render:
-    nothing = torch.zeros(0)
-    return Render(color, nothing, nothing, nothing, nothing, nothing, None, None, 0, Backward())
-
-
 def test_the_loss_is_the_weighted_sum_of_its_terms(monkeypatch: pytest.MonkeyPatch) -> None:
     image, target = torch.rand(24, 32, 3), torch.rand(24, 32, 3)
-    splats = random_splats(5, bases=1)
-    inputs = losses.LossInputs(render_of(image), target, splats, 10.0, 1)
+    inputs = inputs_of(image, target, 10.0)
     weights = losses.weights_of("ges", losses.LossWeights(l1=1.0))
     assert weights == {"l1": 1.0, "ssim": 0.2, "frequency": 0.5}
     alone = losses.training_loss(inputs, weights)
-    assert alone.item() == losses.photometric_loss(image, target, 10.0, l1=1.0, ssim=0.2, masked=0.5, threads=1).item()
+    assert alone.item() == losses.photometric_loss(inputs, weights).item()
 
     def opacity(given: losses.LossInputs, weights: dict[str, float]) -> torch.Tensor | None:
         return weights["opacity"] * given.splats.opacity_logits.sigmoid().mean() if weights["opacity"] else None
@@ -130,4 +123,4 @@ def test_the_loss_is_the_weighted_sum_of_its_terms(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(losses, "TERMS", (*losses.TERMS, opacity))
     assert losses.training_loss(inputs, weights | {"opacity": 0.0}).item() == alone.item()
     more = losses.training_loss(inputs, weights | {"opacity": 2.0}) - alone
-    assert more.item() == pytest.approx(2.0 * splats.opacity_logits.sigmoid().mean().item(), rel=1e-5)
+    assert more.item() == pytest.approx(2.0 * inputs.splats.opacity_logits.sigmoid().mean().item(), rel=1e-5)

@@ -223,11 +223,12 @@ def test_images_are_kept_for_a_bounded_number_of_keyframes_spread_over_the_run()
 
 
 def test_gradients_that_are_not_finite_are_counted_and_the_map_stays_finite(monkeypatch: pytest.MonkeyPatch) -> None:
-    def with_one_bad_pixel(color: torch.Tensor, *others: object, **weights: object) -> torch.Tensor:
+    def with_one_bad_pixel(inputs: losses.LossInputs, weights: dict[str, float]) -> torch.Tensor:
+        color = inputs.render.color
         pixel = color[24, 32, 0]
         return color.mean() + (pixel - pixel.detach()).abs().sqrt()  # 0, with a derivative of NaN
 
-    monkeypatch.setattr(losses, "photometric_loss", with_one_bad_pixel)
+    monkeypatch.setattr(losses, "TERMS", (with_one_bad_pixel,))
     mapper = mapped(tiny_views()[:2], replace(CONFIG, iterations=4, refinement=0))
     assert mapper.log.counts["refused_gradients"] > 0
     assert any("gradients" in text for text in mapper.log.warnings)
