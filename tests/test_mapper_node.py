@@ -96,7 +96,7 @@ def test_an_idle_slice_ends_soon_and_says_when_there_is_nothing_to_do() -> None:
 def test_poses_move_the_map() -> None:
     node = Mapper(settings())
     list(node.on_fused_keyframe(view_message(0, 0.5)))
-    while node.on_idle() is not None:  # what it owes comes before a correction, whenever that arrives
+    while node.on_idle() is not None:  # what is pending comes before a correction, whenever that arrives
         pass
     moved = pose_on_arc(0.5)
     moved[:3, 3] += [1.0, 2.0, 3.0]

@@ -27,7 +27,7 @@ class DensityControlConfig:
     gradient: float = 6.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
     prune_opacity: float = 0.02  # 0 to 1; below: removed
-    prune_scale: float = 0.5  # largest standard deviation in median depths; above: removed
+    prune_scale: float = 0.5  # maximum standard deviation in median depths; above: removed
     max_splats: int = 1_000_000  # no growth beyond
 
 

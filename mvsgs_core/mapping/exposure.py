@@ -14,7 +14,7 @@ from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
 
 IDENTITY = np.eye(3, 4, dtype=np.float32)
-MIN_KNOWN = 0.05  # share of the image that the map must show
+MIN_KNOWN = 0.05  # fraction of the image that the map must show
 MIN_OPACITY = 0.9  # of a pixel that the map shows
 SATURATED = 0.98  # a camera's color from here on, and from its complement down, is cut off
 SAMPLES = 20000  # pixels that are fitted, at most

@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Schedule:
-    """Owed iterations and the order of the keyframes, drawn without replacement, seeded.
+    """Pending iterations and the order of the keyframes, drawn without replacement, seeded.
 
     Keyframes are given by their position in the mapper's list. `pending` counts down to 0.
     """
@@ -26,7 +26,7 @@ class Schedule:
         self._local = []  # the window has moved
 
     def drop(self) -> int:
-        """Forgets what is owed; returns how many iterations that were."""
+        """Cancels the pending iterations; returns how many they were."""
         dropped, self.pending = self.pending, 0
         return dropped
 
@@ -35,7 +35,7 @@ class Schedule:
         self._local, self._all = [], []
 
     def next(self, count: int) -> int:
-        """Position of the next of `count` > 0 keyframes; takes one off what is owed."""
+        """Position of the next of `count` > 0 keyframes; takes one off the pending iterations."""
         self.pending = max(0, self.pending - 1)
         self._turn += 1
         if self._turn % 2:
@@ -46,7 +46,7 @@ class Schedule:
         return self.next_of_all(count)
 
     def next_of_all(self, count: int) -> int:
-        """Position of the next of `count` > 0 keyframes in a random round through all; owes nothing."""
+        """Position of the next of `count` > 0 keyframes in a random round through all; pending iterations stay as they are."""
         if not self._all:
             self._all = [int(i) for i in self._random.permutation(count)]
         return self._all.pop()

@@ -28,7 +28,7 @@ def view(index: int) -> RGBDKeyframe:
 
 
 def begun(config: MapperConfig) -> Atlas:
-    """Two segments, corrections, and iterations that are still owed."""
+    """Two segments, corrections, and iterations that are still pending."""
     atlas = Atlas(OnlineMapper(config))
     for index in range(6):
         atlas.enter(int(index == 3))
