@@ -12,7 +12,7 @@ from mvsgs_core.mapping.optimizer import BETA_1, BETA_2
 
 @torch.no_grad()
 def step_exposure(view: TrainingView, rate: float) -> None:
-    """Adam on the color affine, drawn toward the identity, so that the map and not the exposure accounts for the color."""
+    """Adam on the color affine, drawn toward the identity, so that the map takes up the color and not the exposure."""
     gradient = view.exposure.grad
     view.exposure.grad = None
     view.exposure.requires_grad_(False)

@@ -46,7 +46,7 @@ class Schedule:
         return self.next_of_all(count)
 
     def next_of_all(self, count: int) -> int:
-        """Position of the next of `count` > 0 keyframes in a random round through all; pending iterations stay as they are."""
+        """Position of the next of `count` > 0 keyframes in a random round through all; pending stays as it is."""
         if not self._all:
             self._all = [int(i) for i in self._random.permutation(count)]
         return self._all.pop()
