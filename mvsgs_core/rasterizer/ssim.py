@@ -13,10 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mvsgs_core import native
-
-RADIUS = 5
-SIGMA = 1.5
-C1, C2 = 0.01**2, 0.03**2
+from mvsgs_core.rasterizer.ssim_window import C1, C2, RADIUS, SIGMA
 
 
 def ssim_reference(image: Tensor, target: Tensor) -> Tensor:

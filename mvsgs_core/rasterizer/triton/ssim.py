@@ -17,17 +17,17 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mvsgs_core.rasterizer import ssim
+from mvsgs_core.rasterizer import ssim_window
 
 ROWS, COLUMNS = 16, 128  # of a program's block: 26 source rows are read for 16
-RADIUS = tl.constexpr(ssim.RADIUS)
-C1, C2 = tl.constexpr(ssim.C1), tl.constexpr(ssim.C2)
+RADIUS = tl.constexpr(ssim_window.RADIUS)
+C1, C2 = tl.constexpr(ssim_window.C1), tl.constexpr(ssim_window.C2)
 
 
 @functools.cache
 def window(device: torch.device) -> Tensor:
     """(11,) the Gaussian's taps, their sum 1."""
-    taps = [math.exp(-((k - RADIUS.value) ** 2) / (2 * ssim.SIGMA**2)) for k in range(2 * RADIUS.value + 1)]
+    taps = [math.exp(-((k - RADIUS.value) ** 2) / (2 * ssim_window.SIGMA**2)) for k in range(2 * RADIUS.value + 1)]
     return torch.tensor([tap / sum(taps) for tap in taps], dtype=torch.float32, device=device)
 
 
