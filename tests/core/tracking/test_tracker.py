@@ -98,6 +98,19 @@ def test_a_covered_lens_is_lost_and_found_again() -> None:
     assert error < 0.01 * length
 
 
+def test_a_jump_to_a_known_place_is_relocalized() -> None:
+    room = synthetic(frames=80)[:60]
+    items = [type(i)(n, n / 20.0, i.image, i.intrinsics, i.world_from_cam) for n, i in enumerate([*room, *room[2:8]])]
+    tracker, trajectory, updates = track(items)
+    assert tracker.stats.counts["relocalized"] == 1
+    assert tracker.phase is Phase.TRACKING
+    assert all(update.state == TrackingState.TRACKED for update in updates[60:66])
+    assert set(trajectory.segment.tolist()) == {0}
+    shift = trajectory.world_from_cam[60:, :3, 3] - trajectory.world_from_cam[2:8, :3, 3]
+    step = np.linalg.norm(np.diff(trajectory.world_from_cam[2:8, :3, 3], axis=0), axis=1).mean()
+    assert np.linalg.norm(shift, axis=1).max() < 0.5 * step, "where it was before"
+
+
 def test_a_jump_to_an_unseen_place_starts_a_segment_of_its_own() -> None:
     room = synthetic(frames=80)
     elsewhere = synthetic(frames=40, scene="aerial")
