@@ -52,11 +52,13 @@ inline Camera camera_of(nb::handle settings, Array<const double> pose) {
     camera.width = width;
     camera.height = height;
     camera.near = setting<float>(settings, "near");
-    const float margin_x = kClampMargin * 0.5f * width / camera.fx, margin_y = kClampMargin * 0.5f * height / camera.fy;
-    camera.slope_min[0] = -(camera.cx + 0.5f) / camera.fx - margin_x;
-    camera.slope_max[0] = (width - 0.5f - camera.cx) / camera.fx + margin_x;
-    camera.slope_min[1] = -(camera.cy + 0.5f) / camera.fy - margin_y;
-    camera.slope_max[1] = (height - 0.5f - camera.cy) / camera.fy + margin_y;
+    // In double: a compiler that may reorder float arithmetic would else round these limits by what surrounds them.
+    const double fx = camera.fx, fy = camera.fy, cx = camera.cx, cy = camera.cy;
+    const double margin_x = 0.5 * kClampMargin * width / fx, margin_y = 0.5 * kClampMargin * height / fy;
+    camera.slope_min[0] = float(-(cx + 0.5) / fx - margin_x);
+    camera.slope_max[0] = float((width - 0.5 - cx) / fx + margin_x);
+    camera.slope_min[1] = float(-(cy + 0.5) / fy - margin_y);
+    camera.slope_max[1] = float((height - 0.5 - cy) / fy + margin_y);
     return camera;
 }
 
