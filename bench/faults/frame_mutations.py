@@ -11,7 +11,7 @@ import numpy as np
 
 import msgs
 from msgs import Message
-from msgs.codec import MAX_END_HEADER_BYTES, MAX_HEADER_BYTES, ArraySpec, array_specs, encode
+from msgs.codec import MAX_END_HEADER_BYTES, MAX_HEADER_BYTES, VERSION, ArraySpec, array_specs, encode
 
 LARGEST = 1_000_000  # bytes of a mutated frame
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\u202e\x00"
@@ -51,7 +51,7 @@ def mutated(rng: np.random.Generator, messages: Sequence[Message] = ()) -> Itera
 def frame(name: bytes, header: bytes, arrays: bytes = b"", *, header_bytes: int | None = None) -> bytes:
     """Whatever name and header are. `header_bytes` states another length than the header has."""
     stated = len(header) if header_bytes is None else header_bytes
-    start = _PREFIX.pack(b"NMVS", 1, len(name), 0, stated) + name + header
+    start = _PREFIX.pack(b"NMVS", VERSION, len(name), 0, stated) + name + header
     return start + (bytes(-len(start) % 64) + arrays if arrays else b"")
 
 

@@ -6,7 +6,6 @@ gives the same result every time.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,11 +51,13 @@ def adjust_with_torch(graph: Graph, solver: Solver, device: str) -> Solution:
 
 def find_device(name: str) -> torch.device:
     """A PyTorch device by the name that `Solver.device` has. Raises ValueError where it is missing."""
-    if not re.fullmatch(r"torch|cuda(:\d+)?", name):
-        raise ValueError(f"bundle adjustment on {name}: there are cpu, cuda, cuda:0 and auto")
-    if name != "torch" and not torch.cuda.is_available():
+    try:
+        device = torch.device(torch_device(name))
+    except RuntimeError:
+        raise ValueError(f"bundle adjustment on {name}: there are cpu, cuda, cuda:0 and auto") from None
+    if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"bundle adjustment on {name}: PyTorch sees no CUDA device here; use tracker.device=cpu")
-    return torch.device(torch_device(name))
+    return device
 
 
 class _Adjuster:
