@@ -1,4 +1,4 @@
-# make demo · make test · make bench · make lint: each sets up what it needs. make setup only installs.
+# make demo · make test · make test-quick · make bench · make lint: each sets up what it needs. make setup only installs.
 # Everything lands in .venv and build/; once installed, nothing here needs the network.
 
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
@@ -15,7 +15,7 @@ KERNELS := $(shell find mvsgs_core/csrc -type f 2>/dev/null)
 
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(JOBS)
 
-.PHONY: setup demo test lint bench bench-quick clean check-system
+.PHONY: setup demo test test-quick lint bench bench-quick clean check-system
 
 setup: $(STAMP)
 
@@ -49,6 +49,9 @@ demo: setup
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-quick: setup
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 lint: setup
 	$(BIN)/ruff check .

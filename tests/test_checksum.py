@@ -9,6 +9,8 @@ import pytest
 
 from tests.support.checksum import RECORDED, RUNS, checksum, machine
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("run", RUNS)
 def test_the_map_is_the_same_to_the_bit(run: str, tmp_path: Path) -> None:

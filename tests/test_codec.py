@@ -288,6 +288,7 @@ HEADER_VALUES = st.recursive(
 )
 
 
+@pytest.mark.slow
 @UNHURRIED
 @given(st.sampled_from(["sequence", "scalars", "arrays", "index", "timestamp", "image", "intrinsics"]), HEADER_VALUES)
 def test_any_value_anywhere_in_a_header_is_checked(key: str, value: Any) -> None:

@@ -25,6 +25,7 @@ from tests.support.dataset_folders import write_photos
 from tests.support.shared_data import ROOT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "choice", ["synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "camera", "robot"]
 )
@@ -72,6 +73,7 @@ def test_a_missing_gpu_of_one_slot_is_refused_too(
     assert f"error: mvs.device={device}: this machine has" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", ["tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "player"])
 @pytest.mark.parametrize("path", [None, "/nowhere/at/all"])
 def test_a_missing_path_is_refused_before_a_process_starts(

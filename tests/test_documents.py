@@ -69,6 +69,7 @@ def test_modules_that_are_run_or_imported_exist(document: Path) -> None:
         assert module.endswith(".NAME") or find_spec(module) is not None, f"{document.name}: {module}"
 
 
+@pytest.mark.slow
 @EVERY
 def test_commands_compose(document: Path) -> None:
     """Every `launch/run_all.py` command that a document shows: its slots, choices and parameters are there."""
@@ -98,6 +99,7 @@ def parameters() -> frozenset[str]:
     return frozenset(name for slot, known in slots for name in flat(known.config, slot))
 
 
+@pytest.mark.slow
 @EVERY
 def test_parameters_in_code_marks_exist(document: Path) -> None:
     for name in re.findall(r"`((?:dataset|tracker|mvs|depth_fusion|mapper|evaluator)\.[a-z_.]+)\b", by_hand(document)):

@@ -29,6 +29,7 @@ def test_contract() -> None:
     assert set(outputs(DroidTracker)) == {Keyframe, Poses, TrackerPhase, Trajectory}
 
 
+@pytest.mark.slow
 def test_noise_gives_honest_finite_messages() -> None:
     node, sent, frames = run(TRIAL)
     assert any("noise" in warning for warning in node.stats.warnings)
@@ -62,6 +63,7 @@ def test_noise_gives_honest_finite_messages() -> None:
     assert node.stats.counts["keyframes"] == len(keyframes)
 
 
+@pytest.mark.slow
 def test_too_few_frames_are_not_started() -> None:
     node, sent, _ = run(TRIAL, count=3)
     (trajectory,) = sent

@@ -80,6 +80,7 @@ def test_no_value_is_too_much(value: Any) -> None:
     assert stats["wall_seconds"] == 1.0
 
 
+@pytest.mark.slow
 def test_a_whole_graph_that_is_too_much_loses_its_longest_texts_first() -> None:
     upstream: dict[str, Any] = {}
     for i in range(30):

@@ -223,6 +223,7 @@ def test_a_value_is_converted_to_its_type_or_refused(value: object) -> None:
             assert converted == value
 
 
+@pytest.mark.slow
 def test_every_choice_file_of_the_project_composes() -> None:
     """One at a time, with the default choices elsewhere: its node exists, its parameters and reads hold."""
     stands_for_the_stages = [

@@ -69,6 +69,7 @@ def test_a_field_s_comment_is_read_where_it_stands() -> None:
     assert field_comments(Inherited) == field_comments(Commented) | {"fourth": "what the base does not say"}
 
 
+@pytest.mark.slow
 def test_help_has_every_parameter_with_its_type_default_and_comment() -> None:
     shown = run_all("--help", "mapper=paper", "device=cpu")
     for word in ("dataset: ", "tum", "mapper", "--inline", "--graph", "tracker=external", "_target_=my_tracker"):
@@ -88,6 +89,7 @@ def test_help_has_every_parameter_with_its_type_default_and_comment() -> None:
     assert max(len(line) for line in lines if "/runs/" not in line) <= MAX_WIDTH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slot", ["tracker", "mvs", "depth_fusion", "mapper", "viewer", "evaluator", "recorder"])
 def test_every_parameter_of_every_choice_says_what_it_is(slot: str) -> None:
     for file in (CONF / slot).glob("*.yaml"):
@@ -98,6 +100,7 @@ def test_every_parameter_of_every_choice_says_what_it_is(slot: str) -> None:
                 assert told or field_comments(parameter.owner).get(parameter.name), parameter.path
 
 
+@pytest.mark.slow
 def test_the_graph_is_shown_on_one_screen_and_nothing_runs(tmp_path: Path) -> None:
     shown = run_all("--graph", f"output={tmp_path}/new", "viewer=viser", "mvs=external", "dataset=camera")
     lines = shown.splitlines()
@@ -118,11 +121,13 @@ def test_every_edge_of_the_graph_is_in_its_text() -> None:
     assert sorted(arrows) == sorted([edge.message.__name__, "->", edge.reader] for edge in graph.edges)
 
 
+@pytest.mark.slow
 def test_hydra_s_own_flags_work() -> None:
     assert "_target_: nodes.mapper.Mapper\n" in run_all("--cfg", "job", "mapper.window=5")
     assert "== Flags ==" in run_all("--hydra-help")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("old", "new"), RENAMED)
 def test_an_old_name_is_refused_with_the_new_one(old: str, new: str) -> None:
     command = ["device=cpu", *(["tracker=droid", "tracker.weights=random"] if ".constants." in new else [])]

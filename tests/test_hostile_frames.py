@@ -136,6 +136,7 @@ def test_a_small_frame_takes_little_time_and_memory(data: bytes) -> None:
     assert min(seconds) <= 0.05
 
 
+@pytest.mark.slow
 def test_thousands_of_mutated_frames_give_messages_or_codec_errors() -> None:
     frames = mutated(np.random.default_rng(5))
     errors = [text for _ in range(3000) if (text := answer(next(frames)))]
@@ -150,6 +151,7 @@ values = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=300)
 @given(
     st.sampled_from(sorted(msgs.TYPES)), st.lists(st.tuples(st.integers(0, 30), values), max_size=4), st.integers(0, 3)

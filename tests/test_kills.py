@@ -7,9 +7,13 @@ import re
 import signal
 from pathlib import Path
 
+import pytest
+
 from bench.faults.kills import SCENE
 from bench.faults.launched import Launched, map_opens
 from tests.support.launches import DOWN
+
+pytestmark = pytest.mark.slow
 
 SHORT = (*SCENE, "dataset.options.frames=50", "mapper.refinement=10", "evaluator.max_frames=10")
 

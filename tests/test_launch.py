@@ -16,6 +16,8 @@ import yaml
 from nodes.runtime.transport import create_keys
 from tests.support.launches import DOWN, Launch, launch
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["launch"]  # the fixture
 
 

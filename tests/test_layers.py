@@ -88,6 +88,7 @@ def allowed(importing: str, imported: str) -> bool:
     return imported in below or ("mvsgs_core/*" in below and imported.startswith("mvsgs_core/"))
 
 
+@pytest.mark.slow
 def test_every_import_goes_down() -> None:
     wrong = [
         f"{file} -> {other}: {room(file)} may import {', '.join((GROUND, *ROOMS[room(file)]))} only"

@@ -11,6 +11,8 @@ from msgs import Depth
 from mvsgs_core.datasets import open_dataset
 from nodes.learned_fusion import LearnedFusion
 
+pytestmark = pytest.mark.slow
+
 
 def _depths(scale: float) -> list[Depth]:
     frames = open_dataset("synthetic", frames=25, stride=6, size=(120, 160), scale=scale)

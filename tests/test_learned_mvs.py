@@ -32,6 +32,7 @@ def _depths(config: LearnedMvs.Config, keyframes: list[Keyframe]) -> list[Depth]
     return [d for k in keyframes for d in node.on_keyframe(k)] + list(node.on_end())
 
 
+@pytest.mark.slow
 def test_itermvs_with_published_weights_finds_the_room() -> None:
     weights = str(shared("weights/itermvs_blendedmvs.ckpt"))
     frames = list(open_dataset("synthetic", frames=25, stride=6))
@@ -59,6 +60,7 @@ def test_a_calibration_keeps_the_order_and_the_range() -> None:
     np.testing.assert_allclose(calibrated(confidence, (0.0, 1.0))[1:-1], confidence[1:-1], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", ["mvsformer", "mvsformer_p"])
 def test_the_papers_network_runs_untrained_and_says_so(network: str) -> None:
     frames = list(open_dataset("synthetic", frames=13, stride=6, size=(120, 160)))

@@ -198,6 +198,7 @@ def test_unfiltered_depth_reaches_the_map() -> None:
     assert node.stats.counts["filled"] == 6 * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((Path(__file__).parent.parent / "launch/conf/mapper").glob("*.yaml")))
 def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
     from omegaconf import OmegaConf

@@ -18,6 +18,8 @@ from nodes.runtime.transport import create_keys
 from tests.support.processes import ENVIRONMENT, graph
 from tests.support.shared_data import ROOT
 
+pytestmark = pytest.mark.slow
+
 DOWN = 5.0  # s in which a graph must be down after a failure
 
 

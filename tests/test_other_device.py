@@ -31,6 +31,7 @@ from tests.support.stereo_problems import SIZE, problem
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 
+@pytest.mark.slow
 def test_the_pretended_device_mixes_with_no_other() -> None:
     with PretendDevice():
         here, there = torch.ones(3), torch.ones(3, device=DEVICE)
@@ -46,6 +47,7 @@ def test_the_pretended_device_mixes_with_no_other() -> None:
         assert (leaf.grad.cpu() + here).tolist() == [3.0] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in networks.CASES if "LPIPS" not in name])
 def test_networks(name: str) -> None:
     with torch.no_grad(), PretendDevice():
@@ -53,6 +55,7 @@ def test_networks(name: str) -> None:
         work()
 
 
+@pytest.mark.slow
 def test_stereo_equals_that_of_the_cpu() -> None:
     p = problem()
     surface = np.full(SIZE, 0.22, np.float32)
@@ -66,6 +69,7 @@ def test_stereo_equals_that_of_the_cpu() -> None:
         np.testing.assert_array_equal(there, here)
 
 
+@pytest.mark.slow
 def test_fusion_equals_that_of_the_cpu() -> None:
     results = []
     with PretendDevice():
@@ -86,6 +90,7 @@ def test_bundle_adjustment_equals_that_of_the_cpu() -> None:
     np.testing.assert_array_equal(there.inverse_depth, here.inverse_depth)
 
 
+@pytest.mark.slow
 def test_mapper_from_the_first_keyframe_to_the_snapshot() -> None:
     config = MapperConfig(
         iterations=4, refinement=1, sh_degree=1, device=DEVICE,

@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Depth, FusedKeyframe, Keyframe, SplatMap, Trajectory
+
+pytestmark = pytest.mark.slow
 
 # Hardly more than the least sizes that the networks take: what comes out is noise at any size.
 PATH = [

@@ -18,6 +18,8 @@ from launch.inline import run_inline
 from msgs import Trajectory
 from tests.support.shared_data import shared
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parent.parent
 # Small, so that starting the processes takes longer than the mapping.
 SMALL = [

@@ -145,6 +145,7 @@ def test_the_contract_of_both_nodes() -> None:
     assert outputs(Recorder) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", ["mcap", "mcap_all"])
 def test_both_recorders_and_the_player_fit_into_the_graph(tmp_path: Path, choice: str) -> None:
     recorded(tmp_path / "a.mcap", 1)
@@ -167,6 +168,7 @@ def chunk_starts(path: Path) -> list[int]:
     return [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
 @pytest.mark.parametrize(
     ("offset", "data"),
@@ -215,6 +217,7 @@ def test_a_message_that_is_none_is_left_out(tmp_path: Path) -> None:
     assert any("left out because they are damaged: 3 (first: " in warning for warning in player.stats.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("promised", [2**30, 2**20, 0])
 def test_a_chunk_that_would_fill_the_memory_is_left_out(tmp_path: Path, promised: int) -> None:
     compressor = zstandard.ZstdCompressor().compressobj()

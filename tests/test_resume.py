@@ -74,6 +74,7 @@ def copy_of(folder: Path, target: Path) -> Path:
     return target
 
 
+@pytest.mark.slow
 def test_the_map_so_far_is_there(cut_off: Path) -> None:
     info = checkpoint_info(cut_off)
     assert 30 < info.newest_keyframe_index <= 60
@@ -82,6 +83,7 @@ def test_the_map_so_far_is_there(cut_off: Path) -> None:
     assert len(poses) == len(info.keyframes) > 5
 
 
+@pytest.mark.slow
 def test_with_the_rest_of_the_stream_it_gives_the_same_map_to_the_bit(
     cut_off: Path, whole: SplatMap, tmp_path: Path
 ) -> None:
@@ -101,6 +103,7 @@ def test_with_the_rest_of_the_stream_it_gives_the_same_map_to_the_bit(
     assert report["counts"]["mapper"]["views"] == len(whole.keyframes)
 
 
+@pytest.mark.slow
 def test_without_its_stream_it_is_refined_and_reported(cut_off: Path, tmp_path: Path) -> None:
     output = copy_of(cut_off, tmp_path / "run")
     info = checkpoint_info(output)

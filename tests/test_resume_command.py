@@ -50,6 +50,7 @@ def test_a_stream_that_can_be_read_again_runs_through_the_whole_graph(tmp_path: 
     assert after.observers == before.observers
 
 
+@pytest.mark.slow
 def test_a_stream_that_is_gone_leaves_the_checkpoint_to_be_refined(tmp_path: Path) -> None:
     after = resumed(interrupted(tmp_path, "dataset=camera", "recorder=mcap"))
     assert list(after.slots) == ["dataset", "mapper", "evaluator"]

@@ -28,6 +28,8 @@ from nodes.runtime.transport import create_keys
 from nodes.stream_times import StreamTimes
 from tests.support.shared_data import ROOT
 
+pytestmark = pytest.mark.slow
+
 INTERVAL = 0.03  # s between two frames
 
 

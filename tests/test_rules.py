@@ -51,11 +51,13 @@ def name(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
+@pytest.mark.slow
 def test_only_the_transport_imports_zmq() -> None:
     users = [path for path in python_files(*PACKAGES) if "zmq" in imports(path)]
     assert {name(path.parent) for path in users} == {"nodes/runtime/transport"}
 
 
+@pytest.mark.slow
 def test_the_core_knows_no_node_and_no_message() -> None:
     files = python_files("mvsgs_core")
     assert files
@@ -74,6 +76,7 @@ def test_importing_messages_and_the_transport_loads_no_torch() -> None:
     assert done.stdout == "[]\n"
 
 
+@pytest.mark.slow
 def test_nothing_is_pickled() -> None:
     for path in python_files(*PACKAGES, "bench"):
         assert not imports(path) & SERIALIZERS, name(path)
@@ -85,6 +88,7 @@ def test_nothing_is_pickled() -> None:
             assert not unsafe, f"{name(path)}:{call.lineno}: {function} with allow_pickle"
 
 
+@pytest.mark.slow
 def test_weights_are_loaded_without_code() -> None:
     for path in python_files(*PACKAGES, "bench", "tests"):
         for function, call in calls(path):
@@ -111,6 +115,7 @@ def test_no_module_is_called_utils() -> None:
     assert [name(p) for p in tracked_files() if p.stem in {"utils", "util", "helpers", "misc", "common"}] == []
 
 
+@pytest.mark.slow
 def test_tests_share_what_lies_in_support_only() -> None:
     found = [
         f"{name(path)}: {node.module}"

@@ -135,6 +135,7 @@ def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCaptur
     assert any("guess" in w for w in camera.stats.warnings)
 
 
+@pytest.mark.slow
 def test_a_slow_reader_gets_the_newest_picture_and_the_rest_is_counted(capture: type[FakeCapture]) -> None:
     camera = Camera(Camera.Config(stop=5, intrinsics=[50, 50, 31.5, 23.5]))
     lag = []
@@ -169,6 +170,7 @@ def test_a_loss_is_told_when_it_happens_and_so_is_the_return(capture: type[FakeC
     assert camera.stats.warnings[-2].endswith("was lost: it is opened again until it is found")
 
 
+@pytest.mark.slow
 def test_a_camera_that_hangs_is_told_before_it_is_given_up(capture: type[FakeCapture]) -> None:
     capture.dead_after = 3
     camera = Camera(Camera.Config(timeout=1.0))
@@ -223,6 +225,7 @@ class Stream(http.server.BaseHTTPRequestHandler):
         pass
 
 
+@pytest.mark.slow
 def test_a_network_camera_that_falls_silent() -> None:
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Stream)
     server.daemon_threads = True
@@ -285,6 +288,7 @@ def test_robot_frames_arrive_and_are_numbered_anew(address: str) -> None:
     assert all(isinstance(m, GroundTruth) and m.world_from_cam is None for m in messages[1::2])
 
 
+@pytest.mark.slow
 def test_a_slow_robot_reader_skips_and_counts(address: str) -> None:
     sender = publish(Publisher(address), [frame(i) for i in range(60)], 0.01)
     robot = Robot(Robot.Config(path=address))
@@ -299,6 +303,7 @@ def test_a_slow_robot_reader_skips_and_counts(address: str) -> None:
     assert robot.stats.counts["dropped"] == numbers[-1] - numbers[0] + 1 - len(numbers)
 
 
+@pytest.mark.slow
 def test_a_robot_that_falls_silent_or_never_speaks(address: str) -> None:
     with pytest.raises(TimeoutError, match=r"examples/robot\.py"):
         list(Robot(Robot.Config(path=address, timeout=0.3)).run())
@@ -320,6 +325,7 @@ def _wait(publisher: Publisher) -> None:
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_what_a_robot_should_not_send_is_left_out(address: str) -> None:
     wrong_type = Depth(
         1, 0.1, np.zeros((4, 4, 3), np.uint8), np.ones(4), np.eye(4), 1.0,
@@ -371,6 +377,7 @@ def test_a_foreign_program_that_follows_the_documented_format(address: str) -> N
         np.testing.assert_array_equal(message.intrinsics, [50, 51, 31.5, 23.5])
 
 
+@pytest.mark.slow
 def test_the_example_publishes_a_data_set(address: str, tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "fr3", 6)
     command = [sys.executable, str(ROOT / "examples/robot.py"), "--dataset", "tum", str(folder), "--address", address]

@@ -17,6 +17,8 @@ from msgs import End, Frame
 from nodes.runtime.transport import NewestReader, Publisher, ReliableReader
 from tests.support.launches import Launch
 
+pytestmark = pytest.mark.slow
+
 TOKEN = "0123456789abcdef"
 GUESSES = [b"", b"R", b"N", b"O", b"ORevaluator", b"0", b"f" * 16 + b"R", b"0123456789abcdeR"]
 

@@ -15,6 +15,8 @@ from launch.status import NodeStatus
 from launch.summary import summary
 from tests.support.launches import DOWN, Launch, launch
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["launch"]  # the fixture
 
 STREAM = ("source.count=150", "source.period=0.01")

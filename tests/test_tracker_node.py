@@ -36,6 +36,7 @@ def test_contracts() -> None:
     assert set(outputs(PosedTracker)) == {Keyframe, Trajectory}
 
 
+@pytest.mark.slow
 def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
     frames, _ = messages()
     node = Tracker()
@@ -74,6 +75,7 @@ def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
     assert "front end" in node.stats.seconds
 
 
+@pytest.mark.slow
 def test_changes_of_the_trackers_phase_are_sent() -> None:
     """A hand before the lens: nothing to search with; then noise, which is searched for in the map."""
     frames, _ = messages()
@@ -97,6 +99,7 @@ def test_changes_of_the_trackers_phase_are_sent() -> None:
     assert sum(n for name, n in counts.items() if name.startswith("frames while ")) == 42
 
 
+@pytest.mark.slow
 def test_a_stream_too_short_for_a_start_is_forced_to_one_and_says_so() -> None:
     frames, _ = messages(16)
     node = Tracker()
@@ -109,6 +112,7 @@ def test_a_stream_too_short_for_a_start_is_forced_to_one_and_says_so() -> None:
     assert any("forced" in warning for warning in node.stats.warnings)
 
 
+@pytest.mark.slow
 def test_a_guessed_focal_length_is_estimated_and_sent() -> None:
     frames, _ = messages()
     wrong = np.array([1.4, 1.4, 1.0, 1.0])
@@ -136,6 +140,7 @@ def test_a_stream_of_nothing_ends_with_an_empty_trajectory() -> None:
         assert sent[-1].world_from_cam.shape == (0, 4, 4)
 
 
+@pytest.mark.slow
 def test_no_pose_at_all_is_nothing_with_its_reason() -> None:
     frames, truths = messages(12)
     node = Tracker()
@@ -151,6 +156,7 @@ def test_no_pose_at_all_is_nothing_with_its_reason() -> None:
     assert "12 frames" in posed.stats.values["nothing"]
 
 
+@pytest.mark.slow
 def test_some_pose_is_something() -> None:
     frames, _ = messages(30)
     node = Tracker()
@@ -160,6 +166,7 @@ def test_some_pose_is_something() -> None:
     assert "nothing" not in node.stats.values
 
 
+@pytest.mark.slow
 def test_the_newest_view_is_sent() -> None:
     """Its frame is still there at the end, and the map gets it."""
     frames, truths = messages(40)
@@ -171,6 +178,7 @@ def test_the_newest_view_is_sent() -> None:
         assert max(k.index for k in of_type(sent, Keyframe)) >= 38
 
 
+@pytest.mark.slow
 def test_what_was_taken_out_of_the_keyframes_is_told() -> None:
     """The estimate of the readout time changes while keyframes go out: the report has what each was sent with."""
     frames, _ = rolling_messages(40)
@@ -197,6 +205,7 @@ def run_posed(order: list[Frame | GroundTruth]) -> list[msgs.Message]:
     return [*sent, *node.on_end()]
 
 
+@pytest.mark.slow
 def test_true_poses_come_with_depths_in_their_unit() -> None:
     frames, truths = messages()
     sent = run_posed([m for pair in zip(frames, truths) for m in pair])
@@ -272,6 +281,7 @@ def check_global_shutter(keyframes: list[Keyframe], frames: list[Frame]) -> None
     assert min(gains) > 0.0, gains
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rectify_rolling_shutter", [True, False])
 def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling_shutter: bool) -> None:
     frames, _ = rolling_messages(30)
@@ -287,6 +297,7 @@ def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling
         assert all(k.image is frames[k.index].image for k in keyframes)
 
 
+@pytest.mark.slow
 def test_keyframes_with_true_poses_are_as_a_global_shutter_would_have_taken_them() -> None:
     frames, truths = rolling_messages(30)
     node = PosedTracker(PosedTracker.Config(readout_time=0.5 / FPS))
@@ -305,6 +316,7 @@ def test_a_readout_in_another_unit_is_refused(node: type[Tracker] | type[PosedTr
         node(node.Config(readout_time=readout_time))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_keyframe_whose_shutter_stays_in_is_counted() -> None:
     frames, _ = rolling_messages(30)
     node = Tracker(Tracker.Config(readout_time=0.5 / FPS))

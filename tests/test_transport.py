@@ -74,6 +74,7 @@ def take_all(reader: ReliableReader, pause: float = 0.0) -> list[int]:
     return indices
 
 
+@pytest.mark.slow
 def test_a_slow_reliable_reader_gets_everything_while_a_best_effort_one_skips(address: str, opened: Callable) -> None:
     publisher = opened(Publisher(address, buffer=2))
     reader = opened(ReliableReader(address, Frame, buffer=2))
@@ -96,6 +97,7 @@ def test_a_slow_reliable_reader_gets_everything_while_a_best_effort_one_skips(ad
     until(publisher.gone)
 
 
+@pytest.mark.slow
 def test_a_full_reliable_reader_holds_the_publisher_back(ipc: str, opened: Callable) -> None:
     publisher = opened(Publisher(ipc, buffer=2))
     reader = opened(ReliableReader(ipc, Frame, buffer=2))
@@ -158,6 +160,7 @@ def test_a_frame_above_the_limit_never_reaches_memory(ipc: str, opened: Callable
         xpub.setsockopt(zmq.LINGER, 0)
 
 
+@pytest.mark.slow
 def test_a_publisher_survives_whoever_knocks(opened: Callable) -> None:
     address = tcp_address()
     publisher = opened(Publisher(address))
@@ -193,6 +196,7 @@ def test_a_reader_refuses_a_message_length_beyond_the_limit(opened: Callable) ->
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50 * 1024
 
 
+@pytest.mark.slow
 def test_a_publisher_that_disappears_is_noticed(address: str, opened: Callable) -> None:
     publisher = opened(Publisher(address))
     reader = opened(ReliableReader(address, Frame))
@@ -206,6 +210,7 @@ def test_a_publisher_that_disappears_is_noticed(address: str, opened: Callable) 
         until(lambda: inbox.receive(0.1) is not None)
 
 
+@pytest.mark.slow
 def test_a_reader_that_disappears_is_noticed_even_by_a_publisher_that_waits_for_it(
     address: str, opened: Callable
 ) -> None:

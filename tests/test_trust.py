@@ -45,6 +45,7 @@ def ran(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.rglob("*.ran"))
 
 
+@pytest.mark.slow
 def test_nothing_beside_the_data_is_imported(folder: Path) -> None:
     write_photos(folder, 6)
     done = run_in(folder, "dataset=images", "dataset.path=.", "dataset.intrinsics=[60,60,31.5,23.5]", "device=cpu")
@@ -53,6 +54,7 @@ def test_nothing_beside_the_data_is_imported(folder: Path) -> None:
     assert ran(folder) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["", f"{os.pathsep}{ROOT}", str(ROOT)], ids=["none", "empty entry", "repository"])
 @pytest.mark.parametrize("how", [[], ["--inline"], ["-m", "relay.stride=1,2"]], ids=["processes", "inline", "sweep"])
 def test_a_target_there_works_and_takes_no_other_modules_place(folder: Path, how: list[str], path: str) -> None:

@@ -185,6 +185,7 @@ def test_finished_is_said_only_of_the_map_as_the_mapper_left_it(last: int, said:
     assert ("finished" in node._status.content) == (last == 90)
 
 
+@pytest.mark.slow
 def test_the_launcher_says_where_the_page_is_and_sums_up_before_it_is_closed(tmp_path: Path) -> None:
     command = [
         sys.executable,

@@ -53,6 +53,7 @@ def test_rows_know_whether_they_meet_their_goal() -> None:
     assert at_least("a", 1.9, "s", 2.0) == Row("a", 1.9, "s", ">= 2", False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [choices("scene")[k::4] for k in range(4)])
 def test_every_scene_composes(names: Sequence[str]) -> None:
     for name in names:
@@ -60,6 +61,7 @@ def test_every_scene_composes(names: Sequence[str]) -> None:
         assert "dataset" in graph.sources, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [choices("variant")[k::4] for k in range(4)])
 def test_every_variant_composes_and_changes_something_or_is_the_full_system(names: Sequence[str]) -> None:
     plain = compose([SEARCH, "+scene=room", "output=same"]).resolved
@@ -68,6 +70,7 @@ def test_every_variant_composes_and_changes_something_or_is_the_full_system(name
         assert (graph.resolved == plain) == (name == "full"), name
 
 
+@pytest.mark.slow
 def test_variants_and_curves_name_what_there_is(tmp_path: Path) -> None:
     assert set(ablation.TABLE_III + ablation.SKIPS + ablation.OTHERS) <= set(choices("variant"))
     assert {*ablation.SCENES, *stress.REAL} <= set(choices("scene"))
@@ -318,6 +321,7 @@ def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
     assert memory.stream(log, {"dataset": flat}) == (3.5, 99.0)
 
 
+@pytest.mark.slow
 def test_offline_splatting_of_sparse_points_gets_better() -> None:
     items = list(open_dataset("synthetic", scene="room", frames=12, size=(48, 64), threads=1))
     views = [
@@ -347,6 +351,7 @@ def test_offline_splatting_of_sparse_points_gets_better() -> None:
         SparseMap(views, np.zeros((2, 3)), np.zeros((2, 3), np.uint8), config)
 
 
+@pytest.mark.slow
 def test_each_benchmark_explains_itself() -> None:
     """All in one process: most of the time goes into imports."""
     code = (

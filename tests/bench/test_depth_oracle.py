@@ -19,6 +19,7 @@ def room() -> Scene:
     return load_scene("room", AREA, count=4)
 
 
+@pytest.mark.slow
 def test_the_synthetic_room_allows_perfect_depth(room: Scene) -> None:
     found = oracle(room, AREA)
     assert within(found.carried, align=False) > 0.98
@@ -28,6 +29,7 @@ def test_the_synthetic_room_allows_perfect_depth(room: Scene) -> None:
     assert np.all(found.across <= found.off + 1e-9)
 
 
+@pytest.mark.slow
 def test_poses_that_do_not_fit_the_images_lower_it(room: Scene) -> None:
     """A turn of half a degree hardly moves surfaces, but matches lie 2 to 3 pixels off."""
     turn = geometry.se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(0.5), 0.0]))
@@ -38,6 +40,7 @@ def test_poses_that_do_not_fit_the_images_lower_it(room: Scene) -> None:
     assert np.median(found.off) > 1.0
 
 
+@pytest.mark.slow
 def test_alignment_divides_out_a_maps_scale_only(room: Scene) -> None:
     ratios = [np.array([2.0, 2.0, 2.0, 3.0]), np.zeros(0)]
     assert within(ratios, align=False) == 0.0

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from bench.depth.data import load_scene
 from bench.depth.pose_refinement import refine_poses
 from mvsgs_core import geometry
+
+pytestmark = pytest.mark.slow
 
 
 def _turns(views: list, truths: list) -> float:

@@ -10,6 +10,8 @@ import pytest
 from bench.depth.data import load_scene
 from bench.depth.sensor import sensor_offset, without_offset
 
+pytestmark = pytest.mark.slow
+
 
 def test_an_offset_of_inverse_depth_is_found_and_taken_out_and_none_is_believed_where_there_is_none() -> None:
     scene = load_scene("room", 160 * 120, 9)

@@ -44,6 +44,7 @@ def test_only_what_is_promised_counts_as_documented() -> None:
     assert not file_worker.documented(raised(lambda: np.zeros(3).reshape(2, 2))), "a ValueError, but not in our words"
 
 
+@pytest.mark.slow
 def test_a_worker_that_crashes_or_hangs_is_told_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     SEEDS["ply"][2](tmp_path)
     with files._Worker(tmp_path / "log") as worker:

@@ -19,6 +19,8 @@ pytest.importorskip("triton", reason="triton is not installed: pip install trito
 
 from bench import gpu, networks, record
 
+pytestmark = pytest.mark.slow
+
 MEASURE = gpu.milliseconds
 
 

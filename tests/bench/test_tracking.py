@@ -46,6 +46,7 @@ def test_memory_of_a_keyframe_that_grows_misses_the_goal() -> None:
     assert not met(300.0)
 
 
+@pytest.mark.slow
 def test_a_short_stream_is_followed_and_measured() -> None:
     samples = memory.follow(40, every=20)
     assert [s.frames for s in samples] == [20, 40]

@@ -22,6 +22,8 @@ from mvsgs_core.scene.patches import Patch, quad
 from mvsgs_core.scene.renderer import SceneRenderer
 from mvsgs_core.scene.room import HEIGHT, LENGTH, WIDTH
 
+pytestmark = pytest.mark.slow
+
 LIGHT = Lighting(texel=0.1, rects=(RectLight((0, 0, 3), (0, 1, 0), (1, 0, 0), (5, 5, 5)),), zenith=(0.4, 0.5, 0.6))
 
 

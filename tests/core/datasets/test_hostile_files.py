@@ -200,6 +200,7 @@ def test_file_names_with_digits_of_other_scripts() -> None:
     assert sorted(["b²", "b10", "b9", "b٣"], key=natural_order)[0] == "b٣"  # a superscript is no number
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "compress"),
     [

@@ -42,6 +42,7 @@ def with_poses(items: tuple[Item, Item], change: Callable[[np.ndarray], np.ndarr
     return replace(a, world_from_cam=change(a.world_from_cam)), replace(b, world_from_cam=change(b.world_from_cam))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "folder", "pair", "frames", "options"), WITH_DEPTH)
 def test_depth_and_poses_predict_the_other_image(
     name: str, folder: str, pair: tuple[int, int], frames: int, options: dict[str, Any]
@@ -58,6 +59,7 @@ def test_depth_and_poses_predict_the_other_image(
     assert error < 0.6 * min(wrong.values()), (error, wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "folder", "pair", "limit"),
     [
@@ -78,6 +80,7 @@ def test_matches_lie_on_epipolar_lines(name: str, folder: str, pair: tuple[int, 
     assert error < 0.1 * inverted
 
 
+@pytest.mark.slow
 def test_the_color_camera_of_seven_scenes_is_not_the_published_one() -> None:
     pairs = [(start, start + 20) for start in (0, 60)]
     ours = [two_frames("seven_scenes", "seven_scenes_redkitchen", pair) for pair in pairs]

@@ -15,6 +15,8 @@ from mvsgs_core.tracking.tracker import Update
 from mvsgs_core.trajectory import TrackingState, Trajectory
 from tests.support import droid_oracle as oracle
 
+pytestmark = pytest.mark.slow
+
 HEIGHT, WIDTH, COUNT = 96, 128, 44
 INTRINSICS = np.array([115.0, 115.0, 63.5, 47.5])
 SMALL = {  # thresholds for a map of 16x12 cells

@@ -37,6 +37,7 @@ def test_a_short_stream_is_kept_whole(tmp_path: Path) -> None:
     frames.close()
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_frames_cost_bounded_disk_and_are_kept_evenly(tmp_path: Path) -> None:
     count = 100_000
     frames = Frames(tmp_path, 200, PLENTY)

@@ -74,6 +74,7 @@ def exported(folder: Path, *arguments: str) -> Path:
     return folder / "colmap"
 
 
+@pytest.mark.slow
 def test_colmap_opens_the_model_with_its_cameras_poses_and_points(tmp_path: Path) -> None:
     cameras = save_cameras(tmp_path, TIMES)
     found = opened_by_colmap(exported(tmp_path))
@@ -103,6 +104,7 @@ def test_observations_reproject_where_they_are_and_only_what_is_in_sight_has_the
     assert np.median([len(track) for track in tracks]) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("from_behind", [False, True])
 def test_a_wall_hides_the_points_behind_it(tmp_path: Path, from_behind: bool) -> None:
     """Of two equal walls, 1 apart, one hides the other, from either side."""

@@ -46,6 +46,7 @@ def test_an_empty_map_is_a_file_too(tmp_path: Path) -> None:
     assert len(PlyData.read(str(tmp_path / "map.ply"))["vertex"].data) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["gaussian", "exact", "ges_scale"])
 def test_a_saved_map_is_read_back(tmp_path: Path, kernel: str) -> None:
     final = final_map(4, kernel)
@@ -149,6 +150,7 @@ def test_the_camera_is_the_one_that_the_run_estimated(tmp_path: Path, monkeypatc
         lens(arguments_of("--size", "0", "64"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["means", "log_scales", "quaternions", "opacity_logits", "sh"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_splats_that_are_not_finite_are_refused_or_left_out_and_counted(
@@ -179,6 +181,7 @@ def test_scaling_a_map_scales_its_picture_not_at_all() -> None:
     torch.testing.assert_close(one, two, atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "arguments", "written"),
     [

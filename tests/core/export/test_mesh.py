@@ -27,6 +27,7 @@ def mesh_of_box(folder: Path, name: str, *arguments: str, origin: np.ndarray = O
     return folder / name
 
 
+@pytest.mark.slow
 def test_mesh_lies_on_the_walls_of_the_box(tmp_path: Path) -> None:
     write_poses(tmp_path / "trajectory.txt", [0.5])
     camera_given = ["--size", "48", "64", "--intrinsics", "51", "51", "31.5", "23.5"]
@@ -38,6 +39,7 @@ def test_mesh_lies_on_the_walls_of_the_box(tmp_path: Path) -> None:
     assert np.median(distance) < 0.05
 
 
+@pytest.mark.slow
 def test_glb_opened_by_another_program_looks_from_its_axes_as_the_map_does_from_ours(tmp_path: Path) -> None:
     """Rendered by casting rays into what trimesh reads, with a camera in glTF's axes (y up, looking along -z)."""
     save_cameras(tmp_path, [0.5], SIZE, INTRINSICS)

@@ -91,6 +91,7 @@ v.onloadeddata = () => { v.currentTime = 0.001 }
 </script>"""
 
 
+@pytest.mark.slow
 def test_a_browser_plays_it(tmp_path: Path) -> None:
     browser = next(
         (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None

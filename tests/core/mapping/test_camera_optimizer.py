@@ -43,6 +43,7 @@ def shift(view: RGBDKeyframe, pose: np.ndarray) -> float:
     return float(np.linalg.norm(moved, axis=1).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e3])
 def test_a_wrong_pose_is_mended_and_the_first_one_stays(unit: float) -> None:
     given = views(unit)

@@ -69,6 +69,7 @@ def written(atlas: Atlas, output: Path) -> Path:
     return output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [PLAIN, EVERYTHING], ids=["plain", "everything"])
 def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_map_to_the_bit(
     config: MapperConfig, tmp_path: Path
@@ -243,6 +244,7 @@ def test_no_mutated_byte_raises_anything_but_a_value_error(tmp_path: Path) -> No
     assert refused > 140
 
 
+@pytest.mark.slow
 def test_no_mutated_value_raises_anything_but_a_value_error(tmp_path: Path) -> None:
     """Whole files with a value that no mapper writes: wrong types, sizes, numbers that are not finite, none at all."""
     file = state_files(written(begun(EVERYTHING), tmp_path))[0]

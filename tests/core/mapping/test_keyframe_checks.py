@@ -113,6 +113,7 @@ def test_a_correction_that_is_no_pose_is_refused() -> None:
     assert torch.equal(mapper.state.splats.means, before)
 
 
+@pytest.mark.slow
 def test_no_mutated_keyframe_ends_the_map_or_makes_it_unsound() -> None:
     """Every field with what no camera gives, singly and at a few pixels; the map goes on after each."""
     random = np.random.default_rng(0)

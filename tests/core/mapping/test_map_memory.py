@@ -23,10 +23,13 @@ SIZE = COUNT * (3 * 15 * 4 + 4 + 8 + 4 + 4)  # bytes: values and moments, age, a
 MMAP_THRESHOLD = -3  # of mallopt, malloc.h
 RESET = Path("/proc/self/clear_refs")  # 5: the peak of the resident memory begins anew
 
-pytestmark = pytest.mark.skipif(
-    sys.platform != "linux" or not os.access(RESET, os.W_OK) or not hasattr(ctypes.CDLL(None), "malloc_trim"),
-    reason="peaks of resident memory are read as Linux with glibc gives them",
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        sys.platform != "linux" or not os.access(RESET, os.W_OK) or not hasattr(ctypes.CDLL(None), "malloc_trim"),
+        reason="peaks of resident memory are read as Linux with glibc gives them",
+    ),
+]
 
 
 def splats(count: int) -> Splats:

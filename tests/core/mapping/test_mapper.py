@@ -36,6 +36,7 @@ def test_a_view_between_the_keyframes_is_rendered_well() -> None:
     assert not mapper.log.warnings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("origin", "unit"), [(1e6, 1.0), (-1e5, 1e-3), (0.0, 1e4)])
 def test_the_worlds_origin_and_unit_do_not_matter(origin: float, unit: float) -> None:
     here = score(mapped(tiny_views()), rgbd_keyframe(99, pose_on_arc(0.5)))
@@ -186,6 +187,7 @@ def test_converged_keyframes_are_passed_over() -> None:
     assert mapper.iterations <= 4 * 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["gaussian", "exact", "ges_scale"])
 def test_every_kernel_trains_with_harmonics_and_exposure(kernel: str) -> None:
     training = TrainingConfig(kernel=kernel, betas=True, exposure=True)

@@ -74,6 +74,7 @@ def test_few_and_many_of_a_block_with_bad_values_among_them(fraction: float, bas
         torch.testing.assert_close(kernel.first[name], twin.first[name], rtol=1e-4, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_fresh_splat_seen_every_time_follows_torch_adam() -> None:
     state = random_state(50)
     state.steps.zero_()

@@ -68,6 +68,7 @@ def test_noise_is_told_where_the_map_fits_it_too() -> None:
     assert known(check([(np.zeros((8, 8, 3)), np.zeros((8, 8, 3)))])).noise_limit == float("inf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "folder"),
     [("tum", "tum_fr1_xyz"), ("seven_scenes", "seven_scenes_redkitchen"), ("icl_nuim", "icl_nuim_of_kt0")],

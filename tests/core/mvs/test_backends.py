@@ -31,6 +31,7 @@ def smoothed(
     return backend.semi_global(cost, p.images.reference, p.first, p.step, p1, p2, options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COSTS)
 @pytest.mark.parametrize("radius", [1, 2, 3])
 def test_cost_volumes_of_both_backends_agree(name: Any, radius: int) -> None:

@@ -34,6 +34,7 @@ def test_droid() -> None:
         assert check_error(ours[name], stored) < LAYERS, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backbone", ["twins", "dino"])
 def test_mvsformer(backbone: str) -> None:
     table = checks(folder("mvsformer") / f"{backbone}_checks.json")

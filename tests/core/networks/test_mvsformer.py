@@ -29,6 +29,7 @@ def case(request: pytest.FixtureRequest) -> tuple[MvsFormer, MvsOutput, dict[str
     return net, output, stored
 
 
+@pytest.mark.slow
 def test_features(case: tuple[MvsFormer, MvsOutput, dict[str, np.ndarray]]) -> None:
     net, _, stored = case
     images = torch.from_numpy(stored["images_rgb"]).float()
@@ -38,6 +39,7 @@ def test_features(case: tuple[MvsFormer, MvsOutput, dict[str, np.ndarray]]) -> N
         assert error(features[k][:, :, ::every, ::every], stored[f"features_stage{k + 1}"]) < 2e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", [1, 2, 3, 4])
 def test_stages(case: tuple[MvsFormer, MvsOutput, dict[str, np.ndarray]], stage: int) -> None:
     _, output, stored = case
@@ -53,6 +55,7 @@ def test_stages(case: tuple[MvsFormer, MvsOutput, dict[str, np.ndarray]], stage:
         assert error(ours.volume[:, ::4], stored["volume_mean_stage1"]) < 1e-4
 
 
+@pytest.mark.slow
 def test_confidence(case: tuple[MvsFormer, MvsOutput, dict[str, np.ndarray]]) -> None:
     _, output, stored = case
     assert error(output.confidence, stored["confidence"]) < 2e-4

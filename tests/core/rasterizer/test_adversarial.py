@@ -18,6 +18,7 @@ BACKENDS = ("cpu", "reference")
 BAD_VALUES = (math.nan, math.inf, -math.inf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("field", ["means", "log_scales", "quaternions", "opacity_logits", "sh", "betas"])
 def test_a_parameter_that_is_not_finite(backend: str, field: str) -> None:
@@ -61,6 +62,7 @@ EXTREMES = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", EXTREMES)
 def test_extremes_stay_finite(name: str, kernel: str) -> None:

@@ -14,12 +14,14 @@ from tests.support.rasterizer_scenes import POSE, assert_agree, copy, gradients,
 BACKEND = "cpu"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("bases", [1, 4, 9, 16])
 def test_random_scene(kernel: str, bases: int) -> None:
     assert_agree(random_splats(200, bases, seed=bases), (40, 56), BACKEND, kernel=kernel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["gaussian", "exact"])
 def test_antialiased(kernel: str) -> None:
     small = random_splats(300, log_scale=-4.5)
@@ -98,6 +100,7 @@ def test_equal_depths_blend_in_the_order_of_the_index() -> None:
         assert float(render.color[4, 4, 0]) > float(other.color[4, 4, 0]) + 0.3
 
 
+@pytest.mark.slow
 def test_gradients_far_from_the_origin() -> None:
     """Means relative to a near origin, the pose far away together with them: only differences count."""
     splats, size = random_splats(200), (40, 56)

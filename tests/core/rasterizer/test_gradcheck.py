@@ -36,6 +36,7 @@ def images(kernel: str, antialiased: bool) -> Callable[..., tuple[Tensor, ...]]:
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("bases", [1, 4, 9, 16])
 def test_reference(kernel: str, bases: int) -> None:
@@ -45,6 +46,7 @@ def test_reference(kernel: str, bases: int) -> None:
     assert torch.autograd.gradcheck(images(kernel, False), inputs, eps=1e-6, atol=1e-6, rtol=1e-4, fast_mode=True)
 
 
+@pytest.mark.slow
 def test_reference_in_full() -> None:
     """Every element of the Jacobian, antialiased."""
     delta = torch.zeros(6, dtype=torch.float64, requires_grad=True)

@@ -9,6 +9,8 @@ import torch
 
 from mvsgs_core.rasterizer.ssim import chosen_backend, image_loss
 
+pytestmark = pytest.mark.slow
+
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 if DEVICE == "cpu":
     os.environ.setdefault("TRITON_INTERPRET", "1")  # read when triton is first imported

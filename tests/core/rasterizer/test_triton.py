@@ -24,6 +24,8 @@ from tests.support.rasterizer_scenes import (
     relative_error,
 )
 
+pytestmark = pytest.mark.slow
+
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # read when triton is first imported
 pytest.importorskip("triton", reason="triton is not installed: pip install triton to run its interpreter")

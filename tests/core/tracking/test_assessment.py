@@ -19,6 +19,7 @@ def test_small_images_are_enlarged_at_most_twice(size: tuple[int, int], expected
     assert tracking_size(*size, 320 * 240) == expected
 
 
+@pytest.mark.slow
 def test_small_images_do_not_bend_the_map() -> None:
     """At 160x120 itself, depths were 9 % off the scale of the trajectory, and the error of the trajectory 0.4 %."""
     items = synthetic(frames=60, size=(120, 160))
@@ -38,6 +39,7 @@ def test_small_images_do_not_bend_the_map() -> None:
     assert tracker.stats.warnings == []
 
 
+@pytest.mark.slow
 def test_a_map_that_few_points_hold_says_so() -> None:
     items = synthetic(frames=40, size=(120, 160), textureless=2)
     tracker, _, _ = track(items, TrackerConfig(area=160 * 120))
@@ -45,6 +47,7 @@ def test_a_map_that_few_points_hold_says_so() -> None:
     assert tracker.stats.counts["matches of a pair of keyframes, median"] < 150
 
 
+@pytest.mark.slow
 def test_a_map_that_many_points_hold_does_not() -> None:
     tracker, *_ = tracked_room()
     assert tracker.stats.counts["matches of a pair of keyframes, median"] > 300

@@ -32,6 +32,7 @@ def matrices(poses: np.ndarray) -> np.ndarray:
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_agrees_with_droid_slams_equations(case: str) -> None:
     golden = np.load(shared("golden/droid") / "ba.npz")

@@ -18,6 +18,7 @@ from tests.support.true_maps import image, matcher, pose_error, shuffled, tie, t
 ROUND = 80  # frames of a round: every third of 240 of the room's loop
 
 
+@pytest.mark.slow
 def test_a_second_round_makes_few_keyframes_and_is_as_accurate() -> None:
     once = synthetic(frames=240, loop=True, stride=3)
     items = [replace(once[n % ROUND], index=n, timestamp=n / 7.0) for n in range(2 * ROUND)]
@@ -51,6 +52,7 @@ def covisible(config: CovisibilityConfig = SMALL) -> CovisibleKeyframes:
     return made
 
 
+@pytest.mark.slow
 def test_the_nearest_old_keyframe_is_found_and_followed_for_longer() -> None:
     keyframes = covisible()
     found = keyframes.find(image(101), true_pose(101), NEWEST)

@@ -32,6 +32,7 @@ def jumping() -> list[Item]:
     return [replace(i, index=n, timestamp=n / 20.0) for n, i in enumerate(far)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("items", "kind", "figures"),
     [
@@ -49,6 +50,7 @@ def test_the_reason_is_what_was_measured(items: object, kind: str, figures: str)
     assert tracker.nothing in list(tracker.stats.warnings)
 
 
+@pytest.mark.slow
 def test_a_map_has_no_reason_to_be_none() -> None:
     tracker, _, _ = track(synthetic(frames=80)[:30])
     assert tracker.nothing == ""

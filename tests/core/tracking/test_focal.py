@@ -15,6 +15,8 @@ from mvsgs_core.tracking.tracker import Tracker, Update
 from mvsgs_core.trajectory import Trajectory
 from tests.support.sequences import ate
 
+pytestmark = pytest.mark.slow
+
 SIZE = (240, 320)
 GUESS = np.array(guess_lens(SIZE).intrinsics)
 

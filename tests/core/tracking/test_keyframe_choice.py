@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.front_end import Step
@@ -44,6 +45,7 @@ def test_the_newest_frame_that_is_not_held_out_ends_the_stream() -> None:
     assert newest([20]) == 20
 
 
+@pytest.mark.slow
 def test_no_frame_of_the_room_that_is_held_out_is_mapped() -> None:
     tracker, trajectory, _ = tracked_room()
     keyframes = trajectory.index[trajectory.keyframe].tolist()
@@ -53,6 +55,7 @@ def test_no_frame_of_the_room_that_is_held_out_is_mapped() -> None:
     assert keyframes[-1] == len(trajectory.index) - 1, "the newest view"
 
 
+@pytest.mark.slow
 def test_frames_that_had_to_stay_are_counted() -> None:
     items = [replace(i, index=n, timestamp=n / 20.0) for n, i in enumerate(synthetic(frames=80)[::5])]
     tracker, trajectory, _ = track(items)
@@ -61,6 +64,7 @@ def test_frames_that_had_to_stay_are_counted() -> None:
     assert tracker.stats.counts[HELD_OUT] == len(stayed)
 
 
+@pytest.mark.slow
 def test_a_camera_that_comes_to_rest_makes_no_keyframe_in_the_end() -> None:
     items = synthetic(frames=80)
     moving = list(items[:41])

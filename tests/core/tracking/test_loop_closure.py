@@ -221,6 +221,7 @@ def test_two_segments_become_one_map_with_one_unit() -> None:
         np.testing.assert_allclose(graph.keyframes[n].information, keyframe.information, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_round_through_the_room_is_closed_by_its_images() -> None:
     true = true_graph(*AROUND)
     graph = drifted(true, 1.01, turn=0.005)
@@ -235,6 +236,7 @@ def test_a_round_through_the_room_is_closed_by_its_images() -> None:
     assert ratio_after - 1.0 < 0.15 * (ratio - 1.0)
 
 
+@pytest.mark.slow
 def test_a_second_segment_is_joined_by_its_images() -> None:
     true = true_graph(0, 4, 8, 2, 6)
     graph = true_graph(0, 4, 8)

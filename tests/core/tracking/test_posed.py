@@ -27,6 +27,7 @@ def depths(factor: float, count: int = 40) -> dict[int, tuple[np.ndarray, np.nda
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1000.0, 1e-3])
 def test_the_unit_of_the_poses_does_not_matter(factor: float) -> None:
     plain, scaled = depths(1.0), depths(factor)
@@ -39,6 +40,7 @@ def test_the_unit_of_the_poses_does_not_matter(factor: float) -> None:
         assert np.quantile(np.abs(other[both] / (factor * depth[both]) - 1.0), 0.99) < 0.01
 
 
+@pytest.mark.slow
 def test_held_out_frames_are_no_keyframes_and_the_newest_view_is_one() -> None:
     keyframes = list(depths(1.0))
     assert len(keyframes) >= 5

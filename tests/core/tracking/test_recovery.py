@@ -23,6 +23,8 @@ from tests.support.sequences import synthetic, track
 from tests.support.shared_data import shared
 from tests.support.true_maps import image, matcher, pose_error, true_graph, true_pose
 
+pytestmark = pytest.mark.slow
+
 
 def covered(items: list[Item], noisy: range, black: range) -> list[Item]:
     """Images of noise, which are textured, and black ones, which are not."""

@@ -71,6 +71,7 @@ def test_poses_are_right_once_it_is_taken_out() -> None:
     assert errors[0.025] < 0.2 * errors[0.0]
 
 
+@pytest.mark.slow
 def test_the_synthetic_camera_has_a_global_shutter() -> None:
     tracker, _, _ = tracked_room()
     assert tracker.session.graph.readout_time == 0.0

@@ -6,6 +6,7 @@ import gc
 import tracemalloc
 
 import numpy as np
+import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.datasets import open_dataset
@@ -19,6 +20,8 @@ from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.tracking.tracker import Tracker
 from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import tracked_room
+
+pytestmark = pytest.mark.slow
 
 
 def matches_of(reference: int, frame: int) -> tuple[Matches, np.ndarray]:

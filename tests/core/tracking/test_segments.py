@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.tracking.tracker import Tracker
 from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import ate
+
+pytestmark = pytest.mark.slow
 
 BEFORE, COVERED = 30, 3
 

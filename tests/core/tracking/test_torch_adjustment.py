@@ -68,12 +68,14 @@ def test_some_poses_and_depths_held_some_keyframes_without_edges_some_edges_twic
     assert_equal(graph, Solver(steps=5, tolerance=0.0))
 
 
+@pytest.mark.slow
 def test_poses_only_and_structure_only() -> None:
     graph = noisy()
     assert_equal(replace(graph, free_depth=np.zeros(5, bool)), Solver(steps=5))
     assert_equal(replace(graph, free_pose=np.zeros(5, bool)), Solver(steps=5))
 
 
+@pytest.mark.slow
 def test_a_large_graph_is_taken_in_portions(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = noisy(k=7)
     monkeypatch.setattr(torch_adjustment, "_DENSE", 2 * 6 * 6 * 61 + 1)  # two keyframes at a time
@@ -98,6 +100,7 @@ def test_a_missing_gpu_is_an_error_that_says_so() -> None:
         Tracker(TrackerConfig(device="cuda:0"))
 
 
+@pytest.mark.slow
 def test_a_tracker_on_torch_finds_the_same_path() -> None:
     paths = []
     for device in ("cpu", "torch"):

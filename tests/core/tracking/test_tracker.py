@@ -14,6 +14,8 @@ from mvsgs_core.trajectory import TrackingState
 from tests.support.sequences import ate, synthetic, track, tracked_room
 from tests.support.shared_data import shared
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:
     items = synthetic(frames=80)
