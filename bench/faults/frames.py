@@ -70,6 +70,8 @@ def _decode(data: bytes) -> tuple[str, float]:
     try:
         decode(data)
         answer = "message"
+    except CodecError:
+        answer = CodecError.__name__
     except Exception as error:
         answer = type(error).__name__
     return answer, time.thread_time() - began
