@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from launch.graph import Graph, Replaced, Settings, build_graph
 from launch.refusal import GraphError
-from nodes.runtime.parameters import did_you_mean, parameter_names, plain_values
+from nodes.parameters import did_you_mean, parameter_names, plain_values
 
 CONF = Path(__file__).resolve().parent / "conf"
 DEFAULTS = plain_values(Settings())  # so that a choice's file can name any of the keys of no slot: ${output}

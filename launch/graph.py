@@ -16,7 +16,7 @@ import nodes
 from launch.refusal import GraphError
 from launch.renamed_parameters import refuse_old_names
 from mvsgs_core.named_modules import import_named
-from nodes.runtime.parameters import ParameterError, build, did_you_mean, parameter_names, plain_values
+from nodes.parameters import ParameterError, build, did_you_mean, parameter_names, plain_values
 
 # A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have. Where
 # some slot is their origin, an edge that misses them is an error all the same: corrections would be lost in silence.

@@ -16,7 +16,7 @@ from typing import Any
 
 from launch.field_comments import field_comments
 from launch.graph import Graph, Placement, Settings, Slot
-from nodes.runtime.parameters import Parameter, parameters, plain_values, type_name
+from nodes.parameters import Parameter, parameters, plain_values, type_name
 
 HEADER = """\
 Maps a video, a photo sequence or a live camera with Gaussian splats.

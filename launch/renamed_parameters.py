@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, get_origin, get_type_hints
 
 from launch.refusal import GraphError
-from nodes.runtime.parameters import nested_in
+from nodes.parameters import nested_in
 
 RENAMED: tuple[tuple[str, str], ...] = (  # what it was, what it is with a node that takes it
     ("tracker.keyframe_flow", "tracker.keyframe_choice.max_flow"),

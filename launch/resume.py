@@ -22,7 +22,7 @@ from launch.output import REPORT, read_report
 from launch.refusal import GraphError
 from launch.renamed_parameters import refuse_old_names
 from mvsgs_core.mapping.checkpoints.files import CheckpointInfo, checkpoint_info
-from nodes.runtime.parameters import parameter_names
+from nodes.parameters import parameter_names
 
 WORD = "resume="
 SOURCE = "dataset"  # the slot of the choice that gives a checkpoint's keyframes

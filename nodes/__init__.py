@@ -40,7 +40,7 @@ from typing import Any, ClassVar
 
 import msgs
 from mvsgs_core.stats import Stats
-from nodes.runtime.parameters import Parameter
+from nodes.parameters import Parameter
 
 
 class Node:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from msgs import Depth, Keyframe, Poses
 from mvsgs_core import camera
-from mvsgs_core.mvs.coarse import enlarge_inverse_depth
+from mvsgs_core.inverse_depth import enlarge_inverse_depth
 from nodes import Node
 from nodes.mvs import depth_message
 

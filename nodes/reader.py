@@ -12,7 +12,7 @@ from mvsgs_core import datasets
 from mvsgs_core.datasets import Item, check, open_dataset, options_of
 from mvsgs_core.datasets.options import FileOptions
 from nodes import Node
-from nodes.runtime.parameters import Parameter, parameter_names, parameters
+from nodes.parameters import Parameter, parameter_names, parameters
 
 
 class Reader(Node):

@@ -23,7 +23,7 @@ import yaml
 import nodes
 from launch.compose import CONF
 from launch.graph import Placement, Settings, load_node
-from nodes.runtime.parameters import Parameter, build, parameter_names, parameters
+from nodes.parameters import Parameter, build, parameter_names, parameters
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -10,7 +10,7 @@ import pytest
 from launch.graph import Settings
 from mvsgs_core.mapping.config import MapperConfig
 from nodes import Node
-from nodes.runtime.parameters import parameters
+from nodes.parameters import parameters
 from tests import count_configuration
 
 

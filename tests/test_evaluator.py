@@ -14,7 +14,7 @@ from msgs import FusedKeyframe, GroundTruth, SplatMap, TrackingState, Trajectory
 from mvsgs_core import geometry
 from mvsgs_core.evaluation.scoring import render_frame
 from nodes.evaluator import Evaluator
-from nodes.runtime.parameters import build
+from nodes.parameters import build
 from tests.support.full_disk import full_after
 
 H, W, N, SCALE = 24, 32, 12, 0.5  # the estimate's unit is 2 true units

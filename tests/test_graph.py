@@ -14,7 +14,7 @@ from launch.inline import run_inline
 from launch.placement import thread_plan
 from launch.refusal import GraphError
 from msgs import Frame, GroundTruth, Keyframe, Poses
-from nodes.runtime.parameters import ParameterError, convert
+from nodes.parameters import ParameterError, convert
 from tests.support.fake_graph.stages import Relay, Sink
 
 FAKE = Path(__file__).parent / "support" / "fake_graph" / "conf"

@@ -20,7 +20,7 @@ from launch.refusal import GraphError
 from launch.renamed_parameters import GONE, RENAMED
 from msgs import FusedKeyframe, Preview
 from nodes import Node
-from nodes.runtime.parameters import parameters
+from nodes.parameters import parameters
 from tests.support.shared_data import ROOT
 
 

@@ -12,7 +12,7 @@ import pytest
 from tests.support.shared_data import ROOT
 
 GROUND = "mvsgs_core"  # the files right in it: what several rooms need, and all may import
-PARAMETERS = "nodes/runtime/parameters.py"  # what a parameter is, which the contract speaks of
+PARAMETERS = "nodes/parameters.py"  # what a parameter is, which the contract speaks of
 CONTRACT = "nodes/__init__.py"  # what a node is
 
 # From the ground up: each room, its folders included, with those below it that it may import besides the ground.
@@ -27,7 +27,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "mvsgs_core/fusion": ("mvsgs_core/networks",),
     "mvsgs_core/tracking": ("mvsgs_core/networks",),
     "mvsgs_core/droid": ("mvsgs_core/networks", "mvsgs_core/tracking"),
-    "mvsgs_core/mapping": ("mvsgs_core/rasterizer", "mvsgs_core/export", "mvsgs_core/mvs"),
+    "mvsgs_core/mapping": ("mvsgs_core/rasterizer", "mvsgs_core/export"),
     "mvsgs_core/evaluation": (
         "mvsgs_core/rasterizer",
         "mvsgs_core/networks",

@@ -20,7 +20,7 @@ from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from nodes.mapper import Mapper
-from nodes.runtime.parameters import build
+from nodes.parameters import build
 from tests.support.mapper_messages import settings, view_message
 from tests.support.tiny_scene import pose_on_arc
 

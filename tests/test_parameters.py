@@ -15,7 +15,7 @@ import pytest
 from msgs import End, Frame, Keyframe
 from msgs.codec import decode, encode
 from nodes import Node
-from nodes.runtime.parameters import ParameterError, build, parameters, plain_values
+from nodes.parameters import ParameterError, build, parameters, plain_values
 from nodes.runtime.plain import plain
 from nodes.runtime.runner import Runner, merge_stats, own_stats
 from tests.support.sample_nodes import Left, Wrong

@@ -19,9 +19,9 @@ from msgs.codec import decode, encode
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets.mcap_file import MAGIC
 from nodes import free_inputs, handlers, is_source, outputs
+from nodes.parameters import ParameterError, build
 from nodes.player import Player
 from nodes.recorder import Recorder
-from nodes.runtime.parameters import ParameterError, build
 from tests.support.example_messages import MESSAGES, assert_equal, example
 
 

@@ -32,8 +32,8 @@ from mvsgs_core.datasets import Item
 from mvsgs_core.evaluation import trajectory_metrics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.mapping.config import MapperConfig
+from nodes.parameters import parameter_names
 from nodes.reader import Reader
-from nodes.runtime.parameters import parameter_names
 
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end
 QUICK_SCENE = "room"  # scene of a quick run: in 30 frames of the real ones COLMAP puts no two images together

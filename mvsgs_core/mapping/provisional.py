@@ -13,12 +13,12 @@ import numpy as np
 import torch
 
 from mvsgs_core import camera
+from mvsgs_core.inverse_depth import enlarge_inverse_depth
 from mvsgs_core.mapping.densifier import SOLID
 from mvsgs_core.mapping.filling import continued_depth, fill_points
 from mvsgs_core.mapping.insertion import Points, depth_colors, splats_from_points
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.mvs.coarse import enlarge_inverse_depth
 from mvsgs_core.rasterizer.splats import Splats
 
 KEPT = 8  # keyframes that wait for their depth: the newest

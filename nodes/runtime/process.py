@@ -28,10 +28,10 @@ import msgs
 from msgs import Message
 from mvsgs_core.named_modules import import_named
 from nodes import Node, is_source, outputs
+from nodes.parameters import build
 from nodes.runtime.addresses import PeerLost, load_keys
 from nodes.runtime.freed_memory import FreedMemory
 from nodes.runtime.inbox import Inbox, Reader
-from nodes.runtime.parameters import build
 from nodes.runtime.runner import Runner, end_of, stats_of
 from nodes.runtime.signals import ABORT_SECONDS, Signals, Stopped, end_within
 from nodes.runtime.spec import Spec

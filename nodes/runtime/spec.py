@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import msgs
-from nodes.runtime.parameters import ParameterError, build
+from nodes.parameters import ParameterError, build
 
 
 @dataclass(frozen=True)

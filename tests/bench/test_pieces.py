@@ -15,7 +15,7 @@ from bench.pieces import Pieces
 from bench.runs import CONF, Matrix, Run
 from nodes.mapper import Mapper
 from nodes.mvs import Mvs
-from nodes.runtime.parameters import parameters
+from nodes.parameters import parameters
 
 
 @pytest.fixture

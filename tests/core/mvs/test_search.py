@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mvsgs_core.inverse_depth import enlarge_inverse_depth
 from mvsgs_core.mvs.backend import NativeBackend
-from mvsgs_core.mvs.coarse import enlarge_inverse_depth
 from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, fill_uncertain, search_range, upsample_surface
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 from mvsgs_core.mvs.neighbors import NeighborConfig, select_neighbors
