@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import resource
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +15,7 @@ from mvsgs_core.mapping.checkpoints.checkpointing import MAX_FRACTION, Checkpoin
 from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_files
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.trajectory_file import read_trajectory
+from tests.support.full_disk import full_after
 from tests.support.small_atlas import PLAIN, begun, view
 
 
@@ -37,17 +35,6 @@ def times(checkpoints: Checkpointing, atlas: Atlas) -> float:
     checkpoints.keep(atlas)
     assert checkpoints._writer.wait(20.0)
     return atlas.current.log.counts.get("checkpoints", 0)
-
-
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """As on a disk that is full: no process's file gets longer."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_the_first_checkpoint_is_made_as_soon_as_there_is_a_map(tmp_path: Path) -> None:
@@ -117,7 +104,7 @@ def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> 
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     clock.now += 40.0
     atlas.current.add_keyframe(view(7))
-    with files_of_at_most(20_000):
+    with full_after(20_000):
         assert times(checkpoints, atlas) == 2
         checkpoints.keep(atlas)
     assert any("make room" in text and "File too large" in text for text in atlas.current.log.warnings)
@@ -134,7 +121,7 @@ def test_a_final_map_that_cannot_be_written_is_an_error_and_leaves_the_one_befor
     checkpoints = Checkpointing(tmp_path, 30.0, atlas)
     assert times(checkpoints, atlas) == 1
     before = (tmp_path / "map.ply").read_bytes()
-    with files_of_at_most(20_000), pytest.raises(OSError, match="File too large"):
+    with full_after(20_000), pytest.raises(OSError, match="File too large"):
         checkpoints.finish(atlas)
     assert (tmp_path / "map.ply").read_bytes() == before
     assert checkpoint_info(tmp_path).splats == len(atlas.largest.state)
