@@ -163,7 +163,7 @@ def test_a_frame_above_the_limit_never_reaches_memory(ipc: str, opened: Callable
 @pytest.mark.slow
 def test_a_publisher_survives_whoever_knocks(opened: Callable) -> None:
     address = tcp_address()
-    publisher = opened(Publisher(address))
+    publisher = opened(Publisher(address, token="secret"))  # as over tcp: who knocks is no reader
     host, port = address.removeprefix("tcp://").split(":")
     greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01NULL" + bytes(48)  # ZMTP 3.1 of a client
     ready = b"\x04\x19\x05READY\x0bSocket-Type" + struct.pack(">I", 3) + b"SUB"
@@ -173,7 +173,7 @@ def test_a_publisher_survives_whoever_knocks(opened: Callable) -> None:
         with socket.create_connection((host, int(port))) as knock:
             knock.sendall(words)
             time.sleep(0.02)
-    reader = opened(ReliableReader(address, Frame))
+    reader = opened(ReliableReader(address, Frame, token="secret"))
     until(lambda: publisher.ready(1))
     publisher.send(frame(3))
     until(lambda: reader.take() is not None)
