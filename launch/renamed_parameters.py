@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from launch.refusal import GraphError
 from nodes.parameters import nested_in
@@ -26,6 +26,8 @@ RENAMED: tuple[tuple[str, str], ...] = (  # what it was, what it is with a node 
     ("mvs.best_views", "mvs.cost.top_k"),
     ("mvs.paths", "mvs.smoothing.paths"),
     ("mvs.range_margin", "mvs.ranges.margin"),
+    ("mvs.stages.small_jump", "mvs.stages.p1"),  # of each in the list
+    ("mvs.stages.large_jump", "mvs.stages.p2"),
     ("mvs.least_cells", "mvs.ranges.min_cells"),
     ("mvs.skip_cells", "mvs.pruning.outside_cells"),
     ("depth_fusion.least_views", "depth_fusion.min_views"),
@@ -56,6 +58,7 @@ GONE: Mapping[str, str] = {
     "mapper.coarse_to_fine": "it gained nothing that could be measured",
     "mapper.skip_tiles": "it gained nothing that could be measured",
     "mapper.map_views": "it was for mvs=skipping",
+    "mapper.insertion.min_confidence": "depth comes filtered already",
     "mvs.skip_certain": "it cost precision and saved no time",
     "mvs.skip_explained": "it passed over no keyframe of a camera's stream",
     "mvs.tolerance": "it was of mvs=skipping",
@@ -83,11 +86,19 @@ def _path(slot: str, name: str) -> list[str] | None:
 
 def _given(values: Any, path: list[str]) -> bool:
     """Whether a value stands there; a mapping is none, as a parameter of that name may have become a group."""
-    for key in path:
+    for place, key in enumerate(path):
+        if isinstance(values, list):
+            return any(_given(value, path[place:]) for value in values)
         if not isinstance(values, Mapping) or key not in values:
             return False
         values = values[key]
     return not isinstance(values, Mapping)
+
+
+def _listed_in(annotation: Any) -> type | None:
+    """The dataclass of which a parameter lists any number."""
+    members = get_args(annotation)
+    return nested_in(members[0]) if get_origin(annotation) is tuple and members[1:] == (...,) else None
 
 
 def _takes(config: Any, path: list[str]) -> bool:
@@ -96,7 +107,7 @@ def _takes(config: Any, path: list[str]) -> bool:
         hints = get_type_hints(config)
         if key not in hints:
             return False
-        config = nested_in(hints[key])
+        config = nested_in(hints[key]) or _listed_in(hints[key])
         if config is None:
             return key == path[-1] or get_origin(hints[key]) is dict
     return False

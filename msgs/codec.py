@@ -227,7 +227,7 @@ def _split(view: memoryview) -> tuple[str, memoryview]:
     if version != VERSION:
         raise VersionError(f"a frame of wire version {version}; this program writes and reads version {VERSION}")
     if zero:
-        raise CodecError(f"a frame with the flags {zero}, which are 0")
+        raise CodecError(f"a frame with flags {zero}, which must be 0")
     start = _PREFIX.size + name_length
     try:
         name = bytes(view[_PREFIX.size : start]).decode("ascii")

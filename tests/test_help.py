@@ -138,7 +138,13 @@ def test_an_old_name_is_refused_with_the_new_one(old: str, new: str) -> None:
     there = compose(command).slots[slot].config
     for key in keys[:-1]:
         there = there[key]
-    assert keys[-1] in there or keys[0] == "constants"
+    assert keys[-1] in (there[0] if isinstance(there, list) else there) or keys[0] == "constants"
+
+
+def test_an_old_name_in_a_list_is_refused_too() -> None:
+    stage = "scale: 1, step: 1.0, hypotheses: 9, radius: 2"
+    with pytest.raises(GraphError, match=r"^mvs.stages.small_jump is mvs.stages.p1 now$"):
+        compose([f"mvs.stages=[{{{stage}, p1: 0.1, p2: 1.0}}, {{{stage}, small_jump: 0.1, p2: 1.0}}]", "device=cpu"])
 
 
 @pytest.mark.parametrize("old", sorted(GONE))
