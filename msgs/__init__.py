@@ -9,6 +9,10 @@ pixels of the image they come with. Maps smaller than the image (`h w` against `
 scale the intrinsics with `mvsgs_core.camera.scale_intrinsics`. 0 in a depth or inverse-depth map means "unknown".
 A number with a default is left out of the wire where it has that value, so that older programs still fit.
 
+Exposure: `exposure` is the color affine [A | b] (3, 4) from the map's colors, those of the mean camera, to the image's,
+0 to 1; `vignetting` (v1, v2, v3) the sensor's brightness factor V(r) = 1 + v1 r² + v2 r⁴ + v3 r⁶, r the distance from
+the principal point over half the image's diagonal: image = clip(V(r) (A color + b)). None: the identity, or not known.
+
 `index` is the index of the frame in its stream; a keyframe keeps its frame's index as its id everywhere.
 """
 
@@ -46,6 +50,7 @@ class Frame(_Image):
     """One image of the stream, undistorted."""
 
     intrinsics_guessed: bool = False  # the focal length is a guess, to be estimated by the tracker if it can
+    exposure: float = 0.0  # exposure time times gain over f-number², in a unit that the stream keeps; 0: not known
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,8 @@ class Keyframe(_PosedImage):
     inverse_depth: Annotated[np.ndarray, "float32 h w"]
     inverse_depth_weight: Annotated[np.ndarray, "float32 h w"]  # confidence, 0 to 1
     segment: int  # part of the map; poses of two segments share no frame of reference
+    exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
+    vignetting: Annotated[np.ndarray, "float32 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,8 @@ class Depth(_PosedImage):
     depth: Annotated[np.ndarray, "float32 h w"]
     confidence: Annotated[np.ndarray, "float32 h w"]  # 0 to 1
     segment: int
+    exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
+    vignetting: Annotated[np.ndarray, "float32 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -86,11 +95,13 @@ class FusedKeyframe(_PosedImage):
     normals: Annotated[np.ndarray, "float32 h w 3"]  # camera frame, toward the camera; 0 where depth is 0
     segment: int
     unfiltered: Annotated[np.ndarray, "float32 h w"] | None = None  # refined depth before the filters; None: not sent
+    exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
+    vignetting: Annotated[np.ndarray, "float32 3"] | None = None
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Corrected keyframe poses after bundle adjustment or loop closure, merged by keyframe index.
+    """Corrected keyframe poses after bundle adjustment or loop closure, merged by keyframe index, and exposures.
 
     Absolute, not differences: what was computed at `Keyframe.scale` s has its depths multiplied by scale / s.
     """
@@ -100,6 +111,8 @@ class Poses:
     world_from_cam: Annotated[np.ndarray, "float64 K 4 4"]
     scale: Annotated[np.ndarray, "float64 K"]
     segment: Annotated[np.ndarray, "int32 K"] | None = None  # Keyframe.segment now: a loop joins two; None: as sent
+    exposure: Annotated[np.ndarray, "float32 K 3 4"] | None = None  # of those keyframes now; None: as they were
+    vignetting: Annotated[np.ndarray, "float32 3"] | None = None  # of all images now; None: as it was
 
 
 @dataclass(frozen=True)
@@ -123,6 +136,8 @@ class Trajectory:
     segment: Annotated[np.ndarray, "int32 N"]
     focal_factor: float = 1.0  # by which the tracker multiplied the focal lengths of the frames, if they were guessed
     readout_time: float = 0.0  # seconds of the rolling shutter that was taken out of the keyframes, first row to last
+    exposure: Annotated[np.ndarray, "float32 N 3 4"] | None = None  # of every frame, NaN where it is not known
+    vignetting: Annotated[np.ndarray, "float32 3"] | None = None
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,8 @@ class Trajectory:
     segment: np.ndarray  # (N,) int32: poses of two segments share no frame of reference
     focal_factor: float = 1.0  # on the focal lengths of the frames, where they were guessed
     readout_time: float = 0.0  # seconds of the rolling shutter that was taken out of the keyframes
+    exposure: np.ndarray | None = None  # (N, 3, 4) float32 color affine of each, see `msgs`, NaN where it is not known
+    vignetting: np.ndarray | None = None  # (3,) float32 of the sensor
 
     @classmethod
     def empty(cls) -> Trajectory:

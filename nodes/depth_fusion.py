@@ -64,7 +64,7 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             self.stats.warn(f"some keyframes: {found.problem}")
             self.stats.count(found.problem)
         self.stats.values["part kept"] = found.counts["kept"] / found.counts["pixels"]
-        return FusedKeyframe(
+        fused = FusedKeyframe(
             index=message.index,
             timestamp=message.timestamp,
             image=message.image,
@@ -76,7 +76,10 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             normals=found.normals,
             segment=message.segment,
             unfiltered=found.unfiltered,
+            exposure=message.exposure,
+            vignetting=message.vignetting,
         )
+        return self._exposed(fused)
 
 
 class DepthFusion(FusionNode):

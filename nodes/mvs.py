@@ -59,7 +59,8 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
             self.stats.skip(f"hypotheses {what}", found.result.counts.get(what, 0.0))
         self.stats.values["mean confidence"] = float(np.mean(found.result.confidence))
         depth = depth_message(keyframe, found.result.depth, found.result.confidence)
-        return replace(depth, world_from_cam=found.view.world_from_cam, scale=found.view.scale)
+        depth = replace(depth, world_from_cam=found.view.world_from_cam, scale=found.view.scale)
+        return self._exposed(depth)
 
 
 def depth_message(keyframe: Keyframe, depth: np.ndarray, confidence: np.ndarray) -> Depth:
@@ -74,6 +75,8 @@ def depth_message(keyframe: Keyframe, depth: np.ndarray, confidence: np.ndarray)
         depth=depth,
         confidence=confidence,
         segment=keyframe.segment,
+        exposure=keyframe.exposure,
+        vignetting=keyframe.vignetting,
     )
 
 

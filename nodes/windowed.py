@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from msgs import Poses
+from msgs import Depth, FusedKeyframe, Poses
 from mvsgs_core.keyframe_window import WindowedKeyframe
 from nodes import Node
 
@@ -21,6 +22,7 @@ Core = TypeVar("Core", bound=WindowedCore)
 Found = TypeVar("Found")  # what the core finds of a keyframe
 Sent = TypeVar("Sent")  # the message of it
 K = TypeVar("K", bound=WindowedKeyframe)
+Lit = TypeVar("Lit", Depth, FusedKeyframe)
 
 
 class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
@@ -32,6 +34,8 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         super().__init__(config)
         self._core = self._make_core()
         self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
+        self._exposures: dict[int, np.ndarray] = {}  # (3, 4), the same
+        self._vignetting: np.ndarray | None = None  # (3,) the newest
 
     @abstractmethod
     def _make_core(self) -> Core: ...
@@ -43,8 +47,18 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
         for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
             self._poses[int(i)] = (pose, float(scale))
+        if poses.exposure is not None:
+            self._exposures.update(zip(map(int, poses.index), poses.exposure, strict=True))
+        if poses.vignetting is not None:
+            self._vignetting = poses.vignetting
         self._core.move(self._poses)
         yield poses
+
+    def _exposed(self, message: Lit) -> Lit:
+        """With exposure and vignetting as they are now: corrections may have overtaken the keyframe."""
+        exposure = self._exposures.get(message.index, message.exposure)
+        vignetting = message.vignetting if self._vignetting is None else self._vignetting
+        return replace(message, exposure=exposure, vignetting=vignetting)
 
     def _corrected(self, keyframe: K) -> K:
         """With its newest pose, where that came before the keyframe."""

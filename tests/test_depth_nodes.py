@@ -142,6 +142,29 @@ def test_what_the_filters_reject_is_sent_beside_the_filtered_depth() -> None:
     np.testing.assert_array_equal(view.unfiltered, depth.depth)
 
 
+def test_exposure_and_vignetting_pass_through_and_a_correction_that_overtakes_them_holds() -> None:
+    affine = np.eye(3, 4, dtype=np.float32)
+    dark = np.array([-0.3, 0.0, 0.0], np.float32)
+    mvs, depth_fusion = stereo(), fusion()
+    sent = [keyframe(i, exposure=(1 + i) * affine, vignetting=dark) for i in range(6)]
+    depths = [d for k in sent for d in mvs.on_keyframe(k)]
+    assert [d.index for d in depths] == [0, 1, 2, 3]
+    correction = Poses(
+        1, np.array([2, 4]), np.stack([sent[2].world_from_cam, sent[4].world_from_cam]), np.ones(2),
+        exposure=np.stack([20 * affine, 40 * affine]), vignetting=0.5 * dark,
+    )  # fmt: skip
+    views = [v for d in depths[:1] for v in depth_fusion.on_depth(d)]
+    for node in (mvs, depth_fusion):
+        assert list(node.on_poses(correction)) == [correction]
+    depths = [*depths[1:], *mvs.on_end()]
+    assert [d.exposure[0, 0] for d in depths] == [2, 3, 4, 40, 6]  # 2 was sent before it was corrected
+    views += [v for d in depths for v in depth_fusion.on_depth(d)] + list(depth_fusion.on_end())
+    assert [v.exposure[0, 0] for v in views] == [1, 2, 20, 4, 40, 6]
+    assert all(np.array_equal(v.vignetting, 0.5 * dark) for v in views)
+    (coarse,) = CoarseDepth(CoarseDepth.Config(area=SIZE[0] * SIZE[1])).on_keyframe(sent[3])
+    np.testing.assert_array_equal(coarse.exposure, 4 * affine)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_pose_that_is_not_finite_is_refused(bad: float) -> None:
     pose = look(0.0)
