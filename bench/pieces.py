@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.runs import Matrix, Run, commit
+from bench.runs import ROOT, Matrix, Run, commit
 from bench.table import Row
 
 
@@ -48,7 +48,7 @@ class Pieces:
             if done is None:
                 (place / "piece.json").unlink(missing_ok=True)
                 (run or Matrix.run)(matrix, place)
-                done = {**asked(matrix), "commit": commit()}
+                done = {**asked(matrix), "commit": commit(matrix.checkout)}
                 (place / "piece.json").write_text(json.dumps(done, indent=1))
             found += matrix.collect(place)
             if done["commit"] not in self.commits:
@@ -102,4 +102,5 @@ def asked(matrix: Matrix) -> dict[str, Any]:
         "seeds": list(matrix.seeds),
         "overrides": list(matrix.overrides),
         "settings": [[setting.name, *setting.overrides] for setting in matrix.settings],
+        **({} if matrix.checkout == ROOT else {"checkout": str(matrix.checkout)}),
     }

@@ -81,9 +81,10 @@ class Matrix:
     jobs: int = 1  # at once, by joblib; 1: one after the other, as times need
     settings: Sequence[Setting] = field(default_factory=tuple)
     prefix: Sequence[str] = field(default_factory=tuple)  # before the command: ("taskset", "-c", "0")
+    checkout: Path = ROOT  # whose code runs; its own scenes and variants go before those of this one
 
     def check(self) -> None:
-        """Raises ValueError, listing what there is, for an unknown scene or variant."""
+        """Raises ValueError, listing what there is, for an unknown scene or variant, and for a checkout of no code."""
         for kind, names in (("scene", self.scenes), ("variant", self.variants)):
             known = choices(kind)
             unknown = [name for name in names if name not in known]
@@ -92,18 +93,21 @@ class Matrix:
         names = [setting.name for setting in self.settings]
         if len(set(names)) < len(names):
             raise ValueError(f"two settings of one name: {', '.join(names)}")
+        if not (self.checkout / "launch" / "run_all.py").is_file():
+            raise ValueError(f"{self.checkout} is no checkout of this project: it has no launch/run_all.py")
 
     def command(self, output: Path) -> list[str]:
         launcher = ["hydra/launcher=joblib", f"hydra.launcher.n_jobs={self.jobs}"] if self.jobs > 1 else []
-        search = [f"file://{CONF}"]
+        conf = self.checkout / "bench" / "conf"
+        search = [f"file://{folder}" for folder in dict.fromkeys((conf, CONF)) if folder.is_dir()]
         settings = []
         if self.settings:
             search.append(f"file://{_settings_folder(output)}")
             settings = [f"+setting={','.join(setting.name for setting in self.settings)}"]
         return [
             *self.prefix,
-            sys.executable,
-            str(ROOT / "launch" / "run_all.py"),
+            python(self.checkout),
+            str(self.checkout / "launch" / "run_all.py"),
             "-m",
             f"hydra.searchpath=[{','.join(search)}]",
             *launcher,
@@ -133,7 +137,7 @@ class Matrix:
         self.write_settings(output)
         with (output / "runs.log").open("w") as log:
             return subprocess.Popen(
-                self.command(output), cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, env=environment()
+                self.command(output), cwd=self.checkout, stdout=log, stderr=subprocess.STDOUT, env=environment()
             )
 
     def run(self, output: Path) -> list[Run]:
@@ -164,6 +168,12 @@ class Matrix:
         return runs
 
 
+def python(checkout: Path = ROOT) -> str:
+    """The interpreter that runs a checkout: this one, or another checkout's own, where it has a .venv."""
+    own = checkout / ".venv" / "bin" / "python"
+    return str(own) if checkout != ROOT and own.exists() else sys.executable
+
+
 def launch(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
     """One run of the launcher, to its end; its screen is in the result. Raises CalledProcessError where it fails."""
     command = [sys.executable, str(ROOT / "launch" / "run_all.py"), *arguments]
@@ -172,10 +182,10 @@ def launch(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
 
 
 def environment() -> dict[str, str]:
-    """Environment of the runs: network weights from the shared folder, unless MVSGS_WEIGHTS says otherwise."""
+    """Environment of the runs: data and network weights from the shared folder, unless it says otherwise."""
     weights = SHARED / "weights"
     found = {"MVSGS_WEIGHTS": str(weights)} if weights.is_dir() else {}
-    return {**found, **os.environ}
+    return {"MVSGS_SHARED": str(SHARED), **found, **os.environ}
 
 
 def choices(kind: str) -> list[str]:
@@ -239,9 +249,9 @@ def machine() -> str:
     return f"{model}, {cores} cores, {kernels}"
 
 
-def commit() -> str:
+def commit(checkout: Path = ROOT) -> str:
     """The commit that runs, with a plus where files under version control differ from it."""
-    git = ["git", "-C", str(ROOT)]
+    git = ["git", "-C", str(checkout)]
     name = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     # the records themselves are not part of what is measured
     differs = subprocess.run(

@@ -1,4 +1,4 @@
-"""Writes which frames became keyframes, and all poses: a recorder for benchmarks that compare with other systems."""
+"""Writes the final trajectory: a recorder for benchmarks that compare with other systems, or draw a run's frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nodes import Node
 
 
 class TrackRecorder(Node):
-    """Trajectory -> a JSON file: `index`, `keyframe`, `segment` and `world_from_cam` (null without a pose)."""
+    """Trajectory -> a JSON file of its fields; what is not known of a frame, or at all, is null."""
 
     @dataclass
     class Config:
@@ -24,17 +24,18 @@ class TrackRecorder(Node):
     config: Config
 
     def on_trajectory(self, track: Trajectory) -> None:
-        known = np.isfinite(track.world_from_cam).all(axis=(1, 2))
-        poses = [pose.tolist() if good else None for pose, good in zip(track.world_from_cam, known)]
-        content: dict[str, Any] = {
-            "index": track.index.tolist(),
-            "keyframe": track.keyframe.tolist(),
-            "segment": track.segment.tolist(),
-            "world_from_cam": poses,
-        }
         path = Path(self.config.path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content))
+        path.write_text(json.dumps({name: _plain(value) for name, value in vars(track).items()}, allow_nan=False))
 
     def on_end(self) -> Iterator[Any]:
         yield from ()
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: an array is a list of its rows, a row that is not finite null."""
+    if not isinstance(value, np.ndarray):
+        return value
+    if value.dtype.kind != "f":
+        return value.tolist()
+    return [row.tolist() if np.isfinite(row).all() else None for row in value]

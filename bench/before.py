@@ -1,0 +1,245 @@
+"""This checkout against another, such as an earlier commit: the same scenes and settings, in turns, seed by seed.
+
+    git worktree add --detach ../before COMMIT    # and in it `make setup`
+    python -m bench.before --other ../before
+
+One run at a time, the mapper with one thread; whatever else the machine does meets both. Figures are those of each
+checkout's own report, a scene's parameters are called as the checkout calls them. Without --other this checkout is
+compared with itself: what it shows then is noise. --fewer 10:100,5:50 runs this checkout with so many iterations a
+keyframe and at the end, too: the cheapest that is as good as before tells what the map of before costs now.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench import pieces
+from bench.runs import QUICK, ROOT, Matrix, Run, figure, folder, python, said
+from bench.table import Row, main
+
+Report = dict[str, Any]
+_SMALL_VIDEO = ("dataset.size=[180,240]", "dataset.stop=100")
+SCENES: dict[str, tuple[str, ...]] = {  # with what makes them small enough for three seeds of two checkouts
+    "redkitchen": _SMALL_VIDEO,
+    "tum_fr1_xyz": _SMALL_VIDEO,
+    "hololens_000": (),
+    "kitti_piece": (),
+    "icl_nuim": ("dataset.size=[240,320]",),
+    "aerial": (),
+    "replica_20": (),
+    "room": (),
+    "room_exposure": (),
+}
+GAINS = {  # dB of held-out PSNR that are asked for; of the others that they lose no more than -WORSE
+    "redkitchen": 2.5, "tum_fr1_xyz": 2.5, "icl_nuim": 1.0, "hololens_000": 1.0, "kitti_piece": 1.0, "aerial": 1.0,
+    "room": 0.3, "replica_20": 0.3, "room_exposure": 6.0,
+}  # fmt: skip
+WORSE = -0.1
+GAP = 1.0  # dB that keyframes may be ahead of held-out frames
+SHARE = 0.4  # of the splats and of the mapper's time, at the PSNR of before
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a run; `relative`: its change is a factor, not a difference."""
+
+    table: str
+    name: str
+    unit: str
+    of: Callable[[Report], float | None]
+    relative: bool = False
+
+    def change(self, before: float, after: float) -> float:
+        return after / before if self.relative else after - before
+
+
+def _at(path: str) -> Callable[[Report], float | None]:
+    return lambda report: figure(report, path)
+
+
+def _sum(path: str, scale: float = 1.0) -> Callable[[Report], float | None]:
+    """Over all nodes but the evaluator, which is no part of the system."""
+
+    def total(report: Report) -> float | None:
+        section, _, name = path.partition(".")
+        values = (report.get(section) or {}).get(name) or {}
+        return scale * float(sum(v for node, v in values.items() if node != "evaluator")) if values else None
+
+    return total
+
+
+def _gap(report: Report) -> float | None:
+    keyframes, held_out = (figure(report, f"rendering.{kind}.psnr") for kind in ("keyframes", "held_out"))
+    return None if keyframes is None or held_out is None else keyframes - held_out
+
+
+def _megabytes(report: Report) -> float | None:
+    found = figure(report, "memory.peak_bytes.mapper")
+    return None if found is None else 1e-6 * found
+
+
+PSNR = Figure("Held-out frames", "PSNR", "dB", _at("rendering.held_out.psnr"))
+SPLATS = Figure("The map", "splats", "", _at("map.splats"), relative=True)
+SECONDS = Figure("Processor time", "mapper", "s", _at("time.cpu.mapper"), relative=True)
+AHEAD = Figure("Keyframes", "PSNR ahead of held-out", "dB", _gap)
+FIGURES = (
+    PSNR,
+    Figure("Held-out frames", "SSIM", "", _at("rendering.held_out.ssim")),
+    Figure("Held-out frames, by eye", "LPIPS", "", _at("rendering.held_out.lpips")),
+    Figure("Held-out frames, by eye", "worst PSNR", "dB", _at("rendering.worst.held_out.psnr")),
+    Figure("Keyframes", "PSNR", "dB", _at("rendering.keyframes.psnr")),
+    AHEAD,
+    SPLATS,
+    Figure("The map", "iterations", "", _at("map.iterations"), relative=True),
+    SECONDS,
+    Figure("Processor time", "all nodes", "s", _sum("time.cpu"), relative=True),
+    Figure("Peak memory", "mapper", "MB", _megabytes, relative=True),
+    Figure("Peak memory", "all nodes", "MB", _sum("memory.peak_bytes", 1e-6), relative=True),
+)
+
+
+def check(checkout: Path) -> None:
+    """Raises ValueError where a checkout would not run its own code."""
+    code = "import sys; sys.path.insert(0, sys.argv[1]); import mvsgs_core; print(mvsgs_core.__file__)"
+    command = [python(checkout), "-c", code, str(checkout)]
+    done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
+    found = done.stdout.strip()
+    if done.returncode or not Path(found).is_relative_to(checkout):
+        what = found or (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        raise ValueError(f"{checkout} would run {what}: it needs a .venv of its own; `make setup` there")
+
+
+def rows_of(scene: str, before: Sequence[Run], after: Sequence[Run]) -> list[Row]:
+    """Of the seeds that both have: means with half the range, and the change from seed to seed."""
+    rows = []
+    for shown in FIGURES:
+        pairs = list(_pairs(shown, before, after))
+        if not pairs:
+            continue
+        old, new = np.array(pairs, dtype=float).T
+        changes = np.array([shown.change(*pair) for pair in pairs])
+        name = f"{shown.table}: {scene}: {shown.name}"
+        rows += [
+            Row(f"{name}, before", float(old.mean()), shown.unit, spread=_spread(old)),
+            Row(f"{name}, after", float(new.mean()), shown.unit, *_goal_of_figure(shown, new), spread=_spread(new)),
+        ]
+        kind, unit = ("times before", "") if shown.relative else ("change", shown.unit)
+        goal = _goal_of_change(scene, shown, changes)
+        rows.append(Row(f"{name}, {kind}", float(changes.mean()), unit, *goal, spread=_spread(changes)))
+    return rows
+
+
+def _pairs(shown: Figure, before: Iterable[Run], after: Iterable[Run]) -> Iterable[tuple[float, float]]:
+    """The figure before and after, of each seed that has both."""
+    old = {run.seed: shown.of(run.report) for run in before if run.report}
+    new = {run.seed: shown.of(run.report) for run in after if run.report}
+    for seed in sorted(old.keys() & new.keys()):
+        first, second = old[seed], new[seed]
+        if first is not None and second is not None and (first or not shown.relative):
+            yield first, second
+
+
+def _spread(values: np.ndarray) -> float | None:
+    return float(np.ptp(values) / 2) if len(values) > 1 else None
+
+
+def _goal_of_figure(shown: Figure, values: np.ndarray) -> tuple[str, bool | None]:
+    return (f"<= {GAP:g}", bool(values.mean() <= GAP)) if shown is AHEAD else ("", None)
+
+
+def _goal_of_change(scene: str, shown: Figure, changes: np.ndarray) -> tuple[str, bool | None]:
+    """Of time and memory what is no more than the spread above 1 is no more than before."""
+    if shown is PSNR:
+        wanted = GAINS.get(scene, WORSE)
+        return f">= {wanted:g}", bool(changes.mean() >= wanted)
+    if shown.table in (SECONDS.table, "Peak memory"):
+        return "<= 1", bool(changes.mean() <= 1.0 + (_spread(changes) or 0.0))
+    return "", None
+
+
+def at_equal_quality(scene: str, before: Sequence[Run], candidates: dict[str, Sequence[Run]]) -> list[Row]:
+    """What the cheapest of the candidates costs whose mean PSNR is that of before."""
+    good: dict[str, tuple[float, float]] = {}
+    for name, runs in candidates.items():
+        shares = [[shown.change(*pair) for pair in _pairs(shown, before, runs)] for shown in (SECONDS, SPLATS)]
+        gains = [PSNR.change(*pair) for pair in _pairs(PSNR, before, runs)]
+        if gains and all(shares) and np.mean(gains) >= 0.0:
+            good[name] = float(np.mean(shares[0])), float(np.mean(shares[1]))
+    title = f"At before's PSNR: {scene}"
+    if not good:
+        return [Row(f"{title}: cheapest", "none is as good", "", f"<= {SHARE:g} of before", False)]
+    name = min(good, key=lambda n: good[n])
+    shares_of = zip(("mapper's processor time, times before", "splats, times before"), good[name])
+    return [
+        Row(f"{title}: cheapest", name),
+        *(Row(f"{title}: {what}", value, "", f"<= {SHARE:g}", value <= SHARE) for what, value in shares_of),
+    ]
+
+
+def sides(other: Path, fewer: str | None) -> dict[str, tuple[Path, tuple[str, ...]]]:
+    """Checkout and overrides of each kind of run. Raises ValueError for what is not ITERATIONS:REFINEMENT."""
+    found: dict[str, tuple[Path, tuple[str, ...]]] = {"before": (other, ()), "after": (ROOT, ())}
+    for text in fewer.split(",") if fewer else ():
+        each, colon, last = text.partition(":")
+        if not (colon and each.isdecimal() and last.isdecimal()):
+            raise ValueError(f"--fewer {text!r} must be iterations a keyframe and at the end, such as 10:100")
+        settings = (f"mapper.iterations={each}", f"mapper.refinement={last}")
+        found[f"{each} a keyframe, {last} at the end"] = (ROOT, settings)
+    return found
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    other = options.other.resolve()
+    scenes, seeds = options.scenes.split(","), [int(s) for s in options.seeds.split(",")]
+    overrides = ["recorder=track", "mapper.threads=1", *options.overrides]
+    if options.quick:
+        scenes, seeds = ["room"], seeds[:1]
+        overrides += QUICK
+    for checkout in dict.fromkeys((other, ROOT)):
+        check(checkout)
+    output = folder(options, "before")
+    made = {checkout: pieces.Pieces.of(options, output) for checkout in (other, ROOT)}
+    runs: dict[str, dict[str, list[Run]]] = {scene: {} for scene in scenes}
+    for seed in seeds:
+        for scene in scenes:
+            for side, (checkout, settings) in sides(other, options.fewer).items():
+                given = [*SCENES.get(scene, ()), *overrides, *settings]
+                matrix = Matrix([scene], seeds=[seed], overrides=given, checkout=checkout)
+                found = made[checkout].runs({place(scene, seed, side): matrix})
+                runs[scene].setdefault(side, []).extend(found)
+    rows = [Row(side, ", ".join(made[path].commits)) for side, path in (("before", other), ("after", ROOT))]
+    for scene, by_side in runs.items():
+        rows += rows_of(scene, by_side["before"], by_side["after"])
+        if options.fewer:
+            rows += at_equal_quality(scene, by_side["before"], {k: v for k, v in by_side.items() if k != "before"})
+        rows += [
+            Row(f"{scene}, {side}, seed {run.seed}", said(run), "", "a report", False)
+            for side, group in by_side.items()
+            for run in group
+            if run.report is None
+        ]
+    return rows + [row for kept in made.values() for row in kept.rows()]
+
+
+def place(scene: str, seed: int, side: str) -> str:
+    """Folder of a run, in that of the benchmark; its files are in folder 0 in there."""
+    return f"{scene}/{seed}/{side.replace(' ', '_').replace(',', '')}"
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--other", type=Path, default=ROOT, help="checkout to compare with, such as a git worktree")
+    parser.add_argument("--scenes", default=",".join(SCENES), help="comma separated")
+    parser.add_argument("--seeds", default="0,1,2", help="comma separated")
+    parser.add_argument("--fewer", help="iterations a keyframe and at the end, such as 10:100,5:50")
+    pieces.arguments(parser, "dataset.stop=60")
+
+
+if __name__ == "__main__":
+    main(measure, "Before and after", arguments)

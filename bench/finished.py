@@ -1,0 +1,135 @@
+"""A run that is over, read from its folder: its map at the frames that it was scored on, rendered as they were scored.
+
+It reads what a run with `recorder=track` leaves: config.yaml, track.json, map.ply, cameras.json and report.json. A run
+of an earlier checkout, too, where what it lacks can be had otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from msgs import GroundTruth
+from mvsgs_core import image_metrics
+from mvsgs_core.evaluation import scoring
+from mvsgs_core.evaluation.evaluation import Evaluation
+from mvsgs_core.export.cameras import read_cameras
+from mvsgs_core.export.ply import read_ply
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.held_out import is_held_out
+from mvsgs_core.trajectory import TrackingState, Trajectory
+from nodes.parameters import parameter_names
+from nodes.reader import Reader
+
+TOLERANCE = 0.1  # dB between the mean of the renders made here and what the run's report says of them
+
+
+class FinishedRun:
+    """One run's map, trajectory and held-out frames."""
+
+    def __init__(self, folder: Path, frames: dict[int, GroundTruth]) -> None:
+        """Raises FileNotFoundError for a folder that lacks some of it, and ValueError where what is rendered is not
+        what the report says: a picture of it would show something else than was scored."""
+        self.folder = folder
+        self.report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+        track = json.loads((folder / "track.json").read_text())
+        self.trajectory = trajectory_of(track, self.report, frames)
+        self.map = snapshot_of(folder, self.trajectory)
+        self._evaluation = Evaluation(len(frames), np.inf)
+        for frame in frames.values():
+            self._evaluation.add_frame(frame.index, frame.image, frame.intrinsics, None, None)
+        self._evaluation.trajectory = self.trajectory
+        self._evaluation.add_map(self.map, True)
+        scored = self._evaluation.scored_frames(True)
+        self._scored = {f.index: f for f in scored if not f.keyframe and is_held_out(f.index)}
+        self.psnr = {index: self._score(index) for index in self._scored}
+        found, said = float(np.mean(list(self.psnr.values()))), self.report["rendering"]["held_out"]["psnr"]
+        if said is None or not abs(found - said) <= TOLERANCE:
+            raise ValueError(f"{folder}: held-out frames are rendered at {found:.2f} dB, the report says {said}")
+
+    def close(self) -> None:
+        self._evaluation.close()
+
+    def held_out(self) -> list[int]:
+        """The worst first."""
+        return sorted(self.psnr, key=lambda index: self.psnr[index])
+
+    def photograph(self, index: int) -> np.ndarray:
+        """(H, W, 3) uint8 of a held-out frame."""
+        return self._scored[index].photograph()
+
+    def render(self, index: int) -> scoring.Rendered:
+        """A held-out frame as it was scored."""
+        frame = self._scored[index]
+        return scoring.render_frame(self.map.splats, self.map.kernel, frame, frame.photograph().shape[:2])
+
+    def _score(self, index: int) -> float:
+        photograph = self.photograph(index).astype(np.float32) / 255.0
+        return float(image_metrics.psnr(self.render(index).color, photograph))
+
+
+def frames_of(folder: Path) -> dict[int, GroundTruth]:
+    """The frames that a run in `folder` got, by index."""
+    config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    assert isinstance(config, dict)
+    return read_frames(config["dataset"])
+
+
+def read_frames(settings: dict[str, Any]) -> dict[int, GroundTruth]:
+    """Frames by index, as a reader with these settings, those it does not know left out, gives them."""
+    known = {str(k): v for k, v in settings.items() if k in parameter_names(Reader.Config)}
+    messages = Reader(Reader.Config(**known)).run()
+    return {message.index: message for message in messages if isinstance(message, GroundTruth)}
+
+
+def trajectory_of(track: dict[str, Any], report: dict[str, Any], frames: dict[int, GroundTruth]) -> Trajectory:
+    """What the recorder wrote; what an earlier one left out, from the frames and the report."""
+    poses = _rows(track["world_from_cam"], (4, 4), np.float64)
+    posed = np.isfinite(poses).all(axis=(1, 2))
+    state = np.where(posed, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8)
+    exposure, vignetting = track.get("exposure"), track.get("vignetting")
+    return Trajectory(
+        index=np.array(track["index"], dtype=np.int64),
+        timestamp=np.array(track.get("timestamp") or [frames[i].timestamp for i in track["index"]], dtype=np.float64),
+        world_from_cam=poses,
+        keyframe=np.array(track["keyframe"], dtype=bool),
+        state=np.array(track["state"], dtype=np.uint8) if "state" in track else state,
+        segment=np.array(track["segment"], dtype=np.int32),
+        focal_factor=float(track.get("focal_factor", 1.0)),
+        readout_time=float(track["readout_time"]) if "readout_time" in track else _told_readout(report),
+        exposure=None if exposure is None else _rows(exposure, (3, 4), np.float32),
+        vignetting=None if vignetting is None else np.array(vignetting, dtype=np.float32),
+    )
+
+
+def snapshot_of(folder: Path, trajectory: Trajectory) -> Snapshot:
+    """map.ply with the keyframes of cameras.json, or where there is none those of the trajectory."""
+    splats = read_ply(folder / "map.ply")
+    if (folder / "cameras.json").exists():
+        cameras = read_cameras(folder / "cameras.json")
+        index, poses, exposures = cameras.keyframes, cameras.world_from_cam, cameras.exposures
+    else:
+        mapped = trajectory.keyframe & trajectory.main()
+        index, poses = trajectory.index[mapped], trajectory.world_from_cam[mapped]
+        exposures = np.tile(np.eye(3, 4), (len(index), 1, 1))
+    return replace(
+        splats, keyframes=index, world_from_cam=poses, scale=np.ones(len(index)), exposures=exposures.astype(np.float32)
+    )
+
+
+def _rows(values: list[Any], shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    """(N, *shape), NaN where a row is null."""
+    unknown = np.full(shape, np.nan)
+    return np.array([unknown if value is None else value for value in values], dtype=dtype).reshape(-1, *shape)
+
+
+def _told_readout(report: dict[str, Any]) -> float:
+    """Seconds of the rolling shutter, as the protocol in the report says it; 0 where it says nothing of one."""
+    found = re.search(r"\(([\d.]+) ms a frame\)", report.get("protocol", ""))
+    return 1e-3 * float(found.group(1)) if found else 0.0
