@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -164,7 +164,7 @@ def _goal_of_change(scene: str, shown: Figure, changes: np.ndarray) -> tuple[str
     return "", None
 
 
-def at_equal_quality(scene: str, before: Sequence[Run], candidates: dict[str, Sequence[Run]]) -> list[Row]:
+def at_equal_quality(scene: str, before: Sequence[Run], candidates: Mapping[str, Sequence[Run]]) -> list[Row]:
     """What the cheapest of the candidates costs whose mean PSNR is that of before."""
     good: dict[str, tuple[float, float]] = {}
     for name, runs in candidates.items():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,20 +42,18 @@ class FinishedRun:
         track = json.loads((folder / "track.json").read_text())
         self.trajectory = trajectory_of(track, self.report, frames)
         self.map = snapshot_of(folder, self.trajectory)
-        self._evaluation = Evaluation(len(frames), np.inf)
-        for frame in frames.values():
-            self._evaluation.add_frame(frame.index, frame.image, frame.intrinsics, None, None)
-        self._evaluation.trajectory = self.trajectory
-        self._evaluation.add_map(self.map, True)
-        scored = self._evaluation.scored_frames(True)
+        with closing(Evaluation(len(frames), np.inf)) as evaluation:
+            for frame in frames.values():
+                evaluation.add_frame(frame.index, frame.image, frame.intrinsics, None, None)
+            evaluation.trajectory = self.trajectory
+            evaluation.add_map(self.map, True)
+            scored = evaluation.scored_frames(True)
         self._scored = {f.index: f for f in scored if not f.keyframe and is_held_out(f.index)}
+        self._frames = frames
         self.psnr = {index: self._score(index) for index in self._scored}
         found, said = float(np.mean(list(self.psnr.values()))), self.report["rendering"]["held_out"]["psnr"]
         if said is None or not abs(found - said) <= TOLERANCE:
             raise ValueError(f"{folder}: held-out frames are rendered at {found:.2f} dB, the report says {said}")
-
-    def close(self) -> None:
-        self._evaluation.close()
 
     def held_out(self) -> list[int]:
         """The worst first."""
@@ -62,12 +61,12 @@ class FinishedRun:
 
     def photograph(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8 of a held-out frame."""
-        return self._scored[index].photograph()
+        return self._frames[index].image
 
     def render(self, index: int) -> scoring.Rendered:
         """A held-out frame as it was scored."""
-        frame = self._scored[index]
-        return scoring.render_frame(self.map.splats, self.map.kernel, frame, frame.photograph().shape[:2])
+        size = self.photograph(index).shape[:2]
+        return scoring.render_frame(self.map.splats, self.map.kernel, self._scored[index], size)
 
     def _score(self, index: int) -> float:
         photograph = self.photograph(index).astype(np.float32) / 255.0

@@ -97,12 +97,7 @@ def draw(folder: Path, scene: str, seed: int, file: Path) -> None:
     """Writes the sheet of a scene. Raises FileNotFoundError where its runs are not there, and as `sheet` does."""
     folders = [folder / place(scene, seed, side) / "0" for side in ("before", "after")]
     frames = frames_of(folders[1])
-    runs = [FinishedRun(path, frames) for path in folders]
-    try:
-        picture = sheet(*runs)
-    finally:
-        for run in runs:
-            run.close()
+    picture = sheet(*(FinishedRun(path, frames) for path in folders))
     if not cv2.imwrite(str(file), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
         raise OSError(f"could not write {file}")
 
