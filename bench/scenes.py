@@ -18,6 +18,7 @@ from mvsgs_core.evaluation import metrics, svg
 COLUMNS = {  # path in the report
     "KF PSNR": "rendering.keyframes.psnr",
     "held-out PSNR": "rendering.held_out.psnr",
+    "held-out, fitted": "rendering.held_out_fitted.psnr",
     "all PSNR": "rendering.all.psnr",
     "held-out, unrefined": "rendering_before_refinement.held_out.psnr",
     **{metric.label: f"rendering.held_out.{metric.key}" for metric in metrics.IMAGE[1:]},

@@ -31,6 +31,8 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
         before = _image(_get(report, "rendering_before_refinement", part))
         if after or before:
             lines.append(f"{title}   {after or '-'}" + (f"   (before refinement: {before})" if before else ""))
+    if fitted := _image(_get(report, "rendering", "held_out_fitted")):
+        lines.append(f"  fitted    {fitted}, their poses and exposures fitted at test time")
     lines += _worst(report, "rendering") or _worst(report, "rendering_before_refinement")
     trajectory = _get(report, "trajectory") or {}
     if trajectory:

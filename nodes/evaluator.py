@@ -40,6 +40,7 @@ class Evaluator(Node):
         max_frames: int = 200  # frames scored at most, keyframes, held-out and others evenly; 0: no scoring
         max_bytes: float = 2e9  # of images and depth maps that wait on disk to be scored
         lpips: Literal["auto", "on", "off"] = "auto"  # auto: if its weights are found; on: an error if they are not
+        fitted: bool = True  # score held-out frames also with pose and exposure fitted to them at test time
 
     config: Config
 
@@ -52,7 +53,7 @@ class Evaluator(Node):
         self.folder = folder
         self._lpips = self._load_lpips()
         given = {"lpips": self._lpips.compare} if self._lpips else {}
-        self.evaluation = Evaluation(self.config.max_frames, self.config.max_bytes, given, folder)
+        self.evaluation = Evaluation(self.config.max_frames, self.config.max_bytes, given, folder, self.config.fitted)
         self.report: dict[str, Any] = {}
 
     @classmethod
@@ -84,6 +85,8 @@ class Evaluator(Node):
     def on_end(self) -> Iterator[None]:
         with self.stats.time("scoring"):
             self.report = self.evaluation.report()
+        self.stats.seconds["fitting at test time"] = self.evaluation.fitting
+        self.stats.seconds["scoring"] -= self.evaluation.fitting
         self._add_statistics()
         for note in self.report["notes"]:
             self.stats.warn(note)
@@ -119,7 +122,8 @@ class Evaluator(Node):
             "input": self.config.input.strip(),
         }
         self.report["protocol"] = (
-            "Scored at native resolution; nothing is fitted to a scored frame, exposure neither. "
+            "Scored at native resolution; strict: nothing is fitted to a scored frame, exposure neither. "
+            f"{_fitted(self.report)}"
             f"Keyframes are training views; held-out: every {HELD_OUT_EVERY}th frame that is no keyframe. Covered: "
             "pixels at which the render is more than half opaque. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self._lpips else 'not computed'}. "
@@ -154,6 +158,15 @@ def _snapshot(message: SplatMap) -> Snapshot:
     arrays = {name: value.copy() for name, value in vars(message).items() if isinstance(value, np.ndarray)}
     splats = Splats(**{f.name: torch.from_numpy(arrays.pop(f.name)) for f in fields(Splats)})
     return Snapshot(splats, kernel=message.kernel, iterations=message.iterations, **arrays)
+
+
+def _fitted(report: dict[str, Any]) -> str:
+    if not report["rendering"]["held_out_fitted"]["count"]:
+        return ""
+    return (
+        "Fitted: a held-out frame's pose and color affine, and nothing else, are fitted to it on the finished map "
+        "(least squares), as ARTDECO, PLANING and OnTheFly-NVS score. "
+    )
 
 
 def _shutter(found: trajectory.Trajectory | None) -> str:

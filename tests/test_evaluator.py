@@ -186,6 +186,25 @@ def test_frames_between_keyframes_are_rendered_at_an_exposure_between_theirs(eva
     assert "interpolated in time" in evaluator.report["protocol"]
 
 
+@pytest.mark.parametrize("fitted", [True, False])
+def test_held_out_frames_are_scored_by_both_protocols(tmp_path: Path, fitted: bool) -> None:
+    """Photographs that the map shows but for their exposure; the strict figure is the same with and without fitting."""
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off", fitted=fitted))
+    for k in range(N):
+        image = np.full((H, W, 3), (150, 40, 45), np.uint8)
+        list(node.on_ground_truth(GroundTruth(k, k / 30, image, INTRINSICS, None, None)))
+    report = _feed(node)
+    after = report["rendering"]
+    assert after["held_out"]["psnr"] == pytest.approx(18.18, abs=0.01)
+    assert report["rendering_before_refinement"]["held_out_fitted"]["count"] == 0
+    assert all((frame["fitted"] is not None) == (fitted and frame["held_out"]) for frame in after["frames"])
+    assert ("held-out, fitted" in (tmp_path / "report.html").read_text()) == fitted
+    assert ("ARTDECO" in report["protocol"]) == fitted
+    assert (report["time"]["stages"]["evaluator"]["fitting at test time"] > 0) == fitted
+    assert after["held_out_fitted"]["count"] == 2 * fitted
+    assert not fitted or after["held_out_fitted"]["psnr"] > 40
+
+
 def test_without_truth_the_figures_are_null(tmp_path: Path) -> None:
     node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
     for k in range(N):

@@ -35,6 +35,18 @@ def test_the_worst_frame_the_least_covered_and_the_counts_are_shown() -> None:
     assert any(line.startswith("depth") and line.endswith("2 keyframes") for line in lines)
 
 
+def test_the_figures_with_fitted_cameras_stand_below_the_strict_ones() -> None:
+    fitted = [
+        Score(5, False, {"psnr": 33.0, "ssim": 0.9, "lpips": None}, 1.0, {"psnr": 34.5, "ssim": 0.92, "lpips": None})
+    ]
+    lines = _figures(report(fitted, []))
+    assert lines[:2] == [
+        "held-out    PSNR 33.00 dB, SSIM 0.900, 1 frames",
+        "  fitted    PSNR 34.50 dB, SSIM 0.920, 1 frames, their poses and exposures fitted at test time",
+    ]
+    assert not any("fitted" in line for line in _figures(report(SCORES, [])))
+
+
 def test_a_map_that_was_never_refined_has_a_worst_frame_too() -> None:
     assert any(line.startswith("worst       frame 8") for line in _figures(report([], SCORES)))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from mvsgs_core.evaluation import metrics, scoring, trajectory_metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.exposure import between_keyframes
+from mvsgs_core.evaluation.fitted_camera import fit_camera
 from mvsgs_core.evaluation.frames import Frames
 from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
 from mvsgs_core.evaluation.trajectory_metrics import known_poses
@@ -31,11 +32,13 @@ class Evaluation:
     max_bytes: float  # of frames that wait on disk
     given: Mapping[str, scoring.Compare] = field(default_factory=dict)  # image metrics made at run time, by key
     folder: Path | None = None  # where they wait
+    fitted: bool = True  # held-out frames are scored a second time, their cameras fitted at test time
     started: float | None = None
     mapped: float | None = None
     trajectory: Trajectory | None = None
     maps: dict[bool, Snapshot] = field(default_factory=dict)  # by `refined`
     scores: dict[bool, list[scoring.Score]] = field(default_factory=dict)
+    fitting: float = 0.0  # seconds that went into fitting cameras at test time
 
     def __post_init__(self) -> None:
         self._frames = Frames(self.folder, self.max_frames, self.max_bytes)
@@ -153,12 +156,23 @@ class Evaluation:
             return scoring.summarize([])
         chosen = scoring.choose(self.scored_frames(refined), self.max_frames)
         scores = [scoring.score_frame(finished.splats, finished.kernel, frame, self.given) for frame in chosen]
+        if refined and self.fitted:
+            scores = [self._fitted(finished, frame, score) for frame, score in zip(chosen, scores)]
         self.scores[refined] = scores
         held_out = sum(score.held_out for score in scores)
         few = f"{held_out} of the {len(scores)} frames scored are held out: their mean and their worst say little"
         if held_out < ENOUGH and few not in notes:
             notes.append(few)
         return scoring.summarize(scores)
+
+    def _fitted(self, finished: Snapshot, frame: scoring.ScoredFrame, score: scoring.Score) -> scoring.Score:
+        """The same score, and that of a held-out frame with its camera fitted at test time beside it."""
+        if not score.held_out:
+            return score
+        started = time.perf_counter()
+        fitted = fit_camera(finished.splats, finished.kernel, frame)
+        self.fitting += time.perf_counter() - started
+        return replace(score, fitted=scoring.score_frame(finished.splats, finished.kernel, fitted, self.given).figures)
 
     def _score_trajectory(self, notes: list[str]) -> tuple[trajectory_metrics.Alignment | None, dict[str, Any]]:
         trajectory = self.trajectory or Trajectory.empty()

@@ -43,11 +43,14 @@ def image_tag(picture: np.ndarray, caption: str) -> str:
 def rendering_table(report: Mapping[str, Any]) -> str:
     titles = ("frames", "refinement", *(f"{m.label} {m.unit}".strip() for m in metrics.IMAGE), "count")
     rows = ["<tr>" + "".join(f"<th>{title}</th>" for title in titles) + "</tr>"]
-    for kind in ("keyframes", "held_out", "all"):
+    kinds = {"keyframes": "keyframes", "held_out": "held-out", "held_out_fitted": "held-out, fitted", "all": "all"}
+    for kind, name in kinds.items():
         for when, key in (("before", "rendering_before_refinement"), ("after", "rendering")):
             means = report[key][kind]
+            if kind == "held_out_fitted" and not means["count"]:
+                continue
             values = (m.text(means[m.key], unit=False) for m in metrics.IMAGE)
-            cells = (kind.replace("_", "-"), when, *values, means["count"])
+            cells = (name, when, *values, means["count"])
             rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>")
     return f"<table>{''.join(rows)}</table>"
 

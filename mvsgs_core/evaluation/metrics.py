@@ -60,6 +60,9 @@ TRAJECTORY = (
     Metric("rpe_rotation", "RPE, turn", "°", 3, "lower", "RPE of rotation by frame", lambda poses: poses.relative[1]),
 )  # fmt: skip
 RUN = {  # by their place in the report
+    "rendering.generalization_gap": Metric(
+        "generalization_gap", "KF − held-out", "dB", 2, "lower", "PSNR of keyframes above that of held-out frames"
+    ),
     "trajectory.keyframes": Metric("keyframes", "KFs", "", 0, ""),
     "map.splats": Metric("splats", "splats", "", 0, "", "splats"),
     "map.bytes": Metric("bytes", "MB", "MB", 1, "lower", "map size", factor=1e-6),

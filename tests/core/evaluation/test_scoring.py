@@ -45,14 +45,31 @@ def test_the_worst_of_all_stands_beside_the_worst_of_the_held_out() -> None:
     assert found["held_out"] == {"psnr": 32.0, "ssim": 0.9, "lpips": None, "count": 2}
     assert found["keyframes"]["count"] == 2
     assert found["all"]["count"] == 5
+    assert found["generalization_gap"] == pytest.approx((36.0 + 25.0) / 2 - 32.0)
+    assert found["held_out_fitted"] == {"psnr": None, "ssim": None, "lpips": None, "count": 0}
     assert found["worst"]["held_out"]["index"] == 5
     worst = found["worst"]["all"]
     assert (worst["index"], worst["psnr"], worst["keyframe"], worst["held_out"]) == (4, 20.3, False, False)
     assert found["coverage"] == {"mean": pytest.approx(0.954), "min": 0.8, "min_index": 4, "count": 5}
     assert [frame["index"] for frame in found["frames"]] == [0, 1, 4, 5, 10]
     assert [frame["held_out"] for frame in found["frames"]] == [True, False, False, True, False]  # 10 became a keyframe
-    assert set(found["frames"][0]) == {"index", "keyframe", "held_out", "psnr", "ssim", "lpips", "coverage", "kind"}
+    assert set(found["frames"][0]) == {"index", "keyframe", "held_out", "psnr", "ssim", "lpips", "coverage", "kind",
+                                       "fitted"}  # fmt: skip
     assert [frame["kind"] for frame in found["frames"]][-3:] == ["between keyframes", "held out", "keyframe"]
+
+
+def test_the_protocol_that_fits_cameras_stands_beside_the_strict_one() -> None:
+    fitted = Score(
+        0, False, {"psnr": 30.0, "ssim": 0.9, "lpips": None}, 1.0, {"psnr": 34.0, "ssim": 0.94, "lpips": None}
+    )
+    found = summarize([fitted, score(3, 31.0, keyframe=True), score(5, 20.0)])
+    assert found["held_out"] == {"psnr": 25.0, "ssim": 0.9, "lpips": None, "count": 2}
+    assert found["held_out_fitted"] == {"psnr": 34.0, "ssim": 0.94, "lpips": None, "count": 1}
+    assert found["worst"]["held_out"]["index"] == 5
+    assert found["frames"][0]["psnr"] == 30.0
+    assert found["frames"][0]["fitted"]["psnr"] == 34.0
+    assert found["frames"][2]["fitted"] is None
+    assert summarize([score(0, 30.0)])["generalization_gap"] is None  # nothing to compare with
 
 
 def test_of_no_frame_nothing_is_said() -> None:

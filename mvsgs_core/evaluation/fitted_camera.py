@@ -1,0 +1,134 @@
+"""A held-out frame's camera, fitted to its photograph at test time: pose and exposure, on the finished map.
+
+ARTDECO, PLANING and OnTheFly-NVS score in this way: what is left is the map's error without that of the pose and the
+exposure that the run gave the frame. The map is only rendered. Direct image alignment (Lucas and Kanade 1981) by
+Levenberg-Marquardt over a twist of the camera and an affine of the colors, at half the resolution first; the error is
+the one that PSNR measures, and a step that does not lower it is not taken: no frame gets worse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mvsgs_core import camera, geometry
+from mvsgs_core.evaluation.scoring import Rendered, ScoredFrame, render_frame
+from mvsgs_core.rasterizer.splats import Splats
+
+SMALLEST = 24  # pixels of the shorter side, below which a resolution is left out
+RENDERS = 8  # at each of the two resolutions, beside the first
+CONVERGED = 1e-3  # fall of the error, as a fraction, at which it ends: 0.004 dB
+REFUSED = 3  # steps in a row that do not lower the error, at which it ends
+DAMPING = 1e-3  # of the first step, as a fraction of the diagonal
+FLOOR = 1e-6  # of the diagonal, a pixel: what the photograph does not show stays as it is
+MOTION = 6  # unknowns: translation in median depths and rotation of the camera; then the rows of the color affine
+
+
+@dataclass(frozen=True)
+class _State:
+    frame: ScoredFrame
+    seen: Rendered
+    error: float  # mean squared difference of render and photograph
+
+
+def fit_camera(splats: Splats, kernel: str, frame: ScoredFrame) -> ScoredFrame:
+    """The frame with the pose and the exposure from which the map shows its photograph best; the rest as it was."""
+    photograph = frame.photograph().astype(np.float32) / 255.0
+    height, width = photograph.shape[:2]
+    found = frame
+    for size in (((height + 1) // 2, (width + 1) // 2), (height, width)):
+        if min(size) < SMALLEST:
+            continue
+        intrinsics = camera.scale_intrinsics(frame.intrinsics, (height, width), size)
+        target = camera.resize_image(photograph, size)
+        starts = [frame] if found is frame else [frame, found]  # what was coarsely found has to hold here
+        seen = [_seen(splats, kernel, replace(start, intrinsics=intrinsics), target) for start in starts]
+        found = _aligned(splats, kernel, min(seen, key=lambda state: state.error), target)
+    return replace(frame, world_from_cam=found.world_from_cam, exposure=found.exposure)
+
+
+def _aligned(splats: Splats, kernel: str, best: _State, target: np.ndarray) -> ScoredFrame:
+    """Levenberg-Marquardt (Marquardt 1963) from a state on, at the resolution of `target` (H, W, 3)."""
+    damping, refused = DAMPING, 0
+    linear = linearized(best.seen, target, best.frame.intrinsics)
+    for _ in range(RENDERS):
+        step = np.linalg.solve(linear.hessian + damping * np.diag(np.diag(linear.hessian)), linear.gradient)
+        trial = _seen(splats, kernel, _moved(best.frame, step, linear.length), target)
+        fall = (best.error - trial.error) / max(best.error, 1e-12)
+        if fall > 0.0:
+            best, damping, refused = trial, 0.1 * damping, 0
+            if fall < CONVERGED:
+                break
+            linear = linearized(best.seen, target, best.frame.intrinsics)
+        else:
+            damping, refused = 10.0 * damping, refused + 1
+            if refused == REFUSED:
+                break
+    return best.frame
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Normal equations of the residuals photograph - render in the 18 unknowns."""
+
+    hessian: np.ndarray  # (18, 18) float64
+    gradient: np.ndarray  # (18,) float64
+    length: float  # map units in one of the translation's
+
+
+def linearized(seen: Rendered, target: np.ndarray, intrinsics: np.ndarray) -> Linear:
+    """Of a render against its photograph (H, W, 3); intrinsics (4,) at that size.
+
+    The render follows the camera as the pixels of a still scene of its depth do; where nothing is rendered, or a color
+    is cut off at 0 or 1, it follows nothing.
+    """
+    color, depth = seen.color, seen.depth
+    known = np.isfinite(depth) & (depth > 0)
+    length = float(np.median(depth[known])) if known.any() else 1.0
+    motion = _pixel_motion(np.where(known, depth, np.inf), intrinsics, length)
+    motion[~known] = 0.0
+    rows, columns = np.gradient(color, axis=(0, 1))
+    affine = np.concatenate([color, np.ones_like(color[..., :1])], axis=2).reshape(-1, 4)
+    count = MOTION + color.shape[2] * affine.shape[1]
+    hessian, gradient = np.zeros((count, count)), np.zeros(count)
+    for channel in range(color.shape[2]):
+        moves = -(columns[..., channel, None] * motion[..., 0, :] + rows[..., channel, None] * motion[..., 1, :])
+        jacobian = np.concatenate([moves.reshape(-1, MOTION), affine], axis=1)
+        jacobian[((color[..., channel] <= 0.0) | (color[..., channel] >= 1.0)).ravel()] = 0.0
+        residual = (target[..., channel] - color[..., channel]).ravel()
+        unknowns = np.r_[0:MOTION, MOTION + 4 * channel : MOTION + 4 * channel + 4]
+        hessian[np.ix_(unknowns, unknowns)] += jacobian.T @ jacobian
+        gradient[unknowns] += jacobian.T @ residual
+    return Linear(hessian + FLOOR * color[..., 0].size * np.eye(count), gradient, length)
+
+
+def _pixel_motion(depth: np.ndarray, intrinsics: np.ndarray, length: float) -> np.ndarray:
+    """(H, W, 2, 6) float32: how a point's pixel (u, v) moves with the twist of the camera, its translation in `length`;
+    the interaction matrix of visual servoing (Chaumette and Hutchinson 2006)."""
+    fx, fy, cx, cy = intrinsics
+    u, v = camera.pixel_grid(*depth.shape)
+    x, y, near = (u - cx) / fx, (v - cy) / fy, length / depth
+    zero = np.zeros_like(x)
+    of_u = np.stack([-near, zero, x * near, x * y, -(1.0 + x * x), y], axis=-1) * fx
+    of_v = np.stack([zero, -near, y * near, 1.0 + y * y, -x * y, -x], axis=-1) * fy
+    return np.stack([of_u, of_v], axis=2).astype(np.float32)
+
+
+def _moved(frame: ScoredFrame, step: np.ndarray, length: float) -> ScoredFrame:
+    twist = step[:MOTION] * np.repeat([length, 1.0], 3)
+    change = np.eye(4)
+    change[:3] += step[MOTION:].reshape(3, 4)
+    exposure = np.eye(4)
+    if frame.exposure is not None:
+        exposure[:3] = frame.exposure
+    pose = frame.world_from_cam @ geometry.se3_exp(twist)
+    return replace(frame, world_from_cam=pose, exposure=(change @ exposure)[:3].astype(np.float32))
+
+
+def _seen(splats: Splats, kernel: str, frame: ScoredFrame, target: np.ndarray) -> _State:
+    seen = render_frame(splats, kernel, frame, (target.shape[0], target.shape[1]))
+    return _State(frame, seen, float(np.mean((seen.color - target) ** 2, dtype=np.float64)))
+
+
+__all__ = ["Linear", "fit_camera", "linearized"]
