@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from bench import pieces
-from bench.runs import QUICK, ROOT, Matrix, Run, figure, folder, python, said
+from bench.runs import FEWER, QUICK, ROOT, Matrix, Run, fewer_iterations, figure, folder, folder_name, python, said
 from bench.table import Row, main
 
 Report = dict[str, Any]
@@ -184,15 +184,9 @@ def at_equal_quality(scene: str, before: Sequence[Run], candidates: Mapping[str,
 
 
 def sides(other: Path, fewer: str | None) -> dict[str, tuple[Path, tuple[str, ...]]]:
-    """Checkout and overrides of each kind of run. Raises ValueError for what is not ITERATIONS:REFINEMENT."""
-    found: dict[str, tuple[Path, tuple[str, ...]]] = {"before": (other, ()), "after": (ROOT, ())}
-    for text in fewer.split(",") if fewer else ():
-        each, colon, last = text.partition(":")
-        if not (colon and each.isdecimal() and last.isdecimal()):
-            raise ValueError(f"--fewer {text!r} must be iterations a keyframe and at the end, such as 10:100")
-        settings = (f"mapper.iterations={each}", f"mapper.refinement={last}")
-        found[f"{each} a keyframe, {last} at the end"] = (ROOT, settings)
-    return found
+    """Checkout and overrides of each kind of run."""
+    here = {name: (ROOT, settings) for name, settings in fewer_iterations(fewer).items()}
+    return {"before": (other, ()), "after": (ROOT, ()), **here}
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
@@ -230,14 +224,14 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 def place(scene: str, seed: int, side: str) -> str:
     """Folder of a run, in that of the benchmark; its files are in folder 0 in there."""
-    return f"{scene}/{seed}/{side.replace(' ', '_').replace(',', '')}"
+    return f"{scene}/{seed}/{folder_name(side)}"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--other", type=Path, default=ROOT, help="checkout to compare with, such as a git worktree")
     parser.add_argument("--scenes", default=",".join(SCENES), help="comma separated")
     parser.add_argument("--seeds", default="0,1,2", help="comma separated")
-    parser.add_argument("--fewer", help="iterations a keyframe and at the end, such as 10:100,5:50")
+    parser.add_argument("--fewer", help=FEWER)
     pieces.arguments(parser, "dataset.stop=60")
 
 

@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
 SHARED = Path(os.environ.get("MVSGS_SHARED", ROOT.parent / "shared"))
 DATA = SHARED / "data"
+FEWER = "cheaper runs of ours besides: iterations a keyframe and at the end, such as 10:100,5:50"
 QUICK = ("dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50")  # overrides of a quick run
 
 
@@ -53,6 +54,17 @@ class Setting:
                 choices[f"override /{key}"] = parsed.value()
         config.defaults = [*({key: value} for key, value in choices.items()), "_self_"]
         return f"# @package _global_\n{OmegaConf.to_yaml(config)}"
+
+
+def fewer_iterations(text: str | None) -> dict[str, tuple[str, ...]]:
+    """Overrides of cheaper runs, by what they are, of such as "10:100,5:50". Raises ValueError for anything else."""
+    found: dict[str, tuple[str, ...]] = {}
+    for part in text.split(",") if text else ():
+        each, colon, last = part.partition(":")
+        if not (colon and each.isdecimal() and last.isdecimal()):
+            raise ValueError(f"--fewer {part!r} must be iterations a keyframe and at the end, such as 10:100")
+        found[f"{each} a keyframe, {last} at the end"] = (f"mapper.iterations={each}", f"mapper.refinement={last}")
+    return found
 
 
 @dataclass(frozen=True)
@@ -208,6 +220,11 @@ def folder(options: argparse.Namespace, name: str) -> Path:
     given = options.output or ROOT / "runs" / ("bench-quick" if options.quick else "bench") / name
     given.mkdir(parents=True, exist_ok=True)
     return Path(given).resolve()
+
+
+def folder_name(text: str) -> str:
+    """A name for a folder that Hydra's command line takes, too."""
+    return "".join(c for c in text.replace(" ", "_") if c.isalnum() or c in "_.-")
 
 
 def figure(report: dict[str, Any] | None, path: str) -> float | None:

@@ -2,6 +2,8 @@
 
 Kerbl et al. 2023: one isotropic splat a point, as large as the mean distance to its three nearest, opacity 0.1; random
 views at full resolution; clone, split and prune. No opacity reset, as in the online mapper, whose thresholds it shares.
+Where a view has an exposure, what the map needs beside it is trained, as the online mapper trains it; a view that is
+only rendered has of that what its neighbors in time have.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from mvsgs_core.stats import Stats
 class SparseConfig:
     """Offline optimization."""
 
-    seconds: float = 60.0  # of optimization
+    seconds: float = 60.0  # of optimization, of the processor
     iterations: int | None = None  # of optimization, whatever the time; None: as many as the seconds allow
     settle: float = 0.5  # last fraction of it in which learning rates fall to a tenth and no splat is added
     initial_opacity: float = 0.1
@@ -41,6 +43,10 @@ class Posed:
     image: np.ndarray
     intrinsics: np.ndarray
     world_from_cam: np.ndarray
+    timestamp: float = 0.0  # seconds
+    exposure: np.ndarray | None = (
+        None  # (3, 4) color affine that is known of it; None: the map's colors are the image's
+    )
 
 
 class SparseMap:
@@ -57,6 +63,7 @@ class SparseMap:
         self._trainer = Trainer(config.mapper, self.state, Stats())
         self.seconds = 0.0
         self._random = np.random.default_rng(config.mapper.seed)
+        self._given = views
         self._views = [self._training(view) for view in views]
         start = _splats((points - self.origin) / self.unit, colors, config.initial_opacity)
         self.state.append(start, torch.zeros(len(start), dtype=torch.int64))
@@ -68,20 +75,40 @@ class SparseMap:
     def optimize(self) -> None:
         """As long as the configuration says."""
         order: list[int] = []
-        start = time.perf_counter()
-        while (done := self._done(time.perf_counter() - start)) < 1.0:
+        start = time.process_time()
+        while (done := self._done(time.process_time() - start)) < 1.0:
             order = order or [int(i) for i in self._random.permutation(len(self._views))]
             self._step(self._views[order.pop()], done)
-        self.seconds += time.perf_counter() - start
+        self.seconds += time.process_time() - start
 
     def render(self, view: Posed) -> np.ndarray:
         """Color (H, W, 3) float32 in 0..1."""
+        found = self.exposure_of(view)
+        exposure = None if found is None else torch.from_numpy(found)
         with torch.no_grad():
             color = rasterize(
                 self.state.detached(), self._local(view.world_from_cam), view.intrinsics, view.image.shape[:2],
-                kernel=self.config.mapper.training.kernel, threads=self.config.mapper.threads,
+                exposure=exposure, kernel=self.config.mapper.training.kernel, threads=self.config.mapper.threads,
             ).color  # fmt: skip
         return np.asarray(color.clamp(0, 1).numpy())
+
+    def exposure_of(self, view: Posed) -> np.ndarray | None:
+        """(3, 4) float32: what is known of a view's exposure, and what was trained beside it, linear in time between the
+        views before and after. None where nothing is known."""
+        if view.exposure is None:
+            return None
+        known = [(v.timestamp, self._trained_beside(k)) for k, v in enumerate(self._given) if v.exposure is not None]
+        known.sort(key=lambda entry: entry[0])
+        times, beside = np.array([t for t, _ in known]), np.array([affine for _, affine in known])
+        now = np.array([np.interp(view.timestamp, times, column) for column in beside.reshape(len(known), -1).T])
+        return np.asarray((now.reshape(4, 4) @ _square(view.exposure))[:3], dtype=np.float32)
+
+    def _trained_beside(self, k: int) -> np.ndarray:
+        """(4, 4) that takes the known exposure of training view k to its trained one."""
+        exposure = self._given[k].exposure
+        assert exposure is not None
+        trained = self._views[k].exposure.detach().numpy()
+        return np.asarray(_square(trained) @ np.linalg.inv(_square(exposure)))
 
     def _done(self, seconds: float) -> float:
         """Share of the work."""
@@ -96,12 +123,20 @@ class SparseMap:
     def _training(self, view: Posed) -> TrainingView:
         unknown = np.zeros(view.image.shape[:2], dtype=np.float32)
         posed = RGBDKeyframe(view.index, view.image, view.intrinsics, view.world_from_cam, unknown)
-        return training_view(posed, self._local(view.world_from_cam), None, self.state.device)
+        training = training_view(posed, self._local(view.world_from_cam), None, self.state.device)
+        if view.exposure is not None:
+            training.exposure = torch.from_numpy(view.exposure.astype(np.float32))
+        return training
 
     def _local(self, world_from_cam: np.ndarray) -> np.ndarray:
         local = world_from_cam.copy()
         local[:3, 3] = (local[:3, 3] - self.origin) / self.unit
         return local
+
+
+def _square(affine: np.ndarray) -> np.ndarray:
+    """(4, 4) float64 of [A | b] (3, 4)."""
+    return np.vstack([np.asarray(affine, dtype=np.float64), [0.0, 0.0, 0.0, 1.0]])
 
 
 def _median_depth(views: list[Posed], points: np.ndarray) -> float:

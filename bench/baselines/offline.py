@@ -1,0 +1,126 @@
+"""The offline map of COLMAP's poses and points: in every way that might be its best, at our processor time, and longer.
+
+A way is a choice of training frames, of exposures and of when the learning rates begin to fall. Of all of them the best
+by held-out PSNR stands beside ours: chosen with hindsight, which an offline user does not have.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.baselines.colmap_poses import Model
+from bench.baselines.ours import Ours
+from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
+from mvsgs_core import image_metrics
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
+
+GAIN = 0.1  # dB: a doubling of the time that brings less is the end
+
+
+@dataclass(frozen=True)
+class Way:
+    """How an offline map is made."""
+
+    frames: str = "keyframes"  # it is trained on: "keyframes", ours, or "all": every one that is not held out
+    exposure: str = (
+        "none"  # "none"; "trained": an affine a frame; "tracker": the same, beside what our tracker measured
+    )
+    settle: float = 0.5  # last fraction of the time in which learning rates fall
+
+    @property
+    def name(self) -> str:
+        return f"{self.frames}, exposure {self.exposure}, settles over {self.settle:g}"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One optimization of COLMAP's points: held-out scores after `seconds` of the processor."""
+
+    seconds: float
+    psnr: float
+    ssim: float
+    splats: int
+    iterations: int
+    asked: float  # seconds; the last iteration ends a little later
+    way: str = ""
+
+
+Train = Callable[[Way, float], Trained]  # in so many processor seconds
+
+
+def ways(ours: Ours) -> list[Way]:
+    exposures = ("none", "trained") if ours.exposures is None else ("none", "trained", "tracker")
+    return [Way(*choice) for choice in itertools.product(("keyframes", "all"), exposures, (0.5, 0.75))]
+
+
+def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> Trained:
+    """Raises ValueError where COLMAP has none of the frames, or no points."""
+    poses = dict(zip(model.index.tolist(), model.world_from_cam))
+    measured: dict[int, np.ndarray] = ours.exposures or {}
+
+    def posed(index: int) -> Posed:
+        frame = ours.frames[index]
+        exposure = None if way.exposure == "none" else np.eye(3, 4)
+        if way.exposure == "tracker":
+            exposure = measured.get(index, exposure)
+        return Posed(index, frame.image, frame.intrinsics, poses[index], frame.timestamp, exposure)
+
+    chosen = ours.keyframes if way.frames == "keyframes" else ours.not_held_out
+    mapper = MapperConfig(threads=threads, training=TrainingConfig(exposure=way.exposure != "none"))
+    config = SparseConfig(seconds=seconds, settle=way.settle, mapper=mapper)
+    fitted = SparseMap([posed(i) for i in chosen if i in poses], model.points, model.colors, config)
+    fitted.optimize()
+    psnr, ssim = score((view, fitted.render(view)) for view in (posed(i) for i in ours.held_out if i in poses))
+    return Trained(fitted.seconds, psnr, ssim, len(fitted.state), fitted.iterations, seconds, way.name)
+
+
+def score(renders: Any) -> tuple[float, float]:
+    """Mean PSNR and SSIM of pairs of a view and its render; NaN of none."""
+    scores = []
+    for view, color in renders:
+        photograph = view.image.astype(np.float32) / 255.0
+        scores.append((image_metrics.psnr(color, photograph), image_metrics.ssim(color, photograph)))
+    psnr, ssim = np.mean(scores, axis=0) if scores else (np.nan, np.nan)
+    return float(psnr), float(ssim)
+
+
+def kept_in(file: Path, train: Train) -> Train:
+    """`train` that takes what an earlier call left in `file`, of the same way and time, and adds what is new."""
+    known = {(e["way"], e["asked"]): Trained(**e) for e in json.loads(file.read_text())} if file.exists() else {}
+
+    def found(way: Way, seconds: float) -> Trained:
+        key = way.name, seconds
+        if key not in known:
+            known[key] = train(way, seconds)
+            file.write_text(json.dumps([asdict(result) for result in known.values()], indent=1))
+        return known[key]
+
+    return found
+
+
+def best_way(candidates: Sequence[Way], train: Train, seconds: float) -> tuple[Way, list[Trained]]:
+    """The way of the highest PSNR in so much time, and what each reached."""
+    results = [train(way, seconds) for way in candidates]
+    return candidates[int(np.nanargmax([result.psnr for result in results]))], results
+
+
+def train_longer(way: Way, train: Train, seconds: float, longest: float) -> list[Trained]:
+    """So much time first, then doubled until the gain is small, to at most `longest` times as long."""
+    results: list[Trained] = []
+    times = 1.0
+    while not converged(results) and times <= longest * 1.001:
+        results.append(train(way, times * seconds))
+        times *= 2
+    return results
+
+
+def converged(results: Sequence[Trained]) -> bool:
+    """The last doubling of the time gained less than `GAIN`."""
+    return len(results) > 1 and results[-1].psnr - results[-2].psnr < GAIN
