@@ -4,7 +4,8 @@
     python -m bench.before --other ../before
 
 One run at a time, the mapper with one thread; whatever else the machine does meets both. Figures are those of each
-checkout's own report, a scene's parameters are called as the checkout calls them. Without --other this checkout is
+checkout's own report, a scene's parameters are called as the checkout calls them; where a report has no figures of the
+protocol that fits held-out cameras at test time, its map is scored so here. Without --other this checkout is
 compared with itself: what it shows then is noise. --fewer 10:100,5:50 runs this checkout with so many iterations a
 keyframe and at the end, too: the cheapest that is as good as before tells what the map of before costs now.
 """
@@ -12,15 +13,17 @@ keyframe and at the end, too: the cheapest that is as good as before tells what 
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench import pieces
+from bench.finished import FinishedRun, frames_of
 from bench.runs import FEWER, QUICK, ROOT, Matrix, Run, fewer_iterations, figure, folder, folder_name, python, said
 from bench.table import Row, main
 
@@ -92,6 +95,8 @@ AHEAD = Figure("Keyframes", "PSNR ahead of held-out", "dB", _gap)
 FIGURES = (
     PSNR,
     Figure("Held-out frames", "SSIM", "", _at("rendering.held_out.ssim")),
+    Figure("Held-out frames, camera fitted", "PSNR", "dB", _at("rendering.held_out_fitted.psnr")),
+    Figure("Held-out frames, camera fitted", "SSIM", "", _at("rendering.held_out_fitted.ssim")),
     Figure("Held-out frames, by eye", "LPIPS", "", _at("rendering.held_out.lpips")),
     Figure("Held-out frames, by eye", "worst PSNR", "dB", _at("rendering.worst.held_out.psnr")),
     Figure("Keyframes", "PSNR", "dB", _at("rendering.keyframes.psnr")),
@@ -114,6 +119,19 @@ def check(checkout: Path) -> None:
     if done.returncode or not Path(found).is_relative_to(checkout):
         what = found or (done.stderr.strip().splitlines() or ["nothing"])[-1]
         raise ValueError(f"{checkout} would run {what}: it needs a .venv of its own; `make setup` there")
+
+
+def with_fitted(run: Run) -> Run:
+    """With the figures of the protocol that fits a held-out frame's camera at test time: as the run's report has them,
+    or if that knows no such protocol found here, and kept beside it."""
+    if run.report is None or figure(run.report, "rendering.held_out_fitted.psnr") is not None:
+        return run
+    file = run.folder / "fitted.json"
+    if not file.exists():
+        found = FinishedRun(run.folder, frames_of(run.folder)).fitted()
+        file.write_text(json.dumps(found))
+    rendering = {**run.report["rendering"], "held_out_fitted": json.loads(file.read_text())}
+    return replace(run, report={**run.report, "rendering": rendering})
 
 
 def rows_of(scene: str, before: Sequence[Run], after: Sequence[Run]) -> list[Row]:
@@ -207,7 +225,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
                 given = [*SCENES.get(scene, ()), *overrides, *settings]
                 matrix = Matrix([scene], seeds=[seed], overrides=given, checkout=checkout)
                 found = made[checkout].runs({place(scene, seed, side): matrix})
-                runs[scene].setdefault(side, []).extend(found)
+                runs[scene].setdefault(side, []).extend(with_fitted(run) for run in found)
     rows = [Row(side, ", ".join(made[path].commits)) for side, path in (("before", other), ("after", ROOT))]
     for scene, by_side in runs.items():
         rows += rows_of(scene, by_side["before"], by_side["after"])

@@ -20,6 +20,7 @@ from msgs import GroundTruth
 from mvsgs_core import image_metrics
 from mvsgs_core.evaluation import scoring
 from mvsgs_core.evaluation.evaluation import Evaluation
+from mvsgs_core.evaluation.fitted_camera import fit_camera
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.export.snapshot import Snapshot
@@ -67,6 +68,15 @@ class FinishedRun:
         """A held-out frame as it was scored."""
         size = self.photograph(index).shape[:2]
         return scoring.render_frame(self.map.splats, self.map.kernel, self._scored[index], size)
+
+    def fitted(self) -> dict[str, float]:
+        """Mean figures of the held-out frames by the other protocol: with their cameras fitted at test time."""
+        found = [fit_camera(self.map.splats, self.map.kernel, self._frame(index)) for index in self._scored]
+        figures = [scoring.score_frame(self.map.splats, self.map.kernel, frame).figures for frame in found]
+        return {key: float(np.mean([f[key] for f in figures])) for key in ("psnr", "ssim")}
+
+    def _frame(self, index: int) -> scoring.ScoredFrame:
+        return replace(self._scored[index], photograph=lambda: self.photograph(index))
 
     def _score(self, index: int) -> float:
         photograph = self.photograph(index).astype(np.float32) / 255.0

@@ -93,8 +93,8 @@ class SparseMap:
         return np.asarray(color.clamp(0, 1).numpy())
 
     def exposure_of(self, view: Posed) -> np.ndarray | None:
-        """(3, 4) float32: what is known of a view's exposure, and what was trained beside it, linear in time between the
-        views before and after. None where nothing is known."""
+        """(3, 4) float32: what is known of a view's exposure, and what was trained beside it, linear in time between
+        the views before and after. None where nothing is known."""
         if view.exposure is None:
             return None
         known = [(v.timestamp, self._trained_beside(k)) for k, v in enumerate(self._given) if v.exposure is not None]

@@ -125,6 +125,7 @@ def test_both_run_in_turns_with_the_settings_of_the_scene(tmp_path: Path, monkey
         ran.append((str(output.relative_to(tmp_path)), self.checkout, tuple(self.overrides)))
         (output / "0").mkdir(parents=True)
         (output / "0" / "report.json").write_text(json.dumps(report(30.0 + (self.checkout == ROOT))))
+        (output / "0" / "fitted.json").write_text(json.dumps({"psnr": 35.0}))  # an earlier call's
         return self.collect(output)
 
     monkeypatch.setattr(Matrix, "run", run)
@@ -144,6 +145,7 @@ def test_both_run_in_turns_with_the_settings_of_the_scene(tmp_path: Path, monkey
         ("dataset.size=[180,240]", "dataset.stop=100", "recorder=track", "mapper.threads=1", "evaluator.lpips=off")
     }
     assert rows["Held-out frames: room: PSNR, change"].value == pytest.approx(1.0)
+    assert rows["Held-out frames, camera fitted: room: PSNR, before"].value == 35.0
     assert {"before", "after"} <= rows.keys()
 
 
@@ -188,8 +190,14 @@ def test_pictures_of_runs_show_what_their_reports_say(tmp_path: Path) -> None:
     assert picture is not None
     assert picture.shape == (4 * (180 + pictures.HEADER), 5 * pictures.WIDTH, 3)
     place = tmp_path / before.place("room", 0, "after") / "0"
+    found = finished.FinishedRun(place, finished.frames_of(place))
     file = place / "report.json"
     told = json.loads(file.read_text())
+    fitted = told["rendering"].pop("held_out_fitted")
+    completed = before.with_fitted(Run("room", "full", 0, place, told)).report
+    assert completed is not None
+    assert completed["rendering"]["held_out_fitted"]["psnr"] == pytest.approx(fitted["psnr"], abs=0.05)
+    assert found.psnr.keys() == {f["index"] for f in told["rendering"]["frames"] if f["held_out"]}
     told["rendering"]["held_out"]["psnr"] += 1.0
     file.write_text(json.dumps(told))
     with pytest.raises(ValueError, match="the report says"):

@@ -13,16 +13,11 @@ import numpy as np
 import pytest
 
 from bench import ablation, curves, memory, plots, scenes
-from bench.baselines import __main__ as baselines
-from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
 from bench.runs import CONF, Matrix, Run, Setting, choices, figure, said
 from bench.stress import __main__ as stress
 from bench.table import Row, at_least, at_most
 from launch.compose import compose
 from launch.refusal import GraphError
-from msgs import GroundTruth
-from mvsgs_core.datasets import open_dataset
-from mvsgs_core.mapping.config import MapperConfig
 from tests.support.benchmarks import BENCHMARKS
 from tests.support.shared_data import ROOT
 
@@ -189,53 +184,6 @@ def test_an_ablation_of_one_run_calls_nothing_real() -> None:
     assert rows["room: A: held-out PSNR, change"].value == "once: -3.00"
 
 
-def test_the_error_of_other_poses_is_taken_over_common_frames_after_alignment() -> None:
-    truth = {i: np.eye(4) for i in range(6)}
-    for i, pose in truth.items():
-        pose[:3, 3] = (i, i % 2, 0.1 * i)
-    frames = {i: GroundTruth(i, 0.0, np.zeros((2, 2, 3), np.uint8), np.ones(4), p, None) for i, p in truth.items()}
-    ours = baselines.Ours(report(), {"index": [0, 5, 3], "keyframe": [True, False, True], "world_from_cam": []}, frames)
-    theirs = {i: pose.copy() for i, pose in truth.items() if i != 2}
-    for pose in theirs.values():
-        pose[:3, 3] = 3.0 * pose[:3, 3] + 7.0
-    assert baselines.ate_percent(theirs, ours, list(range(6))) == pytest.approx(0.0, abs=1e-9)
-    theirs[4][:3, 3] += 1.0
-    worse = baselines.ate_percent(theirs, ours, list(range(6)))
-    assert worse is not None
-    assert worse > 1.0
-    assert baselines.ate_percent(theirs, ours, [0, 2]) is None
-    assert (ours.keyframes, ours.held_out, ours.optimization) == ([0, 3], [5], 3.0)
-
-
-def test_the_offline_map_is_trained_until_twice_the_time_brings_little(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scores = {3.0: 20.0, 6.0: 22.0, 12.0: 22.5, 24.0: 22.55, 48.0: 30.0}
-    asked: list[float] = []
-
-    def train(model: Any, ours: baselines.Ours, config: SparseConfig) -> baselines.Trained:
-        asked.append(config.seconds)
-        return baselines.Trained(config.seconds + 0.1, scores[config.seconds], 0.8, 10, 20, config.seconds)
-
-    monkeypatch.setattr(baselines, "train", train)
-    ours = baselines.Ours(report(), {"index": [], "keyframe": [], "world_from_cam": []}, {})
-    model = baselines.Model(*(np.zeros(0) for _ in range(4)), {"mapping": 5.0}, 9.0)
-    kept = tmp_path / "trained.json"
-    cut_short = baselines.train_longer(model, ours, 2.0, 1, kept)
-    assert not baselines.converged(cut_short)
-    found = baselines.train_longer(model, ours, 64.0, 1, kept)
-    assert asked == [3.0, 6.0, 12.0, 24.0]  # the first two once
-    assert baselines.converged(found)
-    rows = {row.name: row for row in baselines.map_rows("room", ours, model, found)}
-    assert rows["room: map, COLMAP + splatting, 8 times as long: gain by twice the time"].value == pytest.approx(0.05)
-    assert rows["room: COLMAP + splatting, gain by the last doubling of its time"].met
-    short = {row.name: row for row in baselines.map_rows("room", ours, model, cut_short)}
-    assert not short["room: COLMAP + splatting, gain by the last doubling of its time"].met
-    other = baselines.Ours(report(time={"wall": 9.0, "stages": {"mapper": {"insertion": 6.0}}}), ours.track, {})
-    baselines.train_longer(model, other, 1.0, 1, kept)
-    assert asked[-1] == 6.0  # results of another time are no start
-
-
 def test_pareto_front_and_its_plot(tmp_path: Path) -> None:
     assert plots.pareto([3.0, 1.0, 2.0, 4.0, np.nan], [9.0, 1.0, 0.5, 9.0, 99.0]) == [1, 0]
     svg = plots.front_plot([("area", "a & b", 1.0, 2.0), ("area", "c", 2.0, 3.0)], (2.0, 3.0), "s", "dB", (0.1, 0.1))
@@ -319,36 +267,6 @@ def test_memory_that_grows_is_told_from_memory_that_does_not() -> None:
     assert memory.growth(grows) > 1.4
     log = "23:59:58.000 starting\n23:59:58.100 waiting\n00:00:01.500 running\n00:01:00.000 ending\n00:01:00.010 done\n"
     assert memory.stream(log, {"dataset": flat}) == (3.5, 99.0)
-
-
-@pytest.mark.slow
-def test_offline_splatting_of_sparse_points_gets_better() -> None:
-    items = list(open_dataset("synthetic", scene="room", frames=12, size=(48, 64), threads=1))
-    views = [
-        Posed(i.index, i.image, i.intrinsics, i.world_from_cam) for i in items[::4] if i.world_from_cam is not None
-    ]
-    points, colors = [], []
-    for item in items[::4]:
-        assert item.depth is not None
-        assert item.world_from_cam is not None
-        v, u = np.mgrid[2:48:3, 2:64:3].reshape(2, -1)
-        fx, fy, cx, cy = item.intrinsics
-        z = item.depth[v, u].astype(np.float64)
-        seen = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
-        points.append(seen @ item.world_from_cam[:3, :3].T + item.world_from_cam[:3, 3])
-        colors.append(item.image[v, u])
-    config = SparseConfig(iterations=120, mapper=MapperConfig(threads=1))
-    fitted = SparseMap(views, np.concatenate(points), np.concatenate(colors), config)
-
-    def error() -> float:
-        return float(np.mean([(fitted.render(v) - v.image / 255.0) ** 2 for v in views]))
-
-    before = error()
-    fitted.optimize()
-    assert fitted.iterations == 120
-    assert error() < 0.5 * before
-    with pytest.raises(ValueError, match="no start"):
-        SparseMap(views, np.zeros((2, 3)), np.zeros((2, 3), np.uint8), config)
 
 
 @pytest.mark.slow
