@@ -190,7 +190,7 @@ def test_a_known_exposure_is_of_use_to_the_offline_map() -> None:
 
 def a_map(file: Path, color: float) -> None:
     """A wall of splats across the whole view, of one gray."""
-    y, x = np.mgrid[-3:3:0.3, -4:4:0.3].reshape(2, -1)
+    y, x = np.mgrid[-7:7:0.4, -9:9:0.4].reshape(2, -1)
     means = torch.from_numpy(np.stack([x, y, np.full_like(x, 4.0)], axis=1).astype(np.float32))
     count = len(means)
     splats = Splats(
