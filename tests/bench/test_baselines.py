@@ -46,7 +46,8 @@ def six_frames(track: dict[str, Any] | None = None, **figures: Any) -> Ours:
     for i in range(6):
         pose = np.eye(4)
         pose[:3, 3] = (i, i % 2, 0.1 * i)
-        frames[i] = GroundTruth(i, 0.1 * i, np.full((12, 16, 3), 40 * i, np.uint8), np.array([9.0, 9, 5, 3]), pose, None)
+        gray = np.full((12, 16, 3), 40 * i, np.uint8)
+        frames[i] = GroundTruth(i, 0.1 * i, gray, np.array([9.0, 9, 5, 3]), pose, None)
     path = {"index": [0, 3, 5], "keyframe": [True, True, False], "world_from_cam": [None] * 3, **(track or {})}
     return Ours(report(**figures), path, frames)
 
