@@ -29,7 +29,7 @@ SKIPS = (  # what is left out, switched off or over; keyframe reuse needs more k
     "no_voxel", "no_map_voxel", "map_voxel_strict", "no_fill", "realtime", "no_skip_cells", "every_frame",
 )  # fmt: skip
 OTHERS = (
-    "no_density_control", "exact", "ges_scale", "ges_loss", "harmonics", "exposure", "refine_poses",
+    "no_density_control", "exact", "ges_scale", "ges_loss", "harmonics", "no_exposure", "refine_poses",
     "global_shutter", "no_rectification", "true_poses",
 )  # fmt: skip
 FIGURES = {  # path in the report

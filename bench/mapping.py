@@ -168,7 +168,6 @@ def variants(config: MapperConfig) -> dict[str, MapperConfig]:
         "every splat stepped": replace(config, training=replace(training, selective=False)),
         "shapes trained (exact)": replace(config, training=replace(training, kernel="exact", betas=True)),
         "harmonics of degree 1": replace(config, sh_degree=1),
-        "exposure trained": replace(config, training=replace(training, exposure=True)),
         "poses trained": replace(config, training=replace(training, refine_poses=True)),
     }
 

@@ -23,7 +23,6 @@ from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.held_out import HELD_OUT_EVERY
-from mvsgs_core.mapping.exposure import IDENTITY
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.trajectory_file import write_trajectory
 from nodes import Node
@@ -127,7 +126,7 @@ class Evaluator(Node):
             f"Keyframes are training views; held-out: every {HELD_OUT_EVERY}th frame that is no keyframe. Covered: "
             "pixels at which the render is more than half opaque. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self._lpips else 'not computed'}. "
-            f"{_shutter(self.evaluation.trajectory)}{_exposure(self.evaluation.maps)}"
+            f"{_shutter(self.evaluation.trajectory)}{_exposure(self.report['exposure'])}"
             "ATE: RMSE of keyframe positions after Sim(3) alignment."
         )
 
@@ -176,11 +175,14 @@ def _shutter(found: trajectory.Trajectory | None) -> str:
     return f"The rolling shutter that the tracker took out of the keyframes is applied to renders ({taken_out}). "
 
 
-def _exposure(maps: dict[bool, Snapshot]) -> str:
-    affines = [affine for finished in maps.values() for affine in finished.exposures]
-    if not affines or np.allclose(affines, IDENTITY):
+def _exposure(found: dict[str, Any] | None) -> str:
+    if found is None:
         return ""
-    return "Renders have the exposures that the mapper found for keyframes, in between interpolated in time. "
+    vignetting = "" if found["vignetting"] is None else " and its vignetting"
+    return (
+        f"Renders have each frame's exposure{vignetting} as the tracker estimated it from matches to keyframes, with "
+        f"what training added to the keyframes' (median {100 * found['remainder']:.1f} %) interpolated in time. "
+    )
 
 
 def _plain(value: Any) -> Any:

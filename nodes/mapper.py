@@ -81,7 +81,8 @@ class Mapper(Node):
             RGBDKeyframe(
                 index=fused.index, image=fused.image, intrinsics=fused.intrinsics, world_from_cam=fused.world_from_cam,
                 depth=fused.depth, scale=fused.scale, confidence=fused.confidence, normals=fused.normals,
-                unfiltered=fused.unfiltered, timestamp=fused.timestamp,
+                unfiltered=fused.unfiltered, timestamp=fused.timestamp, exposure=fused.exposure,
+                vignetting=fused.vignetting,
             ),
             fused.segment,
         )  # fmt: skip
@@ -99,7 +100,7 @@ class Mapper(Node):
             CoarseKeyframe(
                 index=keyframe.index, image=keyframe.image, intrinsics=keyframe.intrinsics, scale=keyframe.scale,
                 world_from_cam=keyframe.world_from_cam, inverse_depth=keyframe.inverse_depth,
-                weight=keyframe.inverse_depth_weight, segment=keyframe.segment,
+                weight=keyframe.inverse_depth_weight, segment=keyframe.segment, exposure=keyframe.exposure,
             )
         )  # fmt: skip
         yield from self._preview()
@@ -111,7 +112,9 @@ class Mapper(Node):
             return
         self._settle()  # the map must not depend on when they come
         self.atlas.revision = max(self.atlas.revision, poses.revision)
-        self.atlas.correct(poses.index, poses.world_from_cam, poses.scale, poses.segment)
+        self.atlas.correct(
+            poses.index, poses.world_from_cam, poses.scale, poses.segment, poses.exposure, poses.vignetting
+        )
         yield from ()
 
     def on_idle(self) -> list[Preview] | None:

@@ -13,6 +13,7 @@ import pytest
 from msgs import FusedKeyframe, GroundTruth, SplatMap, TrackingState, Trajectory
 from mvsgs_core import geometry
 from mvsgs_core.evaluation.scoring import render_frame
+from mvsgs_core.photometry import vignetting_factor
 from nodes.evaluator import Evaluator
 from nodes.parameters import build
 from tests.support.full_disk import full_after
@@ -169,21 +170,46 @@ def test_the_rolling_shutter_that_the_tracker_took_out_is_applied_to_renders(eva
     assert "20.0 ms a frame" in evaluator.report["protocol"]
 
 
-def test_frames_between_keyframes_are_rendered_at_an_exposure_between_theirs(evaluator: Evaluator) -> None:
+def test_frames_are_rendered_at_the_trackers_exposure_and_vignetting(evaluator: Evaluator, tmp_path: Path) -> None:
     poses, index, none = _poses(), np.arange(N), np.zeros(N, np.int32)
     poses[:, :3, 3] += ORIGIN
-    list(evaluator.on_trajectory(Trajectory(index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none)))
+    gains = np.ones(N)
+    gains[[2, 3, 5]] = 0.2, 0.5, 0.7
+    exposure = (gains[:, None, None] * np.eye(3, 4)).astype(np.float32)
+    vignetting = np.array([-0.3, 0.0, 0.0], np.float32)
+    list(
+        evaluator.on_trajectory(
+            Trajectory(
+                index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none, exposure=exposure,
+                vignetting=vignetting,
+            )
+        )
+    )  # fmt: skip
     splat_map = _splat_map(True)
     splat_map.exposures[1, :, :3] *= 0.5  # of frame 3; those of frames 0 and 6 are the identity
     list(evaluator.on_splat_map(splat_map))
     finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.scored_frames()
-    for frame, gain in ((0, 1.0), (2, 2 / 3), (3, 0.5), (5, 5 / 6), (6, 1.0)):
+    factor = vignetting_factor(vignetting, INTRINSICS, (H, W))[..., None]
+    for frame in (0, 2, 3, 5, 6):
         view = views[frame]
-        color = render_frame(finished.splats, finished.kernel, view, (H, W)).color
-        plain = render_frame(finished.splats, finished.kernel, replace(view, exposure=None), (H, W)).color
-        np.testing.assert_allclose(color, gain * plain, atol=1e-5)
+        bare = replace(view, exposure=None, vignetting=None)
+        color, plain = (render_frame(finished.splats, finished.kernel, v, (H, W)).color for v in (view, bare))
+        np.testing.assert_allclose(color, gains[frame] * plain * factor, atol=1e-5)
     list(evaluator.on_end())
-    assert "interpolated in time" in evaluator.report["protocol"]
+    assert "each frame's exposure and its vignetting as the tracker estimated" in evaluator.report["protocol"]
+    report = json.loads((tmp_path / "report.json").read_text())["exposure"]
+    assert report["keyframes"] == list(range(0, N, 3))
+    np.testing.assert_allclose(report["gain"][:3], [[1.0] * 3, [0.5] * 3, [1.0] * 3])
+    assert report["remainder"] < 1e-6
+    np.testing.assert_allclose(report["vignetting"], vignetting)
+    assert "Exposure by frame" in (tmp_path / "report.html").read_text()
+
+
+def test_without_exposures_the_report_speaks_of_none(evaluator: Evaluator, tmp_path: Path) -> None:
+    report = _feed(evaluator)
+    assert report["exposure"] is None
+    assert "tracker estimated" not in report["protocol"]
+    assert "Exposure by frame" not in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize("fitted", [True, False])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +31,10 @@ from tests.support.keyframe_graphs import noisy
 from tests.support.pretend_device import DEVICE, PretendDevice
 from tests.support.stereo_problems import SIZE, problem
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
+
+LIGHT: dict[str, Any] = {
+    "exposure": 1.1 * np.eye(3, 4, dtype=np.float32), "vignetting": np.array([-0.1, 0, 0], np.float32)
+}  # fmt: skip
 
 
 @pytest.mark.slow
@@ -95,12 +101,12 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot() -> None:
     config = MapperConfig(
         iterations=4, refinement=1, sh_degree=1, device=DEVICE,
         training=TrainingConfig(
-            backend="reference", exposure=True, refine_poses=True, pose_visits=0, betas=True, kernel="exact",
+            backend="reference", refine_poses=True, pose_visits=0, betas=True, kernel="exact",
             loss="ges",
         ),
         density_control=DensityControlConfig(every=3),
     )  # fmt: skip
-    views = [rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(3)]
+    views = [replace(rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)), **LIGHT) for k in range(3)]
     with PretendDevice():
         mapper = OnlineMapper(config)
         for one in views:
@@ -121,9 +127,9 @@ def test_mapper_from_the_first_keyframe_to_the_snapshot() -> None:
 
 
 def test_a_checkpoint_of_a_mapper_elsewhere_gives_it_back(tmp_path: Path) -> None:
-    training = TrainingConfig(backend="reference", exposure=True, refine_poses=True, pose_visits=0)
+    training = TrainingConfig(backend="reference", refine_poses=True, pose_visits=0)
     config = MapperConfig(iterations=3, device=DEVICE, training=training)
-    views = [rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)) for k in range(2)]
+    views = [replace(rgbd_keyframe(k, pose_on_arc(0.3 * k), size=(20, 24)), **LIGHT) for k in range(2)]
     images = tmp_path / FOLDER / KEYFRAMES
     images.mkdir(parents=True)
     with PretendDevice():

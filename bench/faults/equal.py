@@ -29,11 +29,7 @@ class Case:
 CASES = (
     Case("small room", SMALL, True),
     Case("demonstration", (), False),
-    Case(
-        "demonstration, exposure and poses trained",
-        ("mapper.training.exposure=true", "mapper.training.refine_poses=true"),
-        False,
-    ),
+    Case("demonstration, poses trained", ("mapper.training.refine_poses=true",), False),
     Case("true poses", ("tracker=ground_truth", *SMALL), False),
 )
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from mvsgs_core.evaluation import metrics, scoring, trajectory_metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
-from mvsgs_core.evaluation.exposure import between_keyframes
+from mvsgs_core.evaluation.exposure import FrameExposures, frame_exposures, summary
 from mvsgs_core.evaluation.fitted_camera import fit_camera
 from mvsgs_core.evaluation.frames import Frames
 from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
@@ -83,6 +83,7 @@ class Evaluation:
             "rendering_before_refinement": rendering[False],
             "trajectory": trajectory_report,
             "depth": self._score_depths(alignment, notes),
+            "exposure": self._exposure_report(),
             "frames_on_disk": {"bytes": self._frames.size},
             "map": {
                 "splats": len(final.splats.means) if final else 0,
@@ -106,7 +107,7 @@ class Evaluation:
         near = NEAR * _typical_depth(finished)
         place = _places(finished)
         moving = velocities(tracked.timestamp, tracked.world_from_cam, main)
-        exposures = self._exposures(finished, main)
+        exposures = self.exposures(refined)
         photographs = self._frames.photographs()
         for k in np.flatnonzero(main & np.isin(tracked.index, list(photographs))):
             index = int(tracked.index[k])
@@ -123,17 +124,19 @@ class Evaluation:
                     photograph.image,
                     near,
                     Shutter(tracked.readout_time, moving[k]) if rolling else None,
-                    None if exposures is None else exposures[k],
+                    None if exposures is None else exposures.affines[k],
+                    tracked.vignetting,
                 )
             )
         return frames
 
-    def _exposures(self, finished: Snapshot, main: np.ndarray) -> np.ndarray | None:
-        """Color affines (N, 3, 4) of the track's frames, from the map's keyframes; None where the mapper had none."""
-        assert self.trajectory is not None
-        known, place = np.flatnonzero(main & np.isin(self.trajectory.index, finished.keyframes)), _places(finished)
-        affines = finished.exposures[[place[int(i)] for i in self.trajectory.index[known]]]
-        return between_keyframes(self.trajectory.timestamp, self.trajectory.timestamp[known], affines)
+    def exposures(self, refined: bool) -> FrameExposures | None:
+        """Of all frames of the track; of those outside of the main part of the map they mean nothing."""
+        finished, tracked = self.maps[refined], self.trajectory
+        assert tracked is not None
+        mapped, place = np.flatnonzero(tracked.main() & np.isin(tracked.index, finished.keyframes)), _places(finished)
+        affines = finished.exposures[[place[int(i)] for i in tracked.index[mapped]]]
+        return frame_exposures(tracked.timestamp, tracked.exposure, mapped, affines)
 
     def photograph(self, index: int) -> np.ndarray:
         """(H, W, 3) uint8. Raises KeyError for a frame that was not kept."""
@@ -164,6 +167,13 @@ class Evaluation:
         if held_out < ENOUGH and few not in notes:
             notes.append(few)
         return scoring.summarize(scores)
+
+    def _exposure_report(self) -> dict[str, Any] | None:
+        refined = True in self.maps
+        if not self.maps or self.trajectory is None:
+            return None
+        finished = self.maps[refined]
+        return summary(finished.keyframes, finished.exposures, self.exposures(refined), self.trajectory.vignetting)
 
     def _fitted(self, finished: Snapshot, frame: scoring.ScoredFrame, score: scoring.Score) -> scoring.Score:
         """The same score, and that of a held-out frame with its camera fitted at test time beside it."""

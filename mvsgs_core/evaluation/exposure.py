@@ -1,21 +1,74 @@
-"""Exposure and white balance of frames that were not mapped: between those that the mapper found for its keyframes."""
+"""Exposure and white balance of every frame: the tracker's, in the gauge of the map, with what the map trained beside.
+
+Nothing is fitted to a frame that is scored: the tracker's exposure comes from the frame's matches to keyframes, and
+what the map found for its keyframes beside the tracker's is interpolated in time.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
-from mvsgs_core.mapping.exposure import IDENTITY
+from mvsgs_core.photometry import IDENTITY, compose, inverse
 
 
-def between_keyframes(timestamps: np.ndarray, keyframes: np.ndarray, affines: np.ndarray) -> np.ndarray | None:
-    """Color affines [A | b] (N, 3, 4) float32 at `timestamps` (N,), linear in time; None if no keyframe has one.
+@dataclass(frozen=True)
+class FrameExposures:
+    """Color affines of N frames, from the map's colors to the photographs'."""
 
-    keyframes: (K,) timestamps, ascending; affines: (K, 3, 4). Before the first and after the last keyframe theirs hold.
-    Nothing is fitted to a frame that is scored: a camera's exposure drifts, so its neighbors in time tell most of it.
+    affines: np.ndarray  # (N, 3, 4) float32
+    remainders: np.ndarray  # (K, 3, 4) float64 of keyframes: what the map's affine does before the tracker's
+
+
+def frame_exposures(
+    timestamps: np.ndarray, measured: np.ndarray | None, rows: np.ndarray, affines: np.ndarray
+) -> FrameExposures | None:
+    """Of frames at `timestamps` (N,) ascending; None where neither tracker nor map has any.
+
+    measured: (N, 3, 4) the tracker's, NaN where not known (then interpolated in time from those that are); None: it
+    has none. rows: (K,) the keyframes among the frames, ascending; affines: (K, 3, 4) the map's of those. Before the
+    first and after the last one theirs holds.
     """
-    if not len(affines) or np.allclose(affines, IDENTITY):
+    known = np.zeros(len(timestamps), bool) if measured is None else np.isfinite(measured).all(axis=(1, 2))
+    if not len(rows) or (not known.any() and np.allclose(affines, IDENTITY)):
         return None
-    found = np.empty((len(timestamps), 3, 4), dtype=np.float32)
+    tracked = np.tile(IDENTITY.astype(np.float64), (len(timestamps), 1, 1))
+    if measured is not None and known.any():
+        tracked = _interpolated(timestamps, timestamps[known], measured[known])
+    remainders = compose(inverse(tracked[rows]), affines)
+    found = compose(tracked, _interpolated(timestamps, timestamps[rows], remainders))
+    return FrameExposures(found.astype(np.float32), remainders)
+
+
+def gains(affines: np.ndarray) -> np.ndarray:
+    """(N, 3) of red, green and blue: by how much affines (N, 3, 4) brighten gray."""
+    return np.asarray(affines[:, :, :3].sum(axis=2))
+
+
+def summary(
+    keyframes: np.ndarray, affines: np.ndarray, found: FrameExposures | None, vignetting: np.ndarray | None
+) -> dict[str, Any] | None:
+    """For report.json, of the keyframes `keyframes` (K,) and the map's affines (K, 3, 4) of them; None: nothing known.
+
+    `gain`: of red, green and blue for each keyframe. `remainder`: the median, over the keyframes, of the relative
+    difference between the map's gain and the tracker's, one factor common to all aside.
+    """
+    if found is None and vignetting is None:
+        return None
+    beside = 1.0 if found is None else gains(found.remainders).mean(axis=1)
+    return {
+        "keyframes": keyframes.tolist(),
+        "gain": gains(affines).tolist(),
+        "remainder": float(np.median(np.abs(beside / np.median(beside) - 1.0))),
+        "vignetting": None if vignetting is None else vignetting.tolist(),
+    }
+
+
+def _interpolated(timestamps: np.ndarray, known: np.ndarray, affines: np.ndarray) -> np.ndarray:
+    """(N, 3, 4) float64 at `timestamps` (N,), linear between the affines (M, 3, 4) of `known` (M,), ascending."""
+    found = np.empty((len(timestamps), 3, 4))
     for row, column in np.ndindex(3, 4):
-        found[:, row, column] = np.interp(timestamps, keyframes, affines[:, row, column])
+        found[:, row, column] = np.interp(timestamps, known, affines[:, row, column])
     return found

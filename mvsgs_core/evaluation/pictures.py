@@ -11,6 +11,7 @@ import numpy as np
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import html, metrics, scoring, svg
 from mvsgs_core.evaluation.evaluation import Evaluation
+from mvsgs_core.evaluation.exposure import gains
 
 Row = tuple[str, dict[str, np.ndarray]]
 
@@ -92,6 +93,19 @@ def plots(evaluation: Evaluation, stages: Mapping[str, Mapping[str, float]]) -> 
     if series:
         result[f"{first.label} by frame"] = svg.plot(series, "frame", first.unit)
         result["Coverage by frame"] = svg.plot(covered, "frame", "% of the pixels more than half opaque")
+    result |= _exposure_plot(evaluation)
     if stages:
         result["Time by stage"] = html.timing_bars(stages)
     return result
+
+
+def _exposure_plot(evaluation: Evaluation) -> dict[str, str]:
+    """Gain of red, green and blue of each frame of the map's part, where there is an exposure."""
+    tracked, refined = evaluation.trajectory, True in evaluation.maps
+    found = evaluation.exposures(refined) if evaluation.maps and tracked is not None else None
+    if found is None or tracked is None:
+        return {}
+    main = tracked.main()
+    x, y = tracked.index[main].astype(float), gains(found.affines)[main]
+    series = [svg.Series(name, x, y[:, k]) for k, name in enumerate(("red", "green", "blue"))]
+    return {"Exposure by frame": svg.plot(series, "frame", "gain against the mean camera")}

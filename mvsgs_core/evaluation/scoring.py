@@ -15,6 +15,7 @@ from mvsgs_core.evaluation import metrics
 from mvsgs_core.evaluation.frames import ENDING
 from mvsgs_core.evaluation.rolling_shutter import Shutter, apply_rolling_shutter
 from mvsgs_core.held_out import is_held_out
+from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -32,7 +33,8 @@ class ScoredFrame:
     photograph: Callable[[], np.ndarray]  # (H, W, 3) uint8, read when needed
     near: float  # nothing nearer is drawn, map units
     shutter: Shutter | None = None  # how the photograph was read out; None: all rows at once
-    exposure: np.ndarray | None = None  # (3, 4) color affine of the photograph, as the mapper has it; None: none
+    exposure: np.ndarray | None = None  # (3, 4) color affine of the photograph; None: none
+    vignetting: np.ndarray | None = None  # (3,) of the sensor; None: none
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Score:
 
 
 class Rendered(NamedTuple):
-    color: np.ndarray  # (H, W, 3) float32 in 0..1, as the frame's exposure and shutter show it
+    color: np.ndarray  # (H, W, 3) float32 in 0..1, as the frame's exposure, shutter and vignetting show it
     depth: np.ndarray  # (H, W) float32, 0 where nothing is rendered
     opacity: np.ndarray  # (H, W) float32 in 0..1
 
@@ -79,10 +81,12 @@ def render_frame(splats: Splats, kernel: str, frame: ScoredFrame, size: tuple[in
         render = rasterize(
             splats, frame.world_from_cam, frame.intrinsics, size, exposure=exposure, kernel=kernel, near=frame.near
         )
-    color, depth = render.color.clamp(0, 1).cpu().numpy(), render.depth.cpu().numpy()
+    color, depth = render.color.cpu().numpy(), render.depth.cpu().numpy()
     if frame.shutter is not None:
         color = apply_rolling_shutter(color, depth, frame.intrinsics, frame.shutter)
-    return Rendered(color, depth, render.opacity.cpu().numpy())
+    if frame.vignetting is not None:
+        color = color * vignetting_factor(frame.vignetting, frame.intrinsics, size)[..., None]
+    return Rendered(color.clip(0.0, 1.0), depth, render.opacity.cpu().numpy())
 
 
 def score_frame(splats: Splats, kernel: str, frame: ScoredFrame, given: Mapping[str, Compare] | None = None) -> Score:

@@ -85,17 +85,23 @@ class Atlas:
         return True
 
     def correct(
-        self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray, segment: np.ndarray | None = None
-    ) -> None:
+        self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray, segment: np.ndarray | None = None,
+        exposure: np.ndarray | None = None, vignetting: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """Corrected poses as in `OnlineMapper.correct`, for each part's keyframes; what is no pose is counted once.
 
-        segment (K,): to which their keyframes belong now; maps of segments that became one are joined.
+        segment (K,): to which their keyframes belong now; maps of segments that became one are joined. exposure
+        (K, 3, 4), vignetting (3,): as in `Photometry.take`.
         """
         usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
         if not usable.all():
             self.current.log.refuse("poses", int((~usable).sum()), NO_POSE)
         for part in self.parts.values() or [self.current]:
             part.correct(index[usable], world_from_cam[usable], scale[usable])
+        if self.current.config.training.exposure and not (exposure is None and vignetting is None):
+            self.current.photometry.take(index.tolist(), exposure, vignetting, self.current.log)
+            for part in self.parts.values() or [self.current]:
+                part.expose()
         if segment is not None:
             self.segment_of.update(zip(index.tolist(), segment.tolist()))
             self.join()
@@ -108,7 +114,9 @@ class Atlas:
             while self.current.step():  # what is pending of the part before
                 pass
             before = self.current
-            self.parts[segment] = OnlineMapper(before.config, before.log, before.corrections)
+            self.parts[segment] = OnlineMapper(
+                before.config, before.log, before.corrections, photometry=before.photometry
+            )
         self.current = self.parts[segment]
 
     def join(self) -> None:
@@ -136,11 +144,12 @@ class Atlas:
 
     def frozen(self) -> Atlas:
         """A copy that shares nothing that changes, on the CPU. Raises ValueError in the middle of a change."""
-        log, corrections = Stats(), dict(self.current.corrections)
+        log, corrections, photometry = Stats(), dict(self.current.corrections), self.current.photometry.copy()
         log.include(self.current.log)
-        parts = {segment: copy_of(part, log, corrections) for segment, part in self.parts.items()}
+        parts = {segment: copy_of(part, log, corrections, photometry) for segment, part in self.parts.items()}
         current = next((parts[s] for s, part in self.parts.items() if part is self.current), None)
         return Atlas(
-            current or OnlineMapper(self.current.config, log, corrections), parts, dict(self.segment_of),
+            current or OnlineMapper(self.current.config, log, corrections, photometry=photometry), parts,
+            dict(self.segment_of),
             self.newest_view, self.stream_seconds, self.revision, self.stream_ended, self.refined,
         )  # fmt: skip

@@ -10,7 +10,7 @@ import torch
 
 from mvsgs_core import camera
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.exposure import colors_of_map, fitted_exposure
+from mvsgs_core.mapping.exposure import Photometry
 from mvsgs_core.mapping.filling import continued_depth, fill_points
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
 from mvsgs_core.mapping.insertion import (
@@ -38,32 +38,19 @@ class Densifier:
 
     def __init__(
         self, config: MapperConfig, state: MapState, frame: FrameOfReference, keyframes: KeyframeStore,
-        render: Callable[[TrainingView, tuple[int, int]], Render], log: Stats,
+        render: Callable[[TrainingView, tuple[int, int]], Render], photometry: Photometry, log: Stats,
     ) -> None:  # fmt: skip
-        """render: of `state` from a keyframe's pose at a size (height, width). What is given here changes by itself."""
+        """render: of `state` as a keyframe's camera photographs it, at a size (height, width). What is given here
+        changes by itself."""
         self.config, self.state, self.frame, self.keyframes = config.insertion, state, frame, keyframes
-        self.render, self.log = render, log
-        self._kernel, self._exposure = config.training.kernel, config.training.exposure
+        self.render, self.photometry, self.log = render, photometry, log
+        self._kernel = config.training.kernel
         self._max_splats = config.density_control.max_splats
 
     def add(self, keyframe: RGBDKeyframe, view: TrainingView, depth: np.ndarray) -> int:
         """Adds the splats of the store's newest keyframe; returns their number. depth: (h, w), checked, world units."""
-        if self._exposure:
-            self._expose(keyframe, view)
         inserted = self._insert(keyframe, view, depth) if (depth > 0).any() else 0
         return inserted + self._fill(keyframe, view)
-
-    def _expose(self, keyframe: RGBDKeyframe, view: TrainingView) -> None:
-        """First guess of a keyframe's exposure: what fits the map, or where that shows too little the earlier one's."""
-        if not len(self.state):
-            return
-        size = _half(view.size)
-        render = self.render(view, size)
-        found = fitted_exposure(render.color.cpu().numpy(), render.opacity.cpu().numpy(), _colors(keyframe, view, size))
-        if found is not None:
-            view.exposure.copy_(torch.from_numpy(found))
-        elif len(self.keyframes) > 1:
-            view.exposure.copy_(self.keyframes.views[-2].exposure.detach())
 
     def _insert(self, keyframe: RGBDKeyframe, view: TrainingView, depth: np.ndarray) -> int:
         """Adds splats where `depth` is known and the map does not show the image yet."""
@@ -128,7 +115,7 @@ class Densifier:
     def _map_colors(self, view: TrainingView, size: tuple[int, int]) -> np.ndarray:
         """The keyframe's colors (h, w, 3) as the map has them."""
         colors = depth_colors(view.image.cpu().numpy(), size)
-        return colors_of_map(colors, view.exposure.detach().cpu().numpy()) if self._exposure else colors
+        return self.photometry.colors_of_map(colors, view)
 
     def _near(self, points: Points, median_depth: float) -> np.ndarray:
         near = near_points(points, self.config, median_depth)

@@ -1,62 +1,111 @@
-"""A keyframe's exposure and white balance: the affine [A | b] (3, 4) that takes the map's colors to the image's.
+"""Exposures in the map: its colors are those of the mean camera, each keyframe has its own affine of them.
 
-The map's own colors are known up to one affine of all: as the map leaves the mapper, the mean over the keyframes is the
-identity, so that frames whose exposure nobody knows look as the average one.
+The tracker says the exposures (`Photometry`), and corrects them as it does poses; splats' colors then go with their
+anchor keyframe as positions do. No color is ever fitted to a render. See `mvsgs_core.photometry` for the model.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.photometry import IDENTITY, compose, inverse, is_exposure, is_vignetting, vignetting_factor
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
+from mvsgs_core.stats import Stats
 
-IDENTITY = np.eye(3, 4, dtype=np.float32)
-MIN_KNOWN = 0.05  # fraction of the image that the map must show
-MIN_OPACITY = 0.9  # of a pixel that the map shows
-SATURATED = 0.98  # a camera's color from here on, and from its complement down, is cut off
-SAMPLES = 20000  # pixels that are fitted, at most
-HOLD = 1e-3  # variance of color that counts as much as the identity does
-GAINS = (0.25, 4.0)  # what a fit may say
-# Of a fit, toward the identity. A fit is a percent off, new splats pass that on to the next keyframe's fit, and only
-# this keeps a long path from drifting; the training finds the rest.
-KEPT = 0.9
+MIN_FACTOR = 0.25  # of vignetting that a color is divided by: below, the pixel's noise is what would be enlarged
+BRIGHTEST = 4.0  # of the map's colors from an image: a dark keyframe's bright pixel is brighter than white
+NO_EXPOSURE = "an exposure or a vignetting that no camera has was refused"
 
 
-def fitted_exposure(render: np.ndarray, opacity: np.ndarray, image: np.ndarray) -> np.ndarray | None:
-    """Gain and offset of each channel that bring a render (H, W, 3) to an image, both in 0..1: (3, 4) float32.
+@dataclass
+class Photometry:
+    """The newest that the tracker said of the photographs; mappers of one stream share it."""
 
-    Robust (Cauchy): what the map does not know yet, or has at a wrong place, has little say. opacity: (H, W) of the
-    render. None where the map shows too little of the image.
+    exposures: dict[int, np.ndarray] = field(default_factory=dict)  # (3, 4) float32 by keyframe; missing: the identity
+    vignetting: np.ndarray | None = None  # (3,) float64 of the sensor; None: none
+
+    def take(
+        self, index: Iterable[int], exposures: np.ndarray | None, vignetting: np.ndarray | None, log: Stats
+    ) -> None:
+        """Exposures (K, 3, 4) of these keyframes, NaN: none, and the vignetting (3,); None: as they were.
+
+        What no camera has is refused and counted: the identity.
+        """
+        for key, affine in zip(index, () if exposures is None else exposures):
+            known = not np.isnan(affine).any() and not np.array_equal(affine, IDENTITY)
+            if known and not is_exposure(affine):
+                log.refuse("exposures", 1, NO_EXPOSURE)
+                known = False
+            if known:
+                self.exposures[key] = affine.astype(np.float32)
+            else:
+                self.exposures.pop(key, None)
+        if vignetting is not None:
+            if not is_vignetting(vignetting):
+                log.refuse("exposures", 1, NO_EXPOSURE)
+            else:
+                self.vignetting = vignetting.astype(np.float64) if vignetting.any() else None
+
+    def colors_of_map(self, colors: np.ndarray, view: TrainingView) -> np.ndarray:
+        """Colors (h, w, 3) of a keyframe's image, at any size, as the map has them."""
+        if view.measured is None and self.vignetting is None:
+            return colors
+        size = (colors.shape[0], colors.shape[1])
+        factor = None
+        if self.vignetting is not None:
+            factor = vignetting_factor(self.vignetting, view.intrinsics_at(size), size)
+        return colors_of_map(colors, view.exposure.detach().cpu().numpy(), factor)
+
+    def copy(self) -> Photometry:
+        """One that later changes do not reach; the arrays never change."""
+        return replace(self, exposures=dict(self.exposures))
+
+
+def colors_of_map(colors: np.ndarray, exposure: np.ndarray, factor: np.ndarray | None = None) -> np.ndarray:
+    """Colors (h, w, 3) of an image as the map has them; factor: (h, w) of vignetting.
+
+    Not cut off at 1: white in a dark image is brighter than that. Of a pixel that is saturated it is the least that the
+    color can be; the training takes it from there.
     """
-    known = (opacity > MIN_OPACITY) & np.isfinite(render).all(axis=-1) & np.isfinite(image).all(axis=-1)
-    known &= (image > 1.0 - SATURATED).all(axis=-1) & (image < SATURATED).all(axis=-1)
-    if known.mean() < MIN_KNOWN:
-        return None
-    every = max(1, int(known.sum()) // SAMPLES)
-    affine = np.zeros((3, 4), dtype=np.float32)
-    for channel in range(3):
-        x = render[..., channel][known][::every].astype(np.float64)
-        y = image[..., channel][known][::every].astype(np.float64)
-        gain, offset = 1.0, float(np.median(y - x))
-        for _ in range(10):
-            error = np.abs(gain * x + offset - y)
-            weight = 1.0 / (1.0 + (error / (1.48 * np.median(error) + 1e-6)) ** 2)
-            weight /= weight.sum()
-            mean_x, mean_y = weight @ x, weight @ y
-            covariance = weight @ ((x - mean_x) * (y - mean_y))
-            gain = float(np.clip((covariance + HOLD) / (weight @ (x - mean_x) ** 2 + HOLD), *GAINS))
-            offset = mean_y - gain * mean_x
-        affine[channel, channel], affine[channel, 3] = 1.0 + KEPT * (gain - 1.0), KEPT * offset
-    return affine
+    flat = colors if factor is None else colors / np.maximum(factor, MIN_FACTOR)[..., None]
+    back = inverse(exposure)
+    return np.clip(flat @ back[:, :3].T + back[:, 3], 0.0, BRIGHTEST)
 
 
-def colors_of_map(colors: np.ndarray, exposure: np.ndarray) -> np.ndarray:
-    """Colors (..., 3) of an image as the map has them, in 0..1."""
-    matrix, offset = exposure[:, :3].astype(np.float64), exposure[:, 3].astype(np.float64)
-    return np.clip((colors - offset) @ np.linalg.pinv(matrix).T, 0.0, 1.0)
+@torch.no_grad()
+def recolor_with_anchors(state: MapState, changes: dict[int, np.ndarray]) -> int:
+    """Takes the colors of all splats whose anchor is a key through an affine (3, 4); returns their number.
+
+    The moments follow as in `deformation`: a gradient by the inverse's transpose.
+    """
+    if not changes or len(state) == 0:
+        return 0
+    splats, count = state.detached(), 0
+    for key, affine in changes.items():
+        chosen = torch.nonzero(state.anchors == key)[:, 0]
+        splats.sh[chosen] = recolored(splats.sh[chosen], affine)
+        back = torch.as_tensor(inverse(affine)[:, :3], device=state.device)
+        for moment, matrix in ((state.first["sh"], back), (state.second["sh"], back.square())):
+            moment[chosen] = (moment[chosen].to(torch.float64) @ matrix).to(torch.float32)
+        count += len(chosen)
+    return count
+
+
+def recolored(sh: Tensor, affine: np.ndarray) -> Tensor:
+    """Harmonics (N, B, 3) whose colors went through an affine (3, 4)."""
+    given = torch.as_tensor(affine, dtype=torch.float64, device=sh.device)
+    matrix, offset = given[:, :3], given[:, 3]
+    changed = sh.to(torch.float64) @ matrix.T
+    changed[:, 0] += (offset + matrix.sum(dim=1) * 0.5 - 0.5) / C0
+    return changed.to(torch.float32)
 
 
 def relative_to_mean(splats: Splats, exposures: np.ndarray) -> tuple[Tensor, np.ndarray]:
@@ -65,11 +114,4 @@ def relative_to_mean(splats: Splats, exposures: np.ndarray) -> tuple[Tensor, np.
     Both together render the same images as before.
     """
     mean = exposures.astype(np.float64).mean(axis=0)
-    matrix, offset = torch.from_numpy(mean[:, :3]), torch.from_numpy(mean[:, 3])
-    sh = splats.sh.to(torch.float64) @ matrix.T
-    sh[:, 0] += (offset + matrix.sum(dim=1) * 0.5 - 0.5) / C0
-    inverse = np.linalg.pinv(mean[:, :3])
-    relative = exposures.astype(np.float64)
-    relative[:, :, :3] = relative[:, :, :3] @ inverse
-    relative[:, :, 3] -= relative[:, :, :3] @ mean[:, 3]
-    return sh.to(torch.float32), relative.astype(np.float32)
+    return recolored(splats.sh, mean), compose(exposures, inverse(mean)).astype(np.float32)

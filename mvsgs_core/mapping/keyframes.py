@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mvsgs_core import camera
 from mvsgs_core.mapping.deformation import Similarity
+from mvsgs_core.photometry import IDENTITY, compose, inverse
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class RGBDKeyframe:
     normals: np.ndarray | None = None  # (h, w, 3), camera frame, 0 where unknown
     unfiltered: np.ndarray | None = None  # (h, w) float32 depth before the filters, 0 where unknown
     timestamp: float = float("nan")  # seconds; NaN: not known
+    exposure: np.ndarray | None = None  # (3, 4) color affine that the tracker estimated; None: not known
+    vignetting: np.ndarray | None = None  # (3,) of the sensor, the same
 
 
 @dataclass(frozen=True)
@@ -51,8 +54,9 @@ class TrainingView:
     world_from_cam: np.ndarray  # (4, 4) float64, world units
     scale: float
     local_from_cam: np.ndarray  # (4, 4) float64, in the mapper's frame and unit
-    exposure: Tensor  # (3, 4) color affine [A | b]
+    exposure: Tensor  # (3, 4) color affine [A | b] that it is rendered with, the identity where none is measured
     exposure_moments: tuple[Tensor, Tensor]
+    measured: np.ndarray | None = None  # (3, 4) the tracker's, which the exposure is near; None: there is none
     pose_delta: np.ndarray = field(default_factory=lambda: np.eye(4))  # (4, 4) from the tracker's camera to the refined
     pose_moments: np.ndarray = field(default_factory=lambda: np.zeros((2, 6)))  # of (translation, rotation)
     pose_steps: int = 0
@@ -106,6 +110,18 @@ class TrainingView:
         self.rescale(scale / self.scale)
         self.scale = scale
         return moved
+
+    def expose(self, measured: np.ndarray | None) -> np.ndarray:
+        """A corrected exposure (3, 4), None: none any more; returns the affine (3, 4) its map colors take.
+
+        What was trained beside the old one stays beside the new one, so that the keyframe's own splats look as before.
+        """
+        old = IDENTITY if self.measured is None else self.measured
+        change = compose(inverse(IDENTITY if measured is None else measured), old)
+        now = IDENTITY if measured is None else compose(self.exposure.detach().cpu().numpy(), inverse(change))
+        self.exposure = torch.as_tensor(now, dtype=torch.float32, device=self.exposure.device)
+        self.measured = measured
+        return change
 
     def record(self, loss: float) -> None:
         """Takes in the loss of an iteration."""

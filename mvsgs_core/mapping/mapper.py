@@ -14,6 +14,7 @@ from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
 from mvsgs_core.mapping.densifier import Densifier, checked_depth
+from mvsgs_core.mapping.exposure import Photometry, recolor_with_anchors
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
 from mvsgs_core.mapping.keyframe_checks import NO_POSE, checked_keyframe, is_pose
 from mvsgs_core.mapping.keyframe_store import KeyframeStore
@@ -37,14 +38,16 @@ class OnlineMapper:
         corrections: dict[int, tuple[np.ndarray, float]] | None = None,
         state: MapState | None = None,
         views: list[TrainingView] | None = None,
+        photometry: Photometry | None = None,
     ) -> None:
-        """log, corrections (world_from_cam (4, 4), scale; by keyframe): what mappers of one stream share.
+        """log, corrections (world_from_cam (4, 4), scale; by keyframe), photometry: what mappers of one stream share.
 
         state, views: of a mapper that is gone on with.
         """
         self.config = config = config or MapperConfig()
         self.log = log or Stats()
         self.corrections = {} if corrections is None else corrections  # newest pose and scale of each keyframe
+        self.photometry = Photometry() if photometry is None else photometry
         self.state = (
             MapState((config.sh_degree + 1) ** 2, torch.device(resolve_device(config.device)))
             if state is None
@@ -53,8 +56,10 @@ class OnlineMapper:
         self.frame = FrameOfReference()
         self.keyframes = KeyframeStore(config.max_keyframes, config.window, self.log, views or ())
         self.schedule = Schedule(config.window, config.seed)
-        self.trainer = Trainer(config, self.state, self.log)
-        self.densifier = Densifier(config, self.state, self.frame, self.keyframes, self.render, self.log)
+        self.trainer = Trainer(config, self.state, self.log, self.photometry)
+        self.densifier = Densifier(
+            config, self.state, self.frame, self.keyframes, self.render, self.photometry, self.log
+        )
 
     @property
     def views(self) -> list[TrainingView]:
@@ -91,6 +96,9 @@ class OnlineMapper:
         checked = checked_keyframe(keyframe, self.log)
         if checked is None:
             return 0
+        if self.config.training.exposure:
+            affine = None if checked.exposure is None else checked.exposure[None]
+            self.photometry.take([checked.index], affine, checked.vignetting, self.log)
         depth = checked_depth(checked.depth, self.log)
         pose, scale = self.corrections.get(
             checked.index, (np.asarray(checked.world_from_cam, dtype=np.float64), checked.scale)
@@ -159,6 +167,22 @@ class OnlineMapper:
         self.log.count("corrected_keyframes", len(moved))
         return count
 
+    def expose(self) -> int:
+        """Brings keyframes and colors to what `photometry` says now; returns the number of splats that changed.
+
+        Splats' colors go with their anchor keyframe's exposure, as their positions go with its pose.
+        """
+        changes: dict[int, np.ndarray] = {}
+        for view in self.views:
+            now, before = self.photometry.exposures.get(view.index), view.measured
+            same = now is before if now is None or before is None else np.array_equal(now, before)
+            if not same:
+                changes[view.index] = view.expose(now)
+        with self.log.time("correction"):
+            count = recolor_with_anchors(self.state, changes)
+        self.log.count("corrected_exposures", len(changes))
+        return count
+
     def join(self, other: OnlineMapper) -> None:
         """Takes over the map of another part of the stream, of the same configuration, whose poses `correct` brought
         into this one's frame of reference.
@@ -206,6 +230,7 @@ class OnlineMapper:
         view = training_view(keyframe, self.frame.local(pose), self.config.max_pixels, self.state.device)
         view.world_from_cam, view.scale, view.median_depth = pose, scale, median / self.frame.length
         view.fixed = not self.views
+        view.expose(self.photometry.exposures.get(view.index))
         if view.valid is not None:
             self.log.refuse(
                 "pixels", int((~view.valid).sum()), "pixels that are not finite were left out of the training"

@@ -19,6 +19,7 @@ from mvsgs_core.mapping.filling import continued_depth, fill_points
 from mvsgs_core.mapping.insertion import Points, depth_colors, splats_from_points
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.photometry import is_exposure
 from mvsgs_core.rasterizer.splats import Splats
 
 KEPT = 8  # keyframes that wait for their depth: the newest
@@ -38,6 +39,7 @@ class CoarseKeyframe:
     inverse_depth: np.ndarray  # (h, w) float32, 0 where unknown
     weight: np.ndarray  # (h, w) float32 0 to 1
     segment: int = 0
+    exposure: np.ndarray | None = None  # (3, 4) color affine; None: not known
 
 
 @dataclass
@@ -131,11 +133,16 @@ def _points(waiting: _Waiting, local_from_cam: np.ndarray, mapper: OnlineMapper)
     size = (view.image.shape[0], view.image.shape[1])
     nothing = np.zeros((1, 1), dtype=np.float32)
     posed = RGBDKeyframe(view.index, view.image, view.intrinsics, waiting.world_from_cam, nothing)
-    render = mapper.render(training_view(posed, local_from_cam, None, mapper.state.device))
+    seen = training_view(posed, local_from_cam, None, mapper.state.device)
+    if mapper.config.training.exposure:
+        own = view.exposure if view.exposure is not None and is_exposure(view.exposure) else None
+        seen.expose(mapper.photometry.exposures.get(view.index, own))
+    render = mapper.render(seen)
     solid = render.opacity.cpu().numpy() > SOLID
     factor = waiting.scale / view.scale / mapper.frame.length  # of depths as they came to the mapper's
     shown = np.where(solid, render.depth.cpu().numpy() / factor, 0.0).astype(np.float32)
     depth, confidence = enlarge_inverse_depth(view.inverse_depth, view.weight, size)
     colors = depth_colors(view.image, size)
     depth = continued_depth(depth, confidence, shown, colors)
-    return fill_points(depth, confidence, view.intrinsics, colors, ~solid, 1)
+    of_map = mapper.photometry.colors_of_map(colors, seen)
+    return fill_points(depth, confidence, view.intrinsics, of_map, ~solid, 1)

@@ -38,9 +38,7 @@ class SelfCheck:
             return self._noise_warning
         causes = []
         if self.steady_psnr > max(MIN_STEADY_PSNR, self.psnr + MAX_EXPOSURE_GAIN):
-            causes.append(
-                f"exposure changes (without: {self.steady_psnr:.1f} dB; mapper.training.exposure=true models it)"
-            )
+            causes.append(f"changes of exposure that nobody knows (without: {self.steady_psnr:.1f} dB)")
         if self.noise > MAX_NOISE:
             causes.append(f"noise of {self.noise:.0f} of 255")
         known = " and ".join(causes) or "motion, blur, wrong poses or too few iterations"

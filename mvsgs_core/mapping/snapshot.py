@@ -8,10 +8,11 @@ import numpy as np
 import torch
 
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.exposure import IDENTITY, relative_to_mean
+from mvsgs_core.mapping.exposure import relative_to_mean
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.photometry import IDENTITY
 from mvsgs_core.rasterizer.splats import Splats
 
 

@@ -9,12 +9,16 @@ from torch import Tensor
 from mvsgs_core.mapping import density_control, optimizer
 from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
 from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.exposure import Photometry
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import LossInputs, frequency_of, training_loss, weights_of
 from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
+
+FACTORS = 8  # images of vignetting that are kept, one for each size and intrinsics
 
 
 class Trainer:
@@ -23,26 +27,35 @@ class Trainer:
     What is not finite is refused, counted in the log, and never reaches the map.
     """
 
-    def __init__(self, config: MapperConfig, state: MapState, log: Stats) -> None:
+    def __init__(
+        self, config: MapperConfig, state: MapState, log: Stats, photometry: Photometry | None = None
+    ) -> None:  # fmt: skip
+        """photometry: None: no camera is known to have an exposure."""
         self.config, self.state, self.log = config, state, log
+        self.photometry = Photometry() if photometry is None else photometry
         self.iterations = 0
         self.rate = 1.0  # factor on all learning rates: falls during the final refinement
         self.generator = torch.Generator().manual_seed(config.seed)  # of density control
+        self._factors: dict[tuple[float, ...], Tensor] = {}
         self._weights = weights_of(config.training.loss, config.training.loss_weights)
 
     def render(self, view: TrainingView, median_depth: float, size: tuple[int, int] | None = None) -> Render:
-        """The map from a keyframe's pose, without gradients. size: height, width; None: the training image's."""
+        """The map as a keyframe's camera photographs it, without gradients. size: height, width; None: the training
+        image's."""
         intrinsics = view.intrinsics if size is None else view.intrinsics_at(size)
-        exposure = view.exposure if self.config.training.exposure else None
+        exposure = None if view.measured is None else view.exposure
         with torch.no_grad():
-            return self._rasterize(
+            render = self._rasterize(
                 self.state.detached(), view, intrinsics, size or view.size, median_depth, exposure, None
             )
+            if self._photographed(view):
+                render.color = render.color.clamp(0.0, 1.0)
+            return render
 
     def step(self, view: TrainingView, median_depth: float, *, refining: bool = False) -> None:
         """One iteration on a keyframe. median_depth: of the scene; refining: no splat is added or removed."""
         training = self.config.training
-        exposure = view.exposure.requires_grad_(True) if training.exposure else None
+        exposure = None if view.measured is None else view.exposure.requires_grad_(True)
         moving = training.refine_poses and not view.fixed and view.visits >= training.pose_visits
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
         render = self._rasterize(self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist)
@@ -70,16 +83,40 @@ class Trainer:
         exposure: Tensor | None, twist: Tensor | None,
     ) -> Render:  # fmt: skip
         training = self.config.training
-        return rasterize(
+        render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
             exposure=exposure, pose_delta=twist, near=training.near * median_depth, antialiased=training.antialiased,
             threads=self.config.threads,
         )  # fmt: skip
+        factor = self._vignetting(intrinsics, size)
+        if factor is not None:
+            render.color = render.color * factor
+        return render
+
+    def _photographed(self, view: TrainingView) -> bool:
+        """Whether exposure or vignetting is known: then the image ends at black and white where the color does not."""
+        return view.measured is not None or self.photometry.vignetting is not None
+
+    def _vignetting(self, intrinsics: np.ndarray, size: tuple[int, int]) -> Tensor | None:
+        """(h, w, 1) factor of an image's colors; None: there is none. Kept, as all images of a camera have the same."""
+        vignetting = self.photometry.vignetting
+        if vignetting is None:
+            return None
+        key = (*vignetting.tolist(), *np.asarray(intrinsics).tolist(), *size)
+        if key not in self._factors:
+            if len(self._factors) >= FACTORS:
+                self._factors.clear()
+            factor = torch.from_numpy(vignetting_factor(vignetting, intrinsics, size))
+            self._factors[key] = factor[..., None].to(self.state.device)
+        return self._factors[key]
 
     def _loss_inputs(self, view: TrainingView, render: Render) -> LossInputs:
         target = view.target
         if view.valid is not None:  # equal to the render where a pixel is left out: no loss, no gradient
             target = torch.where(view.valid[..., None], target, render.color.detach())
+        if self._photographed(view):  # white, or black, says that the color is at least, or most, that
+            color = render.color.detach()
+            target = torch.where(color.clamp(0.0, 1.0) == target, color, target)
         frequency = frequency_of(view.visits, self.config.training.frequency_horizon)
         return LossInputs(render, target, self.state.splats, frequency, self.config.threads)
 
@@ -106,7 +143,7 @@ class Trainer:
     def _step_camera(self, view: TrainingView, twist: Tensor | None, median_depth: float) -> None:
         """Adam on the keyframe's exposure and pose, where they are trained."""
         training = self.config.training
-        if training.exposure:
+        if view.measured is not None:
             step_exposure(view, training.exposure_rate)
         if twist is not None and twist.grad is not None:
             angle = training.pose_rate * self.rate

@@ -31,7 +31,7 @@ RUNS = {
     "default": SMALL,
     "every option": (
         *SMALL, "mapper.training.kernel=exact", "mapper.training.betas=true", "mapper.training.loss=ges",
-        "mapper.training.exposure=true", "mapper.training.refine_poses=true", "mapper.sh_degree=2",
+        "mapper.training.refine_poses=true", "mapper.sh_degree=2",
     ),
 }  # fmt: skip
 ONE_THREAD = tuple(f"{slot}.threads=1" for slot in ("tracker", "mvs", "depth_fusion", "mapper"))

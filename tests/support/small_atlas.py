@@ -18,8 +18,18 @@ SIZE = (24, 32)
 PLAIN = MapperConfig(iterations=10, refinement=6, window=2, threads=1)
 
 
+VIGNETTING = np.array([-0.05, 0.0, 0.01], np.float32)
+
+
+def gain(factor: float) -> np.ndarray:
+    """(3, 4) exposure."""
+    return np.diag([factor, factor, 0.9 * factor, 0.0])[:3].astype(np.float32)
+
+
 def view(index: int) -> RGBDKeyframe:
+    """The first has no exposure yet."""
     found = rgbd_keyframe(index, pose_on_arc(index / 8), SIZE)
+    found = replace(found, exposure=gain(1.0 + 0.02 * index) if index else None, vignetting=VIGNETTING)
     if index != 1:
         return replace(found, timestamp=0.1 * index)
     image = found.image.astype(np.float32) / np.float32(255)
@@ -28,7 +38,7 @@ def view(index: int) -> RGBDKeyframe:
 
 
 def begun(config: MapperConfig) -> Atlas:
-    """Two segments, corrections, and iterations that are still pending."""
+    """Two segments, corrections of poses and exposures, and iterations that are still pending."""
     atlas = Atlas(OnlineMapper(config))
     for index in range(6):
         atlas.enter(int(index == 3))
@@ -38,8 +48,8 @@ def begun(config: MapperConfig) -> Atlas:
             atlas.current.step()
     moved = pose_on_arc(0.3)
     moved[:3, 3] += 0.02
-    for part in atlas.parts.values():
-        part.correct(np.array([2, 7]), np.stack([moved, moved]), np.array([1.1, 1.2]))
+    exposures = np.stack([gain(1.1), gain(1.2)])
+    atlas.correct(np.array([2, 7]), np.stack([moved, moved]), np.array([1.1, 1.2]), None, exposures, 2.0 * VIGNETTING)
     atlas.segment_of.update({3: 1, 2: 0})
     atlas.revision = 4
     return atlas

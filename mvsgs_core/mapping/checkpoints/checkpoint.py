@@ -12,7 +12,7 @@ import numpy as np
 from mvsgs_core.atomic_file import replacing
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, nothing_there, read_state, state_files, write_state
-from mvsgs_core.mapping.checkpoints.state import Arrays, Corrections, pack, unpack, whole
+from mvsgs_core.mapping.checkpoints.state import Arrays, Corrections, pack, photometry_of, unpack, whole
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.stats import Stats
 
@@ -27,7 +27,8 @@ def save(atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, list[s
 
     Raises OSError.
     """
-    log, corrections = atlas.current.log, atlas.current.corrections
+    log, corrections, photometry = atlas.current.log, atlas.current.corrections, atlas.current.photometry
+    exposed = sorted(photometry.exposures)
     index = sorted(corrections)
     poses = np.array([corrections[k][0] for k in index], dtype=np.float64).reshape(-1, 4, 4)
     arrays: dict[str, np.ndarray] = {
@@ -36,6 +37,9 @@ def save(atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, list[s
         "corrections/index": np.array(index, dtype=np.int64),
         "corrections/world_from_cam": poses,
         "corrections/scale": np.array([corrections[k][1] for k in index], dtype=np.float64),
+        "photometry/index": np.array(exposed, dtype=np.int64),
+        "photometry/exposure": np.array([photometry.exposures[k] for k in exposed], np.float32).reshape(-1, 3, 4),
+        "photometry/vignetting": np.zeros(0) if photometry.vignetting is None else photometry.vignetting,
     }
     mappers: list[dict[str, Any]] = []
     for segment, part in atlas.parts.items():
@@ -94,7 +98,7 @@ def _load(file: Path, config: MapperConfig, log: Stats) -> Atlas:
     arrays, parts = Arrays(raw), meta.get("mappers")
     differing = list(_differences(meta.get("config"), config))
     logged = _logged(meta.get("log"))
-    corrections = _corrections(arrays.of("corrections"))
+    corrections, photometry = _corrections(arrays.of("corrections")), photometry_of(arrays.of("photometry"))
     if not isinstance(parts, list) or not parts or not all(isinstance(part, dict) for part in parts):
         raise ValueError("it has no mappers")
     segments = [part.get("segment") for part in parts]
@@ -106,7 +110,9 @@ def _load(file: Path, config: MapperConfig, log: Stats) -> Atlas:
     ):
         raise ValueError("its segments are not clear")
     images = file.parent / KEYFRAMES
-    mappers = [unpack(part, arrays.of(f"map{k}"), config, log, corrections, images) for k, part in enumerate(parts)]
+    mappers = [
+        unpack(part, arrays.of(f"map{k}"), config, log, corrections, photometry, images) for k, part in enumerate(parts)
+    ]
     pairs = arrays.take("segment_of", np.int64, (None, 2))
     atlas = Atlas(
         mappers[chosen[0]], dict(zip(segments, mappers)), dict(pairs.tolist()), meta["newest_view"],

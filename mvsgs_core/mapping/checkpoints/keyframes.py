@@ -10,7 +10,7 @@ import torch
 
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info, read_state
 from mvsgs_core.mapping.checkpoints.images import read_image
-from mvsgs_core.mapping.checkpoints.state import Arrays, keyframe_rows
+from mvsgs_core.mapping.checkpoints.state import Arrays, keyframe_rows, photometry_of
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,8 @@ class KeptKeyframe:
     intrinsics: np.ndarray  # (4,) in pixels of the training image
     world_from_cam: np.ndarray  # (4, 4) float64, the tracker's
     segment: int  # part of the map
+    exposure: np.ndarray  # (3, 4) float32, the tracker's; NaN: none is known
+    vignetting: np.ndarray | None  # (3,) of the sensor, the tracker's
     folder: Path  # of the images
     name: str  # of its image's file; empty where that was let go
 
@@ -38,10 +40,11 @@ def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
     file = checkpoint_info(output).file
     meta, raw = read_state(file)
     try:
+        vignetting = photometry_of(Arrays(raw).of("photometry")).vignetting
         found = [
             KeptKeyframe(
                 row["index"], row["timestamp"], row["intrinsics"], row["world_from_cam"], int(part["segment"]),
-                file.parent / KEYFRAMES, row["file"],
+                row["measured"], vignetting, file.parent / KEYFRAMES, row["file"],
             )
             for k, part in enumerate(meta["mappers"])
             for row in keyframe_rows(Arrays(raw).of(f"map{k}").of("views"), part["images"])

@@ -14,9 +14,11 @@ import torch
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.mapping.checkpoints.images import read_image
 from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.exposure import Photometry
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.photometry import is_exposure, is_vignetting
 from mvsgs_core.stats import Stats
 
 Corrections = dict[int, tuple[np.ndarray, float]]
@@ -30,11 +32,12 @@ VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in Trainin
     "index": (np.int64, ()), "timestamp": (np.float64, ()), "world_from_cam": (np.float64, (4, 4)),
     "scale": (np.float64, ()), "local_from_cam": (np.float64, (4, 4)), "image_intrinsics": (np.float64, (4,)),
     "image_size": (np.int64, (2,)), "exposure": (np.float32, (3, 4)), "exposure_moments": (np.float32, (2, 3, 4)),
+    "measured": (np.float32, (3, 4)),
     "pose_delta": (np.float64, (4, 4)), "pose_moments": (np.float64, (2, 6)), "pose_steps": (np.int64, ()),
     "fixed": (np.bool_, ()), "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_here": (np.int64, ()),
     "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "intrinsics": (np.float64, (4,)),
 }  # fmt: skip
-MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow")
+MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "measured")
 
 
 class Arrays:
@@ -61,7 +64,7 @@ class Arrays:
         return value
 
 
-def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections) -> OnlineMapper:
+def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections, photometry: Photometry) -> OnlineMapper:
     """A mapper on the CPU that shares nothing that changes: what is saved while the other goes on.
 
     Raises ValueError where what is kept of the splats is not of one length: an iteration was cut off.
@@ -71,7 +74,7 @@ def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections) -> Onlin
         raise ValueError(f"the map is in the middle of a change: {sorted(lengths)} splats")
     state = MapState.of(mapper.state.tensors(), torch.device("cpu"))
     views = [_copied(view) for view in mapper.views]
-    copied = OnlineMapper(replace(mapper.config, device="cpu"), log, corrections, state, views)
+    copied = OnlineMapper(replace(mapper.config, device="cpu"), log, corrections, state, views, photometry)
     copied.schedule.restore(mapper.schedule.state(), len(copied.keyframes.with_image))
     copied.frame.origin, copied.frame.unit = mapper.frame.origin, mapper.frame.unit
     copied.trainer.iterations, copied.trainer.rate = mapper.trainer.iterations, mapper.trainer.rate
@@ -87,7 +90,7 @@ def pack(mapper: OnlineMapper, prefix: str, images: list[str]) -> tuple[dict[str
     views, frame = mapper.views, mapper.frame
     arrays = {f"{prefix}/splats/{name}": value.cpu().numpy() for name, value in mapper.state.tensors().items()}
     for name, (dtype, shape) in VIEWS.items():
-        rows = [_plain(getattr(view, name)) for view in views]
+        rows = [_plain(getattr(view, name), shape) for view in views]
         arrays[f"{prefix}/views/{name}"] = np.array(rows, dtype=dtype).reshape(len(views), *shape)
     arrays[f"{prefix}/origin"] = np.zeros(0) if frame.origin is None else frame.origin
     arrays[f"{prefix}/generator"] = mapper.trainer.generator.get_state().numpy()
@@ -99,15 +102,16 @@ def pack(mapper: OnlineMapper, prefix: str, images: list[str]) -> tuple[dict[str
 
 
 def unpack(
-    meta: Any, arrays: Arrays, config: MapperConfig, log: Stats, corrections: Corrections, images: Path
-) -> OnlineMapper:
+    meta: Any, arrays: Arrays, config: MapperConfig, log: Stats, corrections: Corrections, photometry: Photometry,
+    images: Path,
+) -> OnlineMapper:  # fmt: skip
     """The mapper that was packed. images: the folder of its keyframes' images. Raises ValueError for damage."""
     if not isinstance(meta, dict):
         raise ValueError("a mapper's part is no object")
     device = torch.device(resolve_device(config.device))
     views = [_view(row, device, images) for row in keyframe_rows(arrays.of("views"), meta.get("images"))]
     state = _splats(arrays.of("splats"), (config.sh_degree + 1) ** 2, [view.index for view in views], device)
-    mapper = OnlineMapper(config, log, corrections, state, views)
+    mapper = OnlineMapper(config, log, corrections, state, views, photometry)
     mapper.schedule.restore(_object(meta.get("schedule")), len(mapper.keyframes.with_image))
     mapper.trainer.iterations = whole(meta.get("iterations"), "iterations")
     mapper.trainer.rate = _positive(meta.get("rate"))
@@ -123,6 +127,19 @@ def unpack(
     except RuntimeError as error:
         raise ValueError(f"no state of a random generator: {error}") from error
     return mapper
+
+
+def photometry_of(arrays: Arrays) -> Photometry:
+    """What the tracker had said of the photographs. Raises ValueError for damage."""
+    index = arrays.take("index", np.int64, (None,))
+    exposures = arrays.take("exposure", np.float32, (len(index), 3, 4))
+    vignetting = arrays.take("vignetting", np.float64, (None,))
+    if len(vignetting) not in (0, 3) or (len(vignetting) and not is_vignetting(vignetting)):
+        raise ValueError("the vignetting is none that a lens has")
+    if not all(is_exposure(affine) for affine in exposures):
+        raise ValueError("there are exposures that no camera has")
+    found = {int(k): affine.copy() for k, affine in zip(index, exposures)}
+    return Photometry(found, vignetting.copy() if len(vignetting) else None)
 
 
 def whole(value: Any, name: str) -> int:
@@ -167,6 +184,7 @@ def _view(row: dict[str, Any], device: torch.device, folder: Path) -> TrainingVi
     row["image"], row["valid"] = read_image(folder, row.pop("file"), device)
     row["image_size"] = tuple(row["image_size"].tolist())
     row["exposure"] = torch.from_numpy(row["exposure"]).to(device)
+    row["measured"] = None if np.isnan(row["measured"]).any() else row["measured"]
     row["exposure_moments"] = tuple(torch.from_numpy(moment.copy()).to(device) for moment in row["exposure_moments"])
     return TrainingView(**row)
 
@@ -180,12 +198,14 @@ def _copied(view: TrainingView) -> TrainingView:
     )  # fmt: skip
 
 
-def _plain(value: Any) -> Any:
-    """As numpy takes it."""
+def _plain(value: Any, shape: tuple[int, ...]) -> Any:
+    """As numpy takes it; None is NaN."""
+    if value is None:
+        return np.full(shape, np.nan)
     if isinstance(value, torch.Tensor):
         return value.detach().cpu().numpy()
     if isinstance(value, tuple):
-        return [_plain(part) for part in value]
+        return [_plain(part, shape) for part in value]
     return value
 
 

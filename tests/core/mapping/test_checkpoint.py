@@ -28,7 +28,7 @@ from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.keyframes import ConvergenceConfig
 from mvsgs_core.stats import Stats
-from tests.support.small_atlas import PLAIN, begun, view
+from tests.support.small_atlas import PLAIN, VIGNETTING, begun, view
 from tests.support.tiny_scene import pose_on_arc
 
 EVERYTHING = replace(
@@ -36,7 +36,7 @@ EVERYTHING = replace(
     sh_degree=1,
     max_pixels=500,
     max_keyframes=4,
-    training=TrainingConfig(kernel="exact", betas=True, exposure=True, refine_poses=True, pose_visits=1),
+    training=TrainingConfig(kernel="exact", betas=True, refine_poses=True, pose_visits=1),
     convergence=ConvergenceConfig(visits=3),
     density_control=DensityControlConfig(every=7, prune_opacity=0.3),
 )
@@ -81,6 +81,9 @@ def test_a_run_that_goes_on_from_a_checkpoint_gives_the_same_map_to_the_bit(
     again, file = load(tmp_path, config, log)
     assert (again.newest_view, again.revision, again.segment_of) == (5, 4, {3: 1, 2: 0})
     assert log.counts["views"] == 6
+    assert list(again.current.photometry.exposures) == [1, 2, 3, 4, 5, 7]
+    np.testing.assert_array_equal(again.current.photometry.vignetting, 2.0 * VIGNETTING)
+    assert [v.measured is None for part in again.parts.values() for v in part.views] == [True] + 5 * [False]
     assert any("not finite" in text for text in log.warnings)  # of the run so far
     assert file == state_files(tmp_path)[0]
     found = ended(again)
@@ -122,6 +125,9 @@ def test_the_keyframes_of_a_checkpoint_are_what_the_mapper_was_given(tmp_path: P
     np.testing.assert_array_equal(found[4].intrinsics, view(4).intrinsics)
     np.testing.assert_array_equal(found[4].world_from_cam, view(4).world_from_cam)
     assert found[4].timestamp == 0.4
+    np.testing.assert_array_equal(found[4].exposure, view(4).exposure)
+    assert np.isnan(found[0].exposure).all()
+    np.testing.assert_array_equal(found[4].vignetting, 2.0 * VIGNETTING)
 
 
 def test_images_are_written_once_and_two_states_are_kept(tmp_path: Path) -> None:
@@ -285,10 +291,10 @@ def test_no_mutated_value_raises_anything_but_a_value_error(tmp_path: Path) -> N
 
 
 def test_another_version_is_refused_by_its_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.VERSION", 3)
+    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.VERSION", 9)
     written(begun(PLAIN), tmp_path)
     monkeypatch.undo()
-    with pytest.raises(ValueError, match="version 3 of the format: this program reads 2"):
+    with pytest.raises(ValueError, match="version 9 of the format"):
         load(tmp_path, PLAIN, Stats())
 
 

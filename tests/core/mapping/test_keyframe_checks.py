@@ -118,13 +118,16 @@ def test_no_mutated_keyframe_ends_the_map_or_makes_it_unsound() -> None:
     """Every field with what no camera gives, singly and at a few pixels; the map goes on after each."""
     random = np.random.default_rng(0)
     wild = np.array([0.0, -1.0, 1e-40, 1e-9, 1e9, 3e4, 1e19, 3e38, -3e38, np.nan, np.inf, -np.inf])
-    training = TrainingConfig(exposure=True, refine_poses=True, pose_visits=1)
+    training = TrainingConfig(refine_poses=True, pose_visits=1)
     mapper = OnlineMapper(replace(CONFIG, iterations=1, sh_degree=1, training=training))
     mapper.add_keyframe(VIEWS[0])
     for index in range(1, 120):
         view = replace(rgbd_keyframe(index, pose_on_arc(random.random()), (24, 32)), unfiltered=VIEWS[0].depth.copy())
-        changes: dict[str, Any] = {"confidence": np.ones((24, 32), np.float32)}
-        for name in random.choice(["depth", "confidence", "normals", "unfiltered", "intrinsics", "pose", "scale"], 2):
+        light = {"exposure": np.eye(3, 4, dtype=np.float32), "vignetting": np.zeros(3, np.float32)}
+        changes: dict[str, Any] = {"confidence": np.ones((24, 32), np.float32), **light}
+        for name in random.choice(
+            ["depth", "confidence", "normals", "unfiltered", "intrinsics", "pose", "scale", "exposure", "vignetting"], 2
+        ):
             value = random.choice(wild)
             if name == "scale":
                 changes["scale"] = float(value)

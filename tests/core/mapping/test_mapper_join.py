@@ -8,9 +8,13 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.photometry import compose
+from mvsgs_core.rasterizer.spherical_harmonics import C0
+from tests.support.small_atlas import gain
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (24, 32)
@@ -19,19 +23,21 @@ CONFIG = MapperConfig(
     window=2,
     max_keyframes=5,
     sh_degree=1,
-    training=TrainingConfig(refine_poses=True, pose_visits=1, exposure=True),
+    training=TrainingConfig(refine_poses=True, pose_visits=1),
 )
 AWAY = geometry.se3_exp(np.array([0.0, 0.0, -60.0, 0.0, np.pi, 0.0]))  # behind the back of the other's cameras
 # As if begun anew, elsewhere. Splats of equal depth may swap by rounding in another frame, which shows in a few pixels
 # by up to 0.02: in this one none do.
-OTHER_FRAME = geometry.se3_exp(np.array([300.0, -7.0, 20.0, 0.3, 0.2, -0.4]))
+OTHER_FRAME = geometry.se3_exp(np.array([300.0, -7.0, 20.0, 0.5, 0.1, 0.1]))
 
 
 def mapped(indices: list[int], frame: np.ndarray, unit: float, corrections: dict) -> OnlineMapper:
     mapper = OnlineMapper(CONFIG, corrections=corrections)
     for index in indices:
         view = rgbd_keyframe(index, pose_on_arc(index / 8), SIZE, unit=unit)
-        mapper.add_keyframe(replace(view, world_from_cam=frame @ view.world_from_cam))
+        mapper.add_keyframe(
+            replace(view, world_from_cam=frame @ view.world_from_cam, exposure=gain(1.0 + 0.02 * index))
+        )
     while mapper.step():
         pass
     return mapper
@@ -75,6 +81,34 @@ def test_every_keyframe_sees_after_the_join_what_it_saw_before() -> None:
         pass
     assert sum(view.has_image for view in first.views) == 5
     assert all(bool(torch.isfinite(value).all()) for value in first.state.detached().tensors().values())
+
+
+def test_of_two_gauges_of_exposure_the_join_leaves_one() -> None:
+    """As poses do: the tracker says the later part's exposures anew, against the earlier part's mean camera."""
+    atlas, own, gauge = Atlas(OnlineMapper(CONFIG)), {}, gain(0.7)
+    for index in (0, 1, 3, 4):
+        segment = int(index > 2)
+        own[index] = gain(1.1) if index % 2 else gain(0.9)
+        told = compose(own[index], gauge) if segment else own[index]
+        shown = rgbd_keyframe(index, pose_on_arc(index / 8), SIZE)
+        light = (shown.image / 255.0 @ own[index][:, :3].T).clip(0.0, 1.0)
+        image = np.round(255.0 * light).astype(np.uint8)
+        atlas.add(replace(shown, image=image, exposure=told.astype(np.float32)), segment)
+    while atlas.current.step():
+        pass
+    seen = {view.index: part.render(view).color for part in atlas.parts.values() for view in part.views}
+    later = atlas.current.state.splats.sh.detach().clone()
+    joined = np.zeros(4, np.int32)
+    poses = np.stack([AWAY @ pose_on_arc(index / 8) if index > 2 else pose_on_arc(index / 8) for index in own])
+    atlas.correct(np.array(list(own)), poses, np.ones(4), joined, np.stack(list(own.values())))
+    assert len(atlas.parts) == 1
+    mapper = atlas.current
+    for view in mapper.views:
+        np.testing.assert_array_equal(view.measured, own[view.index])
+        torch.testing.assert_close(mapper.render(view).color, seen[view.index], atol=5e-3, rtol=0)
+    # the same wall, so the same colors: of the later part they were those of another mean camera
+    mean = [0.5 + C0 * sh[:, 0].mean(dim=0) for sh in (mapper.state.splats.sh[-len(later) :], later)]
+    torch.testing.assert_close(mean[0], mean[1] * torch.tensor([0.7, 0.7, 0.63]), atol=0.01, rtol=0)
 
 
 def test_maps_that_have_no_depth_or_no_keyframe_yet_are_joined() -> None:
