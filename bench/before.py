@@ -136,7 +136,8 @@ def with_fitted(run: Run) -> Run:
 
 def rows_of(scene: str, before: Sequence[Run], after: Sequence[Run]) -> list[Row]:
     """Of the seeds that both have: means with half the range, and the change from seed to seed."""
-    rows = []
+    counts = {int(n) for run in after if (n := figure(run.report, "rendering.held_out.count")) is not None}
+    rows = [Row(f"{PSNR.table}: {scene}: number", ", ".join(str(n) for n in sorted(counts)))] if counts else []
     for shown in FIGURES:
         pairs = list(_pairs(shown, before, after))
         if not pairs:

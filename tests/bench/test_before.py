@@ -21,7 +21,7 @@ from mvsgs_core.trajectory import TrackingState
 
 def report(psnr: float, seconds: float = 10.0, keyframes: float | None = None, memory: float = 1e8) -> dict[str, Any]:
     return {
-        "rendering": {"held_out": {"psnr": psnr, "ssim": 0.9}, "keyframes": {"psnr": keyframes}},
+        "rendering": {"held_out": {"psnr": psnr, "ssim": 0.9, "count": 14}, "keyframes": {"psnr": keyframes}},
         "map": {"splats": 100 * seconds, "iterations": 50},
         "time": {"cpu": {"mapper": seconds, "tracker": 2.0, "evaluator": 99.0}},
         "memory": {"peak_bytes": {"mapper": memory, "evaluator": 9e9}},
@@ -42,6 +42,7 @@ def test_changes_are_from_seed_to_seed_with_goals_that_fit_the_scene() -> None:
     rows = by_name(before.rows_of("redkitchen", old, new))
     change = rows["Held-out frames: redkitchen: PSNR, change"]
     assert (change.value, change.spread, change.goal, change.met) == (2.5, 0.5, ">= 2.5", True)
+    assert rows["Held-out frames: redkitchen: number"].value == "14"
     assert rows["Held-out frames: redkitchen: PSNR, before"].value == 30.5  # not the seed that failed after
     time = rows["Processor time: redkitchen: mapper, times before"]
     assert time.value == pytest.approx(1.05)
