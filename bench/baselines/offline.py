@@ -19,7 +19,7 @@ from bench.baselines.colmap_poses import Model
 from bench.baselines.ours import Ours
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
 from mvsgs_core import image_metrics
-from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
+from mvsgs_core.mapping.config import MapperConfig
 
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end
 
@@ -73,9 +73,9 @@ def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> T
         return Posed(index, frame.image, frame.intrinsics, poses[index], frame.timestamp, exposure)
 
     chosen = ours.keyframes if way.frames == "keyframes" else ours.not_held_out
-    mapper = MapperConfig(threads=threads, training=TrainingConfig(exposure=way.exposure != "none"))
-    config = SparseConfig(seconds=seconds, settle=way.settle, mapper=mapper)
-    fitted = SparseMap([posed(i) for i in chosen if i in poses], model.points, model.colors, config)
+    config = SparseConfig(seconds=seconds, settle=way.settle, mapper=MapperConfig(threads=threads))
+    vignetting = ours.vignetting if way.exposure == "tracker" else None
+    fitted = SparseMap([posed(i) for i in chosen if i in poses], model.points, model.colors, config, vignetting)
     fitted.optimize()
     psnr, ssim = score((view, fitted.render(view)) for view in (posed(i) for i in ours.held_out if i in poses))
     return Trained(fitted.seconds, psnr, ssim, len(fitted.state), fitted.iterations, seconds, way.name)

@@ -56,6 +56,12 @@ class Ours:
         return {i: np.array(affine) for i, affine in zip(self.track["index"], found) if affine is not None}
 
     @property
+    def vignetting(self) -> np.ndarray | None:
+        """(3,) of the sensor, as the tracker measured it; None where it found none."""
+        found = self.track.get("vignetting")
+        return None if found is None else np.array(found, dtype=np.float64)
+
+    @property
     def optimization(self) -> float:
         """Processor seconds of the mapper, its start included."""
         return float(self.report["time"]["cpu"]["mapper"])

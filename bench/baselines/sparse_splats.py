@@ -14,10 +14,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from mvsgs_core.evaluation.exposure import frame_exposures
 from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.exposure import Photometry
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.trainer import Trainer
+from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
@@ -52,15 +55,20 @@ class Posed:
 class SparseMap:
     """The map of sparse points. All lengths inside are relative to the median depth of the points."""
 
-    def __init__(self, views: list[Posed], points: np.ndarray, colors: np.ndarray, config: SparseConfig) -> None:
-        """points (M, 3), colors (M, 3) uint8. Raises ValueError without a view, or with fewer than 4 points."""
+    def __init__(
+        self, views: list[Posed], points: np.ndarray, colors: np.ndarray, config: SparseConfig,
+        vignetting: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        """points (M, 3), colors (M, 3) uint8, vignetting (3,) of the camera if it is known. Raises ValueError without a
+        view, or with fewer than 4 points."""
         if not views or len(points) < 4:
             raise ValueError(f"{len(views)} views and {len(points)} points are no start")
         self.config = config
         self.origin = views[0].world_from_cam[:3, 3].copy()
         self.unit = _median_depth(views, points)
         self.state = MapState(1, torch.device("cpu"))
-        self._trainer = Trainer(config.mapper, self.state, Stats())
+        self._photometry = Photometry(vignetting=vignetting)
+        self._trainer = Trainer(config.mapper, self.state, Stats(), self._photometry)
         self.seconds = 0.0
         self._random = np.random.default_rng(config.mapper.seed)
         self._given = views
@@ -90,25 +98,26 @@ class SparseMap:
                 self.state.detached(), self._local(view.world_from_cam), view.intrinsics, view.image.shape[:2],
                 exposure=exposure, kernel=self.config.mapper.training.kernel, threads=self.config.mapper.threads,
             ).color  # fmt: skip
-        return np.asarray(color.clamp(0, 1).numpy())
+        image = color.numpy()
+        if self._photometry.vignetting is not None:
+            factor = vignetting_factor(self._photometry.vignetting, view.intrinsics, view.image.shape[:2])
+            image = image * factor[..., None]
+        return np.asarray(np.clip(image, 0.0, 1.0))
 
     def exposure_of(self, view: Posed) -> np.ndarray | None:
-        """(3, 4) float32: what is known of a view's exposure, and what was trained beside it, linear in time between
-        the views before and after. None where nothing is known."""
+        """(3, 4) float32: what is known of a view's exposure, and what was trained beside it, as that of the training
+        views before and after it in time. None where nothing is known."""
         if view.exposure is None:
             return None
-        known = [(v.timestamp, self._trained_beside(k)) for k, v in enumerate(self._given) if v.exposure is not None]
-        known.sort(key=lambda entry: entry[0])
-        times, beside = np.array([t for t, _ in known]), np.array([affine for _, affine in known])
-        now = np.array([np.interp(view.timestamp, times, column) for column in beside.reshape(len(known), -1).T])
-        return np.asarray((now.reshape(4, 4) @ _square(view.exposure))[:3], dtype=np.float32)
-
-    def _trained_beside(self, k: int) -> np.ndarray:
-        """(4, 4) that takes the known exposure of training view k to its trained one."""
-        exposure = self._given[k].exposure
-        assert exposure is not None
-        trained = self._views[k].exposure.detach().numpy()
-        return np.asarray(_square(trained) @ np.linalg.inv(_square(exposure)))
+        known = [(v.timestamp, v.exposure, t) for v, t in zip(self._given, self._views) if v.exposure is not None]
+        times = np.array([view.timestamp, *(time for time, _, _ in known)])
+        measured = np.stack([view.exposure, *(exposure for _, exposure, _ in known)])
+        trained = np.stack([t.exposure.detach().numpy() for _, _, t in known])
+        order = np.argsort(times, kind="stable")
+        place = np.argsort(order)
+        rows = np.sort(place[1:])
+        found = frame_exposures(times[order], measured[order], rows, trained[order[rows] - 1])
+        return None if found is None else found.affines[place[0]]
 
     def _done(self, seconds: float) -> float:
         """Share of the work."""
@@ -125,18 +134,14 @@ class SparseMap:
         posed = RGBDKeyframe(view.index, view.image, view.intrinsics, view.world_from_cam, unknown)
         training = training_view(posed, self._local(view.world_from_cam), None, self.state.device)
         if view.exposure is not None:
-            training.exposure = torch.from_numpy(view.exposure.astype(np.float32))
+            training.measured = view.exposure.astype(np.float32)
+            training.exposure = torch.from_numpy(training.measured.copy())
         return training
 
     def _local(self, world_from_cam: np.ndarray) -> np.ndarray:
         local = world_from_cam.copy()
         local[:3, 3] = (local[:3, 3] - self.origin) / self.unit
         return local
-
-
-def _square(affine: np.ndarray) -> np.ndarray:
-    """(4, 4) float64 of [A | b] (3, 4)."""
-    return np.vstack([np.asarray(affine, dtype=np.float64), [0.0, 0.0, 0.0, 1.0]])
 
 
 def _median_depth(views: list[Posed], points: np.ndarray) -> float:

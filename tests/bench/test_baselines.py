@@ -24,7 +24,7 @@ from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.rasterizer.splats import Splats
 
 NOTHING = np.zeros(0)
@@ -181,12 +181,15 @@ def test_a_known_exposure_is_of_use_to_the_offline_map() -> None:
             exposure = np.eye(3, 4) * gain(round(view.timestamp / 0.1)) if known else None
             return Posed(view.index, view.image, view.intrinsics, view.world_from_cam, view.timestamp, exposure)
 
-        mapper = MapperConfig(threads=1, training=TrainingConfig(exposure=known))
+        mapper = MapperConfig(threads=1)
         fitted = SparseMap([posed(v) for v in training], points, colors, SparseConfig(iterations=150, mapper=mapper))
         fitted.optimize()
         psnr[known], _ = offline.score((posed(v), fitted.render(posed(v))) for v in between)
     assert psnr[True] > psnr[False] + 1.0
     assert fitted.exposure_of(training[0]) is None
+    found = fitted.exposure_of(posed(between[1], True))
+    assert found is not None
+    assert np.allclose(found, np.eye(3, 4) * gain(3), atol=0.05)
 
 
 def a_map(file: Path, color: float) -> None:
