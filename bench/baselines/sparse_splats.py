@@ -33,7 +33,8 @@ class SparseConfig:
 
     seconds: float = 60.0  # of optimization, of the processor
     iterations: int | None = None  # of optimization, whatever the time; None: as many as the seconds allow
-    settle: float = 0.5  # last fraction of it in which learning rates fall to a tenth and no splat is added
+    settle: float = 0.5  # last fraction of it, in which learning rates fall to a tenth
+    grow: float = 0.5  # first fraction of it, in which splats are added
     initial_opacity: float = 0.1
     mapper: MapperConfig = field(default_factory=MapperConfig)  # training, optimizer, density control, seed, threads
 
@@ -127,7 +128,7 @@ class SparseMap:
     def _step(self, view: TrainingView, done: float) -> None:
         settling = max(0.0, (done - 1.0 + self.config.settle) / self.config.settle)
         self._trainer.rate = 0.1**settling
-        self._trainer.step(view, 1.0, refining=settling > 0)
+        self._trainer.step(view, 1.0, refining=done > self.config.grow)
 
     def _training(self, view: Posed) -> TrainingView:
         unknown = np.zeros(view.image.shape[:2], dtype=np.float32)
