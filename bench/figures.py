@@ -82,7 +82,7 @@ def plots_of(rows: Rows) -> dict[str, str]:
     for row in rows("baselines"):
         scene, kind, *rest = row["name"].split(": ")
         if kind.startswith("map, ") and rest:
-            way = f"{scene}, {'ours' if kind == 'map, ours' else 'COLMAP'}"
+            way = f"{scene}, {kind.removeprefix('map, ').partition(',')[0]}"
             found.setdefault(way, {}).setdefault(kind, {})[rest[0]] = row["value"]
     series = [
         svg.Series(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from bench import figures
 from bench.baselines import __main__ as baselines
 from bench.baselines import offline, opensplat
 from bench.baselines.colmap_poses import Model
@@ -268,3 +269,19 @@ def test_the_written_model_is_what_colmap_reads(tmp_path: Path) -> None:
     assert np.allclose(image.cam_from_world().inverse().matrix(), pose[:3])
     assert next(iter(read.cameras.values())).params.tolist() == [9.0, 9.0, 5.5, 3.5]
     assert sorted(p.xyz.tolist() for p in read.points3D.values()) == points.tolist()
+
+
+def test_each_method_is_a_series_of_its_own_in_the_plot() -> None:
+    others = [
+        f"COLMAP + {what}" for what in ("splatting, equal time", "splatting, 2 times as long", "OpenSplat, equal time")
+    ]
+    methods = ["ours", *others]
+    drawn = [
+        {"name": f"room: map, {method}: {figure}", "value": value + k}
+        for k, method in enumerate(methods)
+        for figure, value in (("held-out PSNR", 25.0), ("seconds, frames to map", 10.0))
+    ]
+    rows = {"baselines": drawn, "tracking": [{"name": "room: ATE / pycolmap's, same frames", "value": 0.9}]}
+    plot = figures.plots_of(lambda name: rows[name])["maps"]
+    for series in ("room, ours", "room, COLMAP + splatting", "room, COLMAP + OpenSplat"):
+        assert plot.count(f">{series}<") == 1
