@@ -3,10 +3,10 @@
 Poses: COLMAP (pycolmap) with sequential matching, calibration given, on our keyframes, every 5th frame and a hundred
 evenly, at up to 512x384 pixels: more than our tracker looks at. Map: an offline 3D Gaussian splatting of COLMAP's
 sparse points with COLMAP's poses, by our own rasterizer and optimizer, at the size of our run, scored on our held-out
-frames (every 5th that is no keyframe). It is trained in as many processor seconds as our mapper takes, in every way
-that may be its best: on our keyframes or on every frame that is not held out, with and without an exposure a frame,
-settling early or late; the best of them stands beside ours, and is trained twice as long and so on, until doubling the
-time gains less than 0.1 dB. Both have one thread. --opensplat PATH: OpenSplat on its CPU path, too.
+frames (every 5th that is no keyframe). It is trained in as many processor seconds as our mapper takes, in the way that
+is its best: on our keyframes or on every frame that is not held out, with and without an exposure a frame, settling
+early or late, one choice after the other; then twice as long and so on, until doubling the time gains less than 0.1 dB.
+ Both have one thread. --opensplat PATH: OpenSplat on its CPU path, too.
 All times are of the processor. What ended is kept for --resume.
 """
 
@@ -145,8 +145,8 @@ def compare(scene: str, options: argparse.Namespace, overrides: list[str], made:
         kept.unlink(missing_ok=True)
     train = offline.kept_in(kept, lambda way, seconds: offline.train(model, ours, way, seconds, THREADS))
     try:
-        candidates = offline.ways(ours)[:1] if options.quick else offline.ways(ours)
-        best, tried = offline.best_way(candidates, train, ours.optimization)
+        parts = {} if options.quick else offline.choices(ours)
+        best, tried = offline.best_way(parts, train, ours.optimization)
         trained = offline.train_longer(best, train, ours.optimization, options.longest)
     except ValueError as error:
         return [*rows, Row(f"{scene}: map, COLMAP + splatting", str(error))]

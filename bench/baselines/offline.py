@@ -1,15 +1,14 @@
-"""The offline map of COLMAP's poses and points: in every way that might be its best, at our processor time, and longer.
+"""The offline map of COLMAP's poses and points: in the way that is its best, at our processor time, and longer.
 
-A way is a choice of training frames, of exposures and of when the learning rates begin to fall. Of all of them the best
-by held-out PSNR stands beside ours: chosen with hindsight, which an offline user does not have.
+A way is a choice of training frames, of exposures and of when the learning rates begin to fall. One choice after the
+other takes what is best by held-out PSNR: with hindsight, which an offline user does not have.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +54,10 @@ class Trained:
 Train = Callable[[Way, float], Trained]  # in so many processor seconds
 
 
-def ways(ours: Ours) -> list[Way]:
+def choices(ours: Ours) -> dict[str, tuple[Any, ...]]:
+    """What there is of each part of a way, the first ones the start."""
     exposures = ("none", "trained") if ours.exposures is None else ("none", "trained", "tracker")
-    return [Way(*choice) for choice in itertools.product(("keyframes", "all"), exposures, (0.5, 0.75))]
+    return {"frames": ("keyframes", "all"), "exposure": exposures, "settle": (0.5, 0.25, 0.75)}
 
 
 def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> Trained:
@@ -105,10 +105,16 @@ def kept_in(file: Path, train: Train) -> Train:
     return found
 
 
-def best_way(candidates: Sequence[Way], train: Train, seconds: float) -> tuple[Way, list[Trained]]:
-    """The way of the highest PSNR in so much time, and what each reached."""
-    results = [train(way, seconds) for way in candidates]
-    return candidates[int(np.nanargmax([result.psnr for result in results]))], results
+def best_way(parts: dict[str, tuple[Any, ...]], train: Train, seconds: float) -> tuple[Way, list[Trained]]:
+    """The way of the highest PSNR in so much time, found part by part, and what each that was tried reached."""
+    best = Way(**{part: values[0] for part, values in parts.items()})
+    results = {best: train(best, seconds)}
+    for part, values in parts.items():
+        for value in values[1:]:
+            way = replace(best, **{part: value})
+            results[way] = train(way, seconds)
+        best = max(results, key=lambda way: np.nan_to_num(results[way].psnr, nan=-np.inf))
+    return best, list(results.values())
 
 
 def train_longer(way: Way, train: Train, seconds: float, longest: float) -> list[Trained]:
