@@ -1,0 +1,113 @@
+"""What two images say of each other's light: gray levels of matched points, as the moments of their log ratios.
+
+Tracked points are the most textured of their cells, and texture lies about light: a window around an edge is off as
+soon as the match is, and the mean of encoded gray levels falls as a texture comes nearer (its pixels average less of
+it). So levels are means over small windows at the flattest place of a point's cell, weighted by their spread, in both
+images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from mvsgs_core.tracking.estimation.response import BRIGHTEST, DARKEST, offset_term
+from mvsgs_core.tracking.image import CELL
+
+NOISE = 1.0 / 255.0  # of a window's mean, gray levels 0 to 1: quantization and what is left of the sensor's noise
+SHARE = 0.5  # of a window's spread that counts as its error: matches are off by that part of a window
+MIN_SAMPLES = 30
+TERMS = 6  # 1, what an offset adds, three of the radius, the log ratio
+_STEPS = 4  # of reweighting
+
+
+class Levels:
+    """Means (h, w, 3) and spread (h, w) over windows of 3x3 of a half-size image (h, w, 3) uint8 RGB, 0 to 1."""
+
+    def __init__(self, half: np.ndarray) -> None:
+        values = half.astype(np.float32) * np.float32(1.0 / 255.0)
+        self.mean = np.asarray(cv2.blur(values, (3, 3)))
+        gray = values.mean(axis=2)
+        self.spread = np.sqrt(np.maximum(cv2.blur(gray * gray, (3, 3)) - cv2.blur(gray, (3, 3)) ** 2, 0.0))
+        window = np.ones((3, 3), np.uint8)
+        clipped = cv2.dilate(half, window).max(axis=2) > 255.0 * BRIGHTEST
+        clipped |= cv2.erode(half, window).min(axis=2) < 255.0 * DARKEST
+        self.mean[clipped] = np.nan
+
+    @cached_property
+    def _both(self) -> np.ndarray:
+        return np.dstack([self.mean, self.spread])
+
+    def flattest(self) -> np.ndarray:
+        """(M, 2) where the image is flattest, by cells as `image.find_cells` has them, pixels of the full size."""
+        side = CELL // 2
+        rows, columns = self.spread.shape[0] // side, self.spread.shape[1] // side
+        tiles = self.spread.reshape(rows, side, columns, side).transpose(0, 2, 1, 3).reshape(rows * columns, -1)
+        best = np.argmin(tiles, axis=1)
+        v, u = (c * side for c in np.divmod(np.arange(rows * columns), columns))
+        return np.asarray(2.0 * np.stack([u + best % side, v + best // side], axis=1) + 0.5)
+
+    def at(self, points: np.ndarray) -> Samples:
+        """points (N, 2): pixels of the full size; NaN outside of the image and where the sensor is at its limits."""
+        half = ((points + 0.5) / 2.0 - 0.5).astype(np.float32)
+        found = cv2.remap(
+            self._both, half[None, :, 0], half[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(np.nan, np.nan, np.nan, np.nan),
+        )[0].astype(np.float64)  # fmt: skip
+        return Samples(found[:, :3], found[:, 3])
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Gray levels (N, 3), 0 to 1, NaN where there is none, and their windows' spread (N,)."""
+
+    level: np.ndarray
+    spread: np.ndarray
+
+    def __getitem__(self, chosen: np.ndarray) -> Samples:
+        return Samples(self.level[chosen], self.spread[chosen])
+
+    @property
+    def variance(self) -> np.ndarray:
+        """(N, 3) of the logarithm of the levels."""
+        return np.asarray((NOISE**2 + (SHARE * self.spread[:, None]) ** 2) / self.level**2)
+
+
+def log_ratio_moments(a: Samples, b: Samples, farther: np.ndarray) -> np.ndarray | None:
+    """Weighted moments (3, 6, 6), a channel each, of z = (1, offset term at the mean level, `farther`, log b / a).
+
+    farther (N, 3): radial terms in b less those in a. Weights are those of independent samples, outliers down-weighted
+    (Cauchy), so that the moments are information. None where there are too few samples.
+    """
+    known = np.isfinite(a.level).all(axis=1) & np.isfinite(b.level).all(axis=1)
+    if known.sum() < MIN_SAMPLES:
+        return None
+    a, b = a[known], b[known]
+    log_a, log_b = np.log(a.level), np.log(b.level)
+    ratio, variance = log_b - log_a, a.variance + b.variance
+    mean_ratio, sigma = ratio.mean(axis=1), np.sqrt(variance.mean(axis=1))
+    robust, scale = np.ones(len(sigma)), 1.0
+    for _ in range(_STEPS):
+        weight = robust / sigma**2
+        error = (mean_ratio - (weight @ mean_ratio) / weight.sum()) / sigma
+        scale = 1.4826 * float(np.median(np.abs(error))) + 1e-9
+        robust = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2)
+    z = np.empty((3, len(sigma), TERMS))
+    z[..., 0] = 1.0
+    z[..., 1] = offset_term(np.exp(0.5 * (log_a + log_b))).T  # noise of the ratio is not in it
+    z[..., 2:5] = farther[known]
+    z[..., 5] = ratio.T
+    weight = (robust[:, None] / (variance * scale**2)).T
+    return np.asarray(np.einsum("cni,cn,cnj->cij", z, weight, z, optimize=True))
+
+
+def backward(moments: np.ndarray) -> np.ndarray:
+    """The same seen from b to a: log ratio and radial terms change their sign."""
+    sign = np.array([1.0, 1.0, -1.0, -1.0, -1.0, -1.0])
+    return np.asarray(moments * sign * sign[:, None])
+
+
+__all__ = ["MIN_SAMPLES", "TERMS", "Levels", "Samples", "backward", "log_ratio_moments"]

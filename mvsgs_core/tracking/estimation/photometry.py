@@ -1,0 +1,313 @@
+"""Photometric calibration of a graph of images from the gray levels of their matches (Bergmann et al. 2018, DSO 2017).
+
+Of an edge from image a to b, the log ratio of a point's gray levels is, with t(I) = m / I - 1 (response.py),
+    log I_b - log I_a = (g_b - g_a) + (h_b - h_a) t(I) + log V(r_b) - log V(r_a) + u + w t(I) + noise
+with gain g and lift h of an image and the vignetting V (three parameters). What a whole edge is off together (light
+that surfaces send elsewhere, glare, wrong matches) are random effects u and w of its own, whose sizes the edges'
+disagreement over the graph tells: so that the uncertainties are those of edges and not of pixels. All is linear, and an
+edge takes part by its moments (gray_levels.py): a solution is as cheap as a pose graph's.
+
+What is free is asked of the data, by the Bayesian information criterion on that solution: nothing (a steady camera:
+zero, exactly), gains, gains and a response (h = k g), or gain and lift of each image; and white balance and vignetting.
+The gauge: the mean over the images is zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core.tracking.estimation.gray_levels import TERMS
+from mvsgs_core.tracking.estimation.response import affine, mean_vignetting
+
+EDGE_SIGMA = 0.005  # what an edge is off, as a log ratio, before the edges tell it; it counts as ...
+_PRIOR_EDGES = 10  # ... so many of them
+FLOOR = 0.5 / 255.0  # log ratio: less changes no gray level
+KNOWN_SIGMA = 0.02  # of a known exposure's logarithm: shutters and apertures are rounded
+_EXPONENT, _EXPONENT_SIGMA = 0.5, 0.25  # of gray levels over exposure: gamma-coded images have about 1 / 2.2
+_STEPS = 8
+_GLOBAL = 3  # parameters of the vignetting
+
+
+@dataclass(frozen=True)
+class PhotometricEdges:
+    """E pairs of images, by number, with what their matched gray levels say."""
+
+    source: np.ndarray  # (E,) int
+    to: np.ndarray  # (E,) int
+    moments: np.ndarray  # (E, 3, 6, 6) float64, see `gray_levels.log_ratio_moments`
+
+
+@dataclass(frozen=True)
+class Photometry:
+    """Of K images. Zeros: a steady camera's, exactly."""
+
+    gains: np.ndarray  # (K,) log gain, mean zero
+    lifts: np.ndarray  # (K,) what dark levels gain over it, see response.py
+    white: np.ndarray  # (K, 3) log gain of the channels over the gain
+    sigma: np.ndarray  # (K,) standard deviation of the gains
+    vignetting: np.ndarray  # (3,) of log V = l1 r² + l2 r⁴ + l3 r⁶
+    response: float | None  # lift over gain, of the sensor; None: lifts are the images' own
+    edge_sigma: tuple[float, float]  # of u and w, log ratios
+    balanced: bool  # the white balance is steady
+
+    @staticmethod
+    def steady(count: int) -> Photometry:
+        """Of `count` images of which nothing is known to change."""
+        zero = np.zeros(count)
+        edge = (EDGE_SIGMA, EDGE_SIGMA)
+        return Photometry(zero, zero, np.zeros((count, 3)), zero, np.zeros(_GLOBAL), 0.0, edge, True)
+
+    @property
+    def varies(self) -> bool:
+        return bool(np.any(self.gains) or np.any(self.white))
+
+    def step(self, moments: np.ndarray) -> tuple[float, float, np.ndarray]:
+        """Gain, lift and white balance (3,) of an edge's end over its start, from the edge's moments (3, 6, 6)."""
+        pooled = moments.mean(axis=0)
+        ratio = pooled[:2, 5] - pooled[:2, 2:5] @ self.vignetting
+        if self.response is None:
+            gain, lift = np.linalg.solve(pooled[:2, :2] + 1e-9 * np.eye(2), ratio)
+        else:
+            along = np.array([1.0, self.response])
+            gain = float(along @ ratio / (along @ pooled[:2, :2] @ along))
+            lift = self.response * gain
+        if self.balanced:
+            return float(gain), float(lift), np.zeros(3)
+        first = moments[:, 0]
+        left = (first[:, 5] - first[:, 2:5] @ self.vignetting - lift * first[:, 1]) / first[:, 0]
+        return float(gain), float(lift), left - left.mean()
+
+    @staticmethod
+    def affine(gain: float, lift: float, white: np.ndarray) -> np.ndarray:
+        """(3, 4) float32 color affine [A | b] of a log gain, a lift and the channels' log gains (3,)."""
+        slope, offset = affine(gain + white, np.full(3, lift))
+        return np.concatenate([np.diag(slope), offset[:, None]], axis=1).astype(np.float32)
+
+
+class _Solver:
+    """Least squares on gains and lifts (2 K), the vignetting's parameters (3) and known exposures' exponent and unit."""
+
+    def __init__(self, edges: PhotometricEdges, count: int, known: np.ndarray) -> None:
+        """known (K,): log exposures, NaN where they are not known."""
+        self.edges, self.count = edges, count
+        self.moments = edges.moments.mean(axis=1)  # the channels' errors are one: they count once
+        self.known = np.flatnonzero(np.isfinite(known))
+        self.logs = known[self.known] - known[self.known].mean() if len(self.known) else known[:0]
+        self.trust = np.ones(len(self.moments))
+        self.effects = np.array([EDGE_SIGMA**2, EDGE_SIGMA**2])  # variances of u and w
+        self.solution = np.zeros(0)
+        self.information = np.zeros((0, 0))
+        self.scores = np.zeros((0, 5))
+
+    def solve(self, vignetted: bool) -> None:
+        """Raises numpy.linalg.LinAlgError where the equations have no solution."""
+        for _ in range(_STEPS):
+            information, right = self._equations(vignetted)
+            before, self.solution = self.solution, np.linalg.solve(information, right)
+            self.information = information
+            self._weigh()
+            if before.shape == self.solution.shape and np.abs(before - self.solution).max() < 1e-5:
+                break
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """(2 K,) gains, then lifts, means zero."""
+        halves = self.solution[: 2 * self.count].reshape(2, -1)
+        return np.asarray((halves - halves.mean(axis=1, keepdims=True)).ravel())
+
+    @property
+    def vignetting(self) -> np.ndarray:
+        return self.solution[2 * self.count : 2 * self.count + _GLOBAL]
+
+    def of_nodes(self) -> np.ndarray:
+        """(2 K, 2 K) information of gains and lifts, all else unknown."""
+        n = 2 * self.count
+        inner, outer = self.information[:n, :n], self.information[:n, n:]
+        return np.asarray(inner - outer @ np.linalg.solve(self.information[n:, n:], outer.T))
+
+    def vignetting_shows(self) -> bool:
+        """Whether it is known against zero: by the edges' scatter, image by image, too, and more than a gray level's."""
+        if mean_vignetting(self.vignetting) < FLOOR:
+            return False
+        n, chosen = self.count, slice(2 * self.count, 2 * self.count + _GLOBAL)
+        unit = np.zeros((len(self.information), _GLOBAL))
+        unit[chosen] = np.eye(_GLOBAL)
+        reach = np.linalg.solve(self.information, unit)
+        by_edge = self.scores[:, 2:] @ reach[chosen]
+        for k in (0, 1):
+            by_edge += self.scores[:, k, None] * (reach[self.edges.to + k * n] - reach[self.edges.source + k * n])
+        by_image = np.zeros((n, _GLOBAL))
+        np.add.at(by_image, self.edges.source, by_edge)
+        covariance = reach[chosen] + by_image.T @ by_image
+        value = self.vignetting @ np.linalg.solve(covariance, self.vignetting)
+        return bool(value > _GLOBAL * np.log(max(len(self.scores), 3)))
+
+    def _equations(self, vignetted: bool) -> tuple[np.ndarray, np.ndarray]:
+        a, b, n = self.edges.source, self.edges.to, self.count
+        inner, right_of = self._marginal()
+        end = 2 * n + _GLOBAL
+        size = end + (2 if len(self.known) else 0)
+        information, right = np.zeros((size, size)), np.zeros(size)
+        for i in (0, 1):
+            for k in (0, 1):
+                for row, column, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
+                    np.add.at(information, (row + i * n, column + k * n), sign * inner[:, i, k])
+            np.add.at(right, b + i * n, right_of[:, i])
+            np.add.at(right, a + i * n, -right_of[:, i])
+            if vignetted:
+                np.add.at(information[:, 2 * n : end], b + i * n, inner[:, i, 2:])
+                np.add.at(information[:, 2 * n : end], a + i * n, -inner[:, i, 2:])
+        information[2 * n : end, : 2 * n] = information[: 2 * n, 2 * n : end].T
+        if vignetted:
+            information[2 * n : end, 2 * n : end] = inner[:, 2:, 2:].sum(axis=0)
+            right[2 * n : end] = right_of[:, 2:].sum(axis=0)
+        weak = 1e-6 * inner[:, [0, 1], [0, 1]].mean(axis=0)  # parts without edges between them: mean zero each
+        information[range(2 * n), range(2 * n)] += np.repeat(weak, n)
+        information[range(2 * n, end), range(2 * n, end)] += 1.0  # of no weight, but where nothing says anything
+        if len(self.known):
+            self._add_known(information, right)
+        return information, right
+
+    def _marginal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Information (E, 5, 5) and right side (E, 5) of the edges, their random effects marginalized."""
+        effect = self.moments[:, :, :2]  # with u and w
+        share = np.linalg.inv(effect[:, :2] + np.diag(1.0 / self.effects))
+        left = self.moments - effect @ share @ effect.transpose(0, 2, 1)
+        left *= self.trust[:, None, None]
+        return left[:, :5, :5], left[:, :5, 5]
+
+    def _weigh(self) -> None:
+        """What edges are off, from their disagreement, and the trust in each (Cauchy): a wrong match is one edge."""
+        n, a, b = self.count, self.edges.source, self.edges.to
+        rest = np.zeros((len(self.moments), TERMS))
+        for k in (0, 1):
+            rest[:, k] = self.solution[a + k * n] - self.solution[b + k * n]
+        rest[:, 2:5], rest[:, 5] = -self.vignetting, 1.0
+        own = np.linalg.inv(self.moments[:, :2, :2] + 1e-9 * np.eye(2))
+        off = (own @ (self.moments[:, :2] @ rest[:, :, None]))[:, :, 0]
+        for k in (0, 1):
+            self.effects[k] = _edge_variance(off[:, k], own[:, k, k], n)
+        scatter = own + np.diag(self.effects)
+        distance = (off * np.linalg.solve(scatter, off[:, :, None])[:, :, 0]).sum(axis=1)
+        inner, right_of = self._marginal()
+        self.scores = right_of + (inner @ rest[:, :5, None])[:, :, 0]
+        self.trust = 1.0 / (1.0 + distance / 8.0)
+
+    def _add_known(self, information: np.ndarray, right: np.ndarray) -> None:
+        """gain = exponent * log exposure + unit, to a few percent."""
+        rows = np.zeros((len(self.known), len(right)))
+        rows[range(len(rows)), self.known], rows[:, -2], rows[:, -1] = 1.0, -self.logs, -1.0
+        information += rows.T @ rows / KNOWN_SIGMA**2
+        information[-2, -2] += _EXPONENT_SIGMA**-2
+        right[-2] += _EXPONENT / _EXPONENT_SIGMA**2
+
+
+def solve_photometry(edges: PhotometricEdges, count: int, known: np.ndarray | None = None) -> Photometry:
+    """Photometry of `count` images from their edges.
+
+    known (K,): log exposures of the images, NaN where they are not known.
+    Raises numpy.linalg.LinAlgError where there is no solution, ValueError where it is not finite.
+    """
+    if count < 2 or len(edges.source) == 0:
+        return Photometry.steady(count)
+    solver = _Solver(edges, count, np.full(count, np.nan) if known is None else known)
+    solver.solve(True)
+    vignetting = np.zeros(_GLOBAL)
+    if solver.vignetting_shows():
+        vignetting = solver.vignetting
+    else:
+        solver.solve(False)
+    information = solver.of_nodes()
+    nodes, response = _chosen(solver.nodes, information, count, len(edges.source))
+    sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(_centered(information[:count, :count]))), 0.0))
+    gains, lifts = nodes[:count], nodes[count:]
+    white = _white_balance(edges, count, gains, lifts, vignetting)
+    u, w = np.sqrt(solver.effects)
+    found = Photometry(gains, lifts, white, sigma, vignetting, response, (float(u), float(w)), not np.any(white))
+    if not all(np.isfinite(v).all() for v in (gains, lifts, white, sigma, vignetting)):
+        raise ValueError("the photometric solution is not finite")
+    return found
+
+
+def _chosen(nodes: np.ndarray, information: np.ndarray, count: int, edges: int) -> tuple[np.ndarray, float | None]:
+    """Gains and lifts (2 K,) of the model that the data ask for, and its response: the least information criterion."""
+    n, price = count, float(np.log(max(edges, 3)))
+
+    def criterion(model: np.ndarray, parameters: int) -> float:
+        off = nodes - model
+        return float(off @ information @ off) + price * parameters
+
+    models: list[tuple[float, np.ndarray, float | None]] = [(criterion(np.zeros(2 * n), 0), np.zeros(2 * n), 0.0)]
+    gains, response = nodes[:n], 0.0
+    for step in range(6):
+        gains = _gains_along(nodes, information, response)
+        model = np.concatenate([gains, response * gains])
+        if step in (0, 5):
+            models.append((criterion(model, n - 1 if step == 0 else n), model, response))
+        toward = information @ np.concatenate([np.zeros(n), gains])
+        spread = float(toward[n:] @ gains)
+        if spread <= 0.0:
+            break
+        response = float(toward @ (nodes - np.concatenate([gains, np.zeros(n)]))) / spread
+        response = min(max(response, -0.5), 0.9)  # beyond, gray levels would not grow with the light
+    models.append((criterion(nodes, 2 * (n - 1)), nodes, None))
+    _, best, response_of = min(models, key=lambda m: m[0])
+    if np.abs(best).max() < FLOOR:
+        return np.zeros(2 * n), 0.0
+    halves = best.reshape(2, n)
+    return np.asarray((halves - halves.mean(axis=1, keepdims=True)).ravel()), response_of
+
+
+def _gains_along(nodes: np.ndarray, information: np.ndarray, response: float) -> np.ndarray:
+    """(K,) gains that are nearest to the solution where lifts are `response` times them."""
+    n = len(nodes) // 2
+    both = information[:n] + response * information[n:]
+    inner = both[:, :n] + response * both[:, n:]
+    return np.asarray(np.linalg.solve(inner + 1e-9 * np.trace(inner) / n * np.eye(n), both @ nodes))
+
+
+def _white_balance(
+    edges: PhotometricEdges, count: int, gains: np.ndarray, lifts: np.ndarray, vignetting: np.ndarray
+) -> np.ndarray:
+    """(K, 3) log gains of the channels over the image's, from what the gains leave of each; zeros if they do not show."""
+    a, b, n = edges.source, edges.to, count
+    first = edges.moments[:, :, 0]  # (E, 3, 6)
+    left = (first[..., 5] - first[..., 2:5] @ vignetting - (lifts[b] - lifts[a])[:, None] * first[..., 1]) / first[..., 0]
+    left -= left.mean(axis=1, keepdims=True)
+    own = 1.0 / first[..., 0].mean(axis=1)
+    white, variance, trust = np.zeros((n, 3)), EDGE_SIGMA**2, np.ones(len(own))
+    laplacian = np.zeros((n, n))
+    for _ in range(4):
+        strength = trust / (variance + own)
+        laplacian, pull = np.zeros((n, n)), np.zeros((n, 3))
+        for row, column, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
+            np.add.at(laplacian, (row, column), sign * strength)
+        np.add.at(pull, b, strength[:, None] * left)
+        np.add.at(pull, a, -strength[:, None] * left)
+        white = np.linalg.solve(laplacian + 1e-6 * strength.mean() * np.eye(n), pull)
+        white -= white.mean(axis=0)
+        off = left - (white[b] - white[a])
+        rms = np.sqrt((off**2).sum(axis=1) / 2.0)
+        variance = _edge_variance(rms, own, n)
+        trust = 1.0 / (1.0 + rms**2 / (4.0 * (variance + own)))
+    shown = float(np.einsum("ic,ij,jc", white, laplacian, white))
+    shows = shown > 2 * (n - 1) * np.log(max(len(own), 3)) and np.abs(white).max() > FLOOR
+    return white if shows else np.zeros((n, 3))
+
+
+def _edge_variance(off: np.ndarray, own: np.ndarray, count: int) -> float:
+    """Variance of what edges are off beyond their own (E,), from residuals (E,) of a graph of `count` images."""
+    spare = max(len(off) - count + 1, 0)
+    total = float(np.median(off**2)) / 0.4549 * len(off) / max(spare, 1)
+    found = max(total - float(np.median(own)), 0.0)
+    return (spare * found + _PRIOR_EDGES * EDGE_SIGMA**2) / (spare + _PRIOR_EDGES)
+
+
+def _centered(matrix: np.ndarray) -> np.ndarray:
+    """Information of what is left when the mean is taken out."""
+    return np.asarray(matrix - matrix.mean(axis=0) - matrix.mean(axis=1)[:, None] + matrix.mean())
+
+
+__all__ = ["FLOOR", "PhotometricEdges", "Photometry", "solve_photometry"]
