@@ -33,7 +33,7 @@ class Tracker(TrackerNode):
 
     def _add(self, frame: Frame) -> Update:
         guessed = frame.intrinsics_guessed
-        return self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed)
+        return self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed, frame.exposure)
 
     @property
     def _focal_factor(self) -> float:
@@ -63,6 +63,8 @@ class Tracker(TrackerNode):
             inverse_depth=inverse_depth,
             inverse_depth_weight=weight,
             segment=keyframe.segment,
+            exposure=self.core.exposure(index),
+            vignetting=self.core.vignetting,
         )
 
 

@@ -9,7 +9,9 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.photometer import observed
 from mvsgs_core.tracking.places.localization import localize
 from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.trajectory import TrackingState, Trajectory
@@ -19,7 +21,7 @@ AGREEMENT = 0.7  # of a frame's points, all of which agreed once: fewer after th
 
 @dataclass(slots=True)
 class FrameRecord:
-    """A frame's state and where it was seen from one keyframe; about a kilobyte, kept for every frame of the stream."""
+    """A frame's state and where it was seen from one keyframe; 1.5 kilobytes, kept for every frame of the stream."""
 
     index: int
     timestamp: float  # seconds
@@ -28,9 +30,18 @@ class FrameRecord:
     points: bytes = b""  # of its matches, see sample.py
     cam_from_reference: bytes = b""  # (4, 4) float32: where the search for the pose begins
     same_as: int | None = None  # frame that this one did not move against
+    light: bytes = b""  # what its gray levels say of its exposure, see photometer.py
 
-    def follow(self, graph: KeyframeGraph, reference: int, matches: Matches, cam_from_world: np.ndarray) -> None:
-        """Keeps what gives the frame's pose (4, 4) again, from its matches of a keyframe's points."""
+    def follow(
+        self,
+        graph: KeyframeGraph,
+        reference: int,
+        matches: Matches,
+        cam_from_world: np.ndarray,
+        image: TrackingImage,
+    ) -> None:
+        """Keeps what gives the frame's pose (4, 4) and exposure again, from its matches of a keyframe's points."""
+        self.light = observed(graph, reference, image, matches)
         self.reference, self.same_as = reference, None
         self.points = sample(graph, reference, matches, cam_from_world)
         relative = cam_from_world @ graph.world_from_cam(reference)
@@ -38,7 +49,7 @@ class FrameRecord:
 
     def forget(self) -> None:
         """The frame has no pose."""
-        self.reference, self.same_as, self.points, self.cam_from_reference = None, None, b"", b""
+        self.reference, self.same_as, self.points, self.cam_from_reference, self.light = None, None, b"", b"", b""
 
 
 def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver) -> Trajectory:

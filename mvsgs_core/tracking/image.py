@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core.camera import fit_size, resize_image
+from mvsgs_core.tracking.estimation.gray_levels import Levels, Samples
 
 CELL = 8  # pixels: one point a cell
 BORDER = 24  # pixels around every pyramid level, so that windows need no bounds checks
@@ -32,18 +33,23 @@ class TrackingImage:
     timestamp: float  # seconds
     gray: np.ndarray
     color: np.ndarray | None = None  # (H, W, 3) uint8 RGB: only for a flow that wants it
+    half_color: np.ndarray | None = None  # (H / 2, W / 2, 3) uint8 RGB: what is known of the light; None: nothing
+    exposure: float = 0.0  # see `msgs.Frame`
     velocity: np.ndarray | None = None  # (H / 8, W / 8, 2) float32 pixels a second, where it is known
     _features: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
-    def of(index: int, timestamp: float, image: np.ndarray, size: tuple[int, int], color: bool) -> TrackingImage:
+    def of(
+        index: int, timestamp: float, image: np.ndarray, size: tuple[int, int], color: bool, exposure: float = 0.0
+    ) -> TrackingImage:
         """From an RGB image of any size."""
         if size[0] > image.shape[0]:  # cubic: linear interpolation blurs at every other pixel
             resized = np.asarray(cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_CUBIC))
         else:
             resized = resize_image(image, size)
         gray = cv2.cvtColor(resized, cv2.COLOR_RGB2GRAY)
-        return TrackingImage(index, timestamp, gray, resized if color else None)
+        half = np.asarray(cv2.resize(resized, (size[1] // 2, size[0] // 2), interpolation=cv2.INTER_AREA))
+        return TrackingImage(index, timestamp, gray, resized if color else None, half, exposure)
 
     def bare(self) -> TrackingImage:
         """The same with nothing computed yet: what is kept of a frame that may not be needed again."""
@@ -73,6 +79,18 @@ class TrackingImage:
     def cells(self) -> Cells:
         return find_cells(self.gray)
 
+    @cached_property
+    def levels(self) -> Levels | None:
+        """Gray levels for photometry, where colors are known."""
+        return None if self.half_color is None else Levels(self.half_color)
+
+    @cached_property
+    def flat_places(self) -> tuple[np.ndarray, Samples]:
+        """(M, 2) the flattest place of every cell, and the gray levels there."""
+        assert self.levels is not None
+        places = self.levels.flattest(CELL)
+        return places, self.levels.at(places)
+
     def shutter(self, points: np.ndarray) -> np.ndarray:
         """(N, 2) pixels by which a second of readout time moves what is seen at points (N, 2)."""
         if self.velocity is None:
@@ -101,7 +119,7 @@ class TrackingImage:
 
     def release(self) -> None:
         """Forgets what can be computed again: a keyframe outside the window keeps its pixels and features only."""
-        for name in ("pyramid", "half"):
+        for name in ("pyramid", "half", "levels", "flat_places"):
             self.__dict__.pop(name, None)
 
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from mvsgs_core.trajectory import TrackingState
 
+GRAY_LEVEL = 1.0 / 255.0
+
 
 class Tracked(Protocol):
     """What is published of a keyframe."""
@@ -41,6 +43,8 @@ class Correction:
     world_from_cam: np.ndarray  # (K, 4, 4) float64
     scale: np.ndarray  # (K,) float64: depths now over depths when the keyframe was first published
     segment: np.ndarray | None = None  # (K,) int32 part of the map that it belongs to now; None: there is only one
+    exposure: np.ndarray | None = None  # (K, 3, 4) float32 color affines, see `msgs`; None: as they were
+    vignetting: np.ndarray | None = None  # (3,) float32 of all images; None: as it was
 
 
 @dataclass(frozen=True)
@@ -59,27 +63,50 @@ class _Published:
     inverse_depth: np.ndarray  # when first published
     known: np.ndarray
     segment: int
+    exposure: np.ndarray | None  # (3, 4) color affine; None: the identity
+
+
+class Light(Protocol):
+    """What is known of exposures and vignetting: None, the identity."""
+
+    def exposure(self, index: int) -> np.ndarray | None: ...
+
+    @property
+    def vignetting(self) -> np.ndarray | None: ...
 
 
 class Publisher:
-    """tolerance: what counts as a change, as a fraction of the median depth (positions), radians, fraction (scales).
+    """tolerance: what counts as a change, as a fraction of the median depth (positions), radians, fraction (scales); of
+    exposures and vignetting it is a gray level.
 
     segment_of: the part of the map that a keyframe belongs to; None where the tracker has only one.
+    light: exposures and vignetting; None where the tracker knows none.
     """
 
-    def __init__(self, graph: Keyframes, tolerance: float, segment_of: Callable[[int], int] | None = None) -> None:
+    def __init__(
+        self,
+        graph: Keyframes,
+        tolerance: float,
+        segment_of: Callable[[int], int] | None = None,
+        light: Light | None = None,
+    ) -> None:
         self.graph = graph
         self.tolerance = tolerance
         self.segment_of = segment_of
+        self.light = light
         self.held: list[int] = []  # keyframes that are not published yet
         self.highest_segment = 0  # that was ever published: no number is given twice
         self._published: dict[int, _Published] = {}
+        self._vignetting: np.ndarray | None = None  # that was published last
+        self._lit = False  # an exposure was published
 
     def publish(self, index: int) -> None:
         """A keyframe was sent as it is now, with scale 1."""
         keyframe, segment = self.graph.keyframes[index], self._segment(index)
         known, pose = keyframe.triangulated.copy(), self.graph.world_from_cam(index)
-        self._published[index] = _Published(pose, 1.0, keyframe.inverse_depth.copy(), known, segment)
+        exposure = None if self.light is None else self.light.exposure(index)
+        self._published[index] = _Published(pose, 1.0, keyframe.inverse_depth.copy(), known, segment, exposure)
+        self._lit |= exposure is not None
         self.highest_segment = max(self.highest_segment, segment)
 
     @property
@@ -99,16 +126,20 @@ class Publisher:
     def corrections(self, everything: bool = False) -> Correction | None:
         """Keyframes that moved noticeably, or joined another segment, since they were last published; else None."""
         moved = []
+        vignetting = self._changed_vignetting()
+        everything |= vignetting is not None
         for index, last in self._published.items():
             if index not in self.graph.keyframes:
                 continue
+            exposure = None if self.light is None else self.light.exposure(index)
             pose, scale, segment = self.graph.world_from_cam(index), self._scale(index, last), self._segment(index)
             depth = self.graph.keyframes[index].median_depth
             shift = np.linalg.norm(pose[:3, 3] - last.world_from_cam[:3, 3]) / depth
             turn = np.linalg.norm(pose[:3, :3] - last.world_from_cam[:3, :3]) / np.sqrt(2.0)
             moves = max(shift, turn, abs(np.log(scale / last.scale))) > self.tolerance
-            if everything or moves or last.segment != segment:
-                last.world_from_cam, last.scale, last.segment = pose, scale, segment
+            if everything or moves or last.segment != segment or _differ(exposure, last.exposure):
+                last.world_from_cam, last.scale, last.segment, last.exposure = pose, scale, segment, exposure
+                self._lit |= exposure is not None
                 moved.append(index)
         if not moved:
             return None
@@ -118,7 +149,20 @@ class Publisher:
             np.stack([last.world_from_cam for last in last_of]),
             np.array([last.scale for last in last_of], np.float64),
             None if self.segment_of is None else np.array([last.segment for last in last_of], np.int32),
+            np.stack([_affine(last.exposure) for last in last_of]) if self._lit else None,
+            vignetting,
         )
+
+    def _changed_vignetting(self) -> np.ndarray | None:
+        """(3,) if it changed noticeably since it was last published."""
+        now = np.zeros(3, np.float32) if self.light is None or self.light.vignetting is None else self.light.vignetting
+        before = np.zeros(3, np.float32) if self._vignetting is None else self._vignetting
+        radius = np.linspace(0.0, 1.0, 9)
+        powers = np.stack([radius**2, radius**4, radius**6], axis=1)
+        if np.abs(powers @ (now - before)).max() <= GRAY_LEVEL:
+            return None
+        self._vignetting = now
+        return now
 
     def _segment(self, index: int) -> int:
         return 0 if self.segment_of is None else self.segment_of(index)
@@ -131,4 +175,14 @@ class Publisher:
         return float(np.median(published.inverse_depth[known] / keyframe.inverse_depth[known]))
 
 
-__all__ = ["Correction", "Keyframes", "Publisher", "Tracked", "Update"]
+def _affine(exposure: np.ndarray | None) -> np.ndarray:
+    return np.eye(3, 4, dtype=np.float32) if exposure is None else exposure
+
+
+def _differ(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    """Whether two exposures (3, 4) give black, gray or white by a gray level differently."""
+    off = _affine(a) - _affine(b)
+    return bool(max(np.abs(off[:, :3].sum(axis=1) * level + off[:, 3]).max() for level in (0.0, 0.5, 1.0)) > GRAY_LEVEL)
+
+
+__all__ = ["Correction", "Keyframes", "Light", "Publisher", "Tracked", "Update"]

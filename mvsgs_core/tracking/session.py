@@ -33,6 +33,7 @@ from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import make_flow
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.photometer import Photometer, observed
 from mvsgs_core.tracking.places.covisibility import CovisibleKeyframes
 from mvsgs_core.tracking.places.geometric_verification import PlaceMatch
 from mvsgs_core.tracking.places.loop_closure import LoopCloser
@@ -71,7 +72,10 @@ class Session:
         self.loops = LoopCloser(self.graph, self.local_map, retrieval, config.loop)
         self.relocalizer = Relocalizer(self.graph, self.matcher, retrieval, config.relocalization)
         self.recovery = Recovery(self.graph, self.matcher, config.recovery, config.front_end)
-        self.publisher = Publisher(self.graph, config.tolerance, lambda index: self.graph.keyframes[index].segment)
+        self.photometer = Photometer(self.graph, stats)
+        self.publisher = Publisher(
+            self.graph, config.tolerance, lambda index: self.graph.keyframes[index].segment, self.photometer
+        )
         self._since = 0  # frames since the last keyframe
         self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
 
@@ -120,17 +124,19 @@ class Session:
         if initializing:
             self.diagnosis.saw(self.front_end.reference, frame, step, not followed)
         if step.still:
-            return self._stand_still(record)
+            return self._stand_still(frame, step, record)
         if followed:
             self.relocalizer.found()
         if initializing:
             return self._initialize(frame, step, record) if followed else self._initialize_anew(frame, record)
         return self._track(frame, step, record) if followed else self._lose(frame, record)
 
-    def _stand_still(self, record: FrameRecord) -> Update:
+    def _stand_still(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         self.stats.skip("frames that did not move")
         last = self.records[-2]
         record.state, record.same_as = last.state, last.index if last.same_as is None else last.same_as
+        if self.phase is not Phase.INITIALIZING:
+            record.light = observed(self.graph, step.reference, frame, step.matches)  # the light may have changed
         return Update(record.state)
 
     # INITIALIZING
@@ -187,6 +193,7 @@ class Session:
         if self.config.loops:
             for index in keyframes:
                 self.loops.add(index)
+        self.photometer.update()
         self.stats.count("keyframes", len(keyframes))
         record.state = TrackingState.TRACKED
         return Update(record.state, self._publish(keyframes))
@@ -211,7 +218,7 @@ class Session:
         """A frame whose pose is known; perhaps a keyframe."""
         self.phase = Phase.TRACKING
         record.state = TrackingState.TRACKED
-        record.follow(self.graph, step.reference, step.matches, step.pose)
+        record.follow(self.graph, step.reference, step.matches, step.pose, frame)
         width = frame.size[1]
         limit = self.covisible_keyframes.limit(step.reference, self.config.keyframe_choice.max_flow)
         wanted = self.choice.wants(frame.index, step, width, limit)
@@ -244,6 +251,7 @@ class Session:
         self.calibration.refine(self.members)
         if self.config.loops:
             self._close_loops(frame.index)
+        self.photometer.update()
         for index in self.members[: -self.config.local_map.window]:
             self.graph.keyframes[index].image.release()
         self._refer_to(frame, self.graph.keyframes[frame.index].cam_from_world)
@@ -323,7 +331,7 @@ class Session:
         self.relocalizer.found()
         self.stats.count("relocalized")
         record.state = TrackingState.TRACKED
-        record.follow(self.graph, place.index, place.matches, place.localization.cam_from_world)
+        record.follow(self.graph, place.index, place.matches, place.localization.cam_from_world, frame)
         return Update(record.state)
 
     # In all phases

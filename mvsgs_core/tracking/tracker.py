@@ -70,8 +70,17 @@ class Tracker:
     def keyframe(self, index: int) -> Keyframe:
         return self.session.graph.keyframes[index]
 
+    def exposure(self, index: int) -> np.ndarray | None:
+        """(3, 4) float32 color affine of a keyframe, see `msgs`; None: the identity, or not known."""
+        return self.session.photometer.exposure(index)
+
+    @property
+    def vignetting(self) -> np.ndarray | None:
+        """(3,) float32 of all images, see `msgs`; None: there is none."""
+        return self.session.photometer.vignetting
+
     def trajectory(self) -> Trajectory:
-        """Every frame's pose, after `finish`."""
+        """Every frame's pose and exposure, after `finish`."""
         return self._trajectory
 
     def begin(self, size: tuple[int, int], intrinsics: np.ndarray, guessed: bool = False) -> Session:
@@ -80,18 +89,26 @@ class Tracker:
         return self._session
 
     def add(
-        self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray, guessed: bool = False
+        self,
+        index: int,
+        timestamp: float,
+        image: np.ndarray,
+        intrinsics: np.ndarray,
+        guessed: bool = False,
+        exposure: float = 0.0,
     ) -> Update:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow.
 
         guessed: the focal length is to be estimated; keyframes are published when it is settled, see `focal_factor`.
+        exposure: time times gain over the f-number squared, in a unit that the stream keeps; 0: not known.
         """
         size = image.shape[0], image.shape[1]
         session = self._session or self.begin(size, intrinsics, guessed)
         if not np.allclose(scale_intrinsics(intrinsics, size, session.size), session.intrinsics, rtol=1e-3):
             self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
         with self.stats.time("image"):
-            frame = TrackingImage.of(index, timestamp, image, session.size, session.matcher.flow.needs_color)
+            color = session.matcher.flow.needs_color
+            frame = TrackingImage.of(index, timestamp, image, session.size, color, exposure)
         self.stats.count("frames")
         return session.add(frame)
 
@@ -109,7 +126,10 @@ class Tracker:
         with stats.time("frames without a pose"):
             found = session.recovery.fill_in(session.records)
             solver = Solver(steps=8, threads=self.config.threads or 1)
-            self._trajectory = solve_trajectory(session.records, graph, solver)
+            trajectory = solve_trajectory(session.records, graph, solver)
+        session.photometer.update(whole=True)
+        exposure = session.photometer.of_frames(session.records, trajectory.posed)
+        self._trajectory = replace(trajectory, exposure=exposure, vignetting=session.photometer.vignetting)
         stats.count("frames posed in the end", found)
         stats.count(HELD_OUT, sum(is_held_out(index) for index in graph.keyframes))
         tracking = session.phase is not Phase.INITIALIZING

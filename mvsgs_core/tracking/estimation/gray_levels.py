@@ -9,43 +9,37 @@ images.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
 
 from mvsgs_core.tracking.estimation.response import BRIGHTEST, DARKEST, offset_term
-from mvsgs_core.tracking.image import CELL
 
 NOISE = 1.0 / 255.0  # of a window's mean, gray levels 0 to 1: quantization and what is left of the sensor's noise
-SHARE = 0.5  # of a window's spread that counts as its error: matches are off by that part of a window
+SHARE = 1.0  # of a window's spread that counts as its error: a match beside may be off by a window
 MIN_SAMPLES = 30
 TERMS = 6  # 1, what an offset adds, three of the radius, the log ratio
 _STEPS = 4  # of reweighting
 
 
 class Levels:
-    """Means (h, w, 3) and spread (h, w) over windows of 3x3 of a half-size image (h, w, 3) uint8 RGB, 0 to 1."""
+    """Means and spread of the windows of 3x3 of a half-size image (h, w, 3) uint8 RGB, 0 to 1."""
 
     def __init__(self, half: np.ndarray) -> None:
         values = half.astype(np.float32) * np.float32(1.0 / 255.0)
-        self.mean = np.asarray(cv2.blur(values, (3, 3)))
-        gray = values.mean(axis=2)
-        self.spread = np.sqrt(np.maximum(cv2.blur(gray * gray, (3, 3)) - cv2.blur(gray, (3, 3)) ** 2, 0.0))
+        mean, gray = np.asarray(cv2.blur(values, (3, 3))), values.mean(axis=2)
         window = np.ones((3, 3), np.uint8)
         clipped = cv2.dilate(half, window).max(axis=2) > 255.0 * BRIGHTEST
         clipped |= cv2.erode(half, window).min(axis=2) < 255.0 * DARKEST
-        self.mean[clipped] = np.nan
+        mean[clipped] = np.nan
+        spread = np.sqrt(np.maximum(cv2.blur(gray * gray, (3, 3)) - cv2.blur(gray, (3, 3)) ** 2, 0.0))
+        self._windows = np.dstack([mean, spread])
 
-    @cached_property
-    def _both(self) -> np.ndarray:
-        return np.dstack([self.mean, self.spread])
-
-    def flattest(self) -> np.ndarray:
-        """(M, 2) where the image is flattest, by cells as `image.find_cells` has them, pixels of the full size."""
-        side = CELL // 2
-        rows, columns = self.spread.shape[0] // side, self.spread.shape[1] // side
-        tiles = self.spread.reshape(rows, side, columns, side).transpose(0, 2, 1, 3).reshape(rows * columns, -1)
+    def flattest(self, cell: int) -> np.ndarray:
+        """(M, 2) where each cell of so many pixels is flattest, by rows; pixels of the full size."""
+        side, spread = cell // 2, self._windows[..., 3]
+        rows, columns = spread.shape[0] // side, spread.shape[1] // side
+        tiles = spread.reshape(rows, side, columns, side).transpose(0, 2, 1, 3).reshape(rows * columns, -1)
         best = np.argmin(tiles, axis=1)
         v, u = (c * side for c in np.divmod(np.arange(rows * columns), columns))
         return np.asarray(2.0 * np.stack([u + best % side, v + best // side], axis=1) + 0.5)
@@ -54,7 +48,7 @@ class Levels:
         """points (N, 2): pixels of the full size; NaN outside of the image and where the sensor is at its limits."""
         half = ((points + 0.5) / 2.0 - 0.5).astype(np.float32)
         found = cv2.remap(
-            self._both, half[None, :, 0], half[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
+            self._windows, half[None, :, 0], half[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
             borderValue=(np.nan, np.nan, np.nan, np.nan),
         )[0].astype(np.float64)  # fmt: skip
         return Samples(found[:, :3], found[:, 3])

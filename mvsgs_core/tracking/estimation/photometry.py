@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvsgs_core.tracking.estimation.gray_levels import TERMS
-from mvsgs_core.tracking.estimation.response import affine, mean_vignetting
+from mvsgs_core.tracking.estimation.response import affine, change, vignetting_change
 
 EDGE_SIGMA = 0.005  # what an edge is off, as a log ratio, before the edges tell it; it counts as ...
 _PRIOR_EDGES = 10  # ... so many of them
-FLOOR = 0.5 / 255.0  # log ratio: less changes no gray level
+STEP = 2.0 / 255.0  # gray levels, root mean square: less is no change, texture that is resampled differs by as much
 KNOWN_SIGMA = 0.02  # of a known exposure's logarithm: shutters and apertures are rounded
 _EXPONENT, _EXPONENT_SIGMA = 0.5, 0.25  # of gray levels over exposure: gamma-coded images have about 1 / 2.2
 _STEPS = 8
@@ -48,16 +48,16 @@ class Photometry:
     white: np.ndarray  # (K, 3) log gain of the channels over the gain
     sigma: np.ndarray  # (K,) standard deviation of the gains
     vignetting: np.ndarray  # (3,) of log V = l1 r² + l2 r⁴ + l3 r⁶
-    response: float | None  # lift over gain, of the sensor; None: lifts are the images' own
+    response: float  # lift over gain, of the sensor
+    own_lifts: bool  # lifts are the images' own: more than the response says
     edge_sigma: tuple[float, float]  # of u and w, log ratios
-    balanced: bool  # the white balance is steady
 
     @staticmethod
     def steady(count: int) -> Photometry:
         """Of `count` images of which nothing is known to change."""
         zero = np.zeros(count)
         edge = (EDGE_SIGMA, EDGE_SIGMA)
-        return Photometry(zero, zero, np.zeros((count, 3)), zero, np.zeros(_GLOBAL), 0.0, edge, True)
+        return Photometry(zero, zero, np.zeros((count, 3)), zero, np.zeros(_GLOBAL), 0.0, False, edge)
 
     @property
     def varies(self) -> bool:
@@ -67,13 +67,13 @@ class Photometry:
         """Gain, lift and white balance (3,) of an edge's end over its start, from the edge's moments (3, 6, 6)."""
         pooled = moments.mean(axis=0)
         ratio = pooled[:2, 5] - pooled[:2, 2:5] @ self.vignetting
-        if self.response is None:
+        if self.own_lifts:
             gain, lift = np.linalg.solve(pooled[:2, :2] + 1e-9 * np.eye(2), ratio)
         else:
             along = np.array([1.0, self.response])
             gain = float(along @ ratio / (along @ pooled[:2, :2] @ along))
             lift = self.response * gain
-        if self.balanced:
+        if not np.any(self.white):
             return float(gain), float(lift), np.zeros(3)
         first = moments[:, 0]
         left = (first[:, 5] - first[:, 2:5] @ self.vignetting - lift * first[:, 1]) / first[:, 0]
@@ -87,7 +87,7 @@ class Photometry:
 
 
 class _Solver:
-    """Least squares on gains and lifts (2 K), the vignetting's parameters (3) and known exposures' exponent and unit."""
+    """Least squares on gains and lifts (2 K), the vignetting (3), and the exponent and unit of known exposures."""
 
     def __init__(self, edges: PhotometricEdges, count: int, known: np.ndarray) -> None:
         """known (K,): log exposures, NaN where they are not known."""
@@ -128,8 +128,8 @@ class _Solver:
         return np.asarray(inner - outer @ np.linalg.solve(self.information[n:, n:], outer.T))
 
     def vignetting_shows(self) -> bool:
-        """Whether it is known against zero: by the edges' scatter, image by image, too, and more than a gray level's."""
-        if mean_vignetting(self.vignetting) < FLOOR:
+        """Whether it is known against zero, by the scatter of the edges of each image too, and changes gray levels."""
+        if vignetting_change(self.vignetting) < STEP:
             return False
         n, chosen = self.count, slice(2 * self.count, 2 * self.count + _GLOBAL)
         unit = np.zeros((len(self.information), _GLOBAL))
@@ -220,44 +220,47 @@ def solve_photometry(edges: PhotometricEdges, count: int, known: np.ndarray | No
     else:
         solver.solve(False)
     information = solver.of_nodes()
-    nodes, response = _chosen(solver.nodes, information, count, len(edges.source))
-    sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(_centered(information[:count, :count]))), 0.0))
+    nodes, response, own_lifts = _chosen(solver.nodes, information, count, len(edges.source))
     gains, lifts = nodes[:count], nodes[count:]
     white = _white_balance(edges, count, gains, lifts, vignetting)
     u, w = np.sqrt(solver.effects)
-    found = Photometry(gains, lifts, white, sigma, vignetting, response, (float(u), float(w)), not np.any(white))
+    sigma = np.sqrt(np.diag(np.linalg.inv(_centered(information[:count, :count]))))
+    found = Photometry(gains, lifts, white, sigma, vignetting, response, own_lifts, (float(u), float(w)))
     if not all(np.isfinite(v).all() for v in (gains, lifts, white, sigma, vignetting)):
         raise ValueError("the photometric solution is not finite")
     return found
 
 
-def _chosen(nodes: np.ndarray, information: np.ndarray, count: int, edges: int) -> tuple[np.ndarray, float | None]:
-    """Gains and lifts (2 K,) of the model that the data ask for, and its response: the least information criterion."""
+def _chosen(nodes: np.ndarray, information: np.ndarray, count: int, edges: int) -> tuple[np.ndarray, float, bool]:
+    """Gains and lifts (2 K,) of the model that the data ask for (the least information criterion), the response that
+    is nearest to them, and whether lifts are the images' own."""
     n, price = count, float(np.log(max(edges, 3)))
 
     def criterion(model: np.ndarray, parameters: int) -> float:
         off = nodes - model
         return float(off @ information @ off) + price * parameters
 
-    models: list[tuple[float, np.ndarray, float | None]] = [(criterion(np.zeros(2 * n), 0), np.zeros(2 * n), 0.0)]
-    gains, response = nodes[:n], 0.0
-    for step in range(6):
-        gains = _gains_along(nodes, information, response)
-        model = np.concatenate([gains, response * gains])
-        if step in (0, 5):
-            models.append((criterion(model, n - 1 if step == 0 else n), model, response))
+    response = 0.0
+    gains = _gains_along(nodes, information, response)
+    models = [(criterion(np.zeros(2 * n), 0), np.zeros(2 * n), False)]
+    models.append((criterion(np.concatenate([gains, 0.0 * gains]), n - 1), np.concatenate([gains, 0.0 * gains]), False))
+    for _ in range(6):
         toward = information @ np.concatenate([np.zeros(n), gains])
         spread = float(toward[n:] @ gains)
         if spread <= 0.0:
             break
         response = float(toward @ (nodes - np.concatenate([gains, np.zeros(n)]))) / spread
         response = min(max(response, -0.5), 0.9)  # beyond, gray levels would not grow with the light
-    models.append((criterion(nodes, 2 * (n - 1)), nodes, None))
-    _, best, response_of = min(models, key=lambda m: m[0])
-    if np.abs(best).max() < FLOOR:
-        return np.zeros(2 * n), 0.0
-    halves = best.reshape(2, n)
-    return np.asarray((halves - halves.mean(axis=1, keepdims=True)).ravel()), response_of
+        gains = _gains_along(nodes, information, response)
+    along = np.concatenate([gains, response * gains])
+    models.append((criterion(along, n), along, False))
+    models.append((criterion(nodes, 2 * (n - 1)), nodes, True))
+    which = min(range(len(models)), key=lambda m: models[m][0])
+    _, best, own_lifts = models[which]
+    halves = best.reshape(2, n) - best.reshape(2, n).mean(axis=1, keepdims=True)
+    if change(halves[0], halves[1]) < STEP:
+        return np.zeros(2 * n), 0.0, False
+    return np.asarray(halves.ravel()), response if which >= 2 else 0.0, own_lifts
 
 
 def _gains_along(nodes: np.ndarray, information: np.ndarray, response: float) -> np.ndarray:
@@ -271,10 +274,12 @@ def _gains_along(nodes: np.ndarray, information: np.ndarray, response: float) ->
 def _white_balance(
     edges: PhotometricEdges, count: int, gains: np.ndarray, lifts: np.ndarray, vignetting: np.ndarray
 ) -> np.ndarray:
-    """(K, 3) log gains of the channels over the image's, from what the gains leave of each; zeros if they do not show."""
+    """(K, 3) log gains of the channels over the image's, from what gains leave of each; zeros if they do not show."""
     a, b, n = edges.source, edges.to, count
     first = edges.moments[:, :, 0]  # (E, 3, 6)
-    left = (first[..., 5] - first[..., 2:5] @ vignetting - (lifts[b] - lifts[a])[:, None] * first[..., 1]) / first[..., 0]
+    left = (first[..., 5] - first[..., 2:5] @ vignetting - (lifts[b] - lifts[a])[:, None] * first[..., 1]) / first[
+        ..., 0
+    ]
     left -= left.mean(axis=1, keepdims=True)
     own = 1.0 / first[..., 0].mean(axis=1)
     white, variance, trust = np.zeros((n, 3)), EDGE_SIGMA**2, np.ones(len(own))
@@ -293,7 +298,7 @@ def _white_balance(
         variance = _edge_variance(rms, own, n)
         trust = 1.0 / (1.0 + rms**2 / (4.0 * (variance + own)))
     shown = float(np.einsum("ic,ij,jc", white, laplacian, white))
-    shows = shown > 2 * (n - 1) * np.log(max(len(own), 3)) and np.abs(white).max() > FLOOR
+    shows = shown > 2 * (n - 1) * np.log(max(len(own), 3)) and change(white, np.zeros_like(white)) > STEP
     return white if shows else np.zeros((n, 3))
 
 
@@ -305,9 +310,9 @@ def _edge_variance(off: np.ndarray, own: np.ndarray, count: int) -> float:
     return (spare * found + _PRIOR_EDGES * EDGE_SIGMA**2) / (spare + _PRIOR_EDGES)
 
 
-def _centered(matrix: np.ndarray) -> np.ndarray:
-    """Information of what is left when the mean is taken out."""
-    return np.asarray(matrix - matrix.mean(axis=0) - matrix.mean(axis=1)[:, None] + matrix.mean())
+def _centered(information: np.ndarray) -> np.ndarray:
+    """The information with that of the mean added, which the gauge gives."""
+    return np.asarray(information + np.trace(information) / len(information) ** 2)
 
 
-__all__ = ["FLOOR", "PhotometricEdges", "Photometry", "solve_photometry"]
+__all__ = ["STEP", "PhotometricEdges", "Photometry", "solve_photometry"]

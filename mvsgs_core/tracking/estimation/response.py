@@ -14,6 +14,7 @@ import numpy as np
 MIDDLE = 0.4  # gray level, 0 to 1: about the mean of most images
 DARKEST, BRIGHTEST = 0.03, 0.95  # gray levels that are followed: noise and black levels below, saturation above
 
+_LEVELS = np.linspace(0.05, BRIGHTEST, 10)
 _RADII = np.linspace(0.0, 1.0, 33)
 
 
@@ -42,7 +43,13 @@ def vignetting_polynomial(logarithm: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.lstsq(powers, np.expm1(powers @ logarithm), rcond=None)[0])
 
 
-def mean_vignetting(logarithm: np.ndarray) -> float:
+def change(gain: np.ndarray, lift: np.ndarray) -> float:
+    """Root mean square of what gains and lifts (...) change about gray levels, 0 to 1."""
+    slope, offset = affine(gain, lift)
+    return float(np.sqrt(np.mean((_LEVELS * (slope[..., None] - 1.0) + offset[..., None]) ** 2)))
+
+
+def vignetting_change(logarithm: np.ndarray) -> float:
     """Root mean square over the image of l1 r² + l2 r⁴ + l3 r⁶, (3,) l, its mean taken out: that would be exposure."""
     values = np.stack([_RADII**2, _RADII**4, _RADII**6], axis=1) @ logarithm
     weight = _RADII / _RADII.sum()  # rings of the image
@@ -54,8 +61,9 @@ __all__ = [
     "DARKEST",
     "MIDDLE",
     "affine",
-    "mean_vignetting",
+    "change",
     "offset_term",
     "radial_terms",
+    "vignetting_change",
     "vignetting_polynomial",
 ]

@@ -68,7 +68,7 @@ class Recovery:
             if follower.is_lost(step) or step.localization is None:
                 continue
             if self.config.criteria.accept(self.graph, start, step.matches, step.localization):
-                record.follow(self.graph, start, step.matches, step.localization.cam_from_world)
+                record.follow(self.graph, start, step.matches, step.localization.cam_from_world, image)
                 found += 1
             image.release()
         return found

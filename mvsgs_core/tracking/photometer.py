@@ -1,0 +1,181 @@
+"""The light of the keyframe graph, kept up as it grows: exposures of keyframes and frames, vignetting.
+
+Every edge is looked at once, when it is matched; the whole graph is solved again when it has grown by a tenth, and
+keyframes between take their exposure from their edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.estimation.gray_levels import MIN_SAMPLES, TERMS, backward, log_ratio_moments
+from mvsgs_core.tracking.estimation.photometry import PhotometricEdges, Photometry, solve_photometry
+from mvsgs_core.tracking.estimation.response import radial_terms, vignetting_polynomial
+from mvsgs_core.tracking.graph import Edge, KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.matching.flow import Matches
+
+GROWTH = 1.1  # of the keyframes, at which all are solved again
+
+_OBSERVATION = np.dtype(
+    [("reference", "<i8"), ("moments", "<f4", (3, 2, TERMS))]
+)  # the rows that `Photometry.step` asks
+
+Light = tuple[float, float, np.ndarray]  # log gain, lift, white balance (3,)
+
+
+class Seen(Protocol):
+    """What is asked of a frame's record."""
+
+    @property
+    def index(self) -> int: ...
+
+    @property
+    def light(self) -> bytes: ...
+
+
+def observed(graph: KeyframeGraph, reference: int, image: TrackingImage, matches: Matches) -> bytes:
+    """What a frame's matches of a keyframe's points say of its light: 152 bytes, none where it is too little."""
+    moments = _compared(graph, reference, image, matches.target, matches.alive)
+    if moments is None:
+        return b""
+    return np.array((reference, moments[:, :2]), _OBSERVATION).tobytes()
+
+
+class Photometer:
+    def __init__(self, graph: KeyframeGraph, stats: Stats) -> None:
+        self.graph = graph
+        self.stats = stats
+        self.photometry = Photometry.steady(0)
+        self._order: list[int] = []  # keyframes of the last solution
+        self._lights: dict[int, Light] = {}  # of the keyframes
+        self._moments: dict[tuple[int, int], tuple[Edge, np.ndarray | None]] = {}  # of every edge as it was matched
+
+    @property
+    def vignetting(self) -> np.ndarray | None:
+        """(3,) float32, see `msgs`; None: there is none."""
+        if not np.any(self.photometry.vignetting):
+            return None
+        return vignetting_polynomial(self.photometry.vignetting).astype(np.float32)
+
+    def exposure(self, index: int) -> np.ndarray | None:
+        """(3, 4) float32 color affine of a keyframe; None where exposures do not vary."""
+        if not self.photometry.varies or index not in self._lights:
+            return None
+        return Photometry.affine(*self._lights[index])
+
+    def of_frames(self, records: Sequence[Seen], posed: np.ndarray) -> np.ndarray | None:
+        """(N, 3, 4) float32 color affines of frames, NaN where they are not known or not `posed` (N,); None where
+        exposures do not vary."""
+        if not self.photometry.varies:
+            return None
+        found = np.full((len(records), 3, 4), np.nan, np.float32)
+        for k, record in enumerate(records):
+            light = self._of_frame(record) if posed[k] else None
+            if light is not None:
+                found[k] = Photometry.affine(*light)
+        return found
+
+    def update(self, whole: bool = False) -> None:
+        """Takes in the graph's new edges and keyframes. whole: solves for all of them again in any case."""
+        with self.stats.time("photometry"):
+            self._look_at_edges()
+            order = sorted(self.graph.keyframes)
+            if whole or len(order) >= GROWTH * len(self._order):
+                self._solve(order)
+            elif self.photometry.varies:
+                for index in order:
+                    if index not in self._lights:
+                        self._attach(index)
+
+    def _look_at_edges(self) -> None:
+        graph = self.graph
+        for pair in self._moments.keys() - graph.edges.keys():
+            del self._moments[pair]
+        for (a, b), edge in graph.edges.items():
+            known = self._moments.get((a, b))
+            if known is None or known[0] is not edge:
+                image = graph.keyframes[b].image
+                self._moments[a, b] = edge, _compared(graph, a, image, edge.target.T, edge.weight > 0)
+
+    def _pairs(self) -> dict[tuple[int, int], np.ndarray]:
+        """Moments (3, 6, 6) of every pair of keyframes, both directions in one, from the earlier to the later one."""
+        pairs: dict[tuple[int, int], np.ndarray] = {}
+        for (a, b), (_, moments) in self._moments.items():
+            if moments is not None:
+                pair = min(a, b), max(a, b)
+                pairs[pair] = pairs.get(pair, 0.0) + (moments if a < b else backward(moments))
+        return pairs
+
+    def _solve(self, order: list[int]) -> None:
+        pairs = self._pairs()
+        number = {index: n for n, index in enumerate(order)}
+        edges = PhotometricEdges(
+            np.array([number[a] for a, _ in pairs], np.int64),
+            np.array([number[b] for _, b in pairs], np.int64),
+            np.array(list(pairs.values())).reshape(-1, 3, TERMS, TERMS),
+        )
+        exposures = np.array([self.graph.keyframes[index].image.exposure for index in order])
+        known = np.where(exposures > 0.0, np.log(np.maximum(exposures, 1e-300)), np.nan)
+        try:
+            self.photometry = p = solve_photometry(edges, len(order), known)
+        except (np.linalg.LinAlgError, ValueError) as error:
+            self.stats.warn(f"exposures could not be solved for: {error}")
+            return
+        self._order = order
+        self._lights = {index: (float(p.gains[n]), float(p.lifts[n]), p.white[n]) for n, index in enumerate(order)}
+
+    def _attach(self, index: int) -> None:
+        """The light of a new keyframe, from those it was matched with."""
+        found: list[tuple[float, Light]] = []
+        for (a, b), (_, moments) in self._moments.items():
+            other = b if a == index else a
+            if moments is not None and index in (a, b) and other in self._lights:
+                there = moments if b == index else backward(moments)
+                information = 1.0 / (self.photometry.edge_sigma[0] ** 2 + 1.0 / there[:, 0, 0].mean())
+                found.append((float(information), _moved(self._lights[other], self.photometry.step(there))))
+        if found:
+            weights = np.array([weight for weight, _ in found])
+            gain, lift, white = (
+                np.average([light[k] for _, light in found], axis=0, weights=weights) for k in range(3)
+            )
+            self._lights[index] = float(gain), float(lift), np.asarray(white)
+
+    def _of_frame(self, record: Seen) -> Light | None:
+        if record.index in self._lights:
+            return self._lights[record.index]
+        if not record.light:
+            return None
+        seen = np.frombuffer(record.light, _OBSERVATION)[0]
+        start = self._lights.get(int(seen["reference"]))
+        if start is None:
+            return None
+        return _moved(start, self.photometry.step(seen["moments"].astype(np.float64)))
+
+
+def _moved(light: Light, step: Light) -> Light:
+    return light[0] + step[0], light[1] + step[1], light[2] + step[2]
+
+
+def _compared(
+    graph: KeyframeGraph, reference: int, image: TrackingImage, target: np.ndarray, alive: np.ndarray
+) -> np.ndarray | None:
+    """Moments (3, 6, 6) of the log ratios of a keyframe's cells and an image, where its points were found, (M, 2).
+
+    The flattest place of a cell is looked up as far beside the match as it is beside the cell's point.
+    """
+    keyframe = graph.keyframes[reference].image
+    if keyframe.levels is None or image.levels is None or alive.sum() < MIN_SAMPLES:
+        return None
+    places, samples = keyframe.flat_places
+    places = places[alive]
+    there = target[alive] + places - keyframe.cells.points[alive]
+    farther = radial_terms(there, graph.intrinsics, image.size) - radial_terms(places, graph.intrinsics, image.size)
+    return log_ratio_moments(samples[alive], image.levels.at(there), farther)
+
+
+__all__ = ["Photometer", "observed"]
