@@ -27,6 +27,9 @@ class Difficulties:
     motion_blur: float = 0.0  # exposure time as a fraction of the time between two frames, 0 to 1
     rolling_shutter: float = 0.0  # readout time as a fraction of the time between two frames, 0 to 1
     exposure: float = 0.0  # brightness drifts by up to so many stops up and down
+    white_balance: float = 0.0  # red against blue drifts by up to so many stops either way
+    vignetting: float = 0.0  # part of the light that is missing in the corners, 0 to 1
+    response: float = 0.0  # offset o of a response (1 + o) light^(1 / 2.4) - o in place of sRGB's; sRGB's is 0.055
     noise: float = 0.0  # standard deviation of the sensor's noise at mid gray, 8-bit levels
     gloss: float = 0.0  # strength of highlights, 1 is plausible: surfaces that change with the view
     moving_object: float = 0.0  # a ball of so many times its usual size swings and bounces through the view
@@ -42,7 +45,8 @@ class Difficulties:
                 raise ValueError(f"{f.name}: {value} is negative; 0 is off")
         if self.scale <= 0:
             raise ValueError(f"scale: {self.scale} must be positive")
-        for name, limit in (("drop", 0.95), ("motion_blur", 1.0), ("rolling_shutter", 1.0), ("textureless", 4)):
+        limits = {"drop": 0.95, "motion_blur": 1.0, "rolling_shutter": 1.0, "textureless": 4, "vignetting": 0.95}
+        for name, limit in (limits | {"response": 1.0}).items():
             if getattr(self, name) > limit:
                 raise ValueError(f"{name}: {getattr(self, name)} is more than {limit}")
 
@@ -92,8 +96,11 @@ class Sensor:
         # Highlights roll off instead of clipping hard, as every camera's curve does.
         knee = 0.72
         curve = np.where(light < knee, light, knee + (1 - knee) * (1 - np.exp(-(light - knee) / (1 - knee))))
-        srgb = np.where(curve <= 0.0031308, 12.92 * curve, 1.055 * curve ** (1 / 2.4) - 0.055)
-        self.curve = (255.0 * srgb).astype(np.float32)
+        o = difficulties.response
+        encoded = np.where(curve <= 0.0031308, 12.92 * curve, 1.055 * curve ** (1 / 2.4) - 0.055)
+        if o > 0:
+            encoded = np.maximum((1.0 + o) * curve ** (1 / 2.4) - o, 0.0)
+        self.curve = (255.0 * encoded).astype(np.float32)
 
     def gain(self, s: float) -> float:
         """Factor of the light at frame s."""
@@ -101,9 +108,24 @@ class Sensor:
         stops = 0.6 * np.sin(2 * np.pi * s / 47.0 + phase) + 0.4 * np.sin(2 * np.pi * s / 29.0 + 2.0 * phase)
         return float(2.0 ** (self.difficulties.exposure * stops))
 
+    def white(self, s: float) -> np.ndarray:
+        """(3,) factors of red, green and blue light at frame s."""
+        stops = self.difficulties.white_balance * np.sin(2 * np.pi * s / 61.0 + self.seed % 5)
+        return np.asarray(2.0 ** (stops * np.array([0.5, 0.0, -0.5])))
+
+    def falloff(self, height: int, width: int) -> np.ndarray:
+        """(height, width) factor of the light by vignetting: a parabola of the distance from the middle."""
+        v, u = np.mgrid[:height, :width]
+        square = (u - (width - 1) / 2) ** 2 + (v - (height - 1) / 2) ** 2
+        return np.asarray(1.0 - self.difficulties.vignetting * square / (0.25 * (height**2 + width**2)))
+
     def image(self, light: np.ndarray, s: int, covered: bool = False) -> np.ndarray:
         """(H, W, 3) uint8 RGB of linear light (H, W, 3) at frame s."""
         light = np.zeros_like(light) if covered else light * np.float32(self.gain(s))
+        if self.difficulties.white_balance > 0:
+            light = light * self.white(s).astype(np.float32)
+        if self.difficulties.vignetting > 0:
+            light = light * self.falloff(*light.shape[:2])[..., None].astype(np.float32)
         steps = np.clip(light * (self.STEPS / 4.0) + 0.5, 0, self.STEPS).astype(np.int32)
         values = self.curve[steps]
         if self.difficulties.noise > 0:

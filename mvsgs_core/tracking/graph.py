@@ -64,6 +64,7 @@ class KeyframeGraph:
         self.intrinsics = np.asarray(intrinsics, dtype=np.float64)  # (4,) at the tracker's size
         self.device = device  # of the bundle adjustments of several keyframes, see Solver
         self.readout_time = 0.0  # seconds that the camera needs for an image, from the first row to the last
+        self.vignetting = np.zeros(3)  # of log V = l1 r² + l2 r⁴ + l3 r⁶, as far as it is known
         self.keyframes: dict[int, Keyframe] = {}  # by frame index
         self.edges: dict[tuple[int, int], Edge] = {}  # by frame indices
 

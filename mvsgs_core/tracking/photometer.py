@@ -1,7 +1,8 @@
 """The light of the keyframe graph, kept up as it grows: exposures of keyframes and frames, vignetting.
 
 Every edge is looked at once, when it is matched; the whole graph is solved again when it has grown by a tenth, and
-keyframes between take their exposure from their edges.
+keyframes between take their exposure from their edges. The gauge stays as it is while the graph grows; the end's
+solution has the mean over the keyframes.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class Photometer:
         """(3, 4) float32 color affine of a keyframe; None where exposures do not vary."""
         if not self.photometry.varies or index not in self._lights:
             return None
-        return Photometry.affine(*self._lights[index])
+        return self.photometry.affine(*self._lights[index])
 
     def of_frames(self, records: Sequence[Seen], posed: np.ndarray) -> np.ndarray | None:
         """(N, 3, 4) float32 color affines of frames, NaN where they are not known or not `posed` (N,); None where
@@ -77,16 +78,16 @@ class Photometer:
         for k, record in enumerate(records):
             light = self._of_frame(record) if posed[k] else None
             if light is not None:
-                found[k] = Photometry.affine(*light)
+                found[k] = self.photometry.affine(*light)
         return found
 
     def update(self, whole: bool = False) -> None:
-        """Takes in the graph's new edges and keyframes. whole: solves for all of them again in any case."""
+        """Takes in the graph's new edges and keyframes. whole: the stream has ended, all is solved for again."""
         with self.stats.time("photometry"):
             self._look_at_edges()
             order = sorted(self.graph.keyframes)
             if whole or len(order) >= GROWTH * len(self._order):
-                self._solve(order)
+                self._solve(order, whole)
             elif self.photometry.varies:
                 for index in order:
                     if index not in self._lights:
@@ -111,7 +112,7 @@ class Photometer:
                 pairs[pair] = pairs.get(pair, 0.0) + (moments if a < b else backward(moments))
         return pairs
 
-    def _solve(self, order: list[int]) -> None:
+    def _solve(self, order: list[int], whole: bool) -> None:
         pairs = self._pairs()
         number = {index: n for n, index in enumerate(order)}
         edges = PhotometricEdges(
@@ -126,8 +127,19 @@ class Photometer:
         except (np.linalg.LinAlgError, ValueError) as error:
             self.stats.warn(f"exposures could not be solved for: {error}")
             return
-        self._order = order
-        self._lights = {index: (float(p.gains[n]), float(p.lifts[n]), p.white[n]) for n, index in enumerate(order)}
+        self.graph.vignetting = p.vignetting
+        lights = {index: (float(p.gains[n]), float(p.lifts[n]), p.white[n]) for n, index in enumerate(order)}
+        if p.varies and not whole:
+            lights = self._kept_still(lights)
+        self._order, self._lights = order, lights
+
+    def _kept_still(self, lights: dict[int, Light]) -> dict[int, Light]:
+        """The same in the gauge of before: what is known does not change as a whole with each keyframe that comes."""
+        both = self._lights.keys() & lights.keys()
+        if not both:
+            return lights
+        shift = [np.mean([self._lights[i][k] - lights[i][k] for i in both], axis=0) for k in range(3)]
+        return {index: _moved(light, (float(shift[0]), float(shift[1]), shift[2])) for index, light in lights.items()}
 
     def _attach(self, index: int) -> None:
         """The light of a new keyframe, from those it was matched with."""
@@ -174,8 +186,8 @@ def _compared(
     places, samples = keyframe.flat_places
     places = places[alive]
     there = target[alive] + places - keyframe.cells.points[alive]
-    farther = radial_terms(there, graph.intrinsics, image.size) - radial_terms(places, graph.intrinsics, image.size)
-    return log_ratio_moments(samples[alive], image.levels.at(there), farther)
+    here, across = (radial_terms(points, graph.intrinsics, image.size) for points in (places, there))
+    return log_ratio_moments(samples[alive], image.levels.at(there), (here, across), graph.vignetting)
 
 
 __all__ = ["Photometer", "observed"]

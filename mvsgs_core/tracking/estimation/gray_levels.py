@@ -70,11 +70,14 @@ class Samples:
         return np.asarray((NOISE**2 + (SHARE * self.spread[:, None]) ** 2) / self.level**2)
 
 
-def log_ratio_moments(a: Samples, b: Samples, farther: np.ndarray) -> np.ndarray | None:
-    """Weighted moments (3, 6, 6), a channel each, of z = (1, offset term at the mean level, `farther`, log b / a).
+def log_ratio_moments(
+    a: Samples, b: Samples, radial: tuple[np.ndarray, np.ndarray], dark: np.ndarray
+) -> np.ndarray | None:
+    """Weighted moments (3, 6, 6), a channel each, of z = (1, offset term, radial terms' change, log b / a).
 
-    farther (N, 3): radial terms in b less those in a. Weights are those of independent samples, outliers down-weighted
-    (Cauchy), so that the moments are information. None where there are too few samples.
+    radial: terms (N, 3) in a and b. dark (3,): the vignetting as far as it is known, log V = dark · radial; without it
+    the mean levels of the offset term are. Weights are those of independent samples, outliers down-weighted (Cauchy),
+    so that the moments are information. None where there are too few samples.
     """
     known = np.isfinite(a.level).all(axis=1) & np.isfinite(b.level).all(axis=1)
     if known.sum() < MIN_SAMPLES:
@@ -91,8 +94,10 @@ def log_ratio_moments(a: Samples, b: Samples, farther: np.ndarray) -> np.ndarray
         robust = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2)
     z = np.empty((3, len(sigma), TERMS))
     z[..., 0] = 1.0
-    z[..., 1] = offset_term(np.exp(0.5 * (log_a + log_b))).T  # noise of the ratio is not in it
-    z[..., 2:5] = farther[known]
+    at_a, at_b = (r[known] for r in radial)
+    even = 0.5 * (log_a + log_b - ((at_a + at_b) @ dark)[:, None])  # noise of the ratio is not in it
+    z[..., 1] = offset_term(np.exp(even)).T
+    z[..., 2:5] = at_b - at_a
     z[..., 5] = ratio.T
     weight = (robust[:, None] / (variance * scale**2)).T
     return np.asarray(np.einsum("cni,cn,cnj->cij", z, weight, z, optimize=True))

@@ -26,6 +26,8 @@ _PRIOR_EDGES = 10  # ... so many of them
 STEP = 2.0 / 255.0  # gray levels, root mean square: less is no change, texture that is resampled differs by as much
 KNOWN_SIGMA = 0.02  # of a known exposure's logarithm: shutters and apertures are rounded
 _EXPONENT, _EXPONENT_SIGMA = 0.5, 0.25  # of gray levels over exposure: gamma-coded images have about 1 / 2.2
+WHITE_SIGMA = 0.1  # by which channels may differ between two images, log ratio: taken out of what they say together
+_CONTRASTS = np.array([[1.0, 1.0], [0.0, -2.0], [-1.0, 1.0]]) / np.sqrt([2.0, 6.0])  # of the channels, (3, 2)
 _STEPS = 8
 _GLOBAL = 3  # parameters of the vignetting
 
@@ -65,7 +67,7 @@ class Photometry:
 
     def step(self, moments: np.ndarray) -> tuple[float, float, np.ndarray]:
         """Gain, lift and white balance (3,) of an edge's end over its start, from the edge's moments (3, 6, 6)."""
-        pooled = moments.mean(axis=0)
+        pooled = _pooled(moments)
         ratio = pooled[:2, 5] - pooled[:2, 2:5] @ self.vignetting
         if self.own_lifts:
             gain, lift = np.linalg.solve(pooled[:2, :2] + 1e-9 * np.eye(2), ratio)
@@ -76,13 +78,13 @@ class Photometry:
         if not np.any(self.white):
             return float(gain), float(lift), np.zeros(3)
         first = moments[:, 0]
-        left = (first[:, 5] - first[:, 2:5] @ self.vignetting - lift * first[:, 1]) / first[:, 0]
+        left = first[:, 5] - first[:, 2:5] @ self.vignetting - gain * first[:, 0] - lift * first[:, 1]
+        left = left / (first[:, 0] + self.response * first[:, 1])
         return float(gain), float(lift), left - left.mean()
 
-    @staticmethod
-    def affine(gain: float, lift: float, white: np.ndarray) -> np.ndarray:
+    def affine(self, gain: float, lift: float, white: np.ndarray) -> np.ndarray:
         """(3, 4) float32 color affine [A | b] of a log gain, a lift and the channels' log gains (3,)."""
-        slope, offset = affine(gain + white, np.full(3, lift))
+        slope, offset = affine(gain + white, lift + self.response * white)
         return np.concatenate([np.diag(slope), offset[:, None]], axis=1).astype(np.float32)
 
 
@@ -92,7 +94,7 @@ class _Solver:
     def __init__(self, edges: PhotometricEdges, count: int, known: np.ndarray) -> None:
         """known (K,): log exposures, NaN where they are not known."""
         self.edges, self.count = edges, count
-        self.moments = edges.moments.mean(axis=1)  # the channels' errors are one: they count once
+        self.moments = _pooled(edges.moments)
         self.known = np.flatnonzero(np.isfinite(known))
         self.logs = known[self.known] - known[self.known].mean() if len(self.known) else known[:0]
         self.trust = np.ones(len(self.moments))
@@ -222,7 +224,7 @@ def solve_photometry(edges: PhotometricEdges, count: int, known: np.ndarray | No
     information = solver.of_nodes()
     nodes, response, own_lifts = _chosen(solver.nodes, information, count, len(edges.source))
     gains, lifts = nodes[:count], nodes[count:]
-    white = _white_balance(edges, count, gains, lifts, vignetting)
+    white = _white_balance(edges, gains, lifts, vignetting, response)
     u, w = np.sqrt(solver.effects)
     sigma = np.sqrt(np.diag(np.linalg.inv(_centered(information[:count, :count]))))
     found = Photometry(gains, lifts, white, sigma, vignetting, response, own_lifts, (float(u), float(w)))
@@ -271,15 +273,24 @@ def _gains_along(nodes: np.ndarray, information: np.ndarray, response: float) ->
     return np.asarray(np.linalg.solve(inner + 1e-9 * np.trace(inner) / n * np.eye(n), both @ nodes))
 
 
+def _pooled(moments: np.ndarray) -> np.ndarray:
+    """The channels' moments (..., 3, R, 6) as one, (..., R, 6): their errors are one and count once; what channels
+    differ by is marginalized, or a change of color would be taken for one of the dark levels."""
+    first, rows = moments[..., 0, :] / 3.0, moments[..., :, 0] / 3.0
+    weight = _CONTRASTS.T @ (first[..., :1] * _CONTRASTS) + np.eye(2) / WHITE_SIGMA**2
+    with_contrasts = np.swapaxes(rows, -1, -2) @ _CONTRASTS
+    return np.asarray(moments.mean(axis=-3) - with_contrasts @ np.linalg.solve(weight, _CONTRASTS.T @ first))
+
+
 def _white_balance(
-    edges: PhotometricEdges, count: int, gains: np.ndarray, lifts: np.ndarray, vignetting: np.ndarray
+    edges: PhotometricEdges, gains: np.ndarray, lifts: np.ndarray, vignetting: np.ndarray, response: float
 ) -> np.ndarray:
     """(K, 3) log gains of the channels over the image's, from what gains leave of each; zeros if they do not show."""
-    a, b, n = edges.source, edges.to, count
+    a, b, n = edges.source, edges.to, len(gains)
     first = edges.moments[:, :, 0]  # (E, 3, 6)
-    left = (first[..., 5] - first[..., 2:5] @ vignetting - (lifts[b] - lifts[a])[:, None] * first[..., 1]) / first[
-        ..., 0
-    ]
+    left = first[..., 5] - first[..., 2:5] @ vignetting
+    left -= (gains[b] - gains[a])[:, None] * first[..., 0] + (lifts[b] - lifts[a])[:, None] * first[..., 1]
+    left /= first[..., 0] + response * first[..., 1]  # a channel's gain has its lift, by the response
     left -= left.mean(axis=1, keepdims=True)
     own = 1.0 / first[..., 0].mean(axis=1)
     white, variance, trust = np.zeros((n, 3)), EDGE_SIGMA**2, np.ones(len(own))

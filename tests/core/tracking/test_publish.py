@@ -146,3 +146,42 @@ def test_a_tracker_with_one_segment_says_none() -> None:
     correction = publisher.corrections(everything=True)
     assert correction is not None
     assert correction.segment is None
+
+
+class Lamp:
+    """Exposures and vignetting as a tracker knows them."""
+
+    def __init__(self) -> None:
+        self.gains: dict[int, float] = {}
+        self.vignetting: np.ndarray | None = None
+
+    def exposure(self, index: int) -> np.ndarray | None:
+        gain = self.gains.get(index)
+        return None if gain is None else gain * np.eye(3, 4, dtype=np.float32)
+
+
+def test_exposures_go_out_where_a_gray_level_changes_and_back_to_the_identity() -> None:
+    graph, lamp = Map(3), Lamp()
+    publisher = Publisher(graph, TOLERANCE, light=lamp)
+    publisher.publish_all(sorted(graph.keyframes), settled=True)
+    graph.move(0, 3.0 * TOLERANCE)
+    steady = publisher.corrections()
+    assert steady is not None
+    assert steady.exposure is None
+    lamp.gains = {0: 1.2, 10: 1.001, 20: 0.8}
+    lit = publisher.corrections()
+    assert lit is not None
+    assert lit.index.tolist() == [0, 20]
+    assert lit.vignetting is None
+    np.testing.assert_allclose(lit.exposure[:, 0, 0], [1.2, 0.8])
+    lamp.vignetting = np.array([-0.2, 0.0, 0.0], np.float32)
+    darker = publisher.corrections()
+    assert darker is not None
+    assert darker.index.tolist() == [0, 10, 20]
+    np.testing.assert_array_equal(darker.vignetting, lamp.vignetting)
+    assert publisher.corrections() is None
+    lamp.gains, lamp.vignetting = {}, None
+    off = publisher.corrections()
+    assert off is not None
+    np.testing.assert_array_equal(off.exposure, np.tile(np.eye(3, 4, dtype=np.float32), (3, 1, 1)))
+    np.testing.assert_array_equal(off.vignetting, np.zeros(3))
