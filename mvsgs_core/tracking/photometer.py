@@ -26,8 +26,6 @@ _OBSERVATION = np.dtype(
     [("reference", "<i8"), ("moments", "<f4", (3, 2, TERMS))]
 )  # the rows that `Photometry.step` asks
 
-Light = tuple[float, float, np.ndarray]  # log gain, lift, white balance (3,)
-
 
 class Seen(Protocol):
     """What is asked of a frame's record."""
@@ -53,7 +51,7 @@ class Photometer:
         self.stats = stats
         self.photometry = Photometry.steady(0)
         self._order: list[int] = []  # keyframes of the last solution
-        self._lights: dict[int, Light] = {}  # of the keyframes
+        self._lights: dict[int, np.ndarray] = {}  # (5,) of the keyframes, see `Photometry.lights`
         self._moments: dict[tuple[int, int], tuple[Edge, np.ndarray | None]] = {}  # of every edge as it was matched
 
     @property
@@ -67,7 +65,7 @@ class Photometer:
         """(3, 4) float32 color affine of a keyframe; None where exposures do not vary."""
         if not self.photometry.varies or index not in self._lights:
             return None
-        return self.photometry.affine(*self._lights[index])
+        return self.photometry.affine(self._lights[index])
 
     def of_frames(self, records: Sequence[Seen], posed: np.ndarray) -> np.ndarray | None:
         """(N, 3, 4) float32 color affines of frames, NaN where they are not known or not `posed` (N,); None where
@@ -78,7 +76,7 @@ class Photometer:
         for k, record in enumerate(records):
             light = self._of_frame(record) if posed[k] else None
             if light is not None:
-                found[k] = self.photometry.affine(*light)
+                found[k] = self.photometry.affine(light)
         return found
 
     def update(self, whole: bool = False) -> None:
@@ -128,36 +126,33 @@ class Photometer:
             self.stats.warn(f"exposures could not be solved for: {error}")
             return
         self.graph.vignetting = p.vignetting
-        lights = {index: (float(p.gains[n]), float(p.lifts[n]), p.white[n]) for n, index in enumerate(order)}
+        lights = dict(zip(order, p.lights))
         if p.varies and not whole:
             lights = self._kept_still(lights)
         self._order, self._lights = order, lights
 
-    def _kept_still(self, lights: dict[int, Light]) -> dict[int, Light]:
+    def _kept_still(self, lights: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
         """The same in the gauge of before: what is known does not change as a whole with each keyframe that comes."""
         both = self._lights.keys() & lights.keys()
         if not both:
             return lights
-        shift = [np.mean([self._lights[i][k] - lights[i][k] for i in both], axis=0) for k in range(3)]
-        return {index: _moved(light, (float(shift[0]), float(shift[1]), shift[2])) for index, light in lights.items()}
+        shift = np.mean([self._lights[i] - lights[i] for i in both], axis=0)
+        return {index: light + shift for index, light in lights.items()}
 
     def _attach(self, index: int) -> None:
         """The light of a new keyframe, from those it was matched with."""
-        found: list[tuple[float, Light]] = []
+        found: list[tuple[float, np.ndarray]] = []
         for (a, b), (_, moments) in self._moments.items():
             other = b if a == index else a
             if moments is not None and index in (a, b) and other in self._lights:
                 there = moments if b == index else backward(moments)
                 information = 1.0 / (self.photometry.edge_sigma[0] ** 2 + 1.0 / there[:, 0, 0].mean())
-                found.append((float(information), _moved(self._lights[other], self.photometry.step(there))))
+                found.append((float(information), self._lights[other] + self.photometry.step(there)))
         if found:
-            weights = np.array([weight for weight, _ in found])
-            gain, lift, white = (
-                np.average([light[k] for _, light in found], axis=0, weights=weights) for k in range(3)
-            )
-            self._lights[index] = float(gain), float(lift), np.asarray(white)
+            weights, lights = zip(*found)
+            self._lights[index] = np.asarray(np.average(lights, axis=0, weights=weights))
 
-    def _of_frame(self, record: Seen) -> Light | None:
+    def _of_frame(self, record: Seen) -> np.ndarray | None:
         if record.index in self._lights:
             return self._lights[record.index]
         if not record.light:
@@ -166,11 +161,7 @@ class Photometer:
         start = self._lights.get(int(seen["reference"]))
         if start is None:
             return None
-        return _moved(start, self.photometry.step(seen["moments"].astype(np.float64)))
-
-
-def _moved(light: Light, step: Light) -> Light:
-    return light[0] + step[0], light[1] + step[1], light[2] + step[2]
+        return np.asarray(start + self.photometry.step(seen["moments"].astype(np.float64)))
 
 
 def _compared(

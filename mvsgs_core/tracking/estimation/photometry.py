@@ -65,25 +65,32 @@ class Photometry:
     def varies(self) -> bool:
         return bool(np.any(self.gains) or np.any(self.white))
 
-    def step(self, moments: np.ndarray) -> tuple[float, float, np.ndarray]:
-        """Gain, lift and white balance (3,) of an edge's end over its start, from the edge's moments (3, 6, 6)."""
-        pooled = _pooled(moments)
-        ratio = pooled[:2, 5] - pooled[:2, 2:5] @ self.vignetting
+    @property
+    def lights(self) -> np.ndarray:
+        """(K, 5) log gain, lift and white balance: what adds up along edges."""
+        return np.column_stack([self.gains, self.lifts, self.white])
+
+    def step(self, moments: np.ndarray) -> np.ndarray:
+        """Light (5,) of an edge's end less that of its start, from its moments (3, 6, 6), or their first two rows."""
+        pooled = _pooled(moments[:, :2])
+        ratio = pooled[:, 5] - pooled[:, 2:5] @ self.vignetting
         if self.own_lifts:
-            gain, lift = np.linalg.solve(pooled[:2, :2] + 1e-9 * np.eye(2), ratio)
+            gain, lift = np.linalg.solve(pooled[:, :2] + 1e-9 * np.eye(2), ratio)
         else:
             along = np.array([1.0, self.response])
-            gain = float(along @ ratio / (along @ pooled[:2, :2] @ along))
+            gain = along @ ratio / (along @ pooled[:, :2] @ along)
             lift = self.response * gain
-        if not np.any(self.white):
-            return float(gain), float(lift), np.zeros(3)
-        first = moments[:, 0]
-        left = first[:, 5] - first[:, 2:5] @ self.vignetting - gain * first[:, 0] - lift * first[:, 1]
-        left = left / (first[:, 0] + self.response * first[:, 1])
-        return float(gain), float(lift), left - left.mean()
+        result = np.array([gain, lift, 0.0, 0.0, 0.0])
+        if np.any(self.white):
+            first = moments[:, 0]
+            left = first[:, 5] - first[:, 2:5] @ self.vignetting - gain * first[:, 0] - lift * first[:, 1]
+            left = left / (first[:, 0] + self.response * first[:, 1])
+            result[2:] = left - left.mean()
+        return result
 
-    def affine(self, gain: float, lift: float, white: np.ndarray) -> np.ndarray:
-        """(3, 4) float32 color affine [A | b] of a log gain, a lift and the channels' log gains (3,)."""
+    def affine(self, light: np.ndarray) -> np.ndarray:
+        """(3, 4) float32 color affine [A | b] of a light (5,)."""
+        gain, lift, white = light[0], light[1], light[2:]
         slope, offset = affine(gain + white, lift + self.response * white)
         return np.concatenate([np.diag(slope), offset[:, None]], axis=1).astype(np.float32)
 

@@ -144,7 +144,7 @@ def test_a_step_to_a_frame_is_that_of_the_solution() -> None:
     edges = camera.edges()
     found = solve_photometry(edges, camera.count)
     a, b = int(edges.source[10]), int(edges.to[10])
-    gain, lift, white = found.step(edges.moments[10, :, :2])
+    gain, lift, *white = found.step(edges.moments[10, :, :2])
     assert gain == pytest.approx(camera.gains[b] - camera.gains[a], abs=0.01)
     assert lift == pytest.approx(camera.lifts[b] - camera.lifts[a], abs=0.01)
     np.testing.assert_allclose(white, camera.whites[b] - camera.whites[a], atol=0.01)
@@ -157,7 +157,7 @@ def test_affines_are_the_levels_that_the_model_gives() -> None:
         level += (gain * level + lift * (MIDDLE - level)) / steps
     slope, offset = affine(np.array(gain), np.array(lift))
     assert 0.2 * slope + offset == pytest.approx(level, rel=1e-4)
-    matrix = Photometry.steady(1).affine(gain, lift, np.array([0.1, 0.0, -0.1]))
+    matrix = Photometry.steady(1).affine(np.array([gain, lift, 0.1, 0.0, -0.1]))
     assert matrix.shape == (3, 4)
     assert matrix.dtype == np.float32
     assert np.log(matrix[0, 0] / matrix[1, 1]) == pytest.approx(0.1, abs=1e-6)
