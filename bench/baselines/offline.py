@@ -57,7 +57,7 @@ Train = Callable[[Way, float], Trained]  # in so many processor seconds
 def choices(ours: Ours) -> dict[str, tuple[Any, ...]]:
     """What there is of each part of a way, the first ones the start."""
     exposures = ("none", "trained") if ours.exposures is None else ("none", "trained", "tracker")
-    return {"frames": ("keyframes", "all"), "exposure": exposures, "settle": (0.5, 0.25, 0.75)}
+    return {"frames": ("keyframes", "all"), "exposure": exposures, "settle": (0.5, 0.25, 0.1)}
 
 
 def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> Trained:

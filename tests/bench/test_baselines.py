@@ -96,7 +96,7 @@ def test_theirs_is_trained_in_every_way_and_the_best_goes_on_until_twice_the_tim
     assert measured["exposure"] == ("none", "trained", "tracker")  # where our tracker has exposures, theirs too
     kept = offline.kept_in(tmp_path / "trained.json", train)
     best, tried = offline.best_way(offline.choices(ours), kept, ours.optimization)
-    assert best == Way("all", "trained", 0.25)
+    assert best == Way("all", "trained", 0.1)
     assert len(tried) == 5
     cut_short = offline.train_longer(best, kept, 3.0, 2.0)
     assert not offline.converged(cut_short)
