@@ -4,10 +4,10 @@
     python -m bench.before --other ../before
 
 One run at a time, the mapper with one thread; whatever else the machine does meets both. Figures are those of each
-checkout's own report, a scene's parameters are called as the checkout calls them; where a report has no figures of the
-protocol that fits held-out cameras at test time, its map is scored so here. Without --other this checkout is
-compared with itself: what it shows then is noise. --fewer 10:100,5:50 runs this checkout with so many iterations a
-keyframe and at the end, too: the cheapest that is as good as before tells what the map of before costs now.
+checkout's own report, a scene's parameters are called as the checkout calls them. Where a report has no figure of each
+held-out frame, and none of the protocol that fits its camera at test time, the map is scored so here. Without --other
+this checkout is compared with itself: what it shows then is noise. --fewer 10:100,5:50 runs this checkout with so many
+iterations a keyframe and at the end, too: the cheapest that is as good as before tells what the map of before costs.
 """
 
 from __future__ import annotations
@@ -121,23 +121,36 @@ def check(checkout: Path) -> None:
         raise ValueError(f"{checkout} would run {what}: it needs a .venv of its own; `make setup` there")
 
 
-def with_fitted(run: Run) -> Run:
-    """With the figures of the protocol that fits a held-out frame's camera at test time: as the run's report has them,
-    or if that knows no such protocol found here, and kept beside it."""
+def completed(run: Run) -> Run:
+    """With the figure of each held-out frame, and those by the protocol that fits its camera at test time: as the run's
+    report has them, or if that of an earlier checkout has not, scored here and kept beside it. Raises ValueError where
+    what is scored here is not what the report says."""
     if run.report is None or figure(run.report, "rendering.held_out_fitted.psnr") is not None:
         return run
-    file = run.folder / "fitted.json"
+    file = run.folder / "scored.json"
     if not file.exists():
-        found = FinishedRun(run.folder, frames_of(run.folder)).fitted()
-        file.write_text(json.dumps(found))
-    rendering = {**run.report["rendering"], "held_out_fitted": json.loads(file.read_text())}
-    return replace(run, report={**run.report, "rendering": rendering})
+        found = FinishedRun(run.folder, frames_of(run.folder))
+        frames = [{"index": index, "psnr": psnr, "held_out": True} for index, psnr in found.psnr.items()]
+        file.write_text(json.dumps({"frames": frames, "held_out_fitted": found.fitted()}))
+    return replace(run, report={**run.report, "rendering": {**run.report["rendering"], **json.loads(file.read_text())}})
+
+
+def of_common_frames(before: Report, after: Report) -> tuple[float, float, int] | None:
+    """PSNR before and after over the frames that are held out in both, and how many they are."""
+    known = [
+        {frame["index"]: frame["psnr"] for frame in report["rendering"].get("frames", ()) if frame["held_out"]}
+        for report in (before, after)
+    ]
+    common = sorted(known[0].keys() & known[1].keys())
+    if not common:
+        return None
+    old, new = (float(np.mean([psnr[index] for index in common])) for psnr in known)
+    return old, new, len(common)
 
 
 def rows_of(scene: str, before: Sequence[Run], after: Sequence[Run]) -> list[Row]:
     """Of the seeds that both have: means with half the range, and the change from seed to seed."""
-    counts = {int(n) for run in after if (n := figure(run.report, "rendering.held_out.count")) is not None}
-    rows = [Row(f"{PSNR.table}: {scene}: number", ", ".join(str(n) for n in sorted(counts)))] if counts else []
+    rows = _common_rows(scene, before, after)
     for shown in FIGURES:
         pairs = list(_pairs(shown, before, after))
         if not pairs:
@@ -153,6 +166,23 @@ def rows_of(scene: str, before: Sequence[Run], after: Sequence[Run]) -> list[Row
         goal = _goal_of_change(scene, shown, changes)
         rows.append(Row(f"{name}, {kind}", float(changes.mean()), unit, *goal, spread=_spread(changes)))
     return rows
+
+
+def _common_rows(scene: str, before: Iterable[Run], after: Iterable[Run]) -> list[Row]:
+    old = {run.seed: run.report for run in before if run.report}
+    pairs = [of_common_frames(old[run.seed], run.report) for run in after if run.report and run.seed in old]
+    known = np.array([pair for pair in pairs if pair is not None], dtype=float).reshape(-1, 3)
+    if not len(known):
+        return []
+    title = f"Frames that are held out in both: {scene}"
+    changes = known[:, 1] - known[:, 0]
+    return [
+        Row(f"{title}: number", ", ".join(dict.fromkeys(f"{count:.0f}" for count in known[:, 2]))),
+        Row(f"{title}: PSNR, before", float(known[:, 0].mean()), "dB", spread=_spread(known[:, 0])),
+        Row(f"{title}: PSNR, after", float(known[:, 1].mean()), "dB", spread=_spread(known[:, 1])),
+        Row(f"{title}: PSNR, change", float(changes.mean()), "dB", *_goal_of_change(scene, PSNR, changes),
+            spread=_spread(changes)),
+    ]  # fmt: skip
 
 
 def _pairs(shown: Figure, before: Iterable[Run], after: Iterable[Run]) -> Iterable[tuple[float, float]]:
@@ -226,9 +256,15 @@ def measure(options: argparse.Namespace) -> list[Row]:
                 given = [*SCENES.get(scene, ()), *overrides, *settings]
                 matrix = Matrix([scene], seeds=[seed], overrides=given, checkout=checkout)
                 found = made[checkout].runs({place(scene, seed, side): matrix})
-                runs[scene].setdefault(side, []).extend(with_fitted(run) for run in found)
+                runs[scene].setdefault(side, []).extend(found)
     rows = [Row(side, ", ".join(made[path].commits)) for side, path in (("before", other), ("after", ROOT))]
     for scene, by_side in runs.items():
+        for side, group in by_side.items():
+            for k, run in enumerate(group):
+                try:
+                    group[k] = completed(run)
+                except ValueError as error:
+                    rows.append(Row(f"{scene}, {side}, seed {run.seed}: scored here", str(error)))
         rows += rows_of(scene, by_side["before"], by_side["after"])
         if options.fewer:
             rows += at_equal_quality(scene, by_side["before"], {k: v for k, v in by_side.items() if k != "before"})
