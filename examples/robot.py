@@ -46,7 +46,8 @@ def frames(arguments: argparse.Namespace) -> Iterator[Frame]:
         began = now - item.timestamp if began is None else began
         if not arguments.fast:
             time.sleep(max(0.0, began + item.timestamp - now))
-        yield Frame(item.index, item.timestamp, item.image, item.intrinsics, item.intrinsics_guessed)
+        guessed, exposure = item.intrinsics_guessed, item.exposure
+        yield Frame(item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure)
     for warning in sequence.warnings:
         say(f"warning: {warning}")
 

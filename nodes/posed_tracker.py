@@ -1,4 +1,4 @@
-"""Frame, GroundTruth -> Keyframe, Trajectory: true poses, so that the later stages can be measured alone."""
+"""Frame, GroundTruth -> Keyframe, Poses, Trajectory: true poses, so that the later stages can be measured alone."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msgs import Frame, GroundTruth, Keyframe, TrackingState, Trajectory
+from msgs import Frame, GroundTruth, Keyframe, Poses, TrackingState, Trajectory
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import PosedConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import rectified
 from mvsgs_core.tracking.posed import PosedTracker as CoreTracker
+from mvsgs_core.tracking.publish import affine_of, changed_vignetting, differ
 from nodes import Node
 from nodes.tracking import warn_of_guessed_focal
 
 
 class PosedTracker(Node):
-    """The two inputs are joined by index, in whatever order they come; scale is always 1."""
+    """The two inputs are joined by index, in whatever order they come; scale is always 1.
+
+    Poses say what exposures and vignetting are now: the poses in them stay.
+    """
 
     @dataclass(frozen=True)
     class Config(PosedConfig):
@@ -31,23 +35,26 @@ class PosedTracker(Node):
         self._frames: dict[int, Frame] = {}  # without their truth yet, or keyframes that are not complete
         self._truths: dict[int, GroundTruth] = {}  # without their frames yet
         self._joined: dict[int, tuple[float, np.ndarray]] = {}  # timestamp and pose (4, 4), NaN where there is none
-        self._keyframes: set[int] = set()
+        self._keyframes: dict[int, np.ndarray | None] = {}  # with the exposure (3, 4) that was sent
+        self._vignetting: np.ndarray | None = None  # (3,) that was sent
+        self._revision = 0
 
-    def on_frame(self, frame: Frame) -> Iterator[Keyframe]:
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
         self._frames[frame.index] = frame
         warn_of_guessed_focal(self.stats, frame)
         if frame.index in self._truths:
             yield from self._join(frame.index)
 
-    def on_ground_truth(self, truth: GroundTruth) -> Iterator[Keyframe]:
+    def on_ground_truth(self, truth: GroundTruth) -> Iterator[Keyframe | Poses]:
         self._truths[truth.index] = truth
         if truth.index in self._frames:
             yield from self._join(truth.index)
 
-    def on_end(self) -> Iterator[Keyframe | Trajectory]:
+    def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
         if self._core is not None:
             for index in self._core.finish():
                 yield self._keyframe(self._core, index)
+            yield from self._exposed(self._core)
             self.stats.include(self._core.stats)
         else:
             self.stats.nothing(
@@ -64,6 +71,8 @@ class PosedTracker(Node):
         order = sorted(self._joined)
         poses = np.array([self._joined[index][1] for index in order], np.float64).reshape(n, 4, 4)
         known = np.isfinite(poses).all(axis=(1, 2))
+        exposures = {} if self._core is None else self._core.exposures()
+        unknown = np.full((3, 4), np.nan, np.float32)
         yield Trajectory(
             index=np.array(order, np.int64),
             timestamp=np.array([self._joined[index][0] for index in order], np.float64),
@@ -72,9 +81,11 @@ class PosedTracker(Node):
             state=np.where(known, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8),
             segment=np.where(known, 0, -1).astype(np.int32),
             readout_time=self.config.readout_time,
+            exposure=np.stack([exposures.get(i, unknown) for i in order]) if exposures else None,
+            vignetting=None if self._core is None else self._core.photometer.vignetting,
         )
 
-    def _join(self, index: int) -> Iterator[Keyframe]:
+    def _join(self, index: int) -> Iterator[Keyframe | Poses]:
         frame, pose = self._frames[index], self._truths.pop(index).world_from_cam
         self._joined[index] = (frame.timestamp, np.full((4, 4), np.nan) if pose is None else pose)
         if pose is None:
@@ -84,15 +95,17 @@ class PosedTracker(Node):
             return
         if self._core is None:
             self._core = CoreTracker(self.config, frame.image.shape[:2], frame.intrinsics)
-        for done in self._core.add(index, frame.timestamp, frame.image, pose):
+        for done in self._core.add(index, frame.timestamp, frame.image, pose, frame.exposure):
             yield self._keyframe(self._core, done)
+            yield from self._exposed(self._core)
         for old in (self._frames.keys() & self._joined.keys()) - self._core.pending:
             del self._frames[old]
         self.stats.include(self._core.stats)
 
     def _keyframe(self, core: CoreTracker, index: int) -> Keyframe:
         frame, keyframe = self._frames[index], core.keyframe(index)
-        self._keyframes.add(index)
+        light = core.photometer
+        self._keyframes[index] = light.exposure(index)
         inverse_depth, weight = coarse_map(keyframe)
         return Keyframe(
             index=index,
@@ -104,4 +117,27 @@ class PosedTracker(Node):
             inverse_depth=inverse_depth,
             inverse_depth_weight=weight,
             segment=0,
+            exposure=self._keyframes[index],
+            vignetting=light.vignetting,
+        )
+
+    def _exposed(self, core: CoreTracker) -> Iterator[Poses]:
+        """What the light of the keyframes sent is now, where it changed."""
+        now = {index: core.photometer.exposure(index) for index in self._keyframes}
+        vignetting = changed_vignetting(core.photometer.vignetting, self._vignetting)
+        changed = [
+            index for index, sent in self._keyframes.items() if vignetting is not None or differ(now[index], sent)
+        ]
+        if not changed:
+            return
+        self._revision += 1
+        self._keyframes.update({index: now[index] for index in changed})
+        self._vignetting = self._vignetting if vignetting is None else vignetting
+        yield Poses(
+            self._revision,
+            np.array(changed, np.int64),
+            np.stack([self._joined[index][1] for index in changed]),
+            np.ones(len(changed)),
+            exposure=np.stack([affine_of(now[index]) for index in changed]),
+            vignetting=vignetting,
         )

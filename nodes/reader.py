@@ -54,7 +54,8 @@ class Reader(Node):
                 if self.config.realtime:
                     pace.wait(item.timestamp)
                 self.stats.count("frames")
-                yield Frame(item.index, item.timestamp, item.image, item.intrinsics, item.intrinsics_guessed)
+                guessed, exposure = item.intrinsics_guessed, item.exposure
+                yield Frame(item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure)
                 yield _ground_truth(item)
         finally:  # also when the run is interrupted
             self._pass_warnings_on(sequence)

@@ -33,7 +33,7 @@ def test_contracts() -> None:
     assert handlers(Tracker).keys() == {Frame}
     assert set(outputs(Tracker)) == {Keyframe, Poses, TrackerPhase, Trajectory}
     assert handlers(PosedTracker).keys() == {Frame, GroundTruth}
-    assert set(outputs(PosedTracker)) == {Keyframe, Trajectory}
+    assert set(outputs(PosedTracker)) == {Keyframe, Poses, Trajectory}
 
 
 @pytest.mark.slow

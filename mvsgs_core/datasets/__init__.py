@@ -29,6 +29,7 @@ class Item:
     world_from_cam: np.ndarray | None = None  # (4, 4) float64
     depth: np.ndarray | None = None  # (H, W) float32, z in the poses' unit, 0 = unknown
     intrinsics_guessed: bool = False  # the focal length is a guess, to be estimated by who can
+    exposure: float = 0.0  # exposure time times gain over f-number², in a unit that the sequence keeps; 0: not known
 
 
 class Sequence(Protocol):

@@ -1,4 +1,4 @@
-"""Intrinsics from the EXIF header of a photograph: good to a few percent, a start where nothing better is known."""
+"""What the EXIF header of a photograph tells: intrinsics, good to a few percent, and its exposure."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from mvsgs_core.datasets.lens import Lens
 
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405  # millimeters
+_EXPOSURE_TIME, _F_NUMBER, _SENSITIVITY = 0x829A, 0x829D, 0x8827  # seconds, -, ISO
 _PLANE_X_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210  # sensor pixels per unit
 _PIXEL_WIDTH, _PIXEL_HEIGHT = 0xA002, 0xA003  # of the picture as taken
 _UNIT_MILLIMETERS = {2: 25.4, 3: 10.0, 4: 1.0}
@@ -39,6 +40,22 @@ def read_exif_lens(path: Path) -> Lens | None:
         return Lens((focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), (height, width))
     except ValueError:  # a focal length that no camera has
         return None
+
+
+def read_exif_exposure(path: Path) -> float:
+    """Exposure time (s) times ISO over the f-number squared; 0 where the header lacks one of them or cannot be read."""
+    try:
+        with opened_image(path, path.name) as image:
+            header = image.getexif().get_ifd(_EXIF_IFD)
+    except UnreadableImageError:
+        return 0.0
+    sensitivity = header.get(_SENSITIVITY)
+    if isinstance(sensitivity, tuple):  # of several kinds, the first is the one that counts
+        sensitivity = sensitivity[0] if sensitivity else None
+    seconds, stop, iso = (_positive(v) for v in (header.get(_EXPOSURE_TIME), header.get(_F_NUMBER), sensitivity))
+    if seconds is None or stop is None or iso is None:
+        return 0.0
+    return _positive(seconds * iso / stop**2) or 0.0
 
 
 def _from_sensor(header: dict[int, object], longer_side: int) -> float | None:

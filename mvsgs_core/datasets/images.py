@@ -9,7 +9,7 @@ from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import image_size, lens_from_option
 from mvsgs_core.datasets.colmap import find_colmap, read_colmap
-from mvsgs_core.datasets.exif import read_exif_lens
+from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens
 from mvsgs_core.datasets.files import IMAGE_SUFFIXES, Layout, images_in, natural_order
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model
@@ -71,6 +71,9 @@ class Images(ImageSequence):
             without = len(images) - len(known)
             self.warnings.append(f"images without an EXIF focal length, which take the first one's: {without}")
         return [lens if lens is not None else known[0] for lens in found]
+
+    def _exposure(self, record: Record) -> float:
+        return read_exif_exposure(record.image)
 
 
 def _find_images(folder: Path) -> list[Path]:

@@ -163,7 +163,12 @@ class ImageSequence(FileReader, ABC):
         depth = self._depth(record, native)
         if depth is not None:
             depth = self._framing.depth(depth, lens, size)
-        return Item(index, record.timestamp, framed, intrinsics, record.world_from_cam, depth, lens.guessed)
+        pose, exposure = record.world_from_cam, self._exposure(record)
+        return Item(index, record.timestamp, framed, intrinsics, pose, depth, lens.guessed, exposure)
+
+    def _exposure(self, record: Record) -> float:
+        """As in `Item`: of most sets nothing is known of it."""
+        return 0.0
 
     def _registered(self, depth: np.ndarray) -> np.ndarray:
         """The depth map (h, w) as the color camera would see it: of most sets it is already."""

@@ -8,6 +8,7 @@ solution has the mean over the keyframes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -43,6 +44,14 @@ def observed(graph: KeyframeGraph, reference: int, image: TrackingImage, matches
     if moments is None:
         return b""
     return np.array((reference, moments[:, :2]), _OBSERVATION).tobytes()
+
+
+@dataclass(frozen=True)
+class FrameLight:
+    """What is known of the light of a frame that has no other record."""
+
+    index: int
+    light: bytes = b""  # see `observed`
 
 
 class Photometer:
@@ -181,4 +190,4 @@ def _compared(
     return log_ratio_moments(samples[alive], image.levels.at(there), (here, across), graph.vignetting)
 
 
-__all__ = ["Photometer", "observed"]
+__all__ = ["FrameLight", "Photometer", "observed"]

@@ -19,6 +19,7 @@ from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, newest
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import Matches, make_flow
 from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.photometer import FrameLight, Photometer, observed
 
 FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to be apart where no match says it
 
@@ -43,15 +44,23 @@ class PosedTracker:
         self.choice = KeyframeChoice(config.keyframe_choice)
         self.front_end = FrontEnd(self.graph, matcher, FrontEndConfig(still_flow=0.0), self.threads)
         self.local_map = LocalMap(self.graph, matcher, config.local_map, self.threads)
+        self.photometer = Photometer(self.graph, self.stats)
+        self._lights: list[FrameLight] = []  # of all frames
         self.unit = 1.0  # of the given poses' units, one of the graph's
         self._undecided = True  # about the unit: no two keyframes have given the first depth yet
         self._complete: list[int] = []  # keyframes not given out yet
         self._tail: dict[int, tuple[TrackingImage, np.ndarray, Step]] = {}  # the last two frames since
 
-    def add(self, index: int, timestamp: float, image: np.ndarray, world_from_cam: np.ndarray) -> list[int]:
-        """The next frame with its pose (4, 4). Returns the keyframes, by index, that are complete now."""
-        frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color)
+    def add(
+        self, index: int, timestamp: float, image: np.ndarray, world_from_cam: np.ndarray, exposure: float = 0.0
+    ) -> list[int]:
+        """The next frame with its pose (4, 4) and its exposure, 0 where it is not known, as in `msgs.Frame`.
+
+        Returns the keyframes, by index, that are complete now.
+        """
+        frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color, exposure)
         self.stats.count("frames")
+        self._lights.append(FrameLight(index))
         pose = geometry.inverse(world_from_cam)
         pose[:3, 3] /= self.unit
         if self.front_end.reference is None:
@@ -60,6 +69,7 @@ class PosedTracker:
             step = self.front_end.follow(frame, with_pose=False)
         if self.front_end.is_lost(step):
             return self._insert(frame, pose, {})
+        self._lights[-1] = FrameLight(index, observed(self.graph, step.reference, frame, step.matches))
         if not self.choice.wants(index, step, frame.size[1], self.config.keyframe_choice.max_flow):
             if self._complete == [step.reference] and is_held_out(step.reference) and not is_held_out(index):
                 self.graph.remove(step.reference)  # the first frame of all: this one is as good
@@ -81,6 +91,7 @@ class PosedTracker:
         if last is not None:
             frame, pose, step = tail[last]
             complete = self._insert(frame, pose, {step.reference: step.matches})
+        self.photometer.update(whole=True)
         self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.graph.keyframes))
         complete, self._complete, self._tail = complete + self._complete, [], {}
         return complete
@@ -97,6 +108,13 @@ class PosedTracker:
             information=keyframe.information * self.unit**2,
         )
 
+    def exposures(self) -> dict[int, np.ndarray]:
+        """Color affines (3, 4) float32 of the frames that have one, after `finish`; none where light is steady."""
+        known = self.photometer.of_frames(self._lights, np.ones(len(self._lights), bool))
+        if known is None:
+            return {}
+        return {light.index: affine for light, affine in zip(self._lights, known) if np.isfinite(affine).all()}
+
     def _insert(self, frame: TrackingImage, pose: np.ndarray, matches: dict[int, Matches]) -> list[int]:
         """A frame becomes a keyframe; returns those that are complete now. matches: of the reference's points."""
         if self._undecided:
@@ -110,6 +128,7 @@ class PosedTracker:
             solution = self.graph.optimize(recent | around, set(), recent, solver)
         if solution.failure:
             self.stats.warn(f"triangulation failed: {solution.failure}")
+        self.photometer.update()
         for old in members[: -self.config.local_map.window]:
             self.graph.keyframes[old].image.release()
         self.front_end.refer_to(frame)

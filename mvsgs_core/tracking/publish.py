@@ -126,8 +126,9 @@ class Publisher:
     def corrections(self, everything: bool = False) -> Correction | None:
         """Keyframes that moved noticeably, or joined another segment, since they were last published; else None."""
         moved = []
-        vignetting = self._changed_vignetting()
-        everything |= vignetting is not None
+        vignetting = changed_vignetting(None if self.light is None else self.light.vignetting, self._vignetting)
+        if vignetting is not None:
+            everything, self._vignetting = True, vignetting
         for index, last in self._published.items():
             if index not in self.graph.keyframes:
                 continue
@@ -137,7 +138,7 @@ class Publisher:
             shift = np.linalg.norm(pose[:3, 3] - last.world_from_cam[:3, 3]) / depth
             turn = np.linalg.norm(pose[:3, :3] - last.world_from_cam[:3, :3]) / np.sqrt(2.0)
             moves = max(shift, turn, abs(np.log(scale / last.scale))) > self.tolerance
-            if everything or moves or last.segment != segment or _differ(exposure, last.exposure):
+            if everything or moves or last.segment != segment or differ(exposure, last.exposure):
                 last.world_from_cam, last.scale, last.segment, last.exposure = pose, scale, segment, exposure
                 self._lit |= exposure is not None
                 moved.append(index)
@@ -149,20 +150,9 @@ class Publisher:
             np.stack([last.world_from_cam for last in last_of]),
             np.array([last.scale for last in last_of], np.float64),
             None if self.segment_of is None else np.array([last.segment for last in last_of], np.int32),
-            np.stack([_affine(last.exposure) for last in last_of]) if self._lit else None,
+            np.stack([affine_of(last.exposure) for last in last_of]) if self._lit else None,
             vignetting,
         )
-
-    def _changed_vignetting(self) -> np.ndarray | None:
-        """(3,) if it changed noticeably since it was last published."""
-        now = np.zeros(3, np.float32) if self.light is None or self.light.vignetting is None else self.light.vignetting
-        before = np.zeros(3, np.float32) if self._vignetting is None else self._vignetting
-        radius = np.linspace(0.0, 1.0, 9)
-        powers = np.stack([radius**2, radius**4, radius**6], axis=1)
-        if np.abs(powers @ (now - before)).max() <= GRAY_LEVEL:
-            return None
-        self._vignetting = now
-        return now
 
     def _segment(self, index: int) -> int:
         return 0 if self.segment_of is None else self.segment_of(index)
@@ -175,14 +165,33 @@ class Publisher:
         return float(np.median(published.inverse_depth[known] / keyframe.inverse_depth[known]))
 
 
-def _affine(exposure: np.ndarray | None) -> np.ndarray:
+def changed_vignetting(now: np.ndarray | None, before: np.ndarray | None) -> np.ndarray | None:
+    """(3,) the vignetting now, zeros for none, where it differs from that of before by a gray level; else None."""
+    there, last = (np.zeros(3, np.float32) if v is None else v for v in (now, before))
+    radius = np.linspace(0.0, 1.0, 9)
+    powers = np.stack([radius**2, radius**4, radius**6], axis=1)
+    return there if np.abs(powers @ (there - last)).max() > GRAY_LEVEL else None
+
+
+def affine_of(exposure: np.ndarray | None) -> np.ndarray:
+    """(3, 4) float32: the identity where there is none."""
     return np.eye(3, 4, dtype=np.float32) if exposure is None else exposure
 
 
-def _differ(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+def differ(a: np.ndarray | None, b: np.ndarray | None) -> bool:
     """Whether two exposures (3, 4) give black, gray or white by a gray level differently."""
-    off = _affine(a) - _affine(b)
+    off = affine_of(a) - affine_of(b)
     return bool(max(np.abs(off[:, :3].sum(axis=1) * level + off[:, 3]).max() for level in (0.0, 0.5, 1.0)) > GRAY_LEVEL)
 
 
-__all__ = ["Correction", "Keyframes", "Light", "Publisher", "Tracked", "Update"]
+__all__ = [
+    "Correction",
+    "Keyframes",
+    "Light",
+    "Publisher",
+    "Tracked",
+    "Update",
+    "affine_of",
+    "changed_vignetting",
+    "differ",
+]

@@ -189,6 +189,16 @@ def test_focal_length_from_exif(tmp_path: Path) -> None:
     assert "images without an EXIF focal length, which take the first one's: 1" in sequence.warnings
 
 
+def test_exposure_from_exif(tmp_path: Path) -> None:
+    seconds, stop, iso = 0x829A, 0x829D, 0x8827
+    save_photo(tmp_path / "a.jpg", {0xA405: 26, seconds: 0.01, stop: 2.0, iso: 100})
+    save_photo(tmp_path / "b.jpg", {0xA405: 26, seconds: 0.02, stop: 2.0, iso: 400})
+    save_photo(tmp_path / "c.jpg", {0xA405: 26, seconds: 0.02, iso: 400})
+    save_photo(tmp_path / "d.jpg", {0xA405: 26, seconds: 0.0, stop: 2.0, iso: 400})
+    exposures = [item.exposure for item in open_dataset("images", path=tmp_path)]
+    assert exposures == pytest.approx([0.25, 2.0, 0.0, 0.0])
+
+
 def test_photos_are_turned_upright(tmp_path: Path) -> None:
     save_photo(tmp_path / "a.jpg", {0xA405: 26}, orientation=6)
     item = next(iter(open_dataset("images", path=tmp_path)))
