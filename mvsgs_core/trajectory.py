@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
+
+from mvsgs_core import geometry
 
 
 class TrackingState(IntEnum):
@@ -50,6 +52,34 @@ class Trajectory:
             return posed
         segments, counts = np.unique(self.segment[posed], return_counts=True)
         return np.asarray(posed & (self.segment == segments[np.argmax(counts)]))
+
+    def following(self, keyframes: np.ndarray, world_from_cam: np.ndarray) -> Trajectory:
+        """Its main part, moved to where a map has its keyframes (K,), by index: world_from_cam (K, 4, 4).
+
+        The frames between two of them move as they do, on the screw from one motion to the other, linear in time;
+        those before the first and after the last move as that one.
+        """
+        order = np.argsort(keyframes)
+        anchors = np.flatnonzero(self.main() & np.isin(self.index, keyframes))
+        if not len(anchors):
+            return self
+        known = world_from_cam[order[np.searchsorted(keyframes, self.index[anchors], sorter=order)]]
+        if np.array_equal(known, self.world_from_cam[anchors]):
+            return self
+        poses, main = self.world_from_cam.copy(), np.flatnonzero(self.main())
+        origin = poses[anchors[0], :3, 3].copy()  # the world's may be far away
+        poses[:, :3, 3] -= origin
+        target = known.copy()
+        target[:, :3, 3] -= origin
+        moves, times, now = target @ geometry.inverse(poses[anchors]), self.timestamp[anchors], self.timestamp[main]
+        place = np.interp(now, times, np.arange(len(anchors)))
+        before = np.floor(place).astype(int)
+        after = np.minimum(before + 1, len(anchors) - 1)
+        change = geometry.se3_log(geometry.inverse(moves[before]) @ moves[after])
+        poses[main] = moves[before] @ geometry.se3_exp((place - before)[:, None] * change) @ poses[main]
+        poses[:, :3, 3] += origin
+        poses[anchors] = known
+        return replace(self, world_from_cam=poses)
 
 
 __all__ = ["TrackingState", "Trajectory"]

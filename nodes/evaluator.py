@@ -142,7 +142,7 @@ class Evaluator(Node):
         )
         self.evaluation.close()
         replace_text(folder / "report.json", json.dumps(_plain(self.report), indent=1, allow_nan=False))
-        found = self.evaluation.trajectory
+        found = self.evaluation.final_trajectory
         if found is not None:
             with replacing(folder / "trajectory.txt") as aside:
                 write_trajectory(aside, found.timestamp[found.posed], found.world_from_cam[found.posed])

@@ -98,28 +98,35 @@ class Evaluation:
             "notes": notes + self._frames.notes(),
         }
 
+    @property
+    def final_trajectory(self) -> Trajectory | None:
+        """The tracker's, following the keyframes to where the finished map has them."""
+        finished = self.maps.get(True) or self.maps.get(False)
+        if self.trajectory is None or finished is None:
+            return self.trajectory
+        return self.trajectory.following(finished.keyframes, finished.world_from_cam)
+
     def scored_frames(self, refined: bool = True) -> list[scoring.ScoredFrame]:
         """All frames with a pose in the main part of the map whose image is there, in the order of the stream."""
-        finished, tracked = self.maps[refined], self.trajectory
-        assert tracked is not None
+        finished = self.maps[refined]
+        assert self.trajectory is not None
+        tracked = self.trajectory.following(finished.keyframes, finished.world_from_cam)
         frames = []
         main = tracked.main()
         near = NEAR * _typical_depth(finished)
-        place = _places(finished)
         moving = velocities(tracked.timestamp, tracked.world_from_cam, main)
         exposures = self.exposures(refined)
         photographs = self._frames.photographs()
         for k in np.flatnonzero(main & np.isin(tracked.index, list(photographs))):
             index = int(tracked.index[k])
             photograph = photographs[index]
-            pose = finished.world_from_cam[place[index]] if index in place else tracked.world_from_cam[k]
             focal = 1.0 if photograph.as_mapped else tracked.focal_factor
             rolling = tracked.readout_time and not photograph.as_mapped
             frames.append(
                 scoring.ScoredFrame(
                     index,
                     bool(tracked.keyframe[k]),
-                    finished.relative_pose(pose),
+                    finished.relative_pose(tracked.world_from_cam[k]),
                     photograph.intrinsics * [focal, focal, 1.0, 1.0],
                     photograph.image,
                     near,
@@ -185,7 +192,7 @@ class Evaluation:
         return replace(score, fitted=scoring.score_frame(finished.splats, finished.kernel, fitted, self.given).figures)
 
     def _score_trajectory(self, notes: list[str]) -> tuple[trajectory_metrics.Alignment | None, dict[str, Any]]:
-        trajectory = self.trajectory or Trajectory.empty()
+        trajectory = self.final_trajectory or Trajectory.empty()
         poses = known_poses(trajectory, self._truth)
         counts = {**trajectory_metrics.counts(trajectory), "ate_keyframes": int(poses.keyframe.sum())}
         counts["ate_frames"] = len(poses.keyframe)
@@ -204,16 +211,17 @@ class Evaluation:
 
     def aligned_paths(self) -> dict[str, np.ndarray]:
         """Camera positions (N, 3) for a plot: "estimate" in the frame of the "truth" where there is one."""
-        if self.trajectory is None:
+        trajectory = self.final_trajectory
+        if trajectory is None:
             return {}
-        main = self.trajectory.main()
+        main = trajectory.main()
         alignment, _ = self._score_trajectory([])
         if alignment is None:
-            return {"estimate": self.trajectory.world_from_cam[main][:, :3, 3]}
-        known = main & np.isin(self.trajectory.index, list(self._truth))
+            return {"estimate": trajectory.world_from_cam[main][:, :3, 3]}
+        known = main & np.isin(trajectory.index, list(self._truth))
         return {
-            "truth": trajectory_metrics.poses_of(self._truth, self.trajectory.index[known])[:, :3, 3],
-            "estimate": alignment.positions(self.trajectory.world_from_cam[main]),
+            "truth": trajectory_metrics.poses_of(self._truth, trajectory.index[known])[:, :3, 3],
+            "estimate": alignment.positions(trajectory.world_from_cam[main]),
         }
 
     def _score_depths(self, alignment: trajectory_metrics.Alignment | None, notes: list[str]) -> dict[str, Any]:

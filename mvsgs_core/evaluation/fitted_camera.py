@@ -14,6 +14,7 @@ import numpy as np
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.evaluation.scoring import Rendered, ScoredFrame, render_frame
+from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.splats import Splats
 
 SMALLEST = 24  # pixels of the shorter side, below which a resolution is left out
@@ -51,7 +52,7 @@ def fit_camera(splats: Splats, kernel: str, frame: ScoredFrame) -> ScoredFrame:
 def _aligned(splats: Splats, kernel: str, best: _State, target: np.ndarray) -> ScoredFrame:
     """Levenberg-Marquardt (Marquardt 1963) from a state on, at the resolution of `target` (H, W, 3)."""
     damping, refused = DAMPING, 0
-    linear = linearized(best.seen, target, best.frame.intrinsics)
+    linear = linearized(best.seen, target, best.frame)
     for _ in range(RENDERS):
         step = np.linalg.solve(linear.hessian + damping * np.diag(np.diag(linear.hessian)), linear.gradient)
         trial = _seen(splats, kernel, _moved(best.frame, step, linear.length), target)
@@ -60,7 +61,7 @@ def _aligned(splats: Splats, kernel: str, best: _State, target: np.ndarray) -> S
             best, damping, refused = trial, 0.1 * damping, 0
             if fall < CONVERGED:
                 break
-            linear = linearized(best.seen, target, best.frame.intrinsics)
+            linear = linearized(best.seen, target, best.frame)
         else:
             damping, refused = 10.0 * damping, refused + 1
             if refused == REFUSED:
@@ -77,8 +78,8 @@ class Linear:
     length: float  # map units in one of the translation's
 
 
-def linearized(seen: Rendered, target: np.ndarray, intrinsics: np.ndarray) -> Linear:
-    """Of a render against its photograph (H, W, 3); intrinsics (4,) at that size.
+def linearized(seen: Rendered, target: np.ndarray, frame: ScoredFrame) -> Linear:
+    """Of a render against its photograph (H, W, 3), with the frame's intrinsics at that size.
 
     The render follows the camera as the pixels of a still scene of its depth do; where nothing is rendered, or a color
     is cut off at 0 or 1, it follows nothing.
@@ -86,10 +87,13 @@ def linearized(seen: Rendered, target: np.ndarray, intrinsics: np.ndarray) -> Li
     color, depth = seen.color, seen.depth
     known = np.isfinite(depth) & (depth > 0)
     length = float(np.median(depth[known])) if known.any() else 1.0
-    motion = _pixel_motion(np.where(known, depth, np.inf), intrinsics, length)
+    motion = _pixel_motion(np.where(known, depth, np.inf), frame.intrinsics, length)
     motion[~known] = 0.0
-    rows, columns = np.gradient(color, axis=(0, 1))
-    affine = np.concatenate([color, np.ones_like(color[..., :1])], axis=2).reshape(-1, 4)
+    factor = np.ones_like(depth)[..., None]
+    if frame.vignetting is not None:  # of the camera: it comes after the affine and does not move with the scene
+        factor = factor * vignetting_factor(frame.vignetting, frame.intrinsics, target.shape[:2])[..., None]
+    rows, columns = (factor * slope for slope in np.gradient(color / factor, axis=(0, 1)))
+    affine = np.concatenate([color, factor], axis=2).reshape(-1, 4)
     count = MOTION + color.shape[2] * affine.shape[1]
     hessian, gradient = np.zeros((count, count)), np.zeros(count)
     for channel in range(color.shape[2]):

@@ -1,0 +1,73 @@
+"""Frames between keyframes move with them to where a map has them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.trajectory import Trajectory
+
+N = 13
+FAR = np.array([1e6, -2e6, 3e6])
+KEYFRAMES = np.array([3, 6, 10])
+
+
+def tracked() -> Trajectory:
+    twists = np.array([[0.1 * k, 0.02 * k * k, 0.01 * k, 0.0, 0.02 * k, 0.01 * np.sin(k)] for k in range(N)])
+    poses = geometry.se3_exp(twists)
+    poses[:, :3, 3] += FAR
+    index = np.arange(N)
+    return Trajectory(
+        index, index / 30.0, poses, np.isin(index, KEYFRAMES), np.zeros(N, np.uint8), np.zeros(N, np.int32)
+    )
+
+
+def moved(pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """A pose (..., 4, 4) after a motion of the world around FAR."""
+    local = pose.copy()
+    local[..., :3, 3] -= FAR
+    local = motion @ local
+    local[..., :3, 3] += FAR
+    return np.asarray(local)
+
+
+def test_frames_between_keyframes_follow_a_motion_of_all() -> None:
+    before, motion = tracked(), geometry.se3_exp(np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.1]))
+    target = moved(before.world_from_cam[KEYFRAMES], motion)
+    shuffled = [2, 0, 1]
+    after = before.following(KEYFRAMES[shuffled], target[shuffled])
+    np.testing.assert_array_equal(after.world_from_cam[KEYFRAMES], target)
+    np.testing.assert_allclose(after.world_from_cam, moved(before.world_from_cam, motion), atol=1e-8)
+    np.testing.assert_array_equal(before.world_from_cam, tracked().world_from_cam)
+
+
+def test_between_two_keyframes_the_motion_is_between_theirs() -> None:
+    before = tracked()
+    twist = np.array([0.02, 0.01, -0.02, 0.003, 0.004, -0.002])
+    target = before.world_from_cam[KEYFRAMES].copy()
+    target[1] = moved(target[1], geometry.se3_exp(twist))
+    after = before.following(KEYFRAMES, target)
+    for frame, share in ((0, 0.0), (3, 0.0), (4, 1 / 3), (5, 2 / 3), (6, 1.0), (7, 0.75), (9, 0.25), (12, 0.0)):
+        expected = moved(before.world_from_cam[frame], geometry.se3_exp(share * twist))
+        np.testing.assert_allclose(after.world_from_cam[frame], expected, atol=1e-8)
+
+
+def test_frames_without_a_pose_and_other_parts_of_the_map_stay() -> None:
+    before = tracked()
+    poses, segment = before.world_from_cam.copy(), before.segment.copy()
+    poses[4], segment[11:] = np.nan, 1
+    before = replace(before, world_from_cam=poses, segment=segment)
+    target = poses[KEYFRAMES].copy()
+    target[:, 0, 3] += 0.5
+    after = before.following(KEYFRAMES, target)
+    assert np.isnan(after.world_from_cam[4]).all()
+    np.testing.assert_array_equal(after.world_from_cam[11:], poses[11:])
+    np.testing.assert_allclose(after.world_from_cam[5, 0, 3], poses[5, 0, 3] + 0.5)
+
+
+def test_where_no_keyframe_moved_nothing_does() -> None:
+    before = tracked()
+    assert before.following(KEYFRAMES, before.world_from_cam[KEYFRAMES]) is before
+    assert before.following(np.zeros(0, np.int64), np.zeros((0, 4, 4))) is before

@@ -1,0 +1,136 @@
+"""What the evaluator renders of each frame: its pose, exposure and shutter; what is fitted to it, and what is not."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msgs import GroundTruth, Trajectory
+from mvsgs_core import geometry
+from mvsgs_core.evaluation.scoring import render_frame
+from mvsgs_core.photometry import vignetting_factor
+from nodes.evaluator import Evaluator
+from tests.support.evaluated_wall import (
+    INTRINSICS,
+    ORIGIN,
+    H,
+    N,
+    W,
+    feed,
+    poses_along,
+    splat_map_of,
+    wall_evaluator,
+)
+
+
+@pytest.fixture
+def evaluator(tmp_path: Path) -> Evaluator:
+    return wall_evaluator(tmp_path)
+
+
+def test_frames_are_rendered_with_the_focal_length_that_the_tracker_found(evaluator: Evaluator) -> None:
+    poses, index, none = poses_along(), np.arange(N), np.zeros(N, np.int32)
+    list(evaluator.on_trajectory(Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, 1.25)))
+    list(evaluator.on_splat_map(splat_map_of(True)))
+    for view in evaluator.evaluation.scored_frames():
+        np.testing.assert_array_equal(view.intrinsics, INTRINSICS * [1.25, 1.25, 1.0, 1.0])
+    evaluator.evaluation.close()
+
+
+def test_the_rolling_shutter_that_the_tracker_took_out_is_applied_to_renders(evaluator: Evaluator) -> None:
+    poses, index, none = poses_along(), np.arange(N), np.zeros(N, np.int32)
+    poses[:, :3, 3] += ORIGIN
+    track = Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, readout_time=0.02)
+    list(evaluator.on_trajectory(track))
+    list(evaluator.on_splat_map(splat_map_of(True)))
+    finished, view = evaluator.evaluation.maps[True], evaluator.evaluation.scored_frames()[5]
+    assert view.shutter is not None
+    assert view.shutter.readout_time == 0.02
+    moved = geometry.se3_log(geometry.inverse(poses[4]) @ poses[6])
+    np.testing.assert_allclose(view.shutter.velocity, moved * 15, atol=1e-7)
+    color = render_frame(finished.splats, finished.kernel, view, (H, W)).color
+    still = render_frame(finished.splats, finished.kernel, replace(view, shutter=None), (H, W)).color
+    assert np.abs(color - still).max() > 1e-3
+    list(evaluator.on_end())
+    assert "20.0 ms a frame" in evaluator.report["protocol"]
+
+
+def test_frames_are_rendered_at_the_trackers_exposure_and_vignetting(evaluator: Evaluator, tmp_path: Path) -> None:
+    poses, index, none = poses_along(), np.arange(N), np.zeros(N, np.int32)
+    poses[:, :3, 3] += ORIGIN
+    gains = np.ones(N)
+    gains[[2, 3, 5]] = 0.2, 0.5, 0.7
+    exposure = (gains[:, None, None] * np.eye(3, 4)).astype(np.float32)
+    vignetting = np.array([-0.3, 0.0, 0.0], np.float32)
+    list(
+        evaluator.on_trajectory(
+            Trajectory(
+                index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none, exposure=exposure,
+                vignetting=vignetting,
+            )
+        )
+    )  # fmt: skip
+    splat_map = splat_map_of(True)
+    splat_map.exposures[1, :, :3] *= 0.5  # of frame 3; those of frames 0 and 6 are the identity
+    list(evaluator.on_splat_map(splat_map))
+    finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.scored_frames()
+    factor = vignetting_factor(vignetting, INTRINSICS, (H, W))[..., None]
+    for frame in (0, 2, 3, 5, 6):
+        view = views[frame]
+        bare = replace(view, exposure=None, vignetting=None)
+        color, plain = (render_frame(finished.splats, finished.kernel, v, (H, W)).color for v in (view, bare))
+        np.testing.assert_allclose(color, gains[frame] * plain * factor, atol=1e-5)
+    list(evaluator.on_end())
+    assert "each frame's exposure and its vignetting as the tracker estimated" in evaluator.report["protocol"]
+    report = json.loads((tmp_path / "report.json").read_text())["exposure"]
+    assert report["keyframes"] == list(range(0, N, 3))
+    np.testing.assert_allclose(report["gain"][:3], [[1.0] * 3, [0.5] * 3, [1.0] * 3])
+    assert report["remainder"] < 1e-6
+    np.testing.assert_allclose(report["vignetting"], vignetting)
+    assert "Exposure by frame" in (tmp_path / "report.html").read_text()
+
+
+def test_without_exposures_the_report_speaks_of_none(evaluator: Evaluator, tmp_path: Path) -> None:
+    report = feed(evaluator)
+    assert report["exposure"] is None
+    assert "tracker estimated" not in report["protocol"]
+    assert "Exposure by frame" not in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("fitted", [True, False])
+def test_held_out_frames_are_scored_by_both_protocols(tmp_path: Path, fitted: bool) -> None:
+    """Photographs that the map shows but for their exposure; the strict figure is the same with and without fitting."""
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off", fitted=fitted))
+    for k in range(N):
+        image = np.full((H, W, 3), (150, 40, 45), np.uint8)
+        list(node.on_ground_truth(GroundTruth(k, k / 30, image, INTRINSICS, None, None)))
+    report = feed(node)
+    after = report["rendering"]
+    assert after["held_out"]["psnr"] == pytest.approx(18.18, abs=0.01)
+    assert report["rendering_before_refinement"]["held_out_fitted"]["count"] == 0
+    assert all((frame["fitted"] is not None) == (fitted and frame["held_out"]) for frame in after["frames"])
+    assert ("held-out, fitted" in (tmp_path / "report.html").read_text()) == fitted
+    assert ("ARTDECO" in report["protocol"]) == fitted
+    assert (report["time"]["stages"]["evaluator"]["fitting at test time"] > 0) == fitted
+    assert after["held_out_fitted"]["count"] == 2 * fitted
+    assert not fitted or after["held_out_fitted"]["psnr"] > 40
+
+
+def test_frames_and_the_written_trajectory_follow_the_poses_that_the_map_found(evaluator: Evaluator) -> None:
+    splat_map, poses = splat_map_of(True), poses_along()
+    splat_map.world_from_cam[:, 1, 3] += 0.05
+    poses[:, :3, 3] += ORIGIN
+    index, none = np.arange(N), np.zeros(N, np.int32)
+    list(evaluator.on_trajectory(Trajectory(index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none)))
+    list(evaluator.on_splat_map(splat_map))
+    for view in evaluator.evaluation.scored_frames():
+        expected = poses[view.index, :3, 3] + [0.0, 0.05, 0.0] - ORIGIN
+        np.testing.assert_allclose(view.world_from_cam[:3, 3], expected, atol=1e-8)
+    list(evaluator.on_end())
+    assert evaluator.folder is not None
+    written = np.loadtxt(evaluator.folder / "trajectory.txt")
+    np.testing.assert_allclose(written[:, 2], poses[:, 1, 3] + 0.05, atol=1e-5)
