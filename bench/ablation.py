@@ -34,6 +34,7 @@ OTHERS = (
 )  # fmt: skip
 FIGURES = {  # path in the report
     "held-out PSNR": "rendering.held_out.psnr",
+    "held-out SSIM": "rendering.held_out.ssim",
     "keyframe PSNR": "rendering.keyframes.psnr",
     "depth inliers": "depth.inlier_ratio",
     "completeness": "depth.completeness",
