@@ -18,10 +18,10 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 class OptimizerConfig:
     """Rates of a splat's parameters. Lengths are in units of the scene's median depth."""
 
-    means: float = 5.0e-4  # median depths a step, for a new splat
+    means: float = 1.0e-3  # median depths a step, for a new splat
     means_final: float = 0.05  # fraction of `means` that an old splat keeps
     decay_steps: int = 600  # steps of a splat until then, log-linear
-    log_scales: float = 0.03  # natural logarithm a step
+    log_scales: float = 0.1  # natural logarithm a step
     quaternions: float = 0.015  # a step, of a unit quaternion
     opacity_logits: float = 0.05  # logit a step
     sh: float = 0.03  # color a step, degree 0; higher degrees a twentieth
