@@ -18,9 +18,10 @@ from launch.renamed_parameters import refuse_old_names
 from mvsgs_core.named_modules import import_named
 from nodes.parameters import ParameterError, build, did_you_mean, parameter_names, plain_values
 
-# A tracker that never corrects itself, or knows no path, need not send these: readers work on what they have. Where
-# some slot is their origin, an edge that misses them is an error all the same: corrections would be lost in silence.
-OPTIONAL_MESSAGES = (msgs.Poses, msgs.TrackerPhase, msgs.Trajectory)
+# A tracker that never corrects itself, poses keyframes alone or knows no path need not send these: readers work on what
+# they have. Where some slot is their origin, an edge that misses them is an error all the same: corrections would be
+# lost in silence.
+OPTIONAL_MESSAGES = (msgs.Poses, msgs.TrackedFrame, msgs.TrackerPhase, msgs.Trajectory)
 
 
 @dataclass(frozen=True)

@@ -76,6 +76,19 @@ class Keyframe(_PosedImage):
 
 
 @dataclass(frozen=True)
+class TrackedFrame(_Image):
+    """A frame that became no keyframe, never a held-out one: another view to train the map on.
+
+    Its image is as keyframes' images are. It follows its keyframe wherever that is corrected to.
+    """
+
+    keyframe: int  # against which its pose was found
+    keyframe_from_cam: Annotated[np.ndarray, "float64 4 4"]
+    scale: float  # the map's scale, of that keyframe, that the pose is in, see Poses
+    exposure: Annotated[np.ndarray, "float32 3 4"] | None = None  # from the keyframe's colors; None: no difference
+
+
+@dataclass(frozen=True)
 class Depth(_PosedImage):
     """A keyframe with its multi-view stereo depth."""
 
@@ -191,6 +204,7 @@ Message = (
     Frame
     | GroundTruth
     | Keyframe
+    | TrackedFrame
     | Depth
     | FusedKeyframe
     | Poses

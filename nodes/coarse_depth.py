@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from msgs import Depth, Keyframe, Poses
+from msgs import Depth, Keyframe, Poses, TrackedFrame
 from mvsgs_core import camera
 from mvsgs_core.inverse_depth import enlarge_inverse_depth
 from nodes import Node
@@ -27,6 +27,10 @@ class CoarseDepth(Node):
             depth, confidence = enlarge_inverse_depth(keyframe.inverse_depth, keyframe.inverse_depth_weight, size)
         self.stats.count("keyframes")
         yield depth_message(keyframe, depth, confidence)
+
+    def on_tracked_frame(self, frame: TrackedFrame) -> Iterator[TrackedFrame]:
+        """Passed on, in its place: it needs no depth."""
+        yield frame
 
     def on_poses(self, poses: Poses) -> Iterator[Poses]:
         """Passed on, so that they reach the next stage between the same keyframes."""

@@ -1,4 +1,4 @@
-"""FusedKeyframe, Poses, Keyframe -> SplatMap, Preview: builds the map, optimizes it, refines it at the end."""
+"""FusedKeyframe, TrackedFrame, Poses, Keyframe -> SplatMap, Preview: builds the map, optimizes and refines it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap
+from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap, TrackedFrame
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.between import FrameBetween
 from mvsgs_core.mapping.checkpoints import checkpoint
 from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
@@ -93,6 +94,17 @@ class Mapper(Node):
         self._report()
         yield from self._preview()
 
+    def on_tracked_frame(self, frame: TrackedFrame) -> Iterator[Preview]:
+        if not self._replay or not self._replay.problem:
+            self.atlas.add_between(
+                FrameBetween(
+                    index=frame.index, timestamp=frame.timestamp, image=frame.image, intrinsics=frame.intrinsics,
+                    keyframe=frame.keyframe, keyframe_from_cam=frame.keyframe_from_cam, scale=frame.scale,
+                    exposure=frame.exposure,
+                )
+            )  # fmt: skip
+        yield from ()
+
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Preview]:
         if not self._previewing:
             return
@@ -153,6 +165,7 @@ class Mapper(Node):
             self.stats.skip(counted)
         if self._replay is not None and self._replay.problem:
             self.stats.warn(self._replay.problem)
+            self.atlas.between.waiting.clear()
 
     def _settle(self, realtime: bool = True) -> None:
         """Does the pending iterations. realtime: where the mapper is, it is left for the next keyframe to cancel."""

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msgs import Frame, Keyframe
+from msgs import Frame, Keyframe, TrackedFrame
 from mvsgs_core import geometry
+from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import rectified
@@ -57,7 +58,7 @@ class Tracker(TrackerNode):
             index=index,
             timestamp=frame.timestamp,
             image=image,
-            intrinsics=frame.intrinsics * [self.core.focal_factor, self.core.focal_factor, 1.0, 1.0],
+            intrinsics=self._intrinsics(frame),
             world_from_cam=geometry.inverse(keyframe.cam_from_world),
             scale=1.0,
             inverse_depth=inverse_depth,
@@ -66,6 +67,24 @@ class Tracker(TrackerNode):
             exposure=self.core.exposure(index),
             vignetting=self.core.vignetting,
         )
+
+    def _between(self, found: Between) -> TrackedFrame:
+        frame = self._frames[found.index]
+        with self.stats.time("rectification"):
+            image = rectified(frame.image, found.image, self._readout_time)
+        return TrackedFrame(
+            index=frame.index,
+            timestamp=frame.timestamp,
+            image=image,
+            intrinsics=self._intrinsics(frame),
+            keyframe=found.keyframe,
+            keyframe_from_cam=found.keyframe_from_cam,
+            scale=self.core.scale(found.keyframe),
+            exposure=found.exposure,
+        )
+
+    def _intrinsics(self, frame: Frame) -> np.ndarray:
+        return frame.intrinsics * [self.core.focal_factor, self.core.focal_factor, 1.0, 1.0]
 
 
 def in_milliseconds(readout_times: list[float]) -> str:

@@ -6,8 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, Protocol
 
-from msgs import Frame, Keyframe, Poses, TrackerPhase, Trajectory
+from msgs import Frame, Keyframe, Poses, TrackedFrame, TrackerPhase, Trajectory
 from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
 from mvsgs_core.trajectory import Trajectory as CameraTrajectory
@@ -24,7 +25,7 @@ class CoreTracker(Protocol):
     def phase(self) -> Phase: ...
 
     @property
-    def pending(self) -> set[int]: ...  # frames that may still be sent as keyframes
+    def pending(self) -> set[int]: ...  # frames that may still be sent, as keyframes or between them
 
     def finish(self) -> Iterator[Update]: ...
 
@@ -44,7 +45,7 @@ class TrackerNode(Node, ABC):
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        self._frames: dict[int, Frame] = {}  # those that may still be sent as keyframes
+        self._frames: dict[int, Frame] = {}  # those that may still be sent
         self._revision = 0
         self._phase = Phase.INITIALIZING  # that was sent last
 
@@ -64,14 +65,14 @@ class TrackerNode(Node, ABC):
         """Seconds of the rolling shutter that was taken out of the keyframes' images."""
         return 0.0
 
-    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackerPhase]:
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame | TrackerPhase]:
         self._frames[frame.index] = frame
         yield from self._send(self._add(frame))
         if self.core.phase != self._phase:
             self._phase = self.core.phase
             yield TrackerPhase(frame.index, frame.timestamp, self._phase.value)
 
-    def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
+    def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
         for update in self.core.finish():
             yield from self._send(update)
         self._report()
@@ -80,12 +81,19 @@ class TrackerNode(Node, ABC):
         found = {"focal_factor": self._focal_factor, "readout_time": self._readout_time}
         yield Trajectory(**vars(self.core.trajectory()) | found)
 
-    def _send(self, update: Update) -> Iterator[Keyframe | Poses]:
+    def _between(self, found: Between) -> TrackedFrame:
+        """Of a tracker that poses frames between keyframes while the stream runs."""
+        raise TypeError(f"{type(self).__name__} sends keyframes alone")
+
+    def _send(self, update: Update) -> Iterator[Keyframe | Poses | TrackedFrame]:
         for index in update.keyframes:
             yield self._keyframe(index)
         if update.correction is not None:
             self._revision += 1
             yield Poses(self._revision, **vars(update.correction))
+        for found in update.between:
+            self.stats.count("frames between keyframes")
+            yield self._between(found)
         for index in self._frames.keys() - self.core.pending:
             del self._frames[index]
         self.stats.values["tracking"] = self.core.phase.value

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from msgs import Depth, FusedKeyframe, Poses
+from msgs import Depth, FusedKeyframe, Poses, TrackedFrame
 from mvsgs_core.keyframe_window import WindowedKeyframe
 from nodes import Node
 
@@ -53,6 +53,10 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
             self._vignetting = poses.vignetting
         self._core.move(self._poses)
         yield poses
+
+    def on_tracked_frame(self, frame: TrackedFrame) -> Iterator[TrackedFrame]:
+        """Passed on, in its place among the corrections: it needs no depth."""
+        yield frame
 
     def _exposed(self, message: Lit) -> Lit:
         """With exposure and vignetting as they are now: corrections may have overtaken the keyframe."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from msgs import Depth, FusedKeyframe, Keyframe, Poses
+from msgs import Depth, FusedKeyframe, Keyframe, Poses, TrackedFrame
 from nodes import handlers, outputs
 from nodes.coarse_depth import CoarseDepth
 from nodes.depth_fusion import DepthFusion
@@ -25,11 +25,19 @@ def fusion(**changes: object) -> DepthFusion:
 
 
 def test_contract() -> None:
-    assert set(handlers(Mvs)) == {Keyframe, Poses}
-    assert set(outputs(Mvs)) == {Depth, Poses}
-    assert set(handlers(DepthFusion)) == {Depth, Poses}
-    assert set(outputs(DepthFusion)) == {FusedKeyframe, Poses}
-    assert set(outputs(CoarseDepth)) == {Depth, Poses}
+    assert set(handlers(Mvs)) == {Keyframe, TrackedFrame, Poses}
+    assert set(outputs(Mvs)) == {Depth, TrackedFrame, Poses}
+    assert set(handlers(DepthFusion)) == {Depth, TrackedFrame, Poses}
+    assert set(outputs(DepthFusion)) == {FusedKeyframe, TrackedFrame, Poses}
+    assert set(outputs(CoarseDepth)) == {Depth, TrackedFrame, Poses}
+
+
+def test_frames_between_keyframes_pass_at_once() -> None:
+    first = keyframe(0)
+    frame = TrackedFrame(1, 0.1, first.image, first.intrinsics, 0, np.eye(4), 1.0)
+    for node in (stereo(), fusion(), CoarseDepth()):
+        (passed,) = node.on_tracked_frame(frame)
+        assert passed is frame
 
 
 def test_every_keyframe_becomes_one_view_in_order_and_is_right() -> None:

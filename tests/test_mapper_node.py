@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nodes
-from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap
+from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap, TrackedFrame
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.image_metrics import psnr
@@ -26,7 +26,12 @@ from tests.support.tiny_scene import pose_on_arc
 
 
 def test_inputs_and_outputs_are_declared() -> None:
-    assert nodes.handlers(Mapper) == {FusedKeyframe: "on_fused_keyframe", Poses: "on_poses", Keyframe: "on_keyframe"}
+    assert nodes.handlers(Mapper) == {
+        FusedKeyframe: "on_fused_keyframe",
+        TrackedFrame: "on_tracked_frame",
+        Poses: "on_poses",
+        Keyframe: "on_keyframe",
+    }
     assert set(nodes.outputs(Mapper)) == {SplatMap, Preview}
 
 

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import msgs
-from msgs import Frame, GroundTruth, Keyframe, Poses, TrackerPhase, TrackingState, Trajectory
+from msgs import Frame, GroundTruth, Keyframe, Poses, TrackedFrame, TrackerPhase, TrackingState, Trajectory
+from mvsgs_core import geometry
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
+from mvsgs_core.held_out import is_held_out
 from mvsgs_core.image_metrics import psnr
 from nodes import Node, handlers, outputs
 from nodes.posed_tracker import PosedTracker
@@ -31,7 +33,7 @@ def of_type(sent: list[msgs.Message], kind: type) -> list:  # type: ignore[type-
 
 def test_contracts() -> None:
     assert handlers(Tracker).keys() == {Frame}
-    assert set(outputs(Tracker)) == {Keyframe, Poses, TrackerPhase, Trajectory}
+    assert set(outputs(Tracker)) == {Keyframe, Poses, TrackedFrame, TrackerPhase, Trajectory}
     assert handlers(PosedTracker).keys() == {Frame, GroundTruth}
     assert set(outputs(PosedTracker)) == {Keyframe, Poses, Trajectory}
 
@@ -65,6 +67,8 @@ def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
         elif isinstance(message, Poses):
             assert set(message.index.tolist()) <= published
             assert np.all(message.scale > 0)
+        elif isinstance(message, TrackedFrame):
+            assert message.keyframe in published
     trajectory = sent[-1]
     np.testing.assert_array_equal(trajectory.index, [frame.index for frame in frames])
     assert trajectory.index[trajectory.keyframe].tolist() == indices
@@ -73,6 +77,31 @@ def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
     assert trajectory.segment.dtype == np.int32
     assert node.stats.counts["frames"] == len(frames)
     assert "front end" in node.stats.seconds
+
+
+@pytest.mark.slow
+def test_frames_between_keyframes_are_sent_with_their_poses_and_no_held_out_one_is() -> None:
+    frames, truths = messages()
+    node = Tracker(Tracker.Config(frames_between=2))
+    sent = [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end())
+    between, trajectory = of_type(sent, TrackedFrame), sent[-1]
+    assert isinstance(trajectory, Trajectory)
+    indices, keyframes = [b.index for b in between], [k.index for k in of_type(sent, Keyframe)]
+    assert len(set(indices)) == len(indices) > 5
+    assert not any(is_held_out(index) or index in keyframes for index in indices)
+    assert min(indices) < keyframes[1]  # those of the start, too
+    for before, after in itertools.pairwise(keyframes):
+        assert sum(before < index < after for index in indices) <= 2
+    for b in between:
+        assert b.image is frames[b.index].image
+        true = geometry.inverse(truths[b.keyframe].world_from_cam) @ truths[b.index].world_from_cam
+        turned = true[:3, :3].T @ b.keyframe_from_cam[:3, :3]
+        assert np.degrees(np.linalg.norm(turned - np.eye(3)) / np.sqrt(2.0)) < 0.1
+        final = geometry.inverse(trajectory.world_from_cam[b.keyframe]) @ trajectory.world_from_cam[b.index]
+        assert np.linalg.norm(final[:3, 3] - b.keyframe_from_cam[:3, 3]) < 0.01  # of about the median depth
+    assert not of_type(list(Tracker(Tracker.Config(frames_between=0)).on_frame(frames[0])), TrackedFrame)
+    with pytest.raises(ValueError, match=r"tracker\.frames_between=-1"):
+        Tracker.Config(frames_between=-1)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mvsgs_core.mapping.between import FrameBetween, FramesBetween
 from mvsgs_core.mapping.checkpoints.state import copy_of
 from mvsgs_core.mapping.keyframe_checks import NO_POSE, is_pose
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
@@ -33,6 +34,7 @@ class Atlas:
     stream_seconds: float = 0.0  # timestamp of it
     revision: int = -1  # of the newest Poses
     stream_ended: bool = False
+    between: FramesBetween = field(default_factory=FramesBetween)  # frames that are no keyframes, on their way
     refined: int = 0  # iterations of the final refinement that are done
 
     @property
@@ -55,7 +57,18 @@ class Atlas:
         self.came(keyframe.index, keyframe.timestamp)
         known = len(self.current.views)
         self.current.add_keyframe(keyframe)
+        self.take_between()
         return self.current.views[-1] if len(self.current.views) > known else None
+
+    def add_between(self, given: FrameBetween) -> None:
+        """Takes in a frame to train on, as soon as its keyframe is mapped and another one is, or the stream ends."""
+        self.between.wait(given, self.current.log)
+
+    def take_between(self) -> None:
+        """Those whose keyframes are mapped."""
+        for part in self.parts.values():
+            for given in self.between.take(part.keyframes):
+                part.add_between(given)
 
     def step(self) -> bool:
         """One pending iteration of the current part; False when none is."""
@@ -64,6 +77,7 @@ class Atlas:
     def finish(self) -> None:
         """The stream has ended: of parts that stayed apart, the largest is gone on with."""
         self.stream_ended = True
+        self.take_between()
         parts, log = list(self.parts.values()), self.current.log
         log.values["segments_apart"] = max(0, len(parts) - 1)  # beside the map that is shown
         if len(parts) < 2:
@@ -150,6 +164,6 @@ class Atlas:
         current = next((parts[s] for s, part in self.parts.items() if part is self.current), None)
         return Atlas(
             current or OnlineMapper(self.current.config, log, corrections, photometry=photometry), parts,
-            dict(self.segment_of),
-            self.newest_view, self.stream_seconds, self.revision, self.stream_ended, self.refined,
+            dict(self.segment_of), self.newest_view, self.stream_seconds, self.revision, self.stream_ended,
+            FramesBetween(taken=set(self.between.taken)), self.refined,
         )  # fmt: skip

@@ -41,7 +41,8 @@ class MapperConfig:
     window: int = 6  # newest keyframes, on which the local half of the budget goes
     realtime: bool = False  # a new keyframe cancels the pending iterations of older ones
     max_pixels: int | None = None  # area of the training images; null: as they come
-    max_keyframes: int = 1000  # whose images are kept and trained on; beyond, they are thinned out evenly
+    # images that are kept and trained on; beyond, those of frames between keyframes, then of keyframes are thinned out
+    max_keyframes: int = 1000
     sh_degree: int = 0  # of the view-dependent color, 0 to 3
     seed: int = 0
     threads: int | None = None  # of the rasterizer and the optimizer; null: all

@@ -1,4 +1,4 @@
-"""The keyframes of a map, and the bounded number of them whose images are kept to train on."""
+"""The keyframes of a map with the frames between them, and the bounded number of images that are kept to train on."""
 
 from __future__ import annotations
 
@@ -6,21 +6,32 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.stats import Stats
 
 
 class KeyframeStore:
-    """In the order of the stream. Beyond `max_images`, images are let go; poses, scales and exposures all stay."""
+    """In the order of the stream. Beyond `max_images`, images are let go: first those of frames between keyframes, and
+    these frames with them; of keyframes poses, scales and exposures all stay."""
 
-    def __init__(self, max_images: int, window: int, log: Stats, views: Iterable[TrainingView] = ()) -> None:
+    def __init__(
+        self, max_images: int, window: int, log: Stats, views: Iterable[TrainingView] = (),
+        between: Iterable[BetweenView] = (),
+    ) -> None:  # fmt: skip
         """window: newest keyframes, whose images are never let go."""
         self._max_images, self._window, self._log = max_images, window, log
         self.views = list(views)
         self.with_image = [view for view in self.views if view.has_image]
+        self.between = list(between)
+        self._by_index = {view.index: view for view in self.views}
 
     def __len__(self) -> int:
         return len(self.views)
+
+    def __contains__(self, index: object) -> bool:
+        """Whether the frame of this index is one of the keyframes."""
+        return index in self._by_index
 
     @property
     def median_depth(self) -> float:
@@ -31,13 +42,28 @@ class KeyframeStore:
     @property
     def image_bytes(self) -> int:
         """Of the images: what grows with the length of a run, to a bound."""
-        return sum(view.image.numel() for view in self.with_image)
+        return sum(view.image.numel() for view in self.trained)
+
+    @property
+    def trained(self) -> list[TrainingView]:
+        """All that is trained on: keyframes, then the frames between them."""
+        return [*self.with_image, *self.between]
+
+    def of(self, index: int) -> TrainingView | None:
+        """The keyframe of this frame index."""
+        return self._by_index.get(index)
 
     def add(self, view: TrainingView) -> bool:
         """Whether images were let go for it, so that positions in `with_image` have changed."""
         self.views.append(view)
         self.with_image.append(view)
-        return self._bound_images()
+        self._by_index[view.index] = view
+        return self._bound_images() or bool(self.between)
+
+    def add_between(self, view: BetweenView) -> None:
+        """A frame between keyframes, one of which it belongs to. Positions in `trained` change."""
+        self.between = sorted([*self.between, view], key=lambda known: known.index)
+        self._bound_images()
 
     def take_over(self, other: KeyframeStore, scale: float) -> None:
         """The other's keyframes too, whose unit is `scale` of this one's."""
@@ -50,6 +76,8 @@ class KeyframeStore:
             view.fixed = view.fixed and not self.views  # one holds the frame of reference
         self.views = sorted(self.views + other.views, key=index)
         self.with_image = sorted(self.with_image + other.with_image, key=index)
+        self.between = sorted(self.between + other.between, key=index)
+        self._by_index |= other._by_index
         self._bound_images()
 
     def place_anew(self, local: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -58,9 +86,16 @@ class KeyframeStore:
             view.local_from_cam = local(view.world_from_cam)
 
     def _bound_images(self) -> bool:
-        """Lets go the images of the keyframes whose neighbors in time are closest. Their splats stay, and move with
-        their poses."""
+        """Lets go the images of the frames, then of the keyframes, whose neighbors in time are closest. Keyframes'
+        splats stay, and move with their poses."""
         changed = False
+        while self.between and len(self.with_image) + len(self.between) > self._max_images:
+            between = [view.index for view in self.between]
+            order = [between[0] - 1, *between, between[-1] + 1]
+            k = min(range(len(between)), key=lambda k: order[k + 2] - order[k])
+            del self.between[k]
+            changed = True
+            self._log.skip("frames between keyframes beyond max_keyframes")
         while len(self.with_image) > self._max_images:
             last = len(self.with_image) - max(1, self._window)
             if last < 2:

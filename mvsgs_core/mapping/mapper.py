@@ -11,6 +11,7 @@ import torch
 
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.mapping.between import BetweenView, FrameBetween, between_view
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
 from mvsgs_core.mapping.densifier import Densifier, checked_depth
@@ -38,11 +39,12 @@ class OnlineMapper:
         corrections: dict[int, tuple[np.ndarray, float]] | None = None,
         state: MapState | None = None,
         views: list[TrainingView] | None = None,
+        between: list[BetweenView] | None = None,
         photometry: Photometry | None = None,
     ) -> None:
         """log, corrections (world_from_cam (4, 4), scale; by keyframe), photometry: what mappers of one stream share.
 
-        state, views: of a mapper that is gone on with.
+        state, views, between: of a mapper that is gone on with.
         """
         self.config = config = config or MapperConfig()
         self.log = log or Stats()
@@ -54,7 +56,7 @@ class OnlineMapper:
             else state
         )
         self.frame = FrameOfReference()
-        self.keyframes = KeyframeStore(config.max_keyframes, config.window, self.log, views or ())
+        self.keyframes = KeyframeStore(config.max_keyframes, config.window, self.log, views or (), between or ())
         self.schedule = Schedule(config.window, config.seed)
         self.trainer = Trainer(config, self.state, self.log, self.photometry)
         self.densifier = Densifier(
@@ -118,14 +120,29 @@ class OnlineMapper:
         self.log.count("views_without_depth", float(not (depth > 0).any()))
         return inserted
 
+    def add_between(self, given: FrameBetween) -> bool:
+        """Takes in a frame to train on, one of whose keyframes is here; False, and counted, where no camera gives it.
+
+        No splats come from it.
+        """
+        keyframe = self.keyframes.of(given.keyframe)
+        assert keyframe is not None
+        view = between_view(given, keyframe, self.frame, self.config.max_pixels, self.state.device, self.log)
+        if view is None:
+            return False
+        self.keyframes.add_between(view)
+        self.schedule.reset()
+        self.log.count("frames between keyframes")
+        return True
+
     def step(self) -> bool:
         """One pending iteration; False when none is."""
         if self.schedule.pending == 0 or not self.views or len(self.state) == 0:
             self.schedule.drop()
             return False
         with self.log.time("optimization"):
-            images, convergence = self.keyframes.with_image, self.config.convergence
-            view = images[self.schedule.next(len(images))]
+            images, convergence = self.keyframes.trained, self.config.convergence
+            view = self._chosen(images[self.schedule.next(len(self.keyframes.with_image), len(images))])
             done = convergence.skip and view.converged(convergence)
             if done and not self.schedule.chance(convergence.keep):
                 self.log.skip("iterations_converged")
@@ -134,13 +151,13 @@ class OnlineMapper:
         return True
 
     def refine(self, done: int, total: int) -> None:
-        """Iteration `done` of `total` of the final refinement: any keyframe, falling rates."""
+        """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates."""
         if not self.views or len(self.state) == 0:
             return
         with self.log.time("refinement"):
             self.trainer.rate = 0.1 ** (done / max(total, 1))
-            images = self.keyframes.with_image
-            view = images[self.schedule.next_of_all(len(images))]
+            images = self.keyframes.trained
+            view = self._chosen(images[self.schedule.next_of_all(len(images))])
             self.trainer.step(view, self.median_depth, refining=True)
 
     def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> int:
@@ -161,7 +178,8 @@ class OnlineMapper:
             similarity = view.place(pose, self.frame.local(pose), s)
             if similarity.moves(max(view.median_depth, 1e-6)):
                 moved[key] = similarity
-                view.begin_anew()
+                for changed in (view, *(b for b in self.keyframes.between if b.keyframe == key)):
+                    changed.begin_anew()
         with self.log.time("correction"):
             count = move_with_anchors(self.state, moved)
         self.log.count("corrected_keyframes", len(moved))
@@ -217,6 +235,14 @@ class OnlineMapper:
     def snapshot(self) -> Snapshot:
         """The map in world units, relative to its origin."""
         return snapshot(self.state, self.views, self.frame, self.config.training.kernel, self.iterations)
+
+    def _chosen(self, view: TrainingView) -> TrainingView:
+        """To train on now: a frame between keyframes where its keyframe stands."""
+        if isinstance(view, BetweenView):
+            keyframe = self.keyframes.of(view.keyframe)
+            assert keyframe is not None
+            view.follow(keyframe, self.frame)
+        return view
 
     def _placed(self, keyframe: RGBDKeyframe, depth: np.ndarray, pose: np.ndarray, scale: float) -> TrainingView | None:
         """To train on, in the mapper's frame, which the first ones begin; None where it is too far away from it."""

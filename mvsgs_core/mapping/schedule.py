@@ -1,4 +1,4 @@
-"""Which keyframe the next iteration trains on: half on a local window, half on all (MVS-GS, section III.C)."""
+"""Which image the next iteration trains on: half on a local window, half on all (MVS-GS, section III.C)."""
 
 from __future__ import annotations
 
@@ -34,8 +34,11 @@ class Schedule:
         """The positions have changed: begins new rounds."""
         self._local, self._all = [], []
 
-    def next(self, count: int) -> int:
-        """Position of the next of `count` > 0 keyframes; takes one off the pending iterations."""
+    def next(self, count: int, trained: int | None = None) -> int:
+        """Position of the next of `count` > 0 keyframes; takes one off the pending iterations.
+
+        trained: images in all, the keyframes' first, of which the half on all takes its turns; None: keyframes alone.
+        """
         self.pending = max(0, self.pending - 1)
         self._turn += 1
         if self._turn % 2:
@@ -43,7 +46,7 @@ class Schedule:
                 first = max(0, count - self.window)
                 self._local = [first + int(i) for i in self._random.permutation(count - first)]
             return self._local.pop()
-        return self.next_of_all(count)
+        return self.next_of_all(count if trained is None else trained)
 
     def next_of_all(self, count: int) -> int:
         """Position of the next of `count` > 0 keyframes in a random round through all; pending stays as it is."""
@@ -61,10 +64,13 @@ class Schedule:
             "random": self._random.bit_generator.state,
         }  # fmt: skip
 
-    def restore(self, state: dict[str, Any], count: int) -> None:
-        """Goes on where `state()` was taken, with `count` keyframes. Raises ValueError for what it never returns."""
+    def restore(self, state: dict[str, Any], count: int, trained: int) -> None:
+        """Goes on where `state()` was taken, with `count` keyframes and so many images in all.
+
+        Raises ValueError for what it never returns.
+        """
         self.pending, self._turn = (_at_least_zero(state.get(name)) for name in ("pending", "turn"))
-        self._local, self._all = (_positions(state.get(name), count) for name in ("local", "all"))
+        self._local, self._all = _positions(state.get("local"), count), _positions(state.get("all"), trained)
         try:
             self._random.bit_generator.state = state["random"]
         except (KeyError, TypeError, ValueError, OverflowError) as error:

@@ -40,10 +40,11 @@ class PosedConfig(KeyframeTrackingConfig):
 
 @dataclass(frozen=True)
 class TrackerConfig(KeyframeTrackingConfig):
-    """Raises ValueError for what can't be a readout time."""
+    """Raises ValueError for what can't be a readout time or a number of frames."""
 
     readout_time: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
     loops: bool = True  # old keyframes are looked for by appearance
+    frames_between: int = 8  # frames between two keyframes, at most, that the map is trained on, too; 0: none
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
     min_texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
     min_matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is warned of
@@ -59,6 +60,8 @@ class TrackerConfig(KeyframeTrackingConfig):
 
     def __post_init__(self) -> None:
         check_readout_time(self.readout_time)
+        if self.frames_between < 0:
+            raise ValueError(f"tracker.frames_between={self.frames_between}: a number of frames, 0 for none")
 
 
 __all__ = ["PosedConfig", "TrackerConfig"]

@@ -52,6 +52,20 @@ class FrameRecord:
         self.reference, self.same_as, self.points, self.cam_from_reference, self.light = None, None, b"", b"", b""
 
 
+def followed_pose(record: FrameRecord, graph: KeyframeGraph, solver: Solver) -> np.ndarray | None:
+    """A frame's pose (4, 4) world_from_cam from its matches, against its reference as it is now.
+
+    None where there is no reference, or too few of the matches agree with it any more.
+    """
+    if record.reference is None or record.reference not in graph.keyframes:
+        return None
+    reference = graph.keyframes[record.reference]
+    relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
+    matches = restored(record.points, len(reference.inverse_depth))
+    found = localize(graph, record.reference, matches, relative @ reference.cam_from_world, solver)
+    return None if found.failure or found.inliers < AGREEMENT else geometry.inverse(found.cam_from_world)
+
+
 def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver) -> Trajectory:
     """Final poses: a keyframe's own, else motion-only bundle adjustment against the reference as it is now."""
     n = len(records)
@@ -74,14 +88,11 @@ def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: S
             if state[k] != TrackingState.NOT_INITIALIZED:
                 state[k] = TrackingState.LOST
             continue
-        reference = graph.keyframes[record.reference]
-        relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
-        matches = restored(record.points, len(reference.inverse_depth))
-        found = localize(graph, record.reference, matches, relative @ reference.cam_from_world, solver)
-        if found.failure or found.inliers < AGREEMENT:
+        pose = followed_pose(record, graph, solver)
+        if pose is None:
             state[k] = TrackingState.LOST
             continue
-        poses[k], segment[k] = geometry.inverse(found.cam_from_world), reference.segment
+        poses[k], segment[k] = pose, graph.keyframes[record.reference].segment
         if state[k] != TrackingState.DEGENERATE:
             state[k] = TrackingState.TRACKED
     return Trajectory(
@@ -94,4 +105,4 @@ def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: S
     )
 
 
-__all__ = ["FrameRecord", "solve_trajectory"]
+__all__ = ["FrameRecord", "followed_pose", "solve_trajectory"]

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from mvsgs_core.tracking.between import Between
 from mvsgs_core.trajectory import TrackingState
 
 GRAY_LEVEL = 1.0 / 255.0
@@ -54,6 +55,7 @@ class Update:
     state: TrackingState
     keyframes: tuple[int, ...] = ()  # indices of frames that became keyframes, in order
     correction: Correction | None = None  # of keyframes published before
+    between: tuple[Between, ...] = ()  # frames that are no keyframes, posed against ones that were published
 
 
 @dataclass
@@ -108,6 +110,10 @@ class Publisher:
         self._published[index] = _Published(pose, 1.0, keyframe.inverse_depth.copy(), known, segment, exposure)
         self._lit |= exposure is not None
         self.highest_segment = max(self.highest_segment, segment)
+
+    def scale(self, index: int) -> float:
+        """Depths of a published keyframe now, over those when it was first published."""
+        return self._scale(index, self._published[index])
 
     @property
     def published(self) -> set[int]:

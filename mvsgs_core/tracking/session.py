@@ -19,6 +19,7 @@ from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.back_end import BackEnd
+from mvsgs_core.tracking.between import Between, FramesBetween
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.estimation.calibration import REESTIMATED_AT, Calibration
@@ -76,6 +77,7 @@ class Session:
         self.publisher = Publisher(
             self.graph, config.tolerance, lambda index: self.graph.keyframes[index].segment, self.photometer
         )
+        self.between = FramesBetween(self.graph, self.photometer, config.frames_between, threads)
         self._since = 0  # frames since the last keyframe
         self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
 
@@ -90,8 +92,8 @@ class Session:
 
     @property
     def pending(self) -> set[int]:
-        """Frames that may still become keyframes that are published: their images are needed until then."""
-        waiting = set(self.initializer.waiting) | set(self.publisher.held)
+        """Frames that may still go out, as keyframes or between them: their images are needed until then."""
+        waiting = set(self.initializer.waiting) | set(self.publisher.held) | self.between.waiting
         if self.phase is not Phase.INITIALIZING:
             return waiting | set(self._tail)
         last = self.front_end.last  # the end of the stream may force an initialization with it
@@ -144,6 +146,7 @@ class Session:
     def _begin_segment(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The first keyframe of a segment, if the image has any texture."""
         self.phase = Phase.INITIALIZING
+        self.between.forget()
         record.state = TrackingState.NOT_INITIALIZED
         if not self._has_texture(frame):
             self.diagnosis.no_texture(frame)
@@ -162,7 +165,9 @@ class Session:
             if only and is_held_out(step.reference) and not is_held_out(frame.index):  # this one is as good
                 self.initializer.abandon()
                 return self._begin_segment(frame, record)
+            self.between.add(frame, record)
             return Update(record.state)
+        self.between.end()
         with self.stats.time("start"):
             self.initializer.add(frame, self.segment, step.matches)
             self._refer_to(frame, None)
@@ -196,7 +201,8 @@ class Session:
         self.photometer.update()
         self.stats.count("keyframes", len(keyframes))
         record.state = TrackingState.TRACKED
-        return Update(record.state, self._publish(keyframes))
+        published = self._publish(keyframes)
+        return Update(record.state, published, between=self._settle_between(keyframes))
 
     def _force_initialization(self) -> Iterator[Update]:
         """The stream ended before there was a map: what was collected, with weaker criteria."""
@@ -226,6 +232,7 @@ class Session:
             return Update(record.state)
         if not wanted:
             self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
+            self.between.add(frame, record)
             return Update(record.state)
         return self._add_keyframe(frame, step, record) or self._lose(frame, record)
 
@@ -256,7 +263,8 @@ class Session:
             self.graph.keyframes[index].image.release()
         self._refer_to(frame, self.graph.keyframes[frame.index].cam_from_world)
         correction = self.publisher.corrections()
-        return Update(record.state, self._publish([frame.index]), correction)
+        published = self._publish([frame.index])
+        return Update(record.state, published, correction, self._settle_between([frame.index]))
 
     def _reuse_keyframe(self, frame: TrackingImage, step: Step) -> bool:
         """An old keyframe sees this: it becomes the reference, and no further one is made."""
@@ -358,6 +366,14 @@ class Session:
 
     def _publish(self, keyframes: list[int]) -> tuple[int, ...]:
         return self.publisher.publish_all(keyframes, self.calibration.settled)
+
+    def _settle_between(self, keyframes: list[int]) -> tuple[Between, ...]:
+        """The frames before these keyframes are posed, those of the start matched first; of what was published."""
+        with self.stats.time("frames between keyframes"):
+            if self.between.waiting and len(keyframes) > 1:
+                self.recovery.fill_in([record for record in self.records if record.index >= keyframes[0]])
+            found = self.between.settle(keyframes[-1])
+        return tuple(frame for frame in found if frame.keyframe in self.publisher.published)
 
     def _settle(self) -> tuple[int, ...]:
         """Keyframes that were held back, with the focal length as far as it is known."""

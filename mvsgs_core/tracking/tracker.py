@@ -54,7 +54,7 @@ class Tracker:
 
     @property
     def pending(self) -> set[int]:
-        """Frames that may still become keyframes that are published: their images are needed until then."""
+        """Frames that may still go out, as keyframes or between them: their images are needed until then."""
         return set() if self._session is None else self._session.pending
 
     @property
@@ -69,6 +69,10 @@ class Tracker:
 
     def keyframe(self, index: int) -> Keyframe:
         return self.session.graph.keyframes[index]
+
+    def scale(self, index: int) -> float:
+        """Of a published keyframe: its depths now over those when it was published."""
+        return self.session.publisher.scale(index)
 
     def exposure(self, index: int) -> np.ndarray | None:
         """(3, 4) float32 color affine of a keyframe, see `msgs`; None: the identity, or not known."""

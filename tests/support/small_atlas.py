@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mvsgs_core import geometry
 from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.between import FrameBetween
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
@@ -37,13 +39,22 @@ def view(index: int) -> RGBDKeyframe:
     return replace(found, image=image, timestamp=0.1)
 
 
+def between(index: int, keyframe: int) -> FrameBetween:
+    """A frame that is no keyframe, seen from another that is."""
+    found = rgbd_keyframe(index, pose_on_arc(index / 8), SIZE)
+    relative = geometry.inverse(pose_on_arc(keyframe / 8)) @ pose_on_arc(index / 8)
+    return FrameBetween(index, 0.1 * index, found.image, found.intrinsics, keyframe, relative, 1.0)
+
+
 def begun(config: MapperConfig) -> Atlas:
-    """Two segments, corrections of poses and exposures, and iterations that are still pending."""
+    """Two segments, frames between keyframes, corrections of poses and exposures, and iterations still pending."""
     atlas = Atlas(OnlineMapper(config))
     for index in range(6):
         atlas.enter(int(index == 3))
         atlas.current.add_keyframe(view(index))
         atlas.came(index, 0.1 * index)
+        atlas.add_between(replace(between(20 + index, index), exposure=gain(1.0 + 0.01 * index)))
+        atlas.take_between()
         for _ in range(4):
             atlas.current.step()
     moved = pose_on_arc(0.3)

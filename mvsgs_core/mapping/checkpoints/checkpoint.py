@@ -11,6 +11,7 @@ import numpy as np
 
 from mvsgs_core.atomic_file import replacing
 from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.between import FramesBetween
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, nothing_there, read_state, state_files, write_state
 from mvsgs_core.mapping.checkpoints.state import Arrays, Corrections, pack, photometry_of, unpack, whole
 from mvsgs_core.mapping.config import MapperConfig
@@ -22,8 +23,11 @@ OF_THE_MACHINE = ("device", "threads", "training.backend")
 LOGGED = ("counts", "skipped", "seconds", "warnings")
 
 
-def save(atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, list[str]], *, sync: bool) -> None:
-    """Writes a frozen atlas's state. config: of its mappers, with their device; names: image files by segment.
+def save(
+    atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, tuple[list[str], list[str]]], *, sync: bool
+) -> None:
+    """Writes a frozen atlas's state. config: of its mappers, with their device; names: image files by segment, of
+    keyframes and of the frames between them.
 
     Raises OSError.
     """
@@ -34,6 +38,7 @@ def save(atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, list[s
     arrays: dict[str, np.ndarray] = {
         "keyframes": np.array([view.index for part in atlas.parts.values() for view in part.views], dtype=np.int64),
         "segment_of": np.array(sorted(atlas.segment_of.items()), dtype=np.int64).reshape(-1, 2),
+        "between": np.array(sorted(atlas.between.taken), dtype=np.int64),
         "corrections/index": np.array(index, dtype=np.int64),
         "corrections/world_from_cam": poses,
         "corrections/scale": np.array([corrections[k][1] for k in index], dtype=np.float64),
@@ -43,7 +48,7 @@ def save(atlas: Atlas, config: MapperConfig, file: Path, names: dict[int, list[s
     }
     mappers: list[dict[str, Any]] = []
     for segment, part in atlas.parts.items():
-        head, own = pack(part, f"map{len(mappers)}", names[segment])
+        head, own = pack(part, f"map{len(mappers)}", *names[segment])
         mappers.append({"segment": segment, "current": part is atlas.current, **head})
         arrays |= own
     meta = {
@@ -79,7 +84,7 @@ def images_of(file: Path) -> set[str]:
     """Names of the image files that a state refers to; none where it is damaged."""
     try:
         mappers = read_state(file)[0].get("mappers")
-        return {name for part in mappers for name in part["images"]}  # type: ignore[union-attr]
+        return {name for part in mappers for name in (*part["images"], *part["between"])}  # type: ignore[union-attr]
     except (ValueError, TypeError, KeyError):
         return set()
 
@@ -116,7 +121,8 @@ def _load(file: Path, config: MapperConfig, log: Stats) -> Atlas:
     pairs = arrays.take("segment_of", np.int64, (None, 2))
     atlas = Atlas(
         mappers[chosen[0]], dict(zip(segments, mappers)), dict(pairs.tolist()), meta["newest_view"],
-        meta["stream_seconds"], meta["revision"], meta["stream_ended"], whole(meta["refined"], "refined"),
+        meta["stream_seconds"], meta["revision"], meta["stream_ended"],
+        FramesBetween(taken=set(arrays.take("between", np.int64, (None,)).tolist())), whole(meta["refined"], "refined"),
     )  # fmt: skip
     log.include(logged)
     if differing:

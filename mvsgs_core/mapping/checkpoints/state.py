@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from mvsgs_core.devices import resolve_device
+from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.checkpoints.images import read_image
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import Photometry
@@ -36,6 +37,9 @@ VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in Trainin
     "pose_delta": (np.float64, (4, 4)), "pose_moments": (np.float64, (2, 6)), "pose_steps": (np.int64, ()),
     "fixed": (np.bool_, ()), "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_here": (np.int64, ()),
     "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "intrinsics": (np.float64, (4,)),
+}  # fmt: skip
+BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
+    "keyframe": (np.int64, ()), "keyframe_from_cam": (np.float64, (4, 4)), "from_keyframe": (np.float32, (3, 4)),
 }  # fmt: skip
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "measured")
 
@@ -74,29 +78,31 @@ def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections, photomet
         raise ValueError(f"the map is in the middle of a change: {sorted(lengths)} splats")
     state = MapState.of(mapper.state.tensors(), torch.device("cpu"))
     views = [_copied(view) for view in mapper.views]
-    copied = OnlineMapper(replace(mapper.config, device="cpu"), log, corrections, state, views, photometry)
-    copied.schedule.restore(mapper.schedule.state(), len(copied.keyframes.with_image))
+    between = [_copied(view) for view in mapper.keyframes.between]
+    copied = OnlineMapper(replace(mapper.config, device="cpu"), log, corrections, state, views, between, photometry)
+    _restore(copied, mapper.schedule.state())
     copied.frame.origin, copied.frame.unit = mapper.frame.origin, mapper.frame.unit
     copied.trainer.iterations, copied.trainer.rate = mapper.trainer.iterations, mapper.trainer.rate
     copied.trainer.generator.set_state(mapper.trainer.generator.get_state())
     return copied
 
 
-def pack(mapper: OnlineMapper, prefix: str, images: list[str]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def pack(
+    mapper: OnlineMapper, prefix: str, images: list[str], between: list[str]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Of a mapper on the CPU: what goes into the state's JSON, and arrays whose names begin with the prefix.
 
-    images: the file of each keyframe's image, empty where it was let go.
+    images: the file of each keyframe's image, empty where it was let go; between: of each frame between them.
     """
-    views, frame = mapper.views, mapper.frame
+    frame = mapper.frame
     arrays = {f"{prefix}/splats/{name}": value.cpu().numpy() for name, value in mapper.state.tensors().items()}
-    for name, (dtype, shape) in VIEWS.items():
-        rows = [_plain(getattr(view, name), shape) for view in views]
-        arrays[f"{prefix}/views/{name}"] = np.array(rows, dtype=dtype).reshape(len(views), *shape)
+    arrays |= _columns(mapper.views, VIEWS, f"{prefix}/views/")
+    arrays |= _columns(mapper.keyframes.between, BETWEEN, f"{prefix}/between/")
     arrays[f"{prefix}/origin"] = np.zeros(0) if frame.origin is None else frame.origin
     arrays[f"{prefix}/generator"] = mapper.trainer.generator.get_state().numpy()
     meta = {
         "iterations": mapper.iterations, "unit": frame.unit, "rate": mapper.trainer.rate,
-        "schedule": mapper.schedule.state(), "images": images,
+        "schedule": mapper.schedule.state(), "images": images, "between": between,
     }  # fmt: skip
     return meta, {name: np.ascontiguousarray(value) for name, value in arrays.items()}
 
@@ -109,10 +115,16 @@ def unpack(
     if not isinstance(meta, dict):
         raise ValueError("a mapper's part is no object")
     device = torch.device(resolve_device(config.device))
-    views = [_view(row, device, images) for row in keyframe_rows(arrays.of("views"), meta.get("images"))]
+    views = [_view(row, device, images, TrainingView) for row in keyframe_rows(arrays.of("views"), meta.get("images"))]
+    rows = keyframe_rows(arrays.of("between"), meta.get("between"), BETWEEN)
+    between = [_view(row, device, images, BetweenView) for row in rows]
+    if not {view.keyframe for view in between} <= {view.index for view in views} or not all(
+        b.has_image for b in between
+    ):
+        raise ValueError("frames between keyframes have no keyframe or no image")
     state = _splats(arrays.of("splats"), (config.sh_degree + 1) ** 2, [view.index for view in views], device)
-    mapper = OnlineMapper(config, log, corrections, state, views, photometry)
-    mapper.schedule.restore(_object(meta.get("schedule")), len(mapper.keyframes.with_image))
+    mapper = OnlineMapper(config, log, corrections, state, views, between, photometry)
+    _restore(mapper, _object(meta.get("schedule")))
     mapper.trainer.iterations = whole(meta.get("iterations"), "iterations")
     mapper.trainer.rate = _positive(meta.get("rate"))
     mapper.frame.unit = None if meta.get("unit") is None else _positive(meta.get("unit"))
@@ -162,12 +174,13 @@ def _splats(arrays: Arrays, sh_bases: int, keyframes: list[int], device: torch.d
     return MapState.of({name: torch.from_numpy(value.copy()) for name, value in found.items()}, device)
 
 
-def keyframe_rows(arrays: Arrays, images: Any) -> list[dict[str, Any]]:
+def keyframe_rows(
+    arrays: Arrays, images: Any, kept: dict[str, tuple[type, tuple[int, ...]]] = VIEWS
+) -> list[dict[str, Any]]:
     """The values of each keyframe's TrainingView, and the `file` of its image. Raises ValueError for damage."""
     count = len(arrays.take("index", np.int64, (None,)))
     columns = {
-        name: arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN)
-        for name, (dtype, shape) in VIEWS.items()
+        name: arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN) for name, (dtype, shape) in kept.items()
     }
     sensible = all((columns[n] >= 0).all() for n in ("pose_steps", "visits", "visits_here", "median_depth"))
     if not (sensible and (columns["image_size"] > 0).all() and (columns["scale"] > 0).all()):
@@ -180,16 +193,35 @@ def keyframe_rows(arrays: Arrays, images: Any) -> list[dict[str, Any]]:
     ]
 
 
-def _view(row: dict[str, Any], device: torch.device, folder: Path) -> TrainingView:
+V = TypeVar("V", bound=TrainingView)
+
+
+def _view(row: dict[str, Any], device: torch.device, folder: Path, kind: type[V]) -> V:
     row["image"], row["valid"] = read_image(folder, row.pop("file"), device)
     row["image_size"] = tuple(row["image_size"].tolist())
     row["exposure"] = torch.from_numpy(row["exposure"]).to(device)
     row["measured"] = None if np.isnan(row["measured"]).any() else row["measured"]
     row["exposure_moments"] = tuple(torch.from_numpy(moment.copy()).to(device) for moment in row["exposure_moments"])
-    return TrainingView(**row)
+    return kind(**row)
 
 
-def _copied(view: TrainingView) -> TrainingView:
+def _restore(mapper: OnlineMapper, schedule: dict[str, Any]) -> None:
+    mapper.schedule.restore(schedule, len(mapper.keyframes.with_image), len(mapper.keyframes.trained))
+
+
+def _columns(
+    views: Sequence[TrainingView], kept: dict[str, tuple[type, tuple[int, ...]]], prefix: str
+) -> dict[str, np.ndarray]:
+    """Each value of the views as an array, by its name after the prefix."""
+    return {
+        f"{prefix}{name}": np.array([_plain(getattr(view, name), shape) for view in views], dtype=dtype).reshape(
+            -1, *shape
+        )
+        for name, (dtype, shape) in kept.items()
+    }
+
+
+def _copied(view: V) -> V:
     """On the CPU; images are shared, as they never change."""
     first, second = (moment.to("cpu", copy=True) for moment in view.exposure_moments)
     return replace(

@@ -102,16 +102,19 @@ class CheckpointWriter:
             self._remove_parts()
             self._begun = True
         known = {
-            segment: [self._write_image(view, sync=sync) for view in part.views]
+            segment: (
+                [self._write_image(view, sync=sync) for view in part.views],
+                [self._write_image(view, sync=sync) for view in part.keyframes.between],
+            )
             for segment, part in atlas.parts.items()
         }
         file = state_file(self._output, self._number + 1)
         save(atlas, self._config, file, known, sync=sync)
         self._number += 1
-        images = {name for names in known.values() for name in names if name}
+        images = {name for both in known.values() for names in both for name in names if name}
         self._remove_others({file, self._before}, images | self._images_before)
         self._before, self._images_before = file, images
-        present = {view.index for part in atlas.parts.values() for view in part.keyframes.with_image}
+        present = {view.index for part in atlas.parts.values() for view in part.keyframes.trained}
         self._names = {index: entry for index, entry in self._names.items() if index in present}
 
     def _write_image(self, view: TrainingView, sync: bool) -> str:

@@ -139,7 +139,7 @@ def test_images_are_written_once_and_two_states_are_kept(tmp_path: Path) -> None
         assert writer.wait(20.0)
         times.append({f.name: f.stat().st_mtime_ns for f in (tmp_path / FOLDER / KEYFRAMES).iterdir()})
     assert times[0] == times[1] == times[2]
-    assert len(times[0]) == 4 + 1  # of four keyframes, max_keyframes, and of the other segment's one
+    assert len(times[0]) == 4 + 2  # of four keyframes, max_keyframes; the other segment's, and a frame beside it
     assert [file.name for file in state_files(tmp_path)] == ["state-00000003.npz", "state-00000002.npz"]
     for index in range(6, 9):
         atlas.current.add_keyframe(view(index))
@@ -147,7 +147,7 @@ def test_images_are_written_once_and_two_states_are_kept(tmp_path: Path) -> None
         writer.submit(atlas.frozen())
         assert writer.wait(20.0)
     left = {f.name for f in (tmp_path / FOLDER / KEYFRAMES).iterdir()}
-    assert len(left) == 4 + 1
+    assert len(left) == 4 + 2
     assert left != set(times[0])
     load(tmp_path, config, Stats())
 
