@@ -22,15 +22,15 @@ from bench.runs import QUICK, Matrix, Run, figure, folder
 from bench.table import Row, main
 from mvsgs_core.evaluation.metrics import at
 
-SCENES = ("room", "tum_fr1_xyz", "redkitchen")
+SCENES = ("room", "tum_fr1_xyz", "redkitchen", "room_exposure")
 TABLE_III = ("A", "B", "C", "D")
 SKIPS = (  # what is left out, switched off or over; keyframe reuse needs more keyframes than these scenes have
     "no_skips", "no_skip_converged", "no_selective", "no_unexplored",
     "no_voxel", "no_map_voxel", "map_voxel_strict", "no_fill", "realtime", "no_skip_cells", "every_frame",
 )  # fmt: skip
 OTHERS = (
-    "no_density_control", "exact", "ges_scale", "ges_loss", "harmonics", "no_exposure", "refine_poses",
-    "global_shutter", "no_rectification", "true_poses",
+    "no_density_control", "exact", "ges_scale", "ges_loss", "harmonics", "no_exposure", "no_frames_between",
+    "refine_poses", "global_shutter", "no_rectification", "true_poses",
 )  # fmt: skip
 FIGURES = {  # path in the report
     "held-out PSNR": "rendering.held_out.psnr",

@@ -103,7 +103,14 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
     others = {f"mapper.insertion.{name}" for name in ("voxel", "map_voxel", "map_voxel_error", "fill")}
     others |= {f"mapper.{name}" for name in ("density_control.mode", "training.kernel", "training.loss", "sh_degree")}
     assert others <= switched
-    assert {"mvs", "depth_fusion", "tracker", "tracker.front_end.still_flow", "tracker.readout_time"} <= switched
+    assert {
+        "mvs",
+        "depth_fusion",
+        "tracker",
+        "tracker.front_end.still_flow",
+        "tracker.readout_time",
+        "tracker.frames_between",
+    } <= switched
 
 
 def test_a_partial_ablation_shows_the_variants_it_has(tmp_path: Path) -> None:
