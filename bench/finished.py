@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -99,22 +99,15 @@ def read_frames(settings: dict[str, Any]) -> dict[int, GroundTruth]:
 
 def trajectory_of(track: dict[str, Any], report: dict[str, Any], frames: dict[int, GroundTruth]) -> Trajectory:
     """What the recorder wrote; what an earlier one left out, from the frames and the report."""
-    poses = _rows(track["world_from_cam"], (4, 4), np.float64)
-    posed = np.isfinite(poses).all(axis=(1, 2))
-    state = np.where(posed, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8)
-    exposure, vignetting = track.get("exposure"), track.get("vignetting")
-    return Trajectory(
-        index=np.array(track["index"], dtype=np.int64),
-        timestamp=np.array(track.get("timestamp") or [frames[i].timestamp for i in track["index"]], dtype=np.float64),
-        world_from_cam=poses,
-        keyframe=np.array(track["keyframe"], dtype=bool),
-        state=np.array(track["state"], dtype=np.uint8) if "state" in track else state,
-        segment=np.array(track["segment"], dtype=np.int32),
-        focal_factor=float(track.get("focal_factor", 1.0)),
-        readout_time=float(track["readout_time"]) if "readout_time" in track else _told_readout(report),
-        exposure=None if exposure is None else _rows(exposure, (3, 4), np.float32),
-        vignetting=None if vignetting is None else np.array(vignetting, dtype=np.float32),
-    )
+    known: dict[str, Any] = {f.name: track[f.name] for f in fields(Trajectory) if f.name in track}
+    known = {name: _array(value) if isinstance(value, list) else value for name, value in known.items()}
+    posed = np.isfinite(known["world_from_cam"]).all(axis=(1, 2))
+    rest = {
+        "timestamp": np.array([frames[i].timestamp for i in track["index"]]),
+        "state": np.where(posed, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8),
+        "readout_time": _told_readout(report),
+    }
+    return Trajectory(**{**rest, **known})
 
 
 def snapshot_of(folder: Path, trajectory: Trajectory) -> Snapshot:
@@ -132,10 +125,13 @@ def snapshot_of(folder: Path, trajectory: Trajectory) -> Snapshot:
     )
 
 
-def _rows(values: list[Any], shape: tuple[int, ...], dtype: type) -> np.ndarray:
-    """(N, *shape), NaN where a row is null."""
-    unknown = np.full(shape, np.nan)
-    return np.array([unknown if value is None else value for value in values], dtype=dtype).reshape(-1, *shape)
+def _array(values: list[Any]) -> np.ndarray | None:
+    """(N, ...), NaN where a row is null; None where all are."""
+    rows = [value for value in values if value is not None]
+    if not rows:
+        return None
+    unknown = np.full(np.shape(rows[0]), np.nan)
+    return np.array([unknown if value is None else value for value in values])
 
 
 def _told_readout(report: dict[str, Any]) -> float:
