@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -112,6 +113,18 @@ class Sensor:
         """(3,) factors of red, green and blue light at frame s."""
         stops = self.difficulties.white_balance * np.sin(2 * np.pi * s / 61.0 + self.seed % 5)
         return np.asarray(2.0 ** (stops * np.array([0.5, 0.0, -0.5])))
+
+    def transferred(self, levels: np.ndarray, s: int, mean: Sequence[int]) -> np.ndarray:
+        """(3, L) what gray levels (L,), 0 to 1, of the mean camera of frames `mean` are at frame s, by channel."""
+        scale = np.linspace(0.0, 4.0, self.STEPS + 1)
+        light = np.geomspace(1e-4, 4.0, 4000)
+
+        def shown(gain: float) -> np.ndarray:
+            return np.asarray(np.interp(light * gain, scale, self.curve) / 255.0)
+
+        usual = np.exp(np.mean([np.log(self.gain(k) * self.white(k)) for k in mean], axis=0))
+        here = self.gain(s) * self.white(s)
+        return np.array([np.interp(np.interp(levels, shown(u), light), light, shown(h)) for u, h in zip(usual, here)])
 
     def falloff(self, height: int, width: int) -> np.ndarray:
         """(height, width) factor of the light by vignetting: a parabola of the distance from the middle."""

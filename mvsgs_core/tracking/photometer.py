@@ -110,27 +110,25 @@ class Photometer:
                 image = graph.keyframes[b].image
                 self._moments[a, b] = edge, _compared(graph, a, image, edge.target.T, edge.weight > 0)
 
-    def _pairs(self) -> dict[tuple[int, int], np.ndarray]:
-        """Moments (3, 6, 6) of every pair of keyframes, both directions in one, from the earlier to the later one."""
+    def edges(self, order: Sequence[int]) -> PhotometricEdges:
+        """Of the keyframes `order`, by their places in it: a pair's both directions in one, from the earlier one."""
         pairs: dict[tuple[int, int], np.ndarray] = {}
         for (a, b), (_, moments) in self._moments.items():
             if moments is not None:
                 pair = min(a, b), max(a, b)
                 pairs[pair] = pairs.get(pair, 0.0) + (moments if a < b else backward(moments))
-        return pairs
-
-    def _solve(self, order: list[int], whole: bool) -> None:
-        pairs = self._pairs()
         number = {index: n for n, index in enumerate(order)}
-        edges = PhotometricEdges(
+        return PhotometricEdges(
             np.array([number[a] for a, _ in pairs], np.int64),
             np.array([number[b] for _, b in pairs], np.int64),
             np.array(list(pairs.values())).reshape(-1, 3, TERMS, TERMS),
         )
+
+    def _solve(self, order: list[int], whole: bool) -> None:
         exposures = np.array([self.graph.keyframes[index].image.exposure for index in order])
         known = np.where(exposures > 0.0, np.log(np.maximum(exposures, 1e-300)), np.nan)
         try:
-            self.photometry = p = solve_photometry(edges, len(order), known)
+            self.photometry = p = solve_photometry(self.edges(order), len(order), known)
         except (np.linalg.LinAlgError, ValueError) as error:
             self.stats.warn(f"exposures could not be solved for: {error}")
             return

@@ -22,30 +22,14 @@ LEVELS = np.linspace(0.1, 0.85, 40)
 DIFFICULT: dict[str, Any] = {"exposure": 1.0, "white_balance": 0.3, "vignetting": 0.5, "response": 0.15, "noise": 1.5}
 
 
-def transfers(sensor: Sensor, frames: np.ndarray, mean_of: np.ndarray) -> np.ndarray:
-    """(N, 3, L) what LEVELS of the mean camera of the keyframes `mean_of` become in the frames: the truth."""
-    light = np.geomspace(1e-4, 4.0, 4000)
-
-    def logs(frame: int) -> np.ndarray:
-        return np.asarray(np.log(sensor.gain(frame) * sensor.white(frame)))
-
-    def levels(gain: float) -> np.ndarray:
-        return np.asarray(np.interp(light * gain, np.linspace(0.0, 4.0, sensor.STEPS + 1), sensor.curve) / 255.0)
-
-    mean = np.mean([logs(int(k)) for k in mean_of], axis=0)
-    at = [np.interp(LEVELS, levels(np.exp(mean[c])), light) for c in range(3)]
-    return np.array(
-        [[np.interp(at[c], light, levels(np.exp(logs(int(f))[c]))) for c in range(3)] for f in frames]
-    )  # fmt: skip
-
-
 def errors(trajectory: AnyTrajectory, sensor: Sensor, which: np.ndarray) -> np.ndarray:
     """Of each chosen frame the median relative error of the gray levels that its exposure gives."""
     assert trajectory.exposure is not None
     affine = trajectory.exposure[which].astype(np.float64)
     slope, offset = np.einsum("ncc->nc", affine[:, :, :3]), affine[:, :, 3]
     found = slope[..., None] * LEVELS + offset[..., None]
-    true = transfers(sensor, trajectory.index[which], trajectory.index[trajectory.keyframe])
+    mean = trajectory.index[trajectory.keyframe].tolist()
+    true = np.array([sensor.transferred(LEVELS, int(frame), mean) for frame in trajectory.index[which]])
     shown = (true > 0.05) & (true < 0.9)
     return np.array([np.median(np.abs(f / t - 1.0)[s]) for f, t, s in zip(found, true, shown)])
 
