@@ -95,7 +95,7 @@ def response_error(tracker: Tracker, sensor: Sensor, offset: float) -> float:
     return 100.0 * float(np.abs(brightened(found_offset) / brightened(offset) - 1.0).max())
 
 
-def rows_of_varying(name: str, options: Mapping[str, float], frames: int) -> list[Row]:
+def rows_of_varying(name: str, options: Mapping[str, Any], frames: int) -> list[Row]:
     tracker = tracked(Case("synthetic", {"frames": frames, "threads": 1, **options}).items())
     sensor = Sensor(Difficulties(**options), 0)
     rows = [
