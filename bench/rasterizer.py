@@ -110,8 +110,8 @@ def render_settings(size: tuple[int, int], kernel: str, threads: int) -> RenderS
     """As the C++ kernels take them, with the blending weights, which count what contributed."""
     return RenderSettings(
         pose=torch.eye(4, dtype=torch.float64), intrinsics=tuple(intrinsics(size).tolist()), size=size,
-        exact=kernel == "exact", background=(0.0, 0.0, 0.0), near=1e-3, antialiased=False, degree=0, weights=True,
-        threads=threads,
+        readout=(0.0,) * 6, exact=kernel == "exact", background=(0.0, 0.0, 0.0), near=1e-3, antialiased=False,
+        degree=0, weights=True, threads=threads,
     )  # fmt: skip
 
 

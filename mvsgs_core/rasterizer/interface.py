@@ -14,6 +14,7 @@ MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
 CLAMP_MARGIN = 0.3  # of tan(fov): how far beyond the image the Jacobian follows x/z and y/z
 MIN_COMPENSATION = 0.005  # floor of the antialiased opacity factor
+MAX_MOTION = 0.5  # of the image's width or height: how far a splat moves while the image is read, at most
 MAX_VARIANCE = 1e16  # px^2
 MAX_REACH = 1e12  # of m, where an exact kernel of a small exponent ends at the latest
 MIN_QUATERNION = 1e-8
@@ -26,6 +27,7 @@ class RenderSettings:
     pose: Tensor  # (4, 4) float64 world_from_cam, may carry a gradient
     intrinsics: tuple[float, ...]  # fx, fy, cx, cy, px at `size`
     size: tuple[int, int]  # height, width, px
+    readout: tuple[float, ...]  # (6,) the camera's twist between first and last row, see `rasterize`; 0: no shutter
     exact: bool  # the generalized exponential of each splat's beta, else the Gaussian
     background: tuple[float, ...]  # red, green, blue
     near: float  # map units

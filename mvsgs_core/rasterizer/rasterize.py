@@ -5,6 +5,11 @@ The mathematics, the same in each: EWA splatting (Zwicker et al. 2001) as in 3D 
 - A splat's covariance goes to the image by the projection's Jacobian at its mean, there x/z and y/z clamped to the
   image widened by 0.3 tan(fov) on every side; + 0.3 px^2 on the diagonal (`antialiased` scales the opacity by
   sqrt(det / det_blurred), so that a splat smaller than a pixel does not grow brighter by it).
+- A rolling shutter reads row r of H while the camera is at pose exp(readout (r / H - 1/2)). To first order a splat's
+  mean (u, v) moves by p = du/dt, with dX/dt = -translation - rotation x X, to the row at which it is read: with
+  g = 1 / (1 - p_y / H) and s = g (v / H - 1/2) to (u, v) + s p. Its axes follow by the Jacobian of that, p held, to
+  (x + p_x g y / H, g y). So Seiskari et al. 2024 (2403.13327), with the row solved. p is that of the clamped x/z and
+  y/z, and at most half the image.
 - alpha = min(0.99, opacity * kernel(m)); below 1/255 it is skipped. Splats are blended front to back in the order of
   float32 depth, equal depths in the order of their index; a pixel ends once its transmittance is below 1e-4 (the splat
   that brings it below is blended still).
@@ -55,6 +60,7 @@ def rasterize(
     backend: str = "auto",
     exposure: Tensor | None = None,
     pose_delta: Tensor | None = None,
+    readout: np.ndarray | None = None,
     near: float = 1e-3,
     antialiased: bool = False,
     degree: int | None = None,
@@ -68,6 +74,8 @@ def rasterize(
     background: (3,) color behind the splats, black if None; carries no gradient.
     exposure: (3, 4) affine [A | b]; the color returned is A color + b.
     pose_delta: (6,) twist (translation, rotation) in the camera's frame: renders from world_from_cam @ exp(pose_delta).
+    readout: (6,) twist (translation, rotation) in the camera's frame by which it moves while the image is read from the
+    first row to the last; world_from_cam is its pose in the middle. None: all rows at once. Carries no gradient.
     near: splats with z <= near are left out, map units: relate it to the scene's depth.
     degree: highest degree of the spherical harmonics used; None = all that `splats.sh` has.
     weights: fill `Render.weight_sum` and `weight_max` (adds about a quarter to the forward pass).
@@ -90,6 +98,7 @@ def rasterize(
         pose=_pose(world_from_cam, pose_delta),
         intrinsics=_floats(intrinsics, 4, "intrinsics"),
         size=(int(size[0]), int(size[1])),
+        readout=(0.0,) * 6 if readout is None else _floats(readout, 6, "readout"),
         exact=kernel == "exact",
         background=(0.0, 0.0, 0.0) if background is None else _floats(background, 3, "background"),
         near=float(near),

@@ -35,14 +35,22 @@ def usable(splats: Splats) -> Tensor:
     return torch.stack(finite).all(dim=0) & (splats.quaternions.norm(dim=-1) > interface.MIN_QUATERNION)
 
 
-def axes_on_image(splats: Splats, points: Tensor, settings: RenderSettings) -> Tensor:
-    """(N, 2, 3) in px: the splats' axes, each one standard deviation long, projected by the Jacobian at `points`."""
+def slopes(points: Tensor, settings: RenderSettings) -> tuple[Tensor, Tensor]:
+    """x/z and y/z (N,), clamped to the image and a margin around it."""
     fx, fy, cx, cy = settings.intrinsics
     height, width = settings.size
     x, y, z = points.unbind(-1)
     margin_x, margin_y = (interface.CLAMP_MARGIN * 0.5 * n / f for n, f in ((width, fx), (height, fy)))
     slope_x = (x / z).clamp(-(cx + 0.5) / fx - margin_x, (width - 0.5 - cx) / fx + margin_x)
     slope_y = (y / z).clamp(-(cy + 0.5) / fy - margin_y, (height - 0.5 - cy) / fy + margin_y)
+    return slope_x, slope_y
+
+
+def axes_on_image(splats: Splats, points: Tensor, settings: RenderSettings) -> Tensor:
+    """(N, 2, 3) in px: the splats' axes, each one standard deviation long, projected by the Jacobian at `points`."""
+    fx, fy, _, _ = settings.intrinsics
+    z = points[:, 2]
+    slope_x, slope_y = slopes(points, settings)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx * slope_x / z], -1), torch.stack([zero, fy / z, -fy * slope_y / z], -1)], -2
@@ -50,6 +58,28 @@ def axes_on_image(splats: Splats, points: Tensor, settings: RenderSettings) -> T
     cam_from_world = settings.pose[:3, :3].T.to(points)
     axes = rotation_matrices(splats.quaternions) * torch.exp(splats.log_scales)[:, None, :]
     return jacobian @ cam_from_world @ axes
+
+
+def motion(points: Tensor, settings: RenderSettings) -> Tensor:
+    """(N, 2) px by which camera-frame points (N, 3) move on the image while it is read."""
+    fx, fy, _, _ = settings.intrinsics
+    height, width = settings.size
+    v_x, v_y, v_z, w_x, w_y, w_z = settings.readout
+    (a, b), q = slopes(points, settings), 1.0 / points[:, 2]
+    nearer = v_z * q + w_x * b - w_y * a
+    x = fx * (w_z * b - w_y - v_x * q + a * nearer)
+    y = fy * (w_x - w_z * a - v_y * q + b * nearer)
+    most = interface.MAX_MOTION
+    return torch.stack([x.clamp(-most * width, most * width), y.clamp(-most * height, most * height)], dim=-1)
+
+
+def as_read(centers: Tensor, axes: Tensor, moves: Tensor, height: int) -> tuple[Tensor, Tensor]:
+    """Centers (N, 2) and axes (N, 2, 3) on the image as a rolling shutter sees what moves by `moves` (N, 2)."""
+    stretch = 1.0 / (1.0 - moves[:, 1] / height)
+    late = (centers[:, 1] / height - 0.5) * stretch
+    x, y = axes.unbind(1)
+    sheared = x + (moves[:, 0] * stretch / height)[:, None] * y
+    return centers + late[:, None] * moves, torch.stack([sheared, stretch[:, None] * y], dim=1)
 
 
 @dataclass
@@ -77,9 +107,12 @@ def project(splats: Splats, means2d: Tensor, settings: RenderSettings) -> Projec
     points = (from_camera @ pose[:3, :3]).to(dtype)
     depths = points[:, 2]
     centers = torch.stack([fx * points[:, 0] / depths + cx, fy * points[:, 1] / depths + cy], dim=-1)
+    axes = axes_on_image(splats, points, settings)
+    if any(settings.readout):
+        centers, axes = as_read(centers, axes, motion(points, settings), height)
     centers = centers + means2d * torch.tensor([0.5 * width, 0.5 * height], dtype=dtype, device=device)
 
-    row_x, row_y = axes_on_image(splats, points, settings).unbind(1)
+    row_x, row_y = axes.unbind(1)
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
     # the determinant as a sum of squares (Lagrange's identity): no cancellation for needles
     sharp = torch.linalg.cross(row_x, row_y).square().sum(-1)

@@ -52,6 +52,8 @@ inline Camera camera_of(nb::handle settings, Array<const double> pose) {
     camera.width = width;
     camera.height = height;
     camera.near = setting<float>(settings, "near");
+    camera.readout = setting<std::array<float, 6>>(settings, "readout");
+    for (const float value : camera.readout) camera.rolling |= value != 0.0f;
     // In double: a compiler that may reorder float arithmetic would else round these limits by what surrounds them.
     const double fx = camera.fx, fy = camera.fy, cx = camera.cx, cy = camera.cy;
     const double margin_x = 0.5 * kClampMargin * width / fx, margin_y = 0.5 * kClampMargin * height / fy;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
@@ -25,6 +26,7 @@ constexpr float kMinTransmittance = 1e-4f;
 constexpr float kLog2MinAlpha = -7.994353436858858f;  // log2(1 / 255)
 constexpr float kClampMargin = 0.3f;  // of tan(fov)
 constexpr float kMinCompensation = 0.005f;
+constexpr float kMaxMotion = 0.5f;  // of the image's width or height
 constexpr float kMaxVariance = 1e16f;  // px^2
 constexpr float kMinQuaternion = 1e-8f;
 constexpr float kMaxReach = 1e12f;
@@ -84,6 +86,8 @@ struct Camera {
     int width, height;
     float near;
     float slope_min[2], slope_max[2];  // limits of x/z and y/z in the Jacobian
+    std::array<float, 6> readout;      // twist while the image is read
+    bool rolling = false;              // whether that is not 0
 };
 
 // Read-only parameters; shapes as in splats.py.

@@ -113,6 +113,35 @@ SPLATS_INLINE void shade_backward(const Parameters& p, int64_t first, int count,
     for (int k = 0; k < 3; ++k) on_offset[k] = (on_direction[k] - d[k] * along) * shading.inverse_distance;
 }
 
+// The chain through `roll`: from the gradients of the mean on the image (u, v) and of `to_image` as the shutter sees them
+// to those without it; `still` becomes what `to_image` was before. Returns the gradients of x/z, y/z and 1/z.
+struct OnMotion {
+    Lanes slope_x, slope_y, inverse_z;
+};
+SPLATS_INLINE OnMotion roll_backward(const Camera& camera, const Projection& r, Lanes& on_u, Lanes& on_v,
+                                     Lanes (&on_to_image)[2][3], Lanes (&still)[2][3]) {
+    const Motion& m = r.motion;
+    const std::array<float, 6>& t = camera.readout;
+    const float row = 1.0f / float(camera.height);
+    const Lanes unstretch = 1.0f / m.stretch;
+    Lanes on_shear{}, on_stretch{};
+    for (int k = 0; k < 3; ++k) {
+        still[1][k] = r.to_image[1][k] * unstretch;
+        still[0][k] = r.to_image[0][k] - m.shear * still[1][k];
+        on_shear += on_to_image[0][k] * still[1][k];
+        on_stretch += on_to_image[1][k] * still[1][k];
+        on_to_image[1][k] = m.shear * on_to_image[0][k] + m.stretch * on_to_image[1][k];
+    }
+    const Lanes on_late = on_u * m.u + on_v * m.v;
+    on_stretch += (on_shear * m.u) * row + on_late * m.late * unstretch;
+    const Lanes p = camera.fx * where(m.inside_u, on_u * m.late + on_shear * m.stretch * row);
+    const Lanes q = camera.fy * where(m.inside_v, on_v * m.late + on_stretch * m.stretch * m.stretch * row);
+    on_v += on_late * m.stretch * row;
+    const Lanes a = r.slope_x, b = r.slope_y, inverse_z = 1.0f / r.z, nearer = t[2] * inverse_z + t[3] * b - t[4] * a;
+    return {p * (nearer - t[4] * a) - q * (t[5] + t[4] * b), p * (t[5] + t[3] * a) + q * (nearer + t[3] * b),
+            p * (t[2] * a - t[0]) + q * (t[2] * b - t[1])};
+}
+
 // All that `out` has, garbage in the lanes that are not seen.
 SPLATS_INLINE void splats_backward(const Camera& camera, const Parameters& p, int64_t first, int count,
                                    const Projection& r, const ImageGradient& g, SplatGradient& out) {
@@ -139,19 +168,26 @@ SPLATS_INLINE void splats_backward(const Camera& camera, const Parameters& p, in
     to_quaternion(r, rotation, out.quaternion);
 
     const Lanes inverse_z = 1.0f / r.z, jx = camera.fx * inverse_z, jy = camera.fy * inverse_z;
+    Lanes image_u = g.u, image_v = g.v, still[2][3];
+    OnMotion on_motion{};
+    if (camera.rolling)
+        on_motion = roll_backward(camera, r, image_u, image_v, to_image, still);
+    else
+        std::memcpy(still, r.to_image, sizeof(still));
     Lanes on_jx{}, on_jy{}, toward_x{}, toward_y{};
     for (int k = 0; k < 3; ++k) {
         const float wz = float(camera.rotation[k][2]);
-        on_jx += to_image[0][k] * r.to_image[0][k];
-        on_jy += to_image[1][k] * r.to_image[1][k];
+        on_jx += to_image[0][k] * still[0][k];
+        on_jy += to_image[1][k] * still[1][k];
         toward_x += to_image[0][k] * wz;
         toward_y += to_image[1][k] * wz;
     }
-    const Lanes on_slope_x = where(r.inside_x, -jx * toward_x), on_slope_y = where(r.inside_y, -jy * toward_y);
-    const Lanes on_u = g.u * jx, on_v = g.v * jy;
+    const Lanes on_slope_x = where(r.inside_x, on_motion.slope_x - jx * toward_x);
+    const Lanes on_slope_y = where(r.inside_y, on_motion.slope_y - jy * toward_y);
+    const Lanes on_u = image_u * jx, on_v = image_v * jy;
     const Lanes point[3] = {on_u + on_slope_x * inverse_z, on_v + on_slope_y * inverse_z,
                             g.depth - (on_jx + on_jy + on_u * r.x + on_v * r.y + on_slope_x * r.slope_x +
-                                       on_slope_y * r.slope_y) * inverse_z};
+                                       on_slope_y * r.slope_y + on_motion.inverse_z * inverse_z) * inverse_z};
     Lanes on_offset[3];
     shade_backward(p, first, count, r, g, out, on_offset);
     for (int k = 0; k < 3; ++k) {

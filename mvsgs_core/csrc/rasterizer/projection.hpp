@@ -9,6 +9,14 @@
 
 namespace splats {
 
+// How a rolling shutter moves a splat on the image.
+struct Motion {
+    Lanes u, v;              // px while the image is read
+    Mask inside_u, inside_v;  // where that is not limited
+    Lanes stretch, shear;    // the axes on the image: (x, y) -> (x + shear y, stretch y)
+    Lanes late;              // readouts from the image's middle to when the mean is read
+};
+
 struct Projection {
     Lanes offset[3];            // mean - camera center, world
     Lanes x, y, z;              // in the camera's frame
@@ -18,7 +26,8 @@ struct Projection {
     Lanes rotation[3][3];       // of the splat
     Lanes unit[4], inverse_norm;  // quaternion
     Lanes scale[3];
-    Lanes to_image[2][3];       // Jacobian times cam_from_world
+    Lanes to_image[2][3];       // Jacobian times cam_from_world, with a rolling shutter as that sees it
+    Motion motion;              // where the camera has one
     Lanes axes[2][3];           // the splat's axes on the image, px
     Lanes xx, xy, yy;           // covariance with blur, px^2
     Lanes sharp, determinant;
@@ -125,6 +134,29 @@ SPLATS_INLINE void rotation_of(const Lanes (&unit)[4], Lanes (&out)[3][3]) {
     out[2][2] = 1.0f - 2.0f * (b * b + c * c);
 }
 
+// Moves what was found of the splats to where a rolling shutter sees them.
+SPLATS_INLINE void roll(const Camera& camera, const Lanes& inverse_z, Projection& r) {
+    const std::array<float, 6>& t = camera.readout;
+    const float height = float(camera.height), most_u = kMaxMotion * camera.width, most_v = kMaxMotion * height;
+    const Lanes a = r.slope_x, b = r.slope_y, nearer = t[2] * inverse_z + t[3] * b - t[4] * a;
+    const Lanes u = camera.fx * (t[5] * b - t[4] - t[0] * inverse_z + a * nearer);
+    const Lanes v = camera.fy * (t[3] - t[5] * a - t[1] * inverse_z + b * nearer);
+    Motion& m = r.motion;
+    m.u = limited(u, -most_u, most_u);
+    m.v = limited(v, -most_v, most_v);
+    m.inside_u = at_least(u, -most_u) & at_most(u, most_u);
+    m.inside_v = at_least(v, -most_v) & at_most(v, most_v);
+    m.stretch = height / (height - m.v);
+    m.shear = m.u * m.stretch * (1.0f / height);
+    m.late = ((r.whole_v + r.part_v) * (1.0f / height) - 0.5f) * m.stretch;
+    r.part_u += m.late * m.u;
+    r.part_v += m.late * m.v;
+    for (int k = 0; k < 3; ++k) {
+        r.to_image[0][k] += m.shear * r.to_image[1][k];
+        r.to_image[1][k] *= m.stretch;
+    }
+}
+
 // The splats from `first`, `count` of them, at most sixteen; lanes that are not `seen` hold anything.
 SPLATS_INLINE void project(const Camera& camera, const Parameters& p, int64_t first, int count, Projection& r) {
     Lanes mean[3], q[4], log_scale[3], raw_x, raw_y;
@@ -149,6 +181,7 @@ SPLATS_INLINE void project(const Camera& camera, const Parameters& p, int64_t fi
         r.to_image[0][k] = jx * (wx - r.slope_x * wz);
         r.to_image[1][k] = jy * (wy - r.slope_y * wz);
     }
+    if (camera.rolling) roll(camera, inverse_z, r);
     for (int k = 0; k < 3; ++k) {
         r.scale[k] = exponential(log_scale[k]);
         for (int row = 0; row < 2; ++row)

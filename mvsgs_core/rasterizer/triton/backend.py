@@ -40,7 +40,8 @@ def of_projection(settings: RenderSettings, bases: int) -> dict[str, Any]:
     """What the kernels of the projection are compiled for and launched with; bases: coefficients of the harmonics."""
     return {
         "BASES": bases, "USED": (settings.degree + 1) ** 2, "EXACT": settings.exact,
-        "ANTIALIASED": settings.antialiased, "BLOCK": BLOCK, "ROW": ROW, "num_warps": 2, "enable_fp_fusion": True,
+        "ANTIALIASED": settings.antialiased, "ROLLING": any(settings.readout), "BLOCK": BLOCK, "ROW": ROW,
+        "num_warps": 2, "enable_fp_fusion": True,
     }  # fmt: skip
 
 
@@ -65,7 +66,8 @@ def projected(parameters: list[Tensor], settings: RenderSettings) -> Pass:
     if count:
         project[(programs,)](
             *parameters, camera, rows, footprints, depths, radii, pairs, refused, count, width, height,
-            *settings.intrinsics, settings.near, FOOTPRINT=FOOTPRINT, **of_projection(settings, sh.shape[1]),
+            *settings.intrinsics, *settings.readout, settings.near, FOOTPRINT=FOOTPRINT,
+            **of_projection(settings, sh.shape[1]),
         )  # fmt: skip
     order = torch.argsort(depths, stable=True)
     ends = torch.cumsum(pairs[order], dim=0, dtype=torch.int64)
@@ -130,7 +132,7 @@ def backward(
     if count:
         project_backward[(programs,)](
             *parameters, kept.camera, kept.rows, lists.sums(sums), lists.pairs, *on_splats, on_means2d, on_pose,
-            count, width, height, *settings.intrinsics, POSE=wants_pose, SUMS=SUMS,
+            count, width, height, *settings.intrinsics, *settings.readout, POSE=wants_pose, SUMS=SUMS,
             **of_projection(settings, parameters[4].shape[1]),
         )  # fmt: skip
     if not wants_pose:

@@ -21,6 +21,7 @@ FOOTPRINT = 5  # half height, turn, 1 / pitch u, pitch v^2, reach: where the ell
 BLUR = tl.constexpr(interface.BLUR)
 HALF_MARGIN = tl.constexpr(0.5 * interface.CLAMP_MARGIN)
 MIN_COMPENSATION = tl.constexpr(interface.MIN_COMPENSATION)
+MAX_MOTION = tl.constexpr(interface.MAX_MOTION)
 MAX_VARIANCE = tl.constexpr(interface.MAX_VARIANCE)
 MAX_REACH = tl.constexpr(interface.MAX_REACH)
 LOG2_MAX_REACH = tl.constexpr(40.0)
@@ -90,6 +91,23 @@ def to_image_of(r00, r01, r02, r10, r11, r12, r20, r21, r22, jx, jy, slope_x, sl
 
 
 @triton.jit
+def motion_of(  # type: ignore[no-untyped-def]
+    exact_y, exact_z, slope_x, slope_y, fx, fy, cy, width, height, by_x, by_y, by_z, about_x, about_y, about_z
+):
+    """How a rolling shutter moves a splat: u, v in px, whether they were limited, stretch, shear, late; see Motion."""
+    inverse_z = 1.0 / exact_z.to(tl.float32)
+    nearer = by_z * inverse_z + about_x * slope_y - about_y * slope_x
+    raw_u = fx * (about_z * slope_y - about_y - by_x * inverse_z + slope_x * nearer)
+    raw_v = fy * (about_x - about_z * slope_x - by_y * inverse_z + slope_y * nearer)
+    most_u, most_v = MAX_MOTION * width, MAX_MOTION * height
+    u = tl.minimum(tl.maximum(raw_u, -most_u), most_u)
+    v = tl.minimum(tl.maximum(raw_v, -most_v), most_v)
+    stretch = height / (height - v)
+    late = ((fy * (exact_y / exact_z) + cy) / height - 0.5).to(tl.float32) * stretch
+    return u, v, u == raw_u, v == raw_v, nearer, stretch, u * stretch / height, late
+
+
+@triton.jit
 def axis_of(log_scales, at, inside, m00, m01, m02, m10, m11, m12, q0, q1, q2):  # type: ignore[no-untyped-def]
     """One axis of the splat, (q0, q1, q2) in the world, on the image in px; its length in the world; all finite."""
     log_scale = tl.load(log_scales + at, mask=inside, other=0.0)
@@ -122,9 +140,9 @@ def opacity_of(logit, sharp, determinant, ANTIALIASED: tl.constexpr):  # type: i
 @triton.jit
 def project(  # type: ignore[no-untyped-def]
     means, log_scales, quaternions, opacity_logits, sh, betas, camera, rows, footprints, depths, radii, pairs, refused,
-    count, width, height, fx, fy, cx, cy, near,
-    BASES: tl.constexpr, USED: tl.constexpr, EXACT: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
-    ROW: tl.constexpr, FOOTPRINT: tl.constexpr,
+    count, width, height, fx, fy, cx, cy, by_x, by_y, by_z, about_x, about_y, about_z, near,
+    BASES: tl.constexpr, USED: tl.constexpr, EXACT: tl.constexpr, ANTIALIASED: tl.constexpr, ROLLING: tl.constexpr,
+    BLOCK: tl.constexpr, ROW: tl.constexpr, FOOTPRINT: tl.constexpr,
 ):  # fmt: skip
     """Fills rows (N, ROW), footprints (N, FOOTPRINT), depths (N,) (inf if not seen), radii (N,) px (0 if not seen),
 
@@ -156,6 +174,14 @@ def project(  # type: ignore[no-untyped-def]
     m00, m01, m02, m10, m11, m12 = to_image_of(
         r00, r01, r02, r10, r11, r12, r20, r21, r22, fx / z, fy / z, slope_x, slope_y
     )
+    if ROLLING:
+        move_u, move_v, _inside_u, _inside_v, _nearer, stretch, lean, late = motion_of(
+            exact_y, exact_z, slope_x, slope_y, fx, fy, cy, width, height, by_x, by_y, by_z, about_x, about_y, about_z
+        )
+        u += late * move_u
+        v += late * move_v
+        m00, m01, m02 = m00 + lean * m10, m01 + lean * m11, m02 + lean * m12
+        m10, m11, m12 = stretch * m10, stretch * m11, stretch * m12
     q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation_of(a, b, c, d)
     s0, t0, _scale_0, good_0 = axis_of(log_scales, 3 * n, inside, m00, m01, m02, m10, m11, m12, q00, q10, q20)
     s1, t1, _scale_1, good_1 = axis_of(log_scales, 3 * n + 1, inside, m00, m01, m02, m10, m11, m12, q01, q11, q21)

@@ -16,6 +16,7 @@ from mvsgs_core.rasterizer.triton.projection import (
     camera_of,
     covariance_of,
     finite,
+    motion_of,
     opacity_of,
     rotation_of,
     slope_of,
@@ -56,9 +57,9 @@ def _axis_gradient(  # type: ignore[no-untyped-def]
 def project_backward(  # type: ignore[no-untyped-def]
     means, log_scales, quaternions, opacity_logits, sh, betas, camera, rows, totals, pairs,
     on_means, on_log_scales, on_quaternions, on_logits, on_sh, on_betas, on_means2d, on_pose,
-    count, width, height, fx, fy, cx, cy,
-    BASES: tl.constexpr, USED: tl.constexpr, EXACT: tl.constexpr, ANTIALIASED: tl.constexpr, POSE: tl.constexpr,
-    BLOCK: tl.constexpr, ROW: tl.constexpr, SUMS: tl.constexpr,
+    count, width, height, fx, fy, cx, cy, by_x, by_y, by_z, about_x, about_y, about_z,
+    BASES: tl.constexpr, USED: tl.constexpr, EXACT: tl.constexpr, ANTIALIASED: tl.constexpr, ROLLING: tl.constexpr,
+    POSE: tl.constexpr, BLOCK: tl.constexpr, ROW: tl.constexpr, SUMS: tl.constexpr,
 ):  # fmt: skip
     """Gradients of all parameters, 0 for splats without pairs and where one is not finite; on_pose (programs, 12)
 
@@ -78,7 +79,14 @@ def project_backward(  # type: ignore[no-untyped-def]
     slope_y, inside_y = slope_of(exact_y, exact_z, fy, cy, height)
     inverse_z = 1.0 / z
     jx, jy = fx * inverse_z, fy * inverse_z
-    m00, m01, m02, m10, m11, m12 = to_image_of(r00, r01, r02, r10, r11, r12, r20, r21, r22, jx, jy, slope_x, slope_y)
+    p00, p01, p02, p10, p11, p12 = to_image_of(r00, r01, r02, r10, r11, r12, r20, r21, r22, jx, jy, slope_x, slope_y)
+    m00, m01, m02, m10, m11, m12 = p00, p01, p02, p10, p11, p12
+    if ROLLING:
+        move_u, move_v, inside_u, inside_v, nearer, stretch, lean, late = motion_of(
+            exact_y, exact_z, slope_x, slope_y, fx, fy, cy, width, height, by_x, by_y, by_z, about_x, about_y, about_z
+        )
+        m00, m01, m02 = p00 + lean * p10, p01 + lean * p11, p02 + lean * p12
+        m10, m11, m12 = stretch * p10, stretch * p11, stretch * p12
     a, b, c, e, inverse, _usable = unit_quaternion(quaternions, n, seen)
     q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation_of(a, b, c, e)
     s0, t0, l0, _good_0 = axis_of(log_scales, 3 * n, seen, m00, m01, m02, m10, m11, m12, q00, q10, q20)
@@ -137,15 +145,32 @@ def project_backward(  # type: ignore[no-untyped-def]
     on_m10 = on_t0 * l0 * q00 + on_t1 * l1 * q01 + on_t2 * l2 * q02
     on_m11 = on_t0 * l0 * q10 + on_t1 * l1 * q11 + on_t2 * l2 * q12
     on_m12 = on_t0 * l0 * q20 + on_t1 * l1 * q21 + on_t2 * l2 * q22
-    on_jx = on_m00 * m00 + on_m01 * m01 + on_m02 * m02
-    on_jy = on_m10 * m10 + on_m11 * m11 + on_m12 * m12
+    still_u, still_v = on_u, on_v  # of the mean on the image as a camera that stands still sees it
+    motion_x = tl.zeros([BLOCK], tl.float32)  # of x/z, y/z and 1/z through the motion
+    motion_y = tl.zeros([BLOCK], tl.float32)
+    motion_z = tl.zeros([BLOCK], tl.float32)
+    if ROLLING:
+        on_lean = on_m00 * p10 + on_m01 * p11 + on_m02 * p12
+        on_late = on_u * move_u + on_v * move_v
+        on_stretch = on_m10 * p10 + on_m11 * p11 + on_m12 * p12 + on_lean * move_u / height + on_late * late / stretch
+        on_m10, on_m11, on_m12 = (
+            lean * on_m00 + stretch * on_m10, lean * on_m01 + stretch * on_m11, lean * on_m02 + stretch * on_m12
+        )  # fmt: skip
+        along_u = fx * tl.where(inside_u, on_u * late + on_lean * stretch / height, 0.0)
+        along_v = fy * tl.where(inside_v, on_v * late + on_stretch * stretch * stretch / height, 0.0)
+        motion_x = along_u * (nearer - about_y * slope_x) - along_v * (about_z + about_y * slope_y)
+        motion_y = along_u * (about_z + about_x * slope_x) + along_v * (nearer + about_x * slope_y)
+        motion_z = along_u * (by_z * slope_x - by_x) + along_v * (by_z * slope_y - by_y)
+        still_v = on_v + on_late * stretch / height
+    on_jx = on_m00 * p00 + on_m01 * p01 + on_m02 * p02
+    on_jy = on_m10 * p10 + on_m11 * p11 + on_m12 * p12
     w0, w1, w2 = r02.to(tl.float32), r12.to(tl.float32), r22.to(tl.float32)
-    on_slope_x = tl.where(inside_x, -jx * (on_m00 * w0 + on_m01 * w1 + on_m02 * w2), 0.0)
-    on_slope_y = tl.where(inside_y, -jy * (on_m10 * w0 + on_m11 * w1 + on_m12 * w2), 0.0)
-    point_x = on_u * jx + on_slope_x * inverse_z
-    point_y = on_v * jy + on_slope_y * inverse_z
+    on_slope_x = tl.where(inside_x, motion_x - jx * (on_m00 * w0 + on_m01 * w1 + on_m02 * w2), 0.0)
+    on_slope_y = tl.where(inside_y, motion_y - jy * (on_m10 * w0 + on_m11 * w1 + on_m12 * w2), 0.0)
+    point_x = still_u * jx + on_slope_x * inverse_z
+    point_y = still_v * jy + on_slope_y * inverse_z
     point_z = tl.load(total + 3, mask=seen, other=0.0) - (on_jx + on_jy) * inverse_z
-    point_z -= (on_u * jx * x + on_v * jy * y) * inverse_z
+    point_z -= (still_u * jx * x + still_v * jy * y + motion_z * inverse_z) * inverse_z
     point_z -= (on_slope_x * slope_x + on_slope_y * slope_y) * inverse_z
 
     inverse_distance = 1.0 / tl.sqrt(tl.maximum(d0 * d0 + d1 * d1 + d2 * d2, TINY))

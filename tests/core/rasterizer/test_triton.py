@@ -62,8 +62,9 @@ def pairs_of(splats: Splats, size: tuple[int, int], kernel: str) -> tuple[int, i
     from mvsgs_core.rasterizer.triton import backend as triton_backend
 
     settings = RenderSettings(
-        pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, exact=kernel == "exact",
-        background=(0.0, 0.0, 0.0), near=1e-3, antialiased=False, degree=0, weights=False, threads=1,
+        pose=torch.from_numpy(POSE), intrinsics=tuple(intrinsics(size).tolist()), size=size, readout=(0.0,) * 6,
+        exact=kernel == "exact", background=(0.0, 0.0, 0.0), near=1e-3, antialiased=False, degree=0,
+        weights=False, threads=1,
     )  # fmt: skip
     parameters = list(splats.tensors().values())
     passed = native.load("rasterizer").forward(

@@ -22,7 +22,8 @@ from mvsgs_core.rasterizer.triton import blend, lists, projection, projection_ba
 
 INTEGERS = {"count", "width", "height", "length", "tiles_x", "tiles"}
 FLOATS = {
-    "fx", "fy", "cx", "cy", "near", "red_behind", "green_behind", "blue_behind", "l1_weight", "l1_scale", "ssim_scale",
+    "fx", "fy", "cx", "cy", "by_x", "by_y", "by_z", "about_x", "about_y", "about_z", "near",
+    "red_behind", "green_behind", "blue_behind", "l1_weight", "l1_scale", "ssim_scale",
 }
 POINTERS = {
     "camera": "*fp64", "on_pose": "*fp64", "order": "*i64", "pairs": "*i32", "slots": "*i32",
@@ -40,7 +41,7 @@ def compile_for(capability, function, warps, **constants):
 
 for capability in (80, 90):
     tiles = {"EXACT": capability == 80, "ROW": projection.ROW}
-    splats = {**tiles, "BASES": 4, "USED": 4, "ANTIALIASED": capability == 80, "BLOCK": 64}
+    splats = {**tiles, "BASES": 4, "USED": 4, "ANTIALIASED": capability == 80, "ROLLING": True, "BLOCK": 64}
     sums = blend.SUMS
     compile_for(capability, blend.blend, 1, WEIGHTS=capability == 80, **tiles)
     compile_for(capability, blend.blend_backward, 1, DEPTH=capability == 80, SUMS=sums, **tiles)
