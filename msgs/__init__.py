@@ -39,7 +39,12 @@ class _Image:
 
 @dataclass(frozen=True)
 class _PosedImage(_Image):
-    """What every message of a keyframe has."""
+    """What every message of a keyframe has.
+
+    Those that follow the tracker also carry, where it knows the camera's rolling shutter, the `photograph` as the
+    shutter took it, and how: `readout_time`, and the camera's `velocity`, a twist (translation, rotation) a second in
+    its own axes, in the unit of `scale`. `image` is then as a global shutter would have taken it.
+    """
 
     world_from_cam: Annotated[np.ndarray, "float64 4 4"]
     scale: float  # the map's scale that pose and depths are in, see Poses; 1 when first sent
@@ -63,16 +68,16 @@ class GroundTruth(_Image):
 
 @dataclass(frozen=True)
 class Keyframe(_PosedImage):
-    """A frame that the tracker keeps, with its pose and coarse inverse depth on the tracker's grid.
-
-    The image is as a global shutter would have taken it, where the tracker knows the camera's rolling one.
-    """
+    """A frame that the tracker keeps, with its pose and coarse inverse depth on the tracker's grid."""
 
     inverse_depth: Annotated[np.ndarray, "float32 h w"]
     inverse_depth_weight: Annotated[np.ndarray, "float32 h w"]  # confidence, 0 to 1
     segment: int  # part of the map; poses of two segments share no frame of reference
     exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None
+    photograph: Annotated[np.ndarray, "uint8 H W 3"] | None = None  # as it was taken; None: the image is it
+    velocity: Annotated[np.ndarray, "float64 6"] | None = None
+    readout_time: float = 0.0  # seconds from the first row of the photograph to the last
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,9 @@ class Depth(_PosedImage):
     segment: int
     exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None
+    photograph: Annotated[np.ndarray, "uint8 H W 3"] | None = None  # as it was taken; None: the image is it
+    velocity: Annotated[np.ndarray, "float64 6"] | None = None
+    readout_time: float = 0.0  # seconds from the first row of the photograph to the last
 
 
 @dataclass(frozen=True)
@@ -110,6 +118,9 @@ class FusedKeyframe(_PosedImage):
     unfiltered: Annotated[np.ndarray, "float32 h w"] | None = None  # refined depth before the filters; None: not sent
     exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None
+    photograph: Annotated[np.ndarray, "uint8 H W 3"] | None = None  # as it was taken; None: the image is it
+    velocity: Annotated[np.ndarray, "float64 6"] | None = None
+    readout_time: float = 0.0  # seconds from the first row of the photograph to the last
 
 
 @dataclass(frozen=True)
@@ -148,9 +159,10 @@ class Trajectory:
     state: Annotated[np.ndarray, "uint8 N"]  # TrackingState
     segment: Annotated[np.ndarray, "int32 N"]
     focal_factor: float = 1.0  # by which the tracker multiplied the focal lengths of the frames, if they were guessed
-    readout_time: float = 0.0  # seconds of the rolling shutter that was taken out of the keyframes, first row to last
+    readout_time: float = 0.0  # seconds of the rolling shutter, first row to last; 0: none that is taken account of
     exposure: Annotated[np.ndarray, "float32 N 3 4"] | None = None  # of every frame, NaN where it is not known
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None
+    velocity: Annotated[np.ndarray, "float64 N 6"] | None = None  # as of keyframes; None: that between the poses
 
 
 @dataclass(frozen=True)

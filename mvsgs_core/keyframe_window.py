@@ -21,6 +21,12 @@ class WindowedKeyframe(Protocol):
     def size(self) -> tuple[int, int]:
         """(height, width): keyframes of different sizes are not compared."""
 
+    @property
+    def world_from_cam(self) -> np.ndarray: ...
+
+    @property
+    def scale(self) -> float: ...
+
     def moved(self, world_from_cam: np.ndarray, scale: float) -> Self:
         """The same keyframe after the tracker corrected its pose (4, 4) and the map's scale."""
 

@@ -9,6 +9,8 @@ import numpy as np
 
 from mvsgs_core import geometry
 
+LONGEST_GAP = 0.25  # seconds between frames: over a longer one the velocity is not known
+
 
 class TrackingState(IntEnum):
     """What the tracker knows of a frame's pose."""
@@ -30,9 +32,10 @@ class Trajectory:
     state: np.ndarray  # (N,) uint8 TrackingState
     segment: np.ndarray  # (N,) int32: poses of two segments share no frame of reference
     focal_factor: float = 1.0  # on the focal lengths of the frames, where they were guessed
-    readout_time: float = 0.0  # seconds of the rolling shutter that was taken out of the keyframes
+    readout_time: float = 0.0  # seconds of the rolling shutter, first row to last; 0: none that is taken account of
     exposure: np.ndarray | None = None  # (N, 3, 4) float32 color affine of each, see `msgs`, NaN where it is not known
     vignetting: np.ndarray | None = None  # (3,) float32 of the sensor
+    velocity: np.ndarray | None = None  # (N, 6) of the camera, see `velocities`; None: that between the poses
 
     @classmethod
     def empty(cls) -> Trajectory:
@@ -82,4 +85,21 @@ class Trajectory:
         return replace(self, world_from_cam=poses)
 
 
-__all__ = ["TrackingState", "Trajectory"]
+def velocities(timestamps: np.ndarray, world_from_cam: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Camera velocities (N, 6) by the `known` (N,) neighbors in time of each frame; 0 where there is none.
+
+    A twist (translation, rotation) a second in the camera's own axes, in the unit of the poses. timestamps: (N,)
+    seconds, ascending. world_from_cam: (N, 4, 4).
+    """
+    result = np.zeros((len(timestamps), 6))
+    order = np.flatnonzero(known)
+    for k, n in enumerate(order):
+        around = [m for m in order[max(k - 1, 0) : k + 2] if abs(timestamps[m] - timestamps[n]) < LONGEST_GAP]
+        seconds = timestamps[around[-1]] - timestamps[around[0]]
+        if seconds > 0.0:
+            moved = geometry.inverse(world_from_cam[around[0]]) @ world_from_cam[around[-1]]
+            result[n] = geometry.se3_log(moved) / seconds
+    return result
+
+
+__all__ = ["LONGEST_GAP", "TrackingState", "Trajectory", "velocities"]

@@ -171,8 +171,7 @@ def _fitted(report: dict[str, Any]) -> str:
 def _shutter(found: trajectory.Trajectory | None) -> str:
     if found is None or found.readout_time == 0.0:
         return ""
-    taken_out = f"{1e3 * found.readout_time:.1f} ms a frame"
-    return f"The rolling shutter that the tracker took out of the keyframes is applied to renders ({taken_out}). "
+    return f"Renders are as the camera's rolling shutter saw them ({1e3 * found.readout_time:.1f} ms a frame). "
 
 
 def _exposure(found: dict[str, Any] | None) -> str:

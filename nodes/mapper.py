@@ -83,7 +83,8 @@ class Mapper(Node):
                 index=fused.index, image=fused.image, intrinsics=fused.intrinsics, world_from_cam=fused.world_from_cam,
                 depth=fused.depth, scale=fused.scale, confidence=fused.confidence, normals=fused.normals,
                 unfiltered=fused.unfiltered, timestamp=fused.timestamp, exposure=fused.exposure,
-                vignetting=fused.vignetting,
+                vignetting=fused.vignetting, photograph=fused.photograph, velocity=fused.velocity,
+                readout_time=fused.readout_time,
             ),
             fused.segment,
         )  # fmt: skip

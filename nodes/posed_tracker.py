@@ -10,7 +10,7 @@ import numpy as np
 from msgs import Frame, GroundTruth, Keyframe, Poses, TrackingState, Trajectory
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import PosedConfig
-from mvsgs_core.tracking.estimation.rolling_shutter import rectified
+from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified
 from mvsgs_core.tracking.posed import PosedTracker as CoreTracker
 from mvsgs_core.tracking.publish import affine_of, changed_vignetting, differ
 from nodes import Node
@@ -107,10 +107,12 @@ class PosedTracker(Node):
         light = core.photometer
         self._keyframes[index] = light.exposure(index)
         inverse_depth, weight = coarse_map(keyframe)
+        readout_time = self.config.readout_time
+        velocity = camera_velocity(keyframe, core.graph.intrinsics) if readout_time else None
         return Keyframe(
             index=index,
             timestamp=frame.timestamp,
-            image=rectified(frame.image, keyframe.image, self.config.readout_time),
+            image=rectified(frame.image, keyframe.image, readout_time),
             intrinsics=frame.intrinsics,
             world_from_cam=self._joined[index][1],
             scale=1.0,
@@ -119,6 +121,9 @@ class PosedTracker(Node):
             segment=0,
             exposure=self._keyframes[index],
             vignetting=light.vignetting,
+            photograph=None if velocity is None else frame.image,
+            velocity=velocity,
+            readout_time=0.0 if velocity is None else readout_time,
         )
 
     def _exposed(self, core: CoreTracker) -> Iterator[Poses]:

@@ -11,7 +11,7 @@ from mvsgs_core import geometry
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import TrackerConfig
-from mvsgs_core.tracking.estimation.rolling_shutter import rectified
+from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified
 from mvsgs_core.tracking.publish import Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
 from nodes.tracking import TrackerNode
@@ -22,7 +22,7 @@ class Tracker(TrackerNode):
 
     @dataclass(frozen=True)
     class Config(TrackerConfig):
-        rectify_rolling_shutter: bool = True  # keyframes' images are sent as a global shutter would have taken them
+        rectify_rolling_shutter: bool = True  # take account of it after the tracker: rectify the images of stereo
 
     config: Config
     core: CoreTracker
@@ -47,6 +47,7 @@ class Tracker(TrackerNode):
     def _keyframe(self, index: int) -> Keyframe:
         frame, keyframe = self._frames[index], self.core.keyframe(index)
         inverse_depth, weight = coarse_map(keyframe)
+        velocity = camera_velocity(keyframe, self.core.session.graph.intrinsics) if self._readout_time else None
         with self.stats.time("rectification"):
             image = rectified(frame.image, keyframe.image, self._readout_time)
         self._readout_times.append(0.0 if keyframe.image.velocity is None else self._readout_time)
@@ -66,6 +67,9 @@ class Tracker(TrackerNode):
             segment=keyframe.segment,
             exposure=self.core.exposure(index),
             vignetting=self.core.vignetting,
+            photograph=None if velocity is None else frame.image,
+            velocity=velocity,
+            readout_time=0.0 if velocity is None else self._readout_time,
         )
 
     def _between(self, found: Between) -> TrackedFrame:

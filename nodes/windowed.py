@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from msgs import Depth, FusedKeyframe, Poses, TrackedFrame
+from msgs import Depth, FusedKeyframe, Keyframe, Poses, TrackedFrame
 from mvsgs_core.keyframe_window import WindowedKeyframe
 from nodes import Node
 
@@ -76,3 +76,11 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
             if one is None:
                 return
             yield self._message(one)
+
+
+def moved(message: Keyframe | Depth, now: WindowedKeyframe) -> dict[str, Any]:
+    """What a correction changes of a message: its pose, scale and velocity, as its keyframe has them now."""
+    velocity = message.velocity
+    if velocity is not None:
+        velocity = velocity * np.repeat([now.scale / message.scale, 1.0], 3)
+    return {"world_from_cam": now.world_from_cam, "scale": now.scale, "velocity": velocity}

@@ -79,7 +79,7 @@ def test_a_default_is_left_out_and_comes_back() -> None:
     poses = Poses(1, np.zeros(1, np.int64), np.zeros((1, 4, 4)), np.ones(1))
     assert b"segment" not in bytes(encode(poses))  # readers of before this field take it
     assert decode(encode(poses)).message.segment is None
-    for name in (b"unfiltered", b"exposure", b"vignetting"):
+    for name in (b"unfiltered", b"exposure", b"vignetting", b"photograph", b"velocity"):
         assert name not in bytes(encode(example(msgs.FusedKeyframe, absent=True)))
     joined = decode(encode(replace(poses, segment=np.array([3], np.int32)))).message
     assert joined.segment.tolist() == [3]

@@ -173,6 +173,27 @@ def test_exposure_and_vignetting_pass_through_and_a_correction_that_overtakes_th
     np.testing.assert_array_equal(coarse.exposure, 4 * affine)
 
 
+def test_a_photograph_passes_through_and_its_velocity_follows_the_maps_scale() -> None:
+    velocity = np.arange(1.0, 7.0)
+    mvs, depth_fusion = stereo(), fusion()
+    sent = [keyframe(i) for i in range(6)]
+    sent = [replace(k, photograph=k.image[::-1].copy(), velocity=velocity, readout_time=0.02) for k in sent]
+    depths = [d for k in sent for d in mvs.on_keyframe(k)]
+    assert all(np.array_equal(d.velocity, velocity) for d in depths)
+    poses = np.stack([k.world_from_cam for k in sent])
+    poses[:, :3, 3] *= 2.0
+    correction = Poses(1, np.arange(6), poses, np.full(6, 2.0))
+    for node in (mvs, depth_fusion):
+        list(node.on_poses(correction))
+    views = [v for d in [*depths, *mvs.on_end()] for v in depth_fusion.on_depth(d)] + list(depth_fusion.on_end())
+    assert [v.index for v in views] == list(range(6))
+    for view in views:
+        assert view.scale == 2.0
+        np.testing.assert_allclose(view.velocity, velocity * [2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+        np.testing.assert_array_equal(view.photograph, sent[view.index].image[::-1])
+        assert view.readout_time == 0.02
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_pose_that_is_not_finite_is_refused(bad: float) -> None:
     pose = look(0.0)

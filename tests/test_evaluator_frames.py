@@ -41,20 +41,22 @@ def test_frames_are_rendered_with_the_focal_length_that_the_tracker_found(evalua
     evaluator.evaluation.close()
 
 
-def test_the_rolling_shutter_that_the_tracker_took_out_is_applied_to_renders(evaluator: Evaluator) -> None:
+def test_renders_are_as_the_rolling_shutter_saw_them(evaluator: Evaluator) -> None:
     poses, index, none = poses_along(), np.arange(N), np.zeros(N, np.int32)
     poses[:, :3, 3] += ORIGIN
     track = Trajectory(index, index / 30, poses, index < 0, none.astype(np.uint8), none, readout_time=0.02)
     list(evaluator.on_trajectory(track))
     list(evaluator.on_splat_map(splat_map_of(True)))
     finished, view = evaluator.evaluation.maps[True], evaluator.evaluation.scored_frames()[5]
-    assert view.shutter is not None
-    assert view.shutter.readout_time == 0.02
+    assert view.readout is not None
     moved = geometry.se3_log(geometry.inverse(poses[4]) @ poses[6])
-    np.testing.assert_allclose(view.shutter.velocity, moved * 15, atol=1e-7)
+    np.testing.assert_allclose(view.readout, moved * 15 * 0.02, atol=1e-9)
     color = render_frame(finished.splats, finished.kernel, view, (H, W)).color
-    still = render_frame(finished.splats, finished.kernel, replace(view, shutter=None), (H, W)).color
+    still = render_frame(finished.splats, finished.kernel, replace(view, readout=None), (H, W)).color
     assert np.abs(color - still).max() > 1e-3
+    given = np.arange(6.0) * np.ones((N, 1))
+    list(evaluator.on_trajectory(replace(track, velocity=given)))  # the tracker knows better
+    np.testing.assert_allclose(evaluator.evaluation.scored_frames()[5].readout, 0.02 * given[5])
     list(evaluator.on_end())
     assert "20.0 ms a frame" in evaluator.report["protocol"]
 

@@ -310,6 +310,19 @@ def check_global_shutter(keyframes: list[Keyframe], frames: list[Frame]) -> None
     assert min(gains) > 0.0, gains
 
 
+def check_photographs(keyframes: list[Keyframe], frames: list[Frame]) -> None:
+    """What the map is made of: the frames as they came, and a velocity that turns the camera as its poses do."""
+    still, off = Synthetic(threads=1), []
+    for keyframe in keyframes[1:]:
+        assert keyframe.photograph is frames[keyframe.index].image
+        assert keyframe.readout_time == 0.5 / FPS
+        assert keyframe.velocity is not None
+        before, now = still[keyframe.index - 1].world_from_cam, still[keyframe.index].world_from_cam
+        turn = geometry.se3_log(geometry.inverse(before) @ now)[3:] * FPS
+        off.append(np.linalg.norm(keyframe.velocity[3:] - turn) / np.linalg.norm(turn))
+    assert np.median(off) < 0.3, off
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rectify_rolling_shutter", [True, False])
 def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling_shutter: bool) -> None:
@@ -321,9 +334,10 @@ def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling
     if rectify_rolling_shutter:
         assert trajectory.readout_time == 0.5 / FPS
         check_global_shutter(keyframes, frames)
+        check_photographs(keyframes, frames)
     else:
         assert trajectory.readout_time == 0.0
-        assert all(k.image is frames[k.index].image for k in keyframes)
+        assert all(k.image is frames[k.index].image and k.photograph is None for k in keyframes)
 
 
 @pytest.mark.slow
@@ -336,6 +350,7 @@ def test_keyframes_with_true_poses_are_as_a_global_shutter_would_have_taken_them
     sent += list(node.on_end())
     assert sent[-1].readout_time == 0.5 / FPS  # type: ignore[union-attr]
     check_global_shutter(of_type(sent, Keyframe), frames)
+    check_photographs(of_type(sent, Keyframe), frames)
 
 
 @pytest.mark.parametrize("node", [Tracker, PosedTracker])

@@ -15,10 +15,9 @@ from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_de
 from mvsgs_core.evaluation.exposure import FrameExposures, frame_exposures, summary
 from mvsgs_core.evaluation.fitted_camera import fit_camera
 from mvsgs_core.evaluation.frames import Frames
-from mvsgs_core.evaluation.rolling_shutter import Shutter, velocities
 from mvsgs_core.evaluation.trajectory_metrics import known_poses
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.trajectory import Trajectory
+from mvsgs_core.trajectory import Trajectory, velocities
 
 NEAR = 0.01  # of the typical depth: splats nearer to a camera are not drawn
 ENOUGH = 3  # held-out frames whose mean and worst say something
@@ -114,7 +113,9 @@ class Evaluation:
         frames = []
         main = tracked.main()
         near = NEAR * _typical_depth(finished)
-        moving = velocities(tracked.timestamp, tracked.world_from_cam, main)
+        moving = tracked.velocity
+        if moving is None:
+            moving = velocities(tracked.timestamp, tracked.world_from_cam, main)
         exposures = self.exposures(refined)
         photographs = self._frames.photographs()
         for k in np.flatnonzero(main & np.isin(tracked.index, list(photographs))):
@@ -130,7 +131,7 @@ class Evaluation:
                     photograph.intrinsics * [focal, focal, 1.0, 1.0],
                     photograph.image,
                     near,
-                    Shutter(tracked.readout_time, moving[k]) if rolling else None,
+                    tracked.readout_time * moving[k] if rolling else None,
                     None if exposures is None else exposures.affines[k],
                     tracked.vignetting,
                 )

@@ -13,7 +13,6 @@ import torch
 from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import metrics
 from mvsgs_core.evaluation.frames import ENDING
-from mvsgs_core.evaluation.rolling_shutter import Shutter, apply_rolling_shutter
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.rasterize import rasterize
@@ -32,7 +31,7 @@ class ScoredFrame:
     intrinsics: np.ndarray  # (4,)
     photograph: Callable[[], np.ndarray]  # (H, W, 3) uint8, read when needed
     near: float  # nothing nearer is drawn, map units
-    shutter: Shutter | None = None  # how the photograph was read out; None: all rows at once
+    readout: np.ndarray | None = None  # (6,) twist of the camera while it was read, see `rasterize`; None: all at once
     exposure: np.ndarray | None = None  # (3, 4) color affine of the photograph; None: none
     vignetting: np.ndarray | None = None  # (3,) of the sensor; None: none
 
@@ -79,14 +78,13 @@ def render_frame(splats: Splats, kernel: str, frame: ScoredFrame, size: tuple[in
     exposure = None if frame.exposure is None else torch.from_numpy(frame.exposure)
     with torch.inference_mode():
         render = rasterize(
-            splats, frame.world_from_cam, frame.intrinsics, size, exposure=exposure, kernel=kernel, near=frame.near
-        )
-    color, depth = render.color.cpu().numpy(), render.depth.cpu().numpy()
-    if frame.shutter is not None:
-        color = apply_rolling_shutter(color, depth, frame.intrinsics, frame.shutter)
+            splats, frame.world_from_cam, frame.intrinsics, size, exposure=exposure, kernel=kernel, near=frame.near,
+            readout=frame.readout,
+        )  # fmt: skip
+    color = render.color.cpu().numpy()
     if frame.vignetting is not None:
         color = color * vignetting_factor(frame.vignetting, frame.intrinsics, size)[..., None]
-    return Rendered(color.clip(0.0, 1.0), depth, render.opacity.cpu().numpy())
+    return Rendered(color.clip(0.0, 1.0), render.depth.cpu().numpy(), render.opacity.cpu().numpy())
 
 
 def score_frame(splats: Splats, kernel: str, frame: ScoredFrame, given: Mapping[str, Compare] | None = None) -> Score:

@@ -80,9 +80,11 @@ class KeyframeStore:
         self._by_index |= other._by_index
         self._bound_images()
 
-    def place_anew(self, local: Callable[[np.ndarray], np.ndarray]) -> None:
-        """The frame of reference has another unit: `local` takes poses (4, 4) of the world to it."""
+    def place_anew(self, local: Callable[[np.ndarray], np.ndarray], unit: float = 1.0) -> None:
+        """The frame of reference has another unit: `local` takes poses (4, 4) of the world to it. unit: its length in
+        the one before."""
         for view in self.views:
+            view.velocity[:3] /= unit
             view.local_from_cam = local(view.world_from_cam)
 
     def _bound_images(self) -> bool:

@@ -29,6 +29,9 @@ class RGBDKeyframe:
     timestamp: float = float("nan")  # seconds; NaN: not known
     exposure: np.ndarray | None = None  # (3, 4) color affine that the tracker estimated; None: not known
     vignetting: np.ndarray | None = None  # (3,) of the sensor, the same
+    photograph: np.ndarray | None = None  # (H, W, 3) uint8 as a rolling shutter took it, of which `image` is free
+    velocity: np.ndarray | None = None  # (6,) of the camera, as in `msgs`; with a photograph only
+    readout_time: float = 0.0  # seconds from the first row of the photograph to the last
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class TrainingView:
     pose_moments: np.ndarray = field(default_factory=lambda: np.zeros((2, 6)))  # of (translation, rotation)
     pose_steps: int = 0
     fixed: bool = False  # its pose is not refined: it holds the frame of reference
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))  # of the camera, twist a second, mapper's unit
+    readout_time: float = 0.0  # seconds from the image's first row to its last; 0: all rows at once
     median_depth: float = 0.0  # of its depth map, in the mapper's unit; 0: it has none
     valid: Tensor | None = None  # (H, W) bool; None: every pixel is
     visits: int = 0  # training iterations so far
@@ -72,6 +77,11 @@ class TrainingView:
     def refined_from_cam(self) -> np.ndarray:
         """(4, 4) the pose to train and render from: the tracker's, and what the map made of it."""
         return self.local_from_cam @ self.pose_delta
+
+    @property
+    def readout(self) -> np.ndarray | None:
+        """(6,) twist of the camera while the image was read, see `rasterize`; None: all rows at once."""
+        return self.readout_time * self.velocity if self.readout_time else None
 
     @property
     def has_image(self) -> bool:
@@ -99,9 +109,18 @@ class TrainingView:
     def rescale(self, factor: float) -> None:
         """Lengths in a unit of 1 / `factor` of what it was; the moments follow, a gradient is divided by `factor`."""
         self.median_depth *= factor
+        self.velocity[:3] *= factor
         self.pose_delta[:3, 3] *= factor
         self.pose_moments[0, :3] /= factor
         self.pose_moments[1, :3] /= factor**2
+
+    def take_photograph(self, photograph: np.ndarray, velocity: np.ndarray, readout_time: float) -> None:
+        """From here on the image is the photograph (H, W, 3) uint8 as a rolling shutter took it, and renders are, too.
+
+        velocity: (6,) of the camera, a twist a second in its own axes, in the mapper's unit.
+        """
+        resized = torch.from_numpy(np.array(camera.resize_image(photograph, self.size)))
+        self.image, self.velocity, self.readout_time = resized.to(self.image.device), velocity, readout_time
 
     def place(self, world_from_cam: np.ndarray, local_from_cam: np.ndarray, scale: float) -> Similarity:
         """A corrected pose and scale; returns how what was seen from it moves, in the mapper's frame."""

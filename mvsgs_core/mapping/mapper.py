@@ -114,6 +114,10 @@ class OnlineMapper:
             self.schedule.reset()
         with self.log.time("insertion"):
             inserted = self.densifier.add(checked, view, depth)
+        if checked.photograph is not None and checked.velocity is not None and view.has_image:
+            per_unit = scale / (checked.scale * self.frame.length)
+            velocity = checked.velocity * ([per_unit] * 3 + [1.0] * 3)
+            view.take_photograph(checked.photograph, velocity, checked.readout_time)
         self.schedule.add_budget(self.config.iterations)
         self.log.count("inserted", inserted)
         self.log.count("views")
@@ -211,7 +215,7 @@ class OnlineMapper:
         if other.frame.origin is None:
             return
         if self.frame.adopt(other.frame):
-            self.keyframes.place_anew(self.frame.local)
+            self.keyframes.place_anew(self.frame.local, self.frame.length)
         change = self.frame.from_other(other.frame)
         with self.log.time("joining"):
             move_with_anchors(other.state, dict.fromkeys(other.state.anchors.unique().tolist(), change))
@@ -252,7 +256,7 @@ class OnlineMapper:
         if not self.frame.holds(pose, median):
             return None
         if self.frame.begin(pose, median):
-            self.keyframes.place_anew(self.frame.local)
+            self.keyframes.place_anew(self.frame.local, self.frame.length)
         view = training_view(keyframe, self.frame.local(pose), self.config.max_pixels, self.state.device)
         view.world_from_cam, view.scale, view.median_depth = pose, scale, median / self.frame.length
         view.fixed = not self.views

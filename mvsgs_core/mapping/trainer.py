@@ -85,8 +85,8 @@ class Trainer:
         training = self.config.training
         render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
-            exposure=exposure, pose_delta=twist, near=training.near * median_depth, antialiased=training.antialiased,
-            threads=self.config.threads,
+            exposure=exposure, pose_delta=twist, readout=view.readout, near=training.near * median_depth,
+            antialiased=training.antialiased, threads=self.config.threads,
         )  # fmt: skip
         factor = self._vignetting(intrinsics, size)
         if factor is not None:

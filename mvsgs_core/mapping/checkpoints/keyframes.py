@@ -24,6 +24,8 @@ class KeptKeyframe:
     segment: int  # part of the map
     exposure: np.ndarray  # (3, 4) float32, the tracker's; NaN: none is known
     vignetting: np.ndarray | None  # (3,) of the sensor, the tracker's
+    velocity: np.ndarray  # (6,) of the camera, as in `msgs`
+    readout_time: float  # seconds of its rolling shutter
     folder: Path  # of the images
     name: str  # of its image's file; empty where that was let go
 
@@ -44,7 +46,8 @@ def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
         found = [
             KeptKeyframe(
                 row["index"], row["timestamp"], row["intrinsics"], row["world_from_cam"], int(part["segment"]),
-                row["measured"], vignetting, file.parent / KEYFRAMES, row["file"],
+                row["measured"], vignetting, row["velocity"] * ([float(part["unit"] or 1.0)] * 3 + [1.0] * 3),
+                row["readout_time"], file.parent / KEYFRAMES, row["file"],
             )
             for k, part in enumerate(meta["mappers"])
             for row in keyframe_rows(Arrays(raw).of(f"map{k}").of("views"), part["images"])

@@ -35,12 +35,14 @@ VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in Trainin
     "image_size": (np.int64, (2,)), "exposure": (np.float32, (3, 4)), "exposure_moments": (np.float32, (2, 3, 4)),
     "measured": (np.float32, (3, 4)),
     "pose_delta": (np.float64, (4, 4)), "pose_moments": (np.float64, (2, 6)), "pose_steps": (np.int64, ()),
-    "fixed": (np.bool_, ()), "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_here": (np.int64, ()),
+    "velocity": (np.float64, (6,)), "readout_time": (np.float64, ()), "fixed": (np.bool_, ()),
+    "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_here": (np.int64, ()),
     "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "intrinsics": (np.float64, (4,)),
 }  # fmt: skip
 BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
     "keyframe": (np.int64, ()), "keyframe_from_cam": (np.float64, (4, 4)), "from_keyframe": (np.float32, (3, 4)),
 }  # fmt: skip
+NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "readout_time")
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "measured")
 
 
@@ -182,7 +184,7 @@ def keyframe_rows(
     columns = {
         name: arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN) for name, (dtype, shape) in kept.items()
     }
-    sensible = all((columns[n] >= 0).all() for n in ("pose_steps", "visits", "visits_here", "median_depth"))
+    sensible = all((columns[n] >= 0).all() for n in NEVER_BELOW_0)
     if not (sensible and (columns["image_size"] > 0).all() and (columns["scale"] > 0).all()):
         raise ValueError("keyframes have sizes, scales or counts that none has")
     if not (isinstance(images, list) and len(images) == count and all(isinstance(name, str) for name in images)):
@@ -226,7 +228,7 @@ def _copied(view: V) -> V:
     first, second = (moment.to("cpu", copy=True) for moment in view.exposure_moments)
     return replace(
         view, exposure=view.exposure.detach().to("cpu", copy=True), exposure_moments=(first, second),
-        pose_delta=view.pose_delta.copy(), pose_moments=view.pose_moments.copy(),
+        pose_delta=view.pose_delta.copy(), pose_moments=view.pose_moments.copy(), velocity=view.velocity.copy(),
     )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """The readout time of a rolling shutter, from the matches alone: the one that bundle adjustment agrees with best.
 
-And images as a global shutter would have taken them: poses, stereo and the map are all of one moment.
+And images as a global shutter would have taken them, for stereo: poses and depth are all of one moment. The map is made
+of the photographs as they were taken, by renders as the shutter saw them, for which it gets the camera's velocity.
 
 Rows of an image are taken one after the other. A point at row v that moves at w pixels a second was seen
 w * readout_time * (v / H - 1/2) from where a global shutter would have seen it in the middle of the readout; the
@@ -16,11 +17,13 @@ import cv2
 import numpy as np
 
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
-from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 
 MAX_ESTIMATED = 0.035  # seconds: most cameras need less than a frame at 30 a second
 MAX_READOUT_TIME = 0.2  # seconds: a readout time that is given and longer is a mistake, of the unit for one
+MIN_POINTS = 50  # whose depth is known: from fewer the camera's velocity is not
+VELOCITY_STEPS = 5  # of iteratively reweighted least squares
 MIN_GAIN = 0.02  # of the robust cost: what a global shutter gains by chance is less
 
 
@@ -50,6 +53,32 @@ def estimate_readout_time(graph: KeyframeGraph, indices: Iterable[int], threads:
     return best if gain > MIN_GAIN * costs[0] else 0.0
 
 
+def camera_velocity(keyframe: Keyframe, intrinsics: np.ndarray) -> np.ndarray | None:
+    """(6,) twist (translation, rotation) a second in the camera's axes, in the unit of the keyframe's depths.
+
+    That which moves its points of known depth as the image moves, by least absolute errors; None where either is not
+    known. intrinsics: (4,) of the tracker's images.
+    """
+    flow, known = keyframe.image.velocity, keyframe.triangulated
+    if flow is None or known.sum() < MIN_POINTS:
+        return None
+    fx, fy, cx, cy = intrinsics
+    x, y = ((keyframe.points[known] - [cx, cy]) / [fx, fy]).T
+    near, zero = keyframe.inverse_depth[known], np.zeros(int(known.sum()))
+    # how the image moves with the camera: the interaction matrix of visual servoing (Chaumette and Hutchinson 2006)
+    of_u = np.stack([-near, zero, x * near, x * y, -(1.0 + x * x), y], axis=1) * fx
+    of_v = np.stack([zero, -near, y * near, 1.0 + y * y, -x * y, -x], axis=1) * fy
+    moves = np.stack([of_u, of_v], axis=1)  # (M, 2, 6)
+    seen = flow.reshape(-1, 2)[known].astype(np.float64)
+    weight = np.ones(len(seen))
+    for _ in range(VELOCITY_STEPS):
+        root = np.sqrt(weight)
+        twist = np.linalg.lstsq((moves * root[:, None, None]).reshape(-1, 6), (seen * root[:, None]).ravel())[0]
+        error = np.linalg.norm(moves @ twist - seen, axis=1)
+        weight = 1.0 / np.maximum(error, max(float(np.median(error)), 1e-6))
+    return twist if np.isfinite(twist).all() else None
+
+
 def rectified(image: np.ndarray, frame: TrackingImage, readout_time: float) -> np.ndarray:
     """An image (H, W, 3) uint8 as a global shutter would have taken it in the middle of the readout.
 
@@ -76,4 +105,11 @@ def check_readout_time(readout_time: float | None) -> None:
         )
 
 
-__all__ = ["MAX_ESTIMATED", "MAX_READOUT_TIME", "check_readout_time", "estimate_readout_time", "rectified"]
+__all__ = [
+    "MAX_ESTIMATED",
+    "MAX_READOUT_TIME",
+    "camera_velocity",
+    "check_readout_time",
+    "estimate_readout_time",
+    "rectified",
+]

@@ -7,7 +7,7 @@ import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
-from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout_time
+from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, estimate_readout_time
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
@@ -69,6 +69,41 @@ def test_poses_are_right_once_it_is_taken_out() -> None:
         assert not graph.optimize(indices, indices - {0, 1}, indices, solver).failure
         errors[readout_time] = max(np.abs(graph.keyframes[n].cam_from_world - poses[n]).max() for n in indices)
     assert errors[0.025] < 0.2 * errors[0.0]
+
+
+def moving_keyframe(velocity: np.ndarray, outliers: float = 0.0) -> tuple[Keyframe, np.ndarray]:
+    """A keyframe whose points move on the image as the camera moves; its intrinsics."""
+    random = np.random.default_rng(1)
+    lens = np.array([130.0, 135.0, 79.5, 59.5])
+    image = TrackingImage(0, 0.0, random.integers(0, 255, SIZE, dtype=np.uint8))
+    points, depth = image.cells.points, random.uniform(0.5, 3.0, 300)
+    rays = np.stack([(points[:, 0] - lens[2]) / lens[0], (points[:, 1] - lens[3]) / lens[1], np.ones(300)], axis=1)
+    step = 1e-6  # seconds
+    now = rays * depth[:, None]
+    later = (now - velocity[:3] * step) @ geometry.se3_exp(np.r_[np.zeros(3), velocity[3:] * step])[:3, :3]
+    flow = (later[:, :2] / later[:, 2:] - now[:, :2] / now[:, 2:]) * lens[:2] / step
+    wild = random.random(300) < outliers
+    flow[wild] += random.normal(0.0, 300.0, (int(wild.sum()), 2))
+    image.velocity = flow.reshape(15, 20, 2).astype(np.float32)
+    return Keyframe(image, np.eye(4), 1.0 / depth, np.full(300, 1000.0), 0), lens
+
+
+@pytest.mark.parametrize(("outliers", "off"), [(0.0, 1e-3), (0.3, 0.02)])
+def test_the_cameras_velocity_is_found_in_the_flow(outliers: float, off: float) -> None:
+    velocity = np.array([0.5, -0.3, 0.4, 0.3, -0.6, 0.2])
+    keyframe, lens = moving_keyframe(velocity, outliers)
+    found = camera_velocity(keyframe, lens)
+    assert found is not None
+    np.testing.assert_allclose(found, velocity, atol=off)
+
+
+def test_without_flow_or_depth_no_velocity_is_known() -> None:
+    keyframe, lens = moving_keyframe(np.ones(6))
+    keyframe.information[20:] = 0.0
+    assert camera_velocity(keyframe, lens) is None
+    keyframe.information[:] = 1000.0
+    keyframe.image.velocity = None
+    assert camera_velocity(keyframe, lens) is None
 
 
 @pytest.mark.slow

@@ -1,0 +1,97 @@
+"""The map is trained on photographs as a rolling shutter took them, by renders as it saw them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvsgs_core import geometry
+from mvsgs_core.mapping.keyframes import RGBDKeyframe
+from mvsgs_core.mapping.mapper import OnlineMapper
+from tests.support.small_maps import CONFIG, mapped, score
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
+
+READOUT_TIME = 0.02
+TIMES = (0.0, 0.33, 0.66, 1.0)
+
+
+def photographed(index: int, t: float, velocity: np.ndarray, unit: float = 1.0) -> RGBDKeyframe:
+    """A keyframe whose photograph's rows were each seen from where the camera was then."""
+    still = rgbd_keyframe(index, pose_on_arc(t), unit=unit)
+    photograph = still.image.copy()
+    for row in range(len(photograph)):
+        moved = geometry.se3_exp(velocity * READOUT_TIME * (row / len(photograph) - 0.5))
+        photograph[row] = rgbd_keyframe(index, pose_on_arc(t) @ moved).image[row]
+    scaled = velocity * ([unit] * 3 + [1.0] * 3)
+    return replace(still, photograph=photograph, velocity=scaled, readout_time=READOUT_TIME)
+
+
+def shaking(unit: float = 1.0) -> list[RGBDKeyframe]:
+    """Views of a camera that moves by 3 to 5 pixels within each."""
+    speed = np.random.default_rng(0).choice([-1.0, 1.0], (len(TIMES), 6)) * [4.0, 4.0, 2.0, 2.0, 2.0, 2.0]
+    return [photographed(5 * k, t, speed[k], unit) for k, t in enumerate(TIMES)]
+
+
+@pytest.mark.parametrize("unit", [1.0, 50.0])
+def test_photographs_with_their_shutter_give_the_map_of_still_ones(unit: float) -> None:
+    """Nearly as good, for the shutter is rendered to first order; photographs without it in the render are far off."""
+    views = shaking(unit)
+    between = rgbd_keyframe(99, pose_on_arc(0.5), unit=unit)
+    by_shutter = score(mapped(views), between)
+    still = score(mapped([replace(v, photograph=None) for v in views]), between)
+    ignored = score(mapped([replace(v, readout_time=0.0) for v in views]), between)
+    assert by_shutter - ignored > 1.5 * (still - by_shutter), (by_shutter, still, ignored)
+    assert by_shutter > ignored + 3.0, (by_shutter, still, ignored)
+
+
+def test_the_keyframe_is_shown_as_the_shutter_saw_it() -> None:
+    """The self check and the previews compare like with like."""
+    mapper = mapped(shaking())
+    found = mapper.self_check()
+    assert found is not None
+    for view in mapper.views:
+        view.readout_time = 0.0
+    without = mapper.self_check()
+    assert without is not None
+    assert found.psnr > without.psnr + 2.0
+
+
+def test_the_velocity_follows_the_maps_scale() -> None:
+    view = shaking()[0]
+    mapper = OnlineMapper(CONFIG)
+    assert view.velocity is not None
+    mapper.correct(np.array([0]), view.world_from_cam[None], np.array([2.0]))  # it overtakes the keyframe
+    mapper.add_keyframe(view)
+    (trained,) = mapper.views
+    np.testing.assert_allclose(trained.velocity[:3], 2.0 * view.velocity[:3] / mapper.frame.length)
+    np.testing.assert_array_equal(trained.velocity[3:], view.velocity[3:])
+    mapper.correct(np.array([0]), view.world_from_cam[None], np.array([3.0]))
+    np.testing.assert_allclose(trained.velocity[:3], 3.0 * view.velocity[:3] / mapper.frame.length)
+
+
+def test_a_view_before_the_unit_is_known_gets_its_velocity_in_it() -> None:
+    first, second = shaking()[:2]
+    mapper = OnlineMapper(CONFIG)
+    mapper.add_keyframe(replace(first, depth=np.zeros_like(first.depth), normals=None))
+    mapper.add_keyframe(second)
+    assert mapper.frame.unit is not None
+    assert first.velocity is not None
+    np.testing.assert_allclose(mapper.views[0].velocity[:3], first.velocity[:3] / mapper.frame.unit)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"photograph": np.zeros((4, 4, 3), np.uint8)}, {"velocity": None}, {"velocity": np.full(6, np.nan)},
+        {"readout_time": -0.01}, {"readout_time": float("nan")}, {"readout_time": 5.0},
+    ],
+)  # fmt: skip
+def test_a_photograph_that_says_nothing_is_left_out(change: dict) -> None:
+    view = replace(shaking()[0], **change)
+    mapper = OnlineMapper(CONFIG)
+    mapper.add_keyframe(view)
+    assert mapper.log.counts["refused_photographs"] == 1
+    assert mapper.views[0].readout is None
+    np.testing.assert_array_equal(mapper.views[0].image.numpy(), view.image)

@@ -1,0 +1,27 @@
+"""The camera's velocity between the poses of a trajectory."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.trajectory import velocities
+
+VELOCITY = np.array([0.3, -0.2, 0.4, 0.2, -0.1, 0.3])
+
+
+def test_velocity_of_a_steady_motion_is_found_at_every_frame() -> None:
+    times = np.array([0.0, 0.1, 0.2, 0.25, 0.35])
+    start = geometry.se3_exp(np.array([1.0, 2.0, 3.0, 0.5, 0.2, 0.1]))
+    poses = np.array([start @ geometry.se3_exp(VELOCITY * t) for t in times])
+    found = velocities(times, poses, np.ones(5, dtype=bool))
+    np.testing.assert_allclose(found, np.tile(VELOCITY, (5, 1)), atol=1e-9)
+
+
+def test_velocity_is_zero_where_no_neighbor_in_time_is_known() -> None:
+    times = np.array([0.0, 0.1, 0.2, 1.0, 1.1])
+    poses = np.array([geometry.se3_exp(VELOCITY * t) for t in times])
+    poses[1] = np.nan
+    found = velocities(times, poses, np.array([True, False, True, True, False]))
+    np.testing.assert_allclose(found[[0, 2]], [VELOCITY, VELOCITY], atol=1e-9)
+    assert not found[[1, 3, 4]].any()
