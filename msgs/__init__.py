@@ -137,6 +137,8 @@ class Poses:
     segment: Annotated[np.ndarray, "int32 K"] | None = None  # Keyframe.segment now: a loop joins two; None: as sent
     exposure: Annotated[np.ndarray, "float32 K 3 4"] | None = None  # of those keyframes now; None: as they were
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None  # of all images now; None: as it was
+    velocity: Annotated[np.ndarray, "float64 K 6"] | None = None  # of those keyframes now, NaN or None: as it was
+    readout_time: float = 0.0  # seconds of the rolling shutter that go with the velocities
 
 
 @dataclass(frozen=True)

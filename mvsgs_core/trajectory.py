@@ -48,6 +48,14 @@ class Trajectory:
         """(N,) bool: frames with a pose, verified or not."""
         return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
 
+    def velocities_of(self, index: np.ndarray) -> np.ndarray:
+        """(K, 6) of the camera at the frames `index` (K,), see `velocities`; NaN where no neighbor tells it."""
+        found = np.zeros((len(self.index), 6))
+        for segment in np.unique(self.segment[self.posed]):
+            found += velocities(self.timestamp, self.world_from_cam, self.posed & (self.segment == segment))
+        found[~found.any(axis=1)] = np.nan
+        return np.asarray(found[np.searchsorted(self.index, index)])
+
     def main(self) -> np.ndarray:
         """(N,) bool: frames with a pose in the part of the map that has most frames."""
         posed = self.posed

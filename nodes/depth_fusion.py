@@ -10,7 +10,7 @@ from msgs import Depth, FusedKeyframe
 from mvsgs_core import camera
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig, OnlineFusion
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
-from nodes.windowed import WindowedNode, moved
+from nodes.windowed import WindowedNode
 
 
 class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
@@ -69,7 +69,7 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             timestamp=message.timestamp,
             image=message.image,
             intrinsics=message.intrinsics,
-            **moved(message, found.view),
+            **self._moved(message, found.view),
             depth=found.depth,
             confidence=found.confidence,
             normals=found.normals,
@@ -78,7 +78,6 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             exposure=message.exposure,
             vignetting=message.vignetting,
             photograph=message.photograph,
-            readout_time=message.readout_time,
         )
         return self._exposed(fused)
 

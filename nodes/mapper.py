@@ -126,8 +126,9 @@ class Mapper(Node):
         self._settle()  # the map must not depend on when they come
         self.atlas.revision = max(self.atlas.revision, poses.revision)
         self.atlas.correct(
-            poses.index, poses.world_from_cam, poses.scale, poses.segment, poses.exposure, poses.vignetting
-        )
+            poses.index, poses.world_from_cam, poses.scale, poses.segment, poses.exposure, poses.vignetting,
+            poses.velocity, poses.readout_time,
+        )  # fmt: skip
         yield from ()
 
     def on_idle(self) -> list[Preview] | None:

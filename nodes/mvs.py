@@ -10,7 +10,7 @@ import numpy as np
 
 from msgs import Depth, Keyframe
 from mvsgs_core.mvs.cascade import Cascade, CascadeConfig, CascadeDepth, OnlineStereo
-from nodes.windowed import WindowedNode, moved
+from nodes.windowed import WindowedNode
 
 
 class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
@@ -59,7 +59,7 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
             self.stats.skip(f"hypotheses {what}", found.result.counts.get(what, 0.0))
         self.stats.values["mean confidence"] = float(np.mean(found.result.confidence))
         depth = depth_message(keyframe, found.result.depth, found.result.confidence)
-        depth = replace(depth, **moved(depth, found.view))
+        depth = replace(depth, **self._moved(depth, found.view))
         return self._exposed(depth)
 
 

@@ -36,6 +36,7 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
         self._exposures: dict[int, np.ndarray] = {}  # (3, 4), the same
         self._vignetting: np.ndarray | None = None  # (3,) the newest
+        self._velocities: dict[int, tuple[np.ndarray, float, float]] = {}  # newest, with their scale and readout time
 
     @abstractmethod
     def _make_core(self) -> Core: ...
@@ -51,6 +52,10 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
             self._exposures.update(zip(map(int, poses.index), poses.exposure, strict=True))
         if poses.vignetting is not None:
             self._vignetting = poses.vignetting
+        if poses.velocity is not None:
+            for i, velocity, scale in zip(poses.index, poses.velocity, poses.scale, strict=True):
+                if np.isfinite(velocity).all():
+                    self._velocities[int(i)] = (velocity, float(scale), poses.readout_time)
         self._core.move(self._poses)
         yield poses
 
@@ -64,6 +69,15 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         vignetting = message.vignetting if self._vignetting is None else self._vignetting
         return replace(message, exposure=exposure, vignetting=vignetting)
 
+    def _moved(self, message: Keyframe | Depth, now: WindowedKeyframe) -> dict[str, Any]:
+        """What corrections change of a message: pose, scale and velocity, as its keyframe has them now."""
+        velocity, scale, readout_time = message.velocity, message.scale, message.readout_time
+        if velocity is not None:
+            velocity, scale, readout_time = self._velocities.get(message.index, (velocity, scale, readout_time))
+            velocity = velocity * np.repeat([now.scale / scale, 1.0], 3)
+        moved = {"world_from_cam": now.world_from_cam, "scale": now.scale}
+        return moved | {"velocity": velocity, "readout_time": readout_time}
+
     def _corrected(self, keyframe: K) -> K:
         """With its newest pose, where that came before the keyframe."""
         return keyframe.moved(*self._poses[keyframe.index]) if keyframe.index in self._poses else keyframe
@@ -76,11 +90,3 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
             if one is None:
                 return
             yield self._message(one)
-
-
-def moved(message: Keyframe | Depth, now: WindowedKeyframe) -> dict[str, Any]:
-    """What a correction changes of a message: its pose, scale and velocity, as its keyframe has them now."""
-    velocity = message.velocity
-    if velocity is not None:
-        velocity = velocity * np.repeat([now.scale / message.scale, 1.0], 3)
-    return {"world_from_cam": now.world_from_cam, "scale": now.scale, "velocity": velocity}

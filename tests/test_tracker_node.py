@@ -335,6 +335,16 @@ def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling
         assert trajectory.readout_time == 0.5 / FPS
         check_global_shutter(keyframes, frames)
         check_photographs(keyframes, frames)
+        final = of_type(sent, Poses)[-1]
+        assert final.readout_time == 0.5 / FPS
+        assert final.velocity is not None
+        assert final.index.tolist() == [k.index for k in keyframes]
+        for row, keyframe in zip(final.velocity, keyframes, strict=True):
+            seen = dict(zip(trajectory.index.tolist(), trajectory.world_from_cam, strict=True))
+            around = [n for n in (keyframe.index - 1, keyframe.index + 1) if n in seen and np.isfinite(seen[n]).all()]
+            if len(around) == 2:
+                moved = geometry.se3_log(geometry.inverse(seen[around[0]]) @ seen[around[1]])
+                np.testing.assert_allclose(row, moved * FPS / 2, rtol=1e-6, atol=1e-9)
     else:
         assert trajectory.readout_time == 0.0
         assert all(k.image is frames[k.index].image and k.photograph is None for k in keyframes)

@@ -13,7 +13,7 @@ import numpy as np
 
 from mvsgs_core.mapping.between import FrameBetween, FramesBetween
 from mvsgs_core.mapping.checkpoints.state import copy_of
-from mvsgs_core.mapping.keyframe_checks import NO_POSE, is_pose
+from mvsgs_core.mapping.keyframe_checks import MAX_READOUT_TIME, NO_POSE, is_pose
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.stats import Stats
@@ -100,18 +100,21 @@ class Atlas:
 
     def correct(
         self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray, segment: np.ndarray | None = None,
-        exposure: np.ndarray | None = None, vignetting: np.ndarray | None = None,
+        exposure: np.ndarray | None = None, vignetting: np.ndarray | None = None, velocity: np.ndarray | None = None,
+        readout_time: float = 0.0,
     ) -> None:  # fmt: skip
         """Corrected poses as in `OnlineMapper.correct`, for each part's keyframes; what is no pose is counted once.
 
         segment (K,): to which their keyframes belong now; maps of segments that became one are joined. exposure
-        (K, 3, 4), vignetting (3,): as in `Photometry.take`.
+        (K, 3, 4), vignetting (3,): as in `Photometry.take`. velocity (K, 6), readout_time: as in `OnlineMapper.move`.
         """
         usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
         if not usable.all():
             self.current.log.refuse("poses", int((~usable).sum()), NO_POSE)
         for part in self.parts.values() or [self.current]:
             part.correct(index[usable], world_from_cam[usable], scale[usable])
+            if velocity is not None and 0.0 <= readout_time <= MAX_READOUT_TIME:
+                part.move(index[usable], velocity[usable], readout_time)
         if self.current.config.training.exposure and not (exposure is None and vignetting is None):
             self.current.photometry.take(index.tolist(), exposure, vignetting, self.current.log)
             for part in self.parts.values() or [self.current]:

@@ -46,6 +46,8 @@ class Correction:
     segment: np.ndarray | None = None  # (K,) int32 part of the map that it belongs to now; None: there is only one
     exposure: np.ndarray | None = None  # (K, 3, 4) float32 color affines, see `msgs`; None: as they were
     vignetting: np.ndarray | None = None  # (3,) float32 of all images; None: as it was
+    velocity: np.ndarray | None = None  # (K, 6) of the camera, see `msgs`, NaN where not known; None: as they were
+    readout_time: float = 0.0  # seconds of the rolling shutter that go with them
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,11 @@ class Tracker:
         warn_of_gaps(stats, self._trajectory)
         warn_of_few_matches(stats, graph, self.config.min_matches)
         state = TrackingState.TRACKED if tracking else TrackingState.NOT_INITIALIZED
-        yield Update(state, correction=session.publisher.corrections(everything=True))
+        correction = session.publisher.corrections(everything=True)
+        if correction is not None and graph.readout_time > 0.0:
+            velocity = self._trajectory.velocities_of(correction.index)
+            correction = replace(correction, velocity=velocity, readout_time=graph.readout_time)
+        yield Update(state, correction=correction)
 
 
 __all__ = ["Tracker", "TrackerConfig", "Update"]

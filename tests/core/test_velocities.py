@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.trajectory import velocities
+from mvsgs_core.trajectory import Trajectory, velocities
 
 VELOCITY = np.array([0.3, -0.2, 0.4, 0.2, -0.1, 0.3])
 
@@ -25,3 +25,15 @@ def test_velocity_is_zero_where_no_neighbor_in_time_is_known() -> None:
     found = velocities(times, poses, np.array([True, False, True, True, False]))
     np.testing.assert_allclose(found[[0, 2]], [VELOCITY, VELOCITY], atol=1e-9)
     assert not found[[1, 3, 4]].any()
+
+
+def test_frames_of_two_segments_say_nothing_of_each_others_velocity() -> None:
+    times = np.arange(6) / 10.0
+    poses = np.array([geometry.se3_exp(VELOCITY * t) for t in times])
+    poses[3:, :3, 3] += 100.0  # another frame of reference
+    poses[5] = np.nan
+    segment = np.array([0, 0, 0, 1, 1, -1], np.int32)
+    track = Trajectory(7 + np.arange(6), times, poses, np.zeros(6, bool), np.zeros(6, np.uint8), segment)
+    found = track.velocities_of(np.array([9, 10, 12]))
+    np.testing.assert_allclose(found[:2], [VELOCITY, VELOCITY], atol=1e-9)
+    assert np.isnan(found[2]).all()

@@ -71,6 +71,18 @@ def test_the_velocity_follows_the_maps_scale() -> None:
     np.testing.assert_allclose(trained.velocity[:3], 3.0 * view.velocity[:3] / mapper.frame.length)
 
 
+def test_a_velocity_that_is_known_better_replaces_the_first() -> None:
+    views = shaking()[:2]
+    mapper = mapped([replace(views[0], photograph=None), views[1]])
+    better = np.stack([np.full(6, 2.0), np.arange(1.0, 7.0)])
+    mapper.move(np.array([0, 5]), better, 0.03)
+    assert mapper.views[0].readout is None  # its image has no shutter in it
+    in_unit = better[1] / np.repeat([mapper.frame.length, 1.0], 3)
+    np.testing.assert_allclose(mapper.views[1].readout, 0.03 * in_unit)
+    mapper.move(np.array([5]), np.full((1, 6), np.nan), 0.01)
+    np.testing.assert_allclose(mapper.views[1].readout, 0.03 * in_unit)
+
+
 def test_a_view_before_the_unit_is_known_gets_its_velocity_in_it() -> None:
     first, second = shaking()[:2]
     mapper = OnlineMapper(CONFIG)
