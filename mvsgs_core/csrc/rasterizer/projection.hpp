@@ -153,7 +153,7 @@ SPLATS_INLINE void roll(const Camera& camera, const Lanes& inverse_z, Projection
     r.part_v += m.late * m.v;
     for (int k = 0; k < 3; ++k) {
         r.to_image[0][k] += m.shear * r.to_image[1][k];
-        r.to_image[1][k] *= m.stretch;
+        r.to_image[1][k] = m.stretch * r.to_image[1][k];
     }
 }
 
