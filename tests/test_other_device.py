@@ -142,7 +142,7 @@ def test_a_checkpoint_of_a_mapper_elsewhere_gives_it_back(tmp_path: Path) -> Non
         names = [image_name(view) for view in frozen.current.views]
         for view, name in zip(frozen.current.views, names):
             write_image(images, view, name, sync=False)
-        save(frozen, config, state_file(tmp_path, 1), {0: names}, sync=False)
+        save(frozen, config, state_file(tmp_path, 1), {0: (names, [])}, sync=False)
         again = load(tmp_path, config, Stats())[0].current
         while mapper.step() and again.step():
             pass
