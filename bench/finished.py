@@ -120,9 +120,11 @@ def snapshot_of(folder: Path, trajectory: Trajectory) -> Snapshot:
         mapped = trajectory.keyframe & trajectory.main()
         index, poses = trajectory.index[mapped], trajectory.world_from_cam[mapped]
         exposures = np.tile(np.eye(3, 4), (len(index), 1, 1))
+    steady = np.array_equal(exposures, np.broadcast_to(np.eye(3, 4), exposures.shape))  # the map was made without
     return replace(
-        splats, keyframes=index, world_from_cam=poses, scale=np.ones(len(index)), exposures=exposures.astype(np.float32)
-    )
+        splats, keyframes=index, world_from_cam=poses, scale=np.ones(len(index)),
+        exposures=exposures.astype(np.float32), vignetting=None if steady else trajectory.vignetting,
+    )  # fmt: skip
 
 
 def _array(values: list[Any]) -> np.ndarray | None:

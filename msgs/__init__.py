@@ -186,6 +186,7 @@ class SplatMap:
     world_from_cam: Annotated[np.ndarray, "float64 K 4 4"]  # of those keyframes, as the mapper used them
     scale: Annotated[np.ndarray, "float64 K"]
     exposures: Annotated[np.ndarray, "float32 K 3 4"]  # color affine [A | b] of each keyframe
+    vignetting: Annotated[np.ndarray, "float32 3"] | None = None  # that renders need beside them
 
 
 @dataclass(frozen=True)

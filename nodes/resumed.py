@@ -36,7 +36,6 @@ class Resumed(Node):
 
     def run(self) -> Iterator[GroundTruth | Trajectory | FusedKeyframe | Poses]:
         keyframes = kept_keyframes(self.config.path or "")
-        vignetting = keyframes[0].vignetting if keyframes else None
         self.stats.values["frames_expected"] = len(keyframes)
         for keyframe in keyframes:
             with self.stats.time("read"):
@@ -54,7 +53,6 @@ class Resumed(Node):
             state=np.full(len(keyframes), TrackingState.TRACKED, dtype=np.uint8),
             segment=np.array([keyframe.segment for keyframe in keyframes], dtype=np.int32),
             exposure=np.array([keyframe.exposure for keyframe in keyframes], dtype=np.float32).reshape(-1, 3, 4),
-            vignetting=None if vignetting is None else vignetting.astype(np.float32),
             velocity=np.array([keyframe.velocity for keyframe in keyframes], dtype=np.float64).reshape(-1, 6),
             readout_time=max((keyframe.readout_time for keyframe in keyframes), default=0.0),
         )

@@ -68,15 +68,9 @@ def test_frames_are_rendered_at_the_trackers_exposure_and_vignetting(evaluator: 
     gains[[2, 3, 5]] = 0.2, 0.5, 0.7
     exposure = (gains[:, None, None] * np.eye(3, 4)).astype(np.float32)
     vignetting = np.array([-0.3, 0.0, 0.0], np.float32)
-    list(
-        evaluator.on_trajectory(
-            Trajectory(
-                index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none, exposure=exposure,
-                vignetting=vignetting,
-            )
-        )
-    )  # fmt: skip
-    splat_map = splat_map_of(True)
+    state = none.astype(np.uint8)
+    list(evaluator.on_trajectory(Trajectory(index, index / 30, poses, index % 3 == 0, state, none, exposure=exposure)))
+    splat_map = replace(splat_map_of(True), vignetting=vignetting)
     splat_map.exposures[1, :, :3] *= 0.5  # of frame 3; those of frames 0 and 6 are the identity
     list(evaluator.on_splat_map(splat_map))
     finished, views = evaluator.evaluation.maps[True], evaluator.evaluation.scored_frames()

@@ -133,7 +133,7 @@ class Evaluation:
                     near,
                     tracked.readout_time * moving[k] if rolling else None,
                     None if exposures is None else exposures.affines[k],
-                    tracked.vignetting,
+                    finished.vignetting,
                 )
             )
         return frames
@@ -181,7 +181,7 @@ class Evaluation:
         if not self.maps or self.trajectory is None:
             return None
         finished = self.maps[refined]
-        return summary(finished.keyframes, finished.exposures, self.exposures(refined), self.trajectory.vignetting)
+        return summary(finished.keyframes, finished.exposures, self.exposures(refined), finished.vignetting)
 
     def _fitted(self, finished: Snapshot, frame: scoring.ScoredFrame, score: scoring.Score) -> scoring.Score:
         """The same score, and that of a held-out frame with its camera fitted at test time beside it."""

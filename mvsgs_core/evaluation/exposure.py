@@ -25,14 +25,14 @@ class FrameExposures:
 def frame_exposures(
     timestamps: np.ndarray, measured: np.ndarray | None, rows: np.ndarray, affines: np.ndarray
 ) -> FrameExposures | None:
-    """Of frames at `timestamps` (N,) ascending; None where neither tracker nor map has any.
+    """Of frames at `timestamps` (N,) ascending; None where the map was made without any.
 
     measured: (N, 3, 4) the tracker's, NaN where not known (then interpolated in time from those that are); None: it
     has none. rows: (K,) the keyframes among the frames, ascending; affines: (K, 3, 4) the map's of those. Before the
     first and after the last one theirs holds.
     """
     known = np.zeros(len(timestamps), bool) if measured is None else np.isfinite(measured).all(axis=(1, 2))
-    if not len(rows) or (not known.any() and np.allclose(affines, IDENTITY)):
+    if not len(rows) or np.array_equal(affines, np.broadcast_to(IDENTITY, affines.shape)):
         return None
     tracked = np.tile(IDENTITY.astype(np.float64), (len(timestamps), 1, 1))
     if measured is not None and known.any():

@@ -26,6 +26,7 @@ class Snapshot:
     world_from_cam: np.ndarray  # (K, 4, 4) float64, as refined, world frame (not relative to the origin)
     scale: np.ndarray  # (K,) float64
     exposures: np.ndarray  # (K, 3, 4) float32
+    vignetting: np.ndarray | None = None  # (3,) float32 of the camera, see `photometry`; None: none
 
     def relative_pose(self, world_from_cam: np.ndarray) -> np.ndarray:
         """(4, 4) of a pose in the world (4, 4): relative to `origin`, as the splats are."""

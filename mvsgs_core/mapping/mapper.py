@@ -249,7 +249,9 @@ class OnlineMapper:
 
     def snapshot(self) -> Snapshot:
         """The map in world units, relative to its origin."""
-        return snapshot(self.state, self.views, self.frame, self.config.training.kernel, self.iterations)
+        return snapshot(
+            self.state, self.views, self.frame, self.config.training.kernel, self.iterations, self.photometry.vignetting
+        )
 
     def _chosen(self, view: TrainingView) -> TrainingView:
         """To train on now: a frame between keyframes where its keyframe stands."""

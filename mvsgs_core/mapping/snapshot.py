@@ -22,6 +22,7 @@ def snapshot(
     frame: FrameOfReference,
     kernel: str,
     iterations: int,
+    vignetting: np.ndarray | None = None,
 ) -> Snapshot:
     """The state in world units."""
     local = state.detached()
@@ -43,6 +44,7 @@ def snapshot(
         world_from_cam=np.stack([_refined(v, length) for v in views]) if count else np.zeros((0, 4, 4)),
         scale=np.array([view.scale for view in views], dtype=np.float64),
         exposures=exposures,
+        vignetting=None if vignetting is None else vignetting.astype(np.float32),
     )
 
 

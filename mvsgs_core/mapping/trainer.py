@@ -9,7 +9,7 @@ from torch import Tensor
 from mvsgs_core.mapping import density_control, optimizer
 from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.exposure import Photometry
+from mvsgs_core.mapping.exposure import Photometry, unclipped
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import LossInputs, frequency_of, training_loss, weights_of
 from mvsgs_core.mapping.map_state import MapState
@@ -115,8 +115,7 @@ class Trainer:
         if view.valid is not None:  # equal to the render where a pixel is left out: no loss, no gradient
             target = torch.where(view.valid[..., None], target, render.color.detach())
         if self._photographed(view):  # white, or black, says that the color is at least, or most, that
-            color = render.color.detach()
-            target = torch.where(color.clamp(0.0, 1.0) == target, color, target)
+            target = unclipped(target, render.color)
         frequency = frequency_of(view.visits, self.config.training.frequency_horizon)
         return LossInputs(render, target, self.state.splats, frequency, self.config.threads)
 

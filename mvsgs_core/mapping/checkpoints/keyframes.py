@@ -10,7 +10,7 @@ import torch
 
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info, read_state
 from mvsgs_core.mapping.checkpoints.images import read_image
-from mvsgs_core.mapping.checkpoints.state import Arrays, keyframe_rows, photometry_of
+from mvsgs_core.mapping.checkpoints.state import Arrays, keyframe_rows
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,6 @@ class KeptKeyframe:
     world_from_cam: np.ndarray  # (4, 4) float64, the tracker's
     segment: int  # part of the map
     exposure: np.ndarray  # (3, 4) float32, the tracker's; NaN: none is known
-    vignetting: np.ndarray | None  # (3,) of the sensor, the tracker's
     velocity: np.ndarray  # (6,) of the camera, as in `msgs`
     readout_time: float  # seconds of its rolling shutter
     folder: Path  # of the images
@@ -42,11 +41,10 @@ def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
     file = checkpoint_info(output).file
     meta, raw = read_state(file)
     try:
-        vignetting = photometry_of(Arrays(raw).of("photometry")).vignetting
         found = [
             KeptKeyframe(
                 row["index"], row["timestamp"], row["intrinsics"], row["world_from_cam"], int(part["segment"]),
-                row["measured"], vignetting, row["velocity"] * ([float(part["unit"] or 1.0)] * 3 + [1.0] * 3),
+                row["measured"], row["velocity"] * ([float(part["unit"] or 1.0)] * 3 + [1.0] * 3),
                 row["readout_time"], file.parent / KEYFRAMES, row["file"],
             )
             for k, part in enumerate(meta["mappers"])

@@ -60,5 +60,7 @@ def test_without_a_tracker_that_knows_the_maps_are_interpolated_and_identities_a
     unknown = np.full((5, 3, 4), np.nan, np.float32)
     assert frame_exposures(TIMES, None, rows, plain) is None
     assert frame_exposures(TIMES, unknown, rows, plain) is None
+    off = frame_exposures(TIMES, tracked(1.0, 2.0, 1.0, 0.5, 1.0), rows, plain)
+    assert off is None  # a map without exposures shows every frame as it is
     assert frame_exposures(TIMES, None, np.zeros(0, int), np.zeros((0, 3, 4))) is None
     assert summary(np.zeros(0), np.zeros((0, 3, 4)), None, None) is None

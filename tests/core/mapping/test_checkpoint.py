@@ -127,7 +127,6 @@ def test_the_keyframes_of_a_checkpoint_are_what_the_mapper_was_given(tmp_path: P
     assert found[4].timestamp == 0.4
     np.testing.assert_array_equal(found[4].exposure, view(4).exposure)
     assert np.isnan(found[0].exposure).all()
-    np.testing.assert_array_equal(found[4].vignetting, 2.0 * VIGNETTING)
 
 
 def test_images_are_written_once_and_two_states_are_kept(tmp_path: Path) -> None:

@@ -9,12 +9,14 @@ import pytest
 import torch
 
 from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
-from mvsgs_core.mapping.exposure import BRIGHTEST, Photometry, colors_of_map, recolored, relative_to_mean
+from mvsgs_core.mapping.exposure import BRIGHTEST, Photometry, colors_of_map, recolored, relative_to_mean, unclipped
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.photometry import IDENTITY, compose, inverse, vignetting_factor
 from mvsgs_core.rasterizer.rasterize import rasterize
+from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
+from tests.support.rasterizer_scenes import POSE, intrinsics, random_splats
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (60, 80)
@@ -110,6 +112,8 @@ def test_vignetting_is_in_the_renders_and_not_in_the_map() -> None:
         corner = (color - plain)[:6, :6].abs().mean()
         assert (corner > 0.1) == differs, float(corner)
     assert error(told, 1) < 0.03
+    np.testing.assert_array_equal(told.snapshot().vignetting, DARK)
+    assert untold.snapshot().vignetting is None
     half = told.render(told.views[1], (24, 32)).color
     whole = told.render(told.views[1]).color.reshape(24, 2, 32, 2, 3).mean(dim=(1, 3))
     assert float((half - whole).abs().mean()) < 0.02  # the factor is that of the size
@@ -133,14 +137,38 @@ def test_a_render_beyond_white_has_no_gradient_where_the_photograph_is_white_onl
     view = mapper.views[0]
     with torch.no_grad():
         mapper.state.splats.sh[:, 0] += 3.0  # all is far beyond white
-    inputs = mapper.trainer._loss_inputs(view, mapper.trainer._rasterize(
-        mapper.state.splats, view, view.intrinsics, view.size, 1.0, view.exposure, None
-    ))  # fmt: skip
-    white = view.target == 1.0
-    solid = (inputs.render.color > 1.0) & white
+    color = rasterize(
+        mapper.state.detached(), view.refined_from_cam, view.intrinsics, view.size, exposure=view.exposure
+    ).color
+    target, white = unclipped(view.target, color), view.target == 1.0
+    solid = (color > 1.0) & white
     assert bool(solid.any())
-    assert torch.equal(inputs.target[solid], inputs.render.color.detach()[solid])
-    assert torch.equal(inputs.target[~white], view.target[~white])
+    assert torch.equal(target[solid], color[solid])
+    assert torch.equal(target[~white], view.target[~white])
+
+
+@pytest.mark.parametrize("at", ["dark", "white"])
+def test_gradients_pass_exposure_vignetting_and_the_cut_in_float64(at: str) -> None:
+    """Against finite differences, for the splats' colors, the pose and the exposure."""
+    size = (5, 6)
+    splats = random_splats(4, 4, seed=7, log_scale=0.3)
+    fields = [value.double() for value in splats.tensors().values()]
+    factor = torch.from_numpy(vignetting_factor(DARK, intrinsics(size), size)).double()[..., None]
+    target = torch.full((*size, 3), 0.4 if at == "dark" else 1.0, dtype=torch.float64)
+    target[0] = 0.0
+
+    def loss(sh: torch.Tensor, twist: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
+        given = dict(zip(splats.tensors(), fields)) | {"sh": sh}
+        render = rasterize(
+            Splats(**given), POSE, intrinsics(size), size, backend="reference", exposure=exposure, pose_delta=twist
+        )
+        color = render.color * factor
+        return (color - unclipped(target, color)).square().sum()
+
+    sh = (3.0 * splats.sh).double().requires_grad_()
+    twist = torch.full((6,), 0.02, dtype=torch.float64, requires_grad=True)
+    exposure = torch.from_numpy(3.0 * AFFINE).double().requires_grad_()
+    assert torch.autograd.gradcheck(loss, (sh, twist, exposure), eps=1e-6, atol=1e-6, rtol=1e-4)
 
 
 def test_without_exposures_the_map_is_that_of_exposure_off_to_the_bit() -> None:
