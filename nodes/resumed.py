@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msgs import FusedKeyframe, GroundTruth, Poses, TrackingState, Trajectory
+from msgs import FusedKeyframe, GroundTruth, Poses, TrackedFrame, TrackingState, Trajectory
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.keyframes import kept_keyframes
 from nodes import Node
@@ -16,8 +16,8 @@ from nodes import Node
 class Resumed(Node):
     """Keyframes of a checkpoint -> GroundTruth of each whose image is kept, and their Trajectory.
 
-    Stands for dataset, tracker, mvs and depth_fusion in a graph whose mapper resumes: there is no FusedKeyframe and no
-    correction to come, so that it yields none. The images are those that the map is trained on, none of them is
+    Stands for dataset, tracker, mvs and depth_fusion in a graph whose mapper resumes: there is no FusedKeyframe, no
+    TrackedFrame and no correction to come, so that it yields none. The images are those that the map is trained on, none of them is
     held-out.
     """
 
@@ -34,7 +34,7 @@ class Resumed(Node):
             raise ValueError("dataset.path is missing: give the output directory of the run")
         checkpoint_info(config.path)
 
-    def run(self) -> Iterator[GroundTruth | Trajectory | FusedKeyframe | Poses]:
+    def run(self) -> Iterator[GroundTruth | Trajectory | FusedKeyframe | TrackedFrame | Poses]:
         keyframes = kept_keyframes(self.config.path or "")
         self.stats.values["frames_expected"] = len(keyframes)
         for keyframe in keyframes:
