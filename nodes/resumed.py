@@ -17,8 +17,8 @@ class Resumed(Node):
     """Keyframes of a checkpoint -> GroundTruth of each whose image is kept, and their Trajectory.
 
     Stands for dataset, tracker, mvs and depth_fusion in a graph whose mapper resumes: there is no FusedKeyframe, no
-    TrackedFrame and no correction to come, so that it yields none. The images are those that the map is trained on, none of them is
-    held-out.
+    TrackedFrame and no correction to come, so that it yields none. The images are those that the map is trained on,
+    none of them is held-out.
     """
 
     @dataclass
