@@ -228,7 +228,7 @@ def test_every_choice_file_of_the_project_composes() -> None:
     """One at a time, with the default choices elsewhere: its node exists, its parameters and reads hold."""
     stands_for_the_stages = [
         *(f"{slot}._target_=null" for slot in ("tracker", "mvs", "depth_fusion")),
-        "mapper.reads={FusedKeyframe: dataset, Poses: dataset}",
+        "mapper.reads={FusedKeyframe: dataset, TrackedFrame: dataset, Poses: dataset}",
         "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, FusedKeyframe: dataset, SplatMap: mapper}",
     ]
     for slot in slots_of(CONF):

@@ -28,7 +28,7 @@ SMALL = [
 ]  # fmt: skip
 ROOM = ["dataset.size=[96,128]", "dataset.options.frames=80", "tracker.threads=1"]
 ALONE = [
-    "dataset=resumed", "mapper.reads={FusedKeyframe: dataset, Poses: dataset}",
+    "dataset=resumed", "mapper.reads={FusedKeyframe: dataset, TrackedFrame: dataset, Poses: dataset}",
     "evaluator.reads={GroundTruth: dataset, Trajectory: dataset, FusedKeyframe: dataset, SplatMap: mapper}",
     "tracker._target_=null", "mvs._target_=null", "depth_fusion._target_=null",
 ]  # fmt: skip
