@@ -107,7 +107,7 @@ def rows_of_varying(name: str, options: Mapping[str, Any], frames: int) -> list[
     if "vignetting" in options:
         usual, largest = vignetting_errors(tracker, sensor)
         rows.append(at_most(f"room, {name}: vignetting, median over the image", usual, "%", 2.0))
-        rows.append(Row(f"room, {name}: vignetting, largest, in a corner", largest, "%"))
+        rows.append(at_most(f"room, {name}: vignetting, largest, in a corner", largest, "%", 2.0))
         rows.append(at_most(f"room, {name}: response", response_error(tracker, sensor, options["response"]), "%", 2.0))
     keyframes = len(tracker.session.graph.keyframes)
     cost = 1e3 * tracker.stats.seconds["photometry"] / keyframes

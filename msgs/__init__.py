@@ -48,6 +48,12 @@ class _PosedImage(_Image):
 
     world_from_cam: Annotated[np.ndarray, "float64 4 4"]
     scale: float  # the map's scale that pose and depths are in, see Poses; 1 when first sent
+    exposure: Annotated[np.ndarray, "float32 3 4"] | None = field(default=None, kw_only=True)
+    vignetting: Annotated[np.ndarray, "float32 3"] | None = field(default=None, kw_only=True)
+    # as it was taken; None: the image is it
+    photograph: Annotated[np.ndarray, "uint8 H W 3"] | None = field(default=None, kw_only=True)
+    velocity: Annotated[np.ndarray, "float64 6"] | None = field(default=None, kw_only=True)
+    readout_time: float = field(default=0.0, kw_only=True)  # seconds from the photograph's first row to its last
 
 
 @dataclass(frozen=True)
@@ -73,11 +79,6 @@ class Keyframe(_PosedImage):
     inverse_depth: Annotated[np.ndarray, "float32 h w"]
     inverse_depth_weight: Annotated[np.ndarray, "float32 h w"]  # confidence, 0 to 1
     segment: int  # part of the map; poses of two segments share no frame of reference
-    exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
-    vignetting: Annotated[np.ndarray, "float32 3"] | None = None
-    photograph: Annotated[np.ndarray, "uint8 H W 3"] | None = None  # as it was taken; None: the image is it
-    velocity: Annotated[np.ndarray, "float64 6"] | None = None
-    readout_time: float = 0.0  # seconds from the first row of the photograph to the last
 
 
 @dataclass(frozen=True)
@@ -100,11 +101,6 @@ class Depth(_PosedImage):
     depth: Annotated[np.ndarray, "float32 h w"]
     confidence: Annotated[np.ndarray, "float32 h w"]  # 0 to 1
     segment: int
-    exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
-    vignetting: Annotated[np.ndarray, "float32 3"] | None = None
-    photograph: Annotated[np.ndarray, "uint8 H W 3"] | None = None  # as it was taken; None: the image is it
-    velocity: Annotated[np.ndarray, "float64 6"] | None = None
-    readout_time: float = 0.0  # seconds from the first row of the photograph to the last
 
 
 @dataclass(frozen=True)
@@ -116,11 +112,6 @@ class FusedKeyframe(_PosedImage):
     normals: Annotated[np.ndarray, "float32 h w 3"]  # camera frame, toward the camera; 0 where depth is 0
     segment: int
     unfiltered: Annotated[np.ndarray, "float32 h w"] | None = None  # refined depth before the filters; None: not sent
-    exposure: Annotated[np.ndarray, "float32 3 4"] | None = None
-    vignetting: Annotated[np.ndarray, "float32 3"] | None = None
-    photograph: Annotated[np.ndarray, "uint8 H W 3"] | None = None  # as it was taken; None: the image is it
-    velocity: Annotated[np.ndarray, "float64 6"] | None = None
-    readout_time: float = 0.0  # seconds from the first row of the photograph to the last
 
 
 @dataclass(frozen=True)

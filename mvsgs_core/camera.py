@@ -10,6 +10,7 @@ import numpy as np
 _NARROWEST, _WIDEST = 1000.0, 0.01  # focal lengths as multiples of the longer side: 0.06 and 179 degrees of view
 _OFF_CENTER = 2.0  # image sizes from the middle: a principal point farther out is not even that of a cropped picture
 _LONGEST_SIDE = 2**20  # pixels
+MAX_READOUT_TIME = 0.2  # seconds from the first row to the last: a longer one is a mistake, of the unit for one
 
 
 def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int]) -> None:

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mvsgs_core.camera import MAX_READOUT_TIME
 from mvsgs_core.mapping.between import FrameBetween, FramesBetween
 from mvsgs_core.mapping.checkpoints.state import copy_of
-from mvsgs_core.mapping.keyframe_checks import MAX_READOUT_TIME, NO_POSE, is_pose
+from mvsgs_core.mapping.keyframe_checks import NO_POSE, is_pose
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.stats import Stats
@@ -111,9 +112,14 @@ class Atlas:
         usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
         if not usable.all():
             self.current.log.refuse("poses", int((~usable).sum()), NO_POSE)
+        if velocity is not None and not 0.0 <= readout_time <= MAX_READOUT_TIME:
+            self.current.log.refuse(
+                "readout times", 1, f"a readout time outside of 0 to {MAX_READOUT_TIME:g} s was refused"
+            )
+            velocity = None
         for part in self.parts.values() or [self.current]:
             part.correct(index[usable], world_from_cam[usable], scale[usable])
-            if velocity is not None and 0.0 <= readout_time <= MAX_READOUT_TIME:
+            if velocity is not None:
                 part.move(index[usable], velocity[usable], readout_time)
         if self.current.config.training.exposure and not (exposure is None and vignetting is None):
             self.current.photometry.take(index.tolist(), exposure, vignetting, self.current.log)

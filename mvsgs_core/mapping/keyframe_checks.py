@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mvsgs_core.camera import MAX_READOUT_TIME
 from mvsgs_core.mapping.frame_of_reference import FAR
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.stats import Stats
@@ -17,7 +18,6 @@ from mvsgs_core.stats import Stats
 MIN_SIDE = 8  # pixels of an image
 FOCAL = (0.05, 100.0)  # focal lengths over the image's larger side: 170 degrees to half a degree
 OFF_CENTER = 1.0  # image sizes that the principal point may lie outside of the image
-MAX_READOUT_TIME = 1.0  # seconds from the first row to the last
 NO_POSE = "a corrected pose that is not finite, or none at all, was refused"
 
 

@@ -21,7 +21,7 @@ AGREEMENT = 0.7  # of a frame's points, all of which agreed once: fewer after th
 
 @dataclass(slots=True)
 class FrameRecord:
-    """A frame's state and where it was seen from one keyframe; 1.5 kilobytes, kept for every frame of the stream."""
+    """A frame's state and where it was seen from one keyframe; 1.3 kilobytes, kept for every frame of the stream."""
 
     index: int
     timestamp: float  # seconds

@@ -16,12 +16,12 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
+from mvsgs_core.camera import MAX_READOUT_TIME
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 
 MAX_ESTIMATED = 0.035  # seconds: most cameras need less than a frame at 30 a second
-MAX_READOUT_TIME = 0.2  # seconds: a readout time that is given and longer is a mistake, of the unit for one
 MIN_POINTS = 50  # whose depth is known: from fewer the camera's velocity is not
 VELOCITY_STEPS = 5  # of iteratively reweighted least squares
 MIN_GAIN = 0.02  # of the robust cost: what a global shutter gains by chance is less
@@ -107,7 +107,6 @@ def check_readout_time(readout_time: float | None) -> None:
 
 __all__ = [
     "MAX_ESTIMATED",
-    "MAX_READOUT_TIME",
     "camera_velocity",
     "check_readout_time",
     "estimate_readout_time",

@@ -87,7 +87,9 @@ def test_a_view_between_keyframes_with_holes_is_rendered_better() -> None:
     views = [with_hole(5 * k, t) for k, t in enumerate((0.4, 0.5, 0.6))]
     between = rgbd_keyframe(99, pose_on_arc(0.45))
     without = mapped(views, replace(CONFIG, insertion=InsertionConfig(fill=0)))
-    assert score(mapped(views), between) > score(without, between) + 1.0  # splats grow into a hole, too
+    filled = score(mapped(views), between)
+    assert filled > score(without, between) + 1.0  # splats grow into a hole, too
+    assert filled > 38.5
 
 
 def test_a_corrected_scale_holds_for_the_filling_too() -> None:
