@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core import geometry
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.small_maps import CONFIG, mapped, score
@@ -107,3 +108,18 @@ def test_a_photograph_that_says_nothing_is_left_out(change: dict) -> None:
     assert mapper.log.counts["refused_photographs"] == 1
     assert mapper.views[0].readout is None
     np.testing.assert_array_equal(mapper.views[0].image.numpy(), view.image)
+
+
+@pytest.mark.parametrize("readout_time", [-0.01, 0.5, float("nan")])
+def test_a_corrected_readout_time_that_no_camera_has_is_refused_and_counted(readout_time: float) -> None:
+    atlas = Atlas(OnlineMapper(CONFIG))
+    for view in shaking():
+        atlas.add(view, 0)
+    before = [(view.readout_time, view.velocity.copy()) for view in atlas.current.views]
+    index = np.array([view.index for view in atlas.current.views])
+    poses = np.stack([view.world_from_cam for view in atlas.current.views])
+    atlas.correct(index, poses, np.ones(len(index)), velocity=np.ones((len(index), 6)), readout_time=readout_time)
+    for (time, velocity), view in zip(before, atlas.current.views):
+        assert view.readout_time == time
+        np.testing.assert_array_equal(view.velocity, velocity)
+    assert any("readout time" in warning for warning in atlas.current.log.warnings)
