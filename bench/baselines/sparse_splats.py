@@ -16,7 +16,7 @@ import torch
 
 from mvsgs_core.evaluation.exposure import frame_exposures
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.exposure import Photometry
+from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.trainer import Trainer
@@ -68,7 +68,7 @@ class SparseMap:
         self.origin = views[0].world_from_cam[:3, 3].copy()
         self.unit = _median_depth(views, points)
         self.state = MapState(1, torch.device("cpu"))
-        self._photometry = Photometry(vignetting=vignetting)
+        self._photometry = ImageFormation(vignetting=vignetting)
         self._trainer = Trainer(config.mapper, self.state, Stats(), self._photometry)
         self.seconds = 0.0
         self._random = np.random.default_rng(config.mapper.seed)

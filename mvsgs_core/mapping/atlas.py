@@ -107,7 +107,8 @@ class Atlas:
         """Corrected poses as in `OnlineMapper.correct`, for each part's keyframes; what is no pose is counted once.
 
         segment (K,): to which their keyframes belong now; maps of segments that became one are joined. exposure
-        (K, 3, 4), vignetting (3,): as in `Photometry.take`. velocity (K, 6), readout_time: as in `OnlineMapper.move`.
+        (K, 3, 4), vignetting (3,): as in `ImageFormation.take`. velocity (K, 6), readout_time: as in
+        `OnlineMapper.move`.
         """
         usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
         if not usable.all():

@@ -10,7 +10,7 @@ import torch
 
 from mvsgs_core import camera
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.exposure import Photometry
+from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.filling import continued_depth, fill_points
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
 from mvsgs_core.mapping.insertion import (
@@ -38,7 +38,7 @@ class Densifier:
 
     def __init__(
         self, config: MapperConfig, state: MapState, frame: FrameOfReference, keyframes: KeyframeStore,
-        render: Callable[[TrainingView, tuple[int, int]], Render], photometry: Photometry, log: Stats,
+        render: Callable[[TrainingView, tuple[int, int]], Render], photometry: ImageFormation, log: Stats,
     ) -> None:  # fmt: skip
         """render: of `state` as a keyframe's camera photographs it, at a size (height, width). What is given here
         changes by itself."""

@@ -1,6 +1,6 @@
 """Exposures in the map: its colors are those of the mean camera, each keyframe has its own affine of them.
 
-The tracker says the exposures (`Photometry`), and corrects them as it does poses; splats' colors then go with their
+The tracker says the exposures (`ImageFormation`), and corrects them as it does poses; splats' colors then go with their
 anchor keyframe as positions do. No color is ever fitted to a render. See `mvsgs_core.photometry` for the model.
 """
 
@@ -26,8 +26,8 @@ NO_EXPOSURE = "an exposure or a vignetting that no camera has was refused"
 
 
 @dataclass
-class Photometry:
-    """The newest that the tracker said of the photographs; mappers of one stream share it."""
+class ImageFormation:
+    """How photographs come from the map's colors, as the tracker said last; mappers of one stream share it."""
 
     exposures: dict[int, np.ndarray] = field(default_factory=dict)  # (3, 4) float32 by keyframe; missing: the identity
     vignetting: np.ndarray | None = None  # (3,) float64 of the sensor; None: none
@@ -64,7 +64,7 @@ class Photometry:
             factor = vignetting_factor(self.vignetting, view.intrinsics_at(size), size)
         return colors_of_map(colors, view.exposure.detach().cpu().numpy(), factor)
 
-    def copy(self) -> Photometry:
+    def copy(self) -> ImageFormation:
         """One that later changes do not reach; the arrays never change."""
         return replace(self, exposures=dict(self.exposures))
 

@@ -15,7 +15,7 @@ from mvsgs_core.mapping.between import BetweenView, FrameBetween, between_view
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
 from mvsgs_core.mapping.densifier import Densifier, checked_depth
-from mvsgs_core.mapping.exposure import Photometry, recolor_with_anchors
+from mvsgs_core.mapping.exposure import ImageFormation, recolor_with_anchors
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
 from mvsgs_core.mapping.keyframe_checks import NO_POSE, checked_keyframe, is_pose
 from mvsgs_core.mapping.keyframe_store import KeyframeStore
@@ -40,7 +40,7 @@ class OnlineMapper:
         state: MapState | None = None,
         views: list[TrainingView] | None = None,
         between: list[BetweenView] | None = None,
-        photometry: Photometry | None = None,
+        photometry: ImageFormation | None = None,
     ) -> None:
         """log, corrections (world_from_cam (4, 4), scale; by keyframe), photometry: what mappers of one stream share.
 
@@ -49,7 +49,7 @@ class OnlineMapper:
         self.config = config = config or MapperConfig()
         self.log = log or Stats()
         self.corrections = {} if corrections is None else corrections  # newest pose and scale of each keyframe
-        self.photometry = Photometry() if photometry is None else photometry
+        self.photometry = ImageFormation() if photometry is None else photometry
         self.state = (
             MapState((config.sh_degree + 1) ** 2, torch.device(resolve_device(config.device)))
             if state is None

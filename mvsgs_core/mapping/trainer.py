@@ -9,7 +9,7 @@ from torch import Tensor
 from mvsgs_core.mapping import density_control, optimizer
 from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.exposure import Photometry, unclipped
+from mvsgs_core.mapping.exposure import ImageFormation, unclipped
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import LossInputs, frequency_of, training_loss, weights_of
 from mvsgs_core.mapping.map_state import MapState
@@ -28,11 +28,11 @@ class Trainer:
     """
 
     def __init__(
-        self, config: MapperConfig, state: MapState, log: Stats, photometry: Photometry | None = None
+        self, config: MapperConfig, state: MapState, log: Stats, photometry: ImageFormation | None = None
     ) -> None:  # fmt: skip
         """photometry: None: no camera is known to have an exposure."""
         self.config, self.state, self.log = config, state, log
-        self.photometry = Photometry() if photometry is None else photometry
+        self.photometry = ImageFormation() if photometry is None else photometry
         self.iterations = 0
         self.rate = 1.0  # factor on all learning rates: falls during the final refinement
         self.generator = torch.Generator().manual_seed(config.seed)  # of density control

@@ -15,7 +15,7 @@ import numpy as np
 
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.gray_levels import MIN_SAMPLES, TERMS, backward, log_ratio_moments
-from mvsgs_core.tracking.estimation.photometry import PhotometricEdges, Photometry, solve_photometry
+from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration, PhotometricEdges, solve_photometry
 from mvsgs_core.tracking.estimation.response import radial_terms, vignetting_polynomial
 from mvsgs_core.tracking.graph import Edge, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
@@ -25,7 +25,7 @@ GROWTH = 1.1  # of the keyframes, at which all are solved again
 
 _OBSERVATION = np.dtype(
     [("reference", "<i8"), ("moments", "<f4", (3, 2, TERMS))]
-)  # the rows that `Photometry.step` asks
+)  # the rows that `PhotometricCalibration.step` asks
 
 
 class Seen(Protocol):
@@ -58,9 +58,9 @@ class Photometer:
     def __init__(self, graph: KeyframeGraph, stats: Stats) -> None:
         self.graph = graph
         self.stats = stats
-        self.photometry = Photometry.steady(0)
+        self.photometry = PhotometricCalibration.steady(0)
         self._order: list[int] = []  # keyframes of the last solution
-        self._lights: dict[int, np.ndarray] = {}  # (5,) of the keyframes, see `Photometry.lights`
+        self._lights: dict[int, np.ndarray] = {}  # (5,) of the keyframes, see `PhotometricCalibration.lights`
         self._moments: dict[tuple[int, int], tuple[Edge, np.ndarray | None]] = {}  # of every edge as it was matched
 
     @property

@@ -15,7 +15,7 @@ from mvsgs_core.devices import resolve_device
 from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.checkpoints.images import read_image
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.exposure import Photometry
+from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.mapping.mapper import OnlineMapper
@@ -70,7 +70,7 @@ class Arrays:
         return value
 
 
-def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections, photometry: Photometry) -> OnlineMapper:
+def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections, photometry: ImageFormation) -> OnlineMapper:
     """A mapper on the CPU that shares nothing that changes: what is saved while the other goes on.
 
     Raises ValueError where what is kept of the splats is not of one length: an iteration was cut off.
@@ -110,7 +110,7 @@ def pack(
 
 
 def unpack(
-    meta: Any, arrays: Arrays, config: MapperConfig, log: Stats, corrections: Corrections, photometry: Photometry,
+    meta: Any, arrays: Arrays, config: MapperConfig, log: Stats, corrections: Corrections, photometry: ImageFormation,
     images: Path,
 ) -> OnlineMapper:  # fmt: skip
     """The mapper that was packed. images: the folder of its keyframes' images. Raises ValueError for damage."""
@@ -143,7 +143,7 @@ def unpack(
     return mapper
 
 
-def photometry_of(arrays: Arrays) -> Photometry:
+def photometry_of(arrays: Arrays) -> ImageFormation:
     """What the tracker had said of the photographs. Raises ValueError for damage."""
     index = arrays.take("index", np.int64, (None,))
     exposures = arrays.take("exposure", np.float32, (len(index), 3, 4))
@@ -153,7 +153,7 @@ def photometry_of(arrays: Arrays) -> Photometry:
     if not all(is_exposure(affine) for affine in exposures):
         raise ValueError("there are exposures that no camera has")
     found = {int(k): affine.copy() for k, affine in zip(index, exposures)}
-    return Photometry(found, vignetting.copy() if len(vignetting) else None)
+    return ImageFormation(found, vignetting.copy() if len(vignetting) else None)
 
 
 def whole(value: Any, name: str) -> int:

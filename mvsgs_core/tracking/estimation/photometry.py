@@ -42,7 +42,7 @@ class PhotometricEdges:
 
 
 @dataclass(frozen=True)
-class Photometry:
+class PhotometricCalibration:
     """Of K images. Zeros: a steady camera's, exactly."""
 
     gains: np.ndarray  # (K,) log gain, mean zero
@@ -55,11 +55,11 @@ class Photometry:
     edge_sigma: tuple[float, float]  # of u and w, log ratios
 
     @staticmethod
-    def steady(count: int) -> Photometry:
+    def steady(count: int) -> PhotometricCalibration:
         """Of `count` images of which nothing is known to change."""
         zero = np.zeros(count)
         edge = (EDGE_SIGMA, EDGE_SIGMA)
-        return Photometry(zero, zero, np.zeros((count, 3)), zero, np.zeros(_GLOBAL), 0.0, False, edge)
+        return PhotometricCalibration(zero, zero, np.zeros((count, 3)), zero, np.zeros(_GLOBAL), 0.0, False, edge)
 
     @property
     def varies(self) -> bool:
@@ -213,14 +213,14 @@ class _Solver:
         right[-2] += _EXPONENT / _EXPONENT_SIGMA**2
 
 
-def solve_photometry(edges: PhotometricEdges, count: int, known: np.ndarray | None = None) -> Photometry:
-    """Photometry of `count` images from their edges.
+def solve_photometry(edges: PhotometricEdges, count: int, known: np.ndarray | None = None) -> PhotometricCalibration:
+    """That of `count` images from their edges.
 
     known (K,): log exposures of the images, NaN where they are not known.
     Raises numpy.linalg.LinAlgError where there is no solution, ValueError where it is not finite.
     """
     if count < 2 or len(edges.source) == 0:
-        return Photometry.steady(count)
+        return PhotometricCalibration.steady(count)
     solver = _Solver(edges, count, np.full(count, np.nan) if known is None else known)
     solver.solve(True)
     vignetting = np.zeros(_GLOBAL)
@@ -234,7 +234,7 @@ def solve_photometry(edges: PhotometricEdges, count: int, known: np.ndarray | No
     white = _white_balance(edges, gains, lifts, vignetting, response)
     u, w = np.sqrt(solver.effects)
     sigma = np.sqrt(np.diag(np.linalg.inv(_centered(information[:count, :count]))))
-    found = Photometry(gains, lifts, white, sigma, vignetting, response, own_lifts, (float(u), float(w)))
+    found = PhotometricCalibration(gains, lifts, white, sigma, vignetting, response, own_lifts, (float(u), float(w)))
     if not all(np.isfinite(v).all() for v in (gains, lifts, white, sigma, vignetting)):
         raise ValueError("the photometric solution is not finite")
     return found
@@ -333,4 +333,4 @@ def _centered(information: np.ndarray) -> np.ndarray:
     return np.asarray(information + np.trace(information) / len(information) ** 2)
 
 
-__all__ = ["STEP", "PhotometricEdges", "Photometry", "solve_photometry"]
+__all__ = ["STEP", "PhotometricCalibration", "PhotometricEdges", "solve_photometry"]

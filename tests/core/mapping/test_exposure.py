@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
-from mvsgs_core.mapping.exposure import BRIGHTEST, Photometry, colors_of_map, recolored, relative_to_mean, unclipped
+from mvsgs_core.mapping.exposure import BRIGHTEST, ImageFormation, colors_of_map, recolored, relative_to_mean, unclipped
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.photometry import IDENTITY, compose, inverse, vignetting_factor
@@ -235,7 +235,7 @@ def test_what_no_camera_has_is_refused_and_counted_and_the_map_stays_sound(value
 
 
 def test_none_is_as_it_was_and_an_identity_is_none_any_more() -> None:
-    known, log = Photometry(), Stats()
+    known, log = ImageFormation(), Stats()
     known.take([1, 2], np.stack([AFFINE, DIM]), DARK, log)
     kept = known.copy()
     known.take([1, 2], None, None, log)

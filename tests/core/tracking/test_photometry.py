@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core.tracking.estimation.gray_levels import Levels, Samples, backward, log_ratio_moments
-from mvsgs_core.tracking.estimation.photometry import PhotometricEdges, Photometry, solve_photometry
+from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration, PhotometricEdges, solve_photometry
 from mvsgs_core.tracking.estimation.response import MIDDLE, affine, vignetting_polynomial
 
 POINTS = 400
@@ -157,7 +157,7 @@ def test_affines_are_the_levels_that_the_model_gives() -> None:
         level += (gain * level + lift * (MIDDLE - level)) / steps
     slope, offset = affine(np.array(gain), np.array(lift))
     assert 0.2 * slope + offset == pytest.approx(level, rel=1e-4)
-    matrix = Photometry.steady(1).affine(np.array([gain, lift, 0.1, 0.0, -0.1]))
+    matrix = PhotometricCalibration.steady(1).affine(np.array([gain, lift, 0.1, 0.0, -0.1]))
     assert matrix.shape == (3, 4)
     assert matrix.dtype == np.float32
     assert np.log(matrix[0, 0] / matrix[1, 1]) == pytest.approx(0.1, abs=1e-6)
