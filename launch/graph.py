@@ -188,12 +188,14 @@ def _build_slot(
     if parameters.get("device") == "auto":
         parameters["device"] = device.resolved
     typed: dict[type, str] = {}
+    unused = node.unused_inputs(built)
     for message, sender in reads.items():
         if message not in msgs.TYPES:
             raise GraphError(f"{name}.reads.{message}: no such message; there are: {', '.join(msgs.TYPES)}")
         if not isinstance(sender, str):
             raise GraphError(f"{name}.reads.{message}={sender}: must be the name of the slot that sends it")
-        typed[msgs.TYPES[message]] = sender
+        if msgs.TYPES[message] not in unused:
+            typed[msgs.TYPES[message]] = sender
     return Slot(name, node, parameters, typed, build(Placement, placement, name))
 
 

@@ -70,6 +70,11 @@ class Node:
         """Of a parameter that is a mapping: the keys that it takes, with their defaults. Others take any."""
         return {}
 
+    @classmethod
+    def unused_inputs(cls, config: Any) -> frozenset[type]:
+        """Of the messages that `reads` names, those that the node makes nothing of with these parameters."""
+        return frozenset()
+
     def run(self) -> Iterator[Any]:
         """Sources only: yields messages until the stream ends."""
         raise TypeError(f"{type(self).__name__} is no source: it has no run()")
