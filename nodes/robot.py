@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from msgs import End, Frame
 from msgs.codec import CodecError
 from mvsgs_core.camera import resize_image, scale_intrinsics
@@ -16,11 +14,9 @@ from mvsgs_core.datasets.framing import target_size
 from nodes.live import LiveSource
 from nodes.runtime.addresses import TransportError, check_address, load_keys
 from nodes.runtime.transport import LiveReader
-from nodes.stream_times import LATEST, StreamTimes
+from nodes.stream_frames import StreamFrames
 
 POLL = 0.5  # s at most between two looks at the clock
-FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye and a telescope nothing can be tracked
-MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
 
 
 class Robot(LiveSource):
@@ -40,8 +36,7 @@ class Robot(LiveSource):
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
-        self._native: tuple[int, int] | None = None
-        self._times = StreamTimes()
+        self._frames = StreamFrames(self.stats, "the robot")
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -73,7 +68,7 @@ class Robot(LiveSource):
                 self._watch(self._reader)
             if isinstance(message, End):
                 return None
-            usable = self._usable(message) if isinstance(message, Frame) else None
+            usable = self._frames.accept(message) if isinstance(message, Frame) else None
             if usable is not None:
                 return usable
         silence = f"no usable frame from {self.config.path} for {self.config.timeout:g} s"
@@ -93,35 +88,9 @@ class Robot(LiveSource):
             self.stats.counts["renumbered"] = reader.renumbered
             self.stats.warn("the robot's sequence numbers jumped, as they do when its program starts again")
 
-    def _usable(self, frame: Frame) -> Frame | None:
-        """The frame at a time after all before it; None, with a warning, if it cannot belong to the same stream."""
-        wrong = self._fault(frame)
-        shown = None if wrong else self._times.accept(frame.timestamp)
-        if shown is None:
-            self.stats.count("unusable")
-            self.stats.warn(wrong or f"frames whose timestamp is no time in seconds (beyond {LATEST:g}) were left out")
-            return None
-        if self._times.repaired > self.stats.counts.get("times_repaired", 0):
-            self.stats.counts["times_repaired"] = self._times.repaired
-            self.stats.warn("the robot's timestamps stood still, went back or leapt: there the time here was taken")
-        self._native = self._native or (frame.image.shape[0], frame.image.shape[1])
-        return replace(frame, timestamp=shown)
-
-    def _fault(self, frame: Frame) -> str | None:
-        native = frame.image.shape[0], frame.image.shape[1]
-        side = max(native)
-        focal, center = frame.intrinsics[:2], frame.intrinsics[2:]
-        if not MIN_SIDE <= min(native) <= side <= MAX_SIDE:
-            return f"frames with sides outside of {MIN_SIDE} to {MAX_SIDE} pixels were left out, such as {native}"
-        if self._native not in (None, native):
-            return f"frames of another size than the first, {self._native}, were left out, such as {native}"
-        in_view = np.all((FOCAL_RANGE[0] * side <= focal) & (focal <= FOCAL_RANGE[1] * side))
-        if not in_view or not np.all(np.abs(center) <= 2 * side):
-            return f"frames without valid intrinsics were left out, such as {frame.intrinsics.tolist()} for {native}"
-        return None
-
     def _framed(self, frame: Frame) -> Frame:
-        assert self._native is not None
-        size = target_size(self.config.size, self._native)
-        intrinsics = scale_intrinsics(frame.intrinsics, self._native, size)
+        native = self._frames.native
+        assert native is not None
+        size = target_size(self.config.size, native)
+        intrinsics = scale_intrinsics(frame.intrinsics, native, size)
         return replace(frame, image=resize_image(frame.image, size), intrinsics=intrinsics)

@@ -27,11 +27,12 @@ from tests.support.shared_data import ROOT
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "choice", ["synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "camera", "robot"]
+    "choice",
+    ["synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "images", "video", "bag", "camera", "robot", "ros2"],
 )
 def test_every_dataset_choice_composes(choice: str) -> None:
     graph = compose([f"dataset={choice}"])
-    live = choice in ("camera", "robot")
+    live = choice in ("camera", "robot", "ros2")
     frames = [edge for edge in graph.out_of("dataset") if edge.message is Frame]
     assert frames
     assert all(edge.best_effort == live for edge in frames)

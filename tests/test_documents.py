@@ -94,7 +94,14 @@ def flat(config: Mapping[str, Any], prefix: str) -> Iterator[str]:
 @cache
 def parameters() -> frozenset[str]:
     """`slot.path` of what the choices have, as far as their nodes' configurations go."""
-    compositions = ([], ["tracker=droid"], ["tracker=ground_truth"], ["dataset=robot"], ["mvs=itermvs"])
+    compositions = (
+        [],
+        ["tracker=droid"],
+        ["tracker=ground_truth"],
+        ["dataset=robot"],
+        ["dataset=ros2"],
+        ["mvs=itermvs"],
+    )
     slots = [slot for overrides in compositions for slot in compose(list(overrides)).slots.items()]
     return frozenset(name for slot, known in slots for name in flat(known.config, slot))
 

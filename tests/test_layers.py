@@ -38,10 +38,11 @@ ROOMS: dict[str, tuple[str, ...]] = {
     PARAMETERS: (),
     CONTRACT: ("msgs", PARAMETERS),
     "nodes/runtime": ("msgs", PARAMETERS, CONTRACT),
-    "nodes": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "mvsgs_core/*"),
+    "nodes/ros2": (),
+    "nodes": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "mvsgs_core/*"),
     "launch": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "mvsgs_core/mapping", "mvsgs_core/evaluation"),
     "examples": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes", "mvsgs_core/datasets"),
-    "bench": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes", "launch", "mvsgs_core/*"),
+    "bench": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "nodes", "launch", "mvsgs_core/*"),
 }
 
 

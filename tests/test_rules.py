@@ -58,6 +58,11 @@ def test_only_the_transport_imports_zmq() -> None:
 
 
 @pytest.mark.slow
+def test_only_one_file_imports_dds() -> None:
+    assert [name(path) for path in python_files(*PACKAGES) if "cyclonedds" in imports(path)] == ["nodes/ros2/dds.py"]
+
+
+@pytest.mark.slow
 def test_the_core_knows_no_node_and_no_message() -> None:
     files = python_files("mvsgs_core")
     assert files

@@ -15,7 +15,7 @@ from mvsgs_core.datasets.bag_file import messages, opened_bag
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.files import Layout
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.ros import calibrated, lens_of, rgb_of
+from mvsgs_core.datasets.ros import calibrated, lens_of, rectified, rgb_of
 from mvsgs_core.datasets.sequence import FileReader, Notices, same_shape
 
 if TYPE_CHECKING:
@@ -125,12 +125,11 @@ def _recorded_lens(bag: AnyReader, topic: str, given: str | None, notices: Notic
         others = f", only at {', '.join(topics)} (dataset.options.info_topic chooses one)" if topics else ""
         notices.append(f"no calibration: the bag has no camera_info for {topic}{others}")
         return None
-    rectified = "rect" in PurePosixPath(topic).as_posix().split("image")[-1]
     for _, _, data in messages(bag, [c for c in bag.connections if c.topic == chosen], notices):
         with reading(chosen, "in the bag is no camera_info that can be used; set dataset.intrinsics=[fx,fy,cx,cy]"):
             info = bag.deserialize(data, _INFO)
             if calibrated(info):
-                return lens_of(info, rectified)
+                return lens_of(info, rectified(topic))
             break
     notices.append(f"no calibration: {chosen} in the bag is empty, the camera was not calibrated")
     return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import PurePosixPath
 from typing import Any
 
 import cv2
@@ -32,6 +33,7 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
 }
+COMPRESSED = "/compressed"  # after the topic of images: the same as CompressedImage
 _RADIAL = ("plumb_bob", "rational_polynomial", "")
 _FISHEYE = ("equidistant", "fisheye")
 
@@ -70,6 +72,16 @@ def _raw(message: Any) -> np.ndarray:
         return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
     except cv2.error as error:  # a pattern of two by two pixels in an image of one row
         raise UnreadableImageError(f"a {width}x{height} image in {message.encoding}: {brief(error)}") from error
+
+
+def camera_info_topic(topic: str) -> str:
+    """Where the calibration of images is by ROS's custom: beside them, whatever transport they come by."""
+    return str(PurePosixPath(topic.removesuffix(COMPRESSED)).parent / "camera_info")
+
+
+def rectified(topic: str) -> bool:
+    """Whether images are undistorted already, by ROS's names for them: image_rect, image_rect_color."""
+    return "rect" in topic.split("image")[-1]
 
 
 def calibrated(info: Any) -> bool:

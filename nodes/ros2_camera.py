@@ -1,0 +1,191 @@
+"""Source: images that a program of ROS 2 publishes, with their calibration, over DDS and without ROS."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from msgs import Frame
+from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.datasets.calibration import lens_from_option
+from mvsgs_core.datasets.framing import Framing
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.ros import COMPRESSED, calibrated, camera_info_topic, lens_of, rectified, rgb_of
+from mvsgs_core.datasets.sequence import same_shape
+from nodes.live import LiveSource
+from nodes.ros2.cdr import CdrError
+from nodes.ros2.connection import LOOPBACK, SENSOR_DATA, Connection, check_installed
+from nodes.ros2.messages import CameraInfo, CompressedImage, Image
+from nodes.stream_frames import StreamFrames
+
+if TYPE_CHECKING:
+    from nodes.ros2.dds import Reader
+
+POLL = 0.5  # s at most between two looks at the clock
+
+
+class Ros2Camera(LiveSource):
+    """sensor_msgs Image or CompressedImage -> Frame, undistorted, and GroundTruth with the same image.
+
+    The newest image is taken, the sender is never held back. What comes is not trusted: what is no message, no image or
+    no image of this stream is left out and counted. The stream ends with silence, as ROS 2 has no end.
+    """
+
+    @dataclass(kw_only=True)
+    class Config(LiveSource.Config, Connection):
+        path: str = "/camera/image_raw"  # topic of the images
+        type: Literal["auto", "raw", "compressed"] = "auto"  # auto: compressed if the topic ends with /compressed
+        info_topic: str | None = None  # of their CameraInfo; null: camera_info beside the images
+        # [fx, fy, cx, cy] in pixels of the images; auto: a guess; null: CameraInfo's
+        intrinsics: list[float] | str | None = None
+        distortion: list[float] = field(default_factory=list)  # with intrinsics: [k1, k2, p1, p2(, k3)] as in OpenCV
+        crop: int | None = None  # pixels cut off after undistortion; null: zoom to hide the empty border
+        info_timeout: float = 5.0  # s from the first image without a CameraInfo before the focal length is guessed
+        timeout: float = 30.0  # s without a usable image before the camera counts as gone
+        reliable: bool = False  # lost images are sent again; the sender must be reliable too
+        queue: int = SENSOR_DATA.depth  # images that may wait; of these the newest is taken
+
+        def __post_init__(self) -> None:
+            LiveSource.Config.__post_init__(self)
+            Connection.__post_init__(self)
+            self.topic(self.path)
+            if self.info_topic is not None:
+                self.topic(self.info_topic)
+            if self.queue < 1:
+                raise ValueError(f"queue={self.queue}: at least one image must have a place")
+
+    config: Config
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        c = self.config
+        self._framing = Framing(c.size, c.crop)
+        self._frames = StreamFrames(self.stats, "the camera")
+        self._topic = c.topic(c.path)
+        self._info_topic = c.topic(c.info_topic) if c.info_topic else camera_info_topic(self._topic)
+        self._lens: Lens | None = None
+        self._uncalibrated_since: float | None = None  # the first image without
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        check_installed()
+        if config.intrinsics is not None:
+            lens_from_option(config.intrinsics, config.distortion, (480, 640))
+
+    def _open(self) -> None:
+        """Raises DdsError."""
+        from nodes.ros2.dds import Participant
+
+        c = self.config
+        compressed = self._topic.endswith(COMPRESSED) if c.type == "auto" else c.type == "compressed"
+        quality = replace(SENSOR_DATA, reliable=c.reliable, depth=c.queue)
+        participant = Participant(c)
+        self._images: Reader[Image] | Reader[CompressedImage]
+        if compressed:
+            self._images = participant.reader(self._topic, CompressedImage, quality)
+        else:
+            self._images = participant.reader(self._topic, Image, quality)
+        self._infos = participant.reader(self._info_topic, CameraInfo, SENSOR_DATA)
+
+    def _close(self) -> None:
+        del self._images, self._infos
+
+    def _take(self, first: bool) -> Frame | None:
+        """The next usable image. Raises TimeoutError where none ever comes."""
+        deadline = time.monotonic() + self.config.timeout
+        while (left := deadline - time.monotonic()) > 0:
+            self._images.wait(min(POLL, left))
+            waiting = self._images.take()
+            if not waiting:
+                continue
+            self.stats.count("dropped", len(waiting) - 1)
+            with self.stats.time("image"):
+                frame = self._frame(waiting[-1])
+            if frame is not None and (usable := self._frames.accept(frame)) is not None:
+                return usable
+        silence = f"no usable image at {self._topic} for {self.config.timeout:g} s"
+        if first:
+            raise TimeoutError(f"{silence}: {self.stats.warnings[0] if self.stats.warnings else self._why_nothing()}")
+        self.stats.warn(f"{silence}: the stream ends here")
+        return None
+
+    def _why_nothing(self) -> str:
+        c = self.config
+        if self._images.writers:
+            return "somebody publishes there, but sends nothing"
+        hint = f"nobody publishes it in domain {c.number} on interface={c.interface}"
+        if c.interface == LOOPBACK:
+            return (
+                f"{hint}: start its program here with ROS_LOCALHOST_ONLY=1, or look beyond with dataset.interface=auto"
+            )
+        return f"{hint} as {self._images.type.ros}: compare with ros2 topic info -v {self._topic}"
+
+    def _frame(self, data: bytes) -> Frame | None:
+        """What was sent, with its lens's intrinsics; None, counted and said, where there is no image in it."""
+        try:
+            message = self._images.decode(data)
+            image = rgb_of(message)
+        except CdrError as error:
+            self.stats.refuse("messages", 1, f"what is no image message was left out: {error}")
+            return None
+        except BadFileError as error:
+            self._frames.refuse(f"images left out because they could not be read: {error}")
+            return None
+        native = image.shape[0], image.shape[1]
+        lens = self._lens_for(native)
+        if lens is None:
+            return None
+        if not same_shape(native, lens.size):
+            self._frames.refuse(
+                f"images left out because their calibration is for another aspect ratio: {native} for {lens.size}"
+            )
+            return None
+        stamp = message.header.stamp.seconds
+        return Frame(0, stamp if stamp > 0 else time.time(), image, np.array(lens.at(native).intrinsics), lens.guessed)
+
+    def _lens_for(self, native: tuple[int, int]) -> Lens | None:
+        """The lens of the stream; None as long as its CameraInfo is waited for."""
+        if self._lens is None:
+            self._lens = self._given_lens(native) or self._calibrated_lens() or self._guessed_lens(native)
+        if self._lens is None:
+            self.stats.count("before_calibration")
+        return self._lens
+
+    def _given_lens(self, native: tuple[int, int], otherwise: str | None = None) -> Lens | None:
+        intrinsics = otherwise if self.config.intrinsics is None else self.config.intrinsics
+        if intrinsics is None:
+            return None
+        lens, notes = lens_from_option(intrinsics, self.config.distortion, native)
+        for note in notes:
+            self.stats.warn(note)
+        return lens
+
+    def _calibrated_lens(self) -> Lens | None:
+        """Of the first CameraInfo that says anything."""
+        for data in self._infos.take():
+            try:
+                info = self._infos.decode(data)
+                if calibrated(info):
+                    return lens_of(info, rectified(self._topic))
+                self.stats.warn(f"the CameraInfo at {self._info_topic} is empty: the camera was not calibrated")
+            except ValueError as error:  # what is no message (CdrError) and what no camera has
+                self.stats.refuse("calibrations", 1, f"a CameraInfo that cannot be used was left out: {error}")
+        return None
+
+    def _guessed_lens(self, native: tuple[int, int]) -> Lens | None:
+        now = time.monotonic()
+        self._uncalibrated_since = self._uncalibrated_since or now
+        if now - self._uncalibrated_since < self.config.info_timeout:
+            return None
+        self.stats.warn(f"no calibration came at {self._info_topic} in {self.config.info_timeout:g} s")
+        return self._given_lens(native, "auto")
+
+    def _framed(self, frame: Frame) -> Frame:
+        assert self._lens is not None
+        native = frame.image.shape[0], frame.image.shape[1]
+        size = self._framing.size_of(self._lens.size)
+        image, intrinsics = self._framing.image(frame.image, self._lens.at(native), size)
+        return replace(frame, image=image, intrinsics=intrinsics)

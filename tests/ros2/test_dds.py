@@ -1,0 +1,149 @@
+"""DDS: every type there and back with a program that has Cyclone's serializer; on loopback nothing else gets in."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nodes.ros2.connection import DEFAULT, LATCHED, LOOPBACK, SENSOR_DATA, Connection, Quality
+from nodes.ros2.messages import Header, Time
+from tests.support.ros2_messages import TYPES, example, plain
+from tests.support.ros2_peer import OWN_DOMAIN, Peer
+from tests.support.shared_data import ROOT
+
+pytest.importorskip("cyclonedds", reason="ROS 2 is reached by cyclonedds (pip install cyclonedds)")
+pytest.importorskip("rosbags", reason="the other program has rosbags' definitions")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def participant() -> Any:
+    from nodes.ros2.dds import Participant
+
+    return Participant(Connection(domain=OWN_DOMAIN))
+
+
+@pytest.mark.parametrize("message_type", TYPES, ids=lambda t: t.ros)
+def test_every_type_there_and_back(peer: Peer, participant: Any, message_type: Any) -> None:
+    topic = f"/there/{message_type.__name__.lower()}"
+    message = example(message_type, np.random.default_rng(7))
+    peer.subscribe(topic, message_type.ros)
+    writer = participant.writer(topic, message_type, DEFAULT)
+    _until(lambda: writer.readers > 0)
+    assert writer.write(message)
+    assert peer.wait_for(topic) == [plain(message)]
+
+    back = topic.replace("there", "back")
+    reader = participant.reader(back, message_type, DEFAULT)
+    peer.advertise(back, message_type.ros)
+    peer.wait_for_reader(back)
+    peer.publish(back, plain(message))
+    reader.wait(10.0)
+    taken = reader.take()
+    assert [plain(reader.decode(data)) for data in taken] == [plain(message)]
+
+
+def test_a_late_reader_gets_what_is_kept_for_it(peer: Peer, participant: Any) -> None:
+    kept = participant.writer("/late/kept", Header, LATCHED)
+    lost = participant.writer("/late/lost", Header, DEFAULT)
+    for number in range(3):
+        kept.write(Header(Time(number, 0), "map"))
+        lost.write(Header(Time(number, 0), "map"))
+    for topic in ("/late/kept", "/late/lost"):
+        peer.subscribe(topic, Header.ros, transient_local=topic.endswith("kept"))
+    assert [message["stamp"]["sec"] for message in peer.wait_for("/late/kept")] == [2]
+    _until(lambda: lost.readers > 0)
+    lost.write(Header(Time(9, 0), "map"))
+    assert [message["stamp"]["sec"] for message in peer.wait_for("/late/lost")] == [9]
+
+
+@pytest.mark.parametrize(("offered", "wanted", "meet"), [(SENSOR_DATA, True, False), (DEFAULT, False, True)])
+def test_qualities_meet_as_in_ros(peer: Peer, participant: Any, offered: Quality, wanted: bool, meet: bool) -> None:
+    topic = f"/quality/{offered.depth}"
+    writer = participant.writer(topic, Header, offered)
+    peer.subscribe(topic, Header.ros, reliable=wanted)
+    if meet:
+        _until(lambda: writer.readers > 0)
+    else:
+        time.sleep(1.0)
+        assert writer.readers == 0
+
+
+def test_an_image_of_a_megabyte_arrives_whole(peer: Peer, participant: Any) -> None:
+    from nodes.ros2.messages import Image
+
+    data = np.random.default_rng(0).integers(0, 255, 480 * 640 * 3, np.uint8)
+    writer = participant.writer("/large", Image, DEFAULT)
+    reader = participant.reader("/large", Image, DEFAULT)
+    _until(lambda: writer.readers > 0)
+    writer.write(Image(Header(Time(1, 2), "camera"), 480, 640, "rgb8", 0, 1920, data))
+    reader.wait(10.0)
+    (taken,) = reader.take()
+    assert (reader.decode(taken).data == data).all()
+
+
+def bound() -> dict[int, str]:
+    """Port of each UDP socket of this process that listens at all addresses -> the interface it is bound to."""
+    found = {}
+    for link in Path("/proc/self/fd").iterdir():
+        try:
+            if not str(link.readlink()).startswith("socket:"):
+                continue
+        except OSError:
+            continue
+        with socket.socket(fileno=os.dup(int(link.name))) as own:
+            if own.family == socket.AF_INET and own.type == socket.SOCK_DGRAM and own.getsockname()[0] == "0.0.0.0":
+                device = own.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
+                found[own.getsockname()[1]] = device.rstrip(b"\0").decode()
+    return found
+
+
+def test_nothing_listens_beyond_loopback_unless_it_is_told_to() -> None:
+    code = (
+        "import sys; from nodes.ros2.connection import *; from nodes.ros2.dds import *;"
+        "from nodes.ros2.messages import Header; from tests.ros2.test_dds import bound;"
+        f"p = Participant(Connection(domain={OWN_DOMAIN}, interface=sys.argv[1]));"
+        "r = p.reader('/x', Header, DEFAULT); w = p.writer('/x', Header, DEFAULT); print({*bound().values()})"
+    )
+
+    def devices(interface: str) -> str:
+        command = [sys.executable, "-c", code, interface]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+
+    assert devices(LOOPBACK) == "{'lo'}"
+    assert devices("auto") == "{''}"
+
+
+def test_an_interface_that_is_none_or_another_is_refused() -> None:
+    from nodes.ros2.dds import DdsError, Participant
+
+    with pytest.raises(DdsError, match="interface=nosuch0"):
+        Participant(Connection(domain=OWN_DOMAIN + 1, interface="nosuch0"))
+    here = Participant(Connection(domain=OWN_DOMAIN + 2))
+    with pytest.raises(DdsError, match="already"):
+        Participant(Connection(domain=OWN_DOMAIN + 2, interface="auto"))
+    del here
+    Participant(Connection(domain=OWN_DOMAIN + 2))
+
+
+def _until(met: Any, seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not met():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)

@@ -1,0 +1,374 @@
+"""dataset=ros2: images of another process over DDS, its calibration, what is false in them, and silence."""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from itertools import count, pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from msgs import Frame, GroundTruth
+from mvsgs_core.datasets.framing import Framing
+from mvsgs_core.datasets.lens import Lens
+from nodes.ros2 import messages
+from nodes.ros2.cdr import CdrError, encode
+from nodes.ros2.connection import LOOPBACK, Connection
+from nodes.ros2_camera import Ros2Camera
+from tests.support.ros2_peer import OWN_DOMAIN, Peer
+
+pytest.importorskip("cyclonedds", reason="ROS 2 is reached by cyclonedds (pip install cyclonedds)")
+pytest.importorskip("rosbags", reason="the other program has rosbags' definitions")
+pytestmark = pytest.mark.slow
+
+SIZE = 24, 32
+K = [25.0, 0, 15.5, 0, 25.0, 11.5, 0, 0, 1]
+INFO = {"height": 24, "width": 32, "distortion_model": "plumb_bob", "d": [0.0] * 5, "k": K, "p": [0.0] * 12}
+IMAGE, COMPRESSED, CALIBRATION = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
+_numbers = count()
+
+
+@pytest.fixture(scope="module")
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def camera() -> str:
+    """A namespace of its own."""
+    return f"/camera_{next(_numbers)}"
+
+
+def stamp(seconds: float) -> dict[str, Any]:
+    return {"stamp": {"sec": int(seconds), "nanosec": round(seconds % 1 * 1e9)}, "frame_id": "camera"}
+
+
+def picture(number: int, time: float | None = None, size: tuple[int, int] = SIZE, **other: Any) -> dict[str, Any]:
+    """mono8, of the brightness `number`."""
+    header = stamp(1000 + number / 10 if time is None else time)
+    data = [number % 256] * (size[0] * size[1])
+    return {
+        "header": header,
+        "height": size[0],
+        "width": size[1],
+        "encoding": "mono8",
+        "step": size[1],
+        "data": data,
+    } | other
+
+
+def config(camera: str, **other: Any) -> Ros2Camera.Config:
+    given = {"path": f"{camera}/image_raw", "domain": OWN_DOMAIN, "timeout": 3.0}
+    return Ros2Camera.Config(**(given | other))
+
+
+def received(config: Ros2Camera.Config, send: Callable[[], None], frames: int = 0) -> tuple[list[Frame], Ros2Camera]:
+    """What the node makes of what `send` publishes once it listens. frames: with which it ends; 0: with silence."""
+    node = Ros2Camera(config)
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    taken = []
+    stream = node.run()
+    for message in stream:
+        if isinstance(message, Frame):
+            taken.append(message)
+            if len(taken) == frames:
+                break
+    stream.close()
+    thread.join()
+    return taken, node
+
+
+def sender(
+    peer: Peer, camera: str, messages: list[Any], info: dict[str, Any] | None = INFO, interval: float = 0.03,
+    name: str = IMAGE, topic: str = "image_raw", info_first: bool = True,
+) -> Callable[[], None]:  # fmt: skip
+    """Sends the calibration with every image, as drivers do."""
+    images, infos = f"{camera}/{topic}", f"{camera}/camera_info"
+    peer.advertise(images, name)
+    peer.advertise(infos, CALIBRATION)
+
+    def send() -> None:
+        peer.wait_for_reader(images)
+        peer.wait_for_reader(infos)
+        for message in messages:
+            if info is not None:
+                peer.publish(infos, {"header": stamp(0.0), **info})
+            if isinstance(message, bytes):
+                peer.publish_raw(images, message)
+            else:
+                peer.publish(images, message)
+            time.sleep(interval)
+
+    return send
+
+
+def until_killed(send: Callable[[], None]) -> Callable[[], None]:
+    def sending() -> None:
+        with suppress(EOFError, OSError):
+            send()
+
+    return sending
+
+
+def numbers(frames: list[Frame]) -> list[int]:
+    return [int(frame.image[0, 0, 0]) for frame in frames]
+
+
+def test_images_arrive_with_their_times_and_calibration(peer: Peer, camera: str) -> None:
+    send = sender(peer, camera, [picture(i) for i in range(20)])
+    frames, node = received(config(camera), send)
+    assert numbers(frames)[-1] == 19
+    assert len(frames) >= 15
+    assert [frame.index for frame in frames] == list(range(len(frames)))
+    for frame, number in zip(frames, numbers(frames), strict=True):
+        assert frame.timestamp == pytest.approx(1000 + number / 10, abs=1e-6)
+        assert frame.image.shape == (24, 32, 3)
+        assert (frame.image == number).all()
+        assert frame.intrinsics == pytest.approx([25.0, 25.0, 15.5, 11.5])
+        assert not frame.intrinsics_guessed
+    assert node.stats.warnings == [f"no usable image at {camera}/image_raw for 3 s: the stream ends here"]
+
+
+def test_ground_truth_is_the_same_image(peer: Peer, camera: str) -> None:
+    node = Ros2Camera(config(camera, stop=2))
+    send = sender(peer, camera, [picture(i) for i in range(20)])
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    messages = list(node.run())
+    thread.join()
+    assert [type(m) for m in messages] == [Frame, GroundTruth] * 2
+    for frame, truth in zip(messages[::2], messages[1::2], strict=True):
+        assert (frame.image == truth.image).all()
+        assert truth.world_from_cam is None
+
+
+def test_compressed_images(peer: Peer, camera: str) -> None:
+    def compressed(i: int) -> dict[str, Any]:
+        data = io.BytesIO()
+        Image.fromarray(np.full((24, 32, 3), (10 * i, 50, 200), np.uint8)).save(data, "PNG")
+        return {"header": stamp(5.0 + i), "format": "png", "data": list(data.getvalue())}
+
+    topic = "image_raw/compressed"
+    send = sender(peer, camera, [compressed(i) for i in range(12)], name=COMPRESSED, topic=topic)
+    frames, _ = received(config(camera, path=f"{camera}/{topic}"), send, frames=5)
+    assert all(frame.image[3, 4].tolist()[1:] == [50, 200] for frame in frames)
+    assert frames[0].intrinsics == pytest.approx([25.0, 25.0, 15.5, 11.5])
+
+
+RGB = (200, 60, 20)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pixel", "shown"),
+    [
+        ("rgb8", RGB, RGB), ("bgr8", RGB[::-1], RGB), ("rgba8", (*RGB, 9), RGB), ("bgra8", (*RGB[::-1], 9), RGB),
+        ("mono16", (0, 77), (77, 77, 77)), ("yuv422", (128, 90, 128, 90), None),
+        ("yuv422_yuy2", (90, 128, 90, 128), None),
+    ],
+)  # fmt: skip
+def test_encodings(
+    peer: Peer, camera: str, encoding: str, pixel: tuple[int, ...], shown: tuple[int, int, int] | None
+) -> None:
+    per_pixel = 2 if encoding.startswith("yuv") else len(pixel)
+    row = list(pixel) * (32 * per_pixel // len(pixel))
+    message = picture(0, encoding=encoding, step=32 * per_pixel, data=row * 24)
+    frames, _ = received(config(camera), sender(peer, camera, [message] * 9), frames=1)
+    assert frames[0].image.std(axis=(0, 1)).max() == 0
+    if shown is not None:
+        assert frames[0].image[5, 5].tolist() == list(shown)
+    else:
+        assert np.ptp(frames[0].image[5, 5].astype(int)) <= 2  # no color in it: gray
+
+
+def test_bayer_colors(peer: Peer, camera: str) -> None:
+    mosaic = np.zeros((24, 32), np.uint8)
+    mosaic[::2, ::2], mosaic[::2, 1::2], mosaic[1::2, ::2], mosaic[1::2, 1::2] = RGB[0], RGB[1], RGB[1], RGB[2]
+    message = picture(0, encoding="bayer_rggb8", data=mosaic.ravel().tolist())
+    frames, _ = received(config(camera), sender(peer, camera, [message] * 9), frames=1)
+    assert frames[0].image[10, 10].tolist() == list(RGB)
+
+
+@pytest.mark.parametrize(
+    ("model", "d"),
+    [("plumb_bob", [0.2, 0.05, 0, 0, 0]), ("rational_polynomial", [0.2, 0.05, 0, 0, 0, 0.01, 0, 0]),
+     ("equidistant", [1.0, 0.3, 0, 0]), ("fisheye", [1.0, 0.3, 0, 0])],
+)  # fmt: skip
+def test_distortion_is_taken_out(peer: Peer, camera: str, model: str, d: list[float]) -> None:
+    info = INFO | {"distortion_model": model, "d": d}
+    gray = np.add.outer(np.arange(24), 7 * np.arange(32)).astype(np.uint8)
+    send = sender(peer, camera, [picture(0, data=gray.ravel().tolist())] * 9, info)
+    frames, node = received(config(camera, size=[12, 16]), send, frames=1)
+    lens = Lens((25.0, 25.0, 15.5, 11.5), SIZE, tuple(map(float, d)), fisheye=len(d) == 4)
+    image, intrinsics = Framing([12, 16]).image(np.repeat(gray[..., None], 3, axis=2), lens, (12, 16))
+    assert (frames[0].image == image).all()
+    assert frames[0].intrinsics == pytest.approx(intrinsics)
+    assert intrinsics[0] > 1.02 * 12.5  # it is zoomed to hide the border
+    assert not node.stats.warnings
+
+
+def test_rectified_images_have_the_projection_of_their_calibration(peer: Peer, camera: str) -> None:
+    p = [30.0, 0, 16.0, 0, 0, 31.0, 12.0, 0, 0, 0, 1, 0]
+    info = INFO | {"d": [-0.2, 0.05, 0, 0, 0], "p": p}
+    send = sender(peer, camera, [picture(i) for i in range(9)], info, topic="image_rect")
+    frames, _ = received(config(camera, path=f"{camera}/image_rect"), send, frames=1)
+    assert frames[0].intrinsics == pytest.approx([30.0, 31.0, 16.0, 12.0])
+
+
+def test_without_calibration_the_focal_length_is_guessed_and_said(peer: Peer, camera: str) -> None:
+    send = sender(peer, camera, [picture(i) for i in range(40)], info=None)
+    frames, node = received(config(camera, info_timeout=0.5), send)
+    assert frames[0].intrinsics_guessed
+    assert node.stats.counts["before_calibration"] >= 5
+    text = "\n".join(node.stats.warnings)
+    assert f"no calibration came at {camera}/camera_info in 0.5 s" in text
+    assert "intrinsics are a guess" in text
+
+
+def test_calibration_of_a_camera_that_nobody_calibrated_and_of_none(peer: Peer, camera: str) -> None:
+    send = sender(peer, camera, [picture(i) for i in range(40)], INFO | {"k": [0.0] * 9})
+    frames, node = received(config(camera, info_timeout=0.5), send)
+    assert frames[0].intrinsics_guessed
+    assert any("is empty: the camera was not calibrated" in text for text in node.stats.warnings)
+
+
+@pytest.mark.parametrize(
+    "change", [{"k": [float("nan"), *K[1:]], "height": 24}, {"k": [1e300, *K[1:]]}, {"distortion_model": "tarot"},
+               {"d": [float("inf")] * 5}, {"d": [0.1] * 7}]
+)  # fmt: skip
+def test_a_calibration_that_no_camera_has_is_refused(peer: Peer, camera: str, change: dict[str, Any]) -> None:
+    send = sender(peer, camera, [picture(i) for i in range(40)], INFO | change)
+    frames, node = received(config(camera, info_timeout=0.5), send)
+    assert frames[0].intrinsics_guessed
+    assert all(text.isprintable() for text in node.stats.warnings)
+    refused = node.stats.counts.get("refused_calibrations", 0)
+    assert refused or any("is empty" in text for text in node.stats.warnings)
+
+
+def test_intrinsics_that_are_given_hold(peer: Peer, camera: str) -> None:
+    send = sender(peer, camera, [picture(i) for i in range(9)])
+    frames, _ = received(config(camera, intrinsics=[40.0, 41.0, 15.0, 11.0]), send, frames=1)
+    assert frames[0].intrinsics == pytest.approx([40.0, 41.0, 15.0, 11.0])
+
+
+def test_what_is_false_is_counted_and_the_stream_goes_on(peer: Peer, camera: str) -> None:
+    good = [picture(i) for i in range(40)]
+    header = messages.Header(messages.Time(1000, 500_000_000), "camera")
+    image = messages.Image(header, 24, 32, "mono8", 0, 32, np.full(24 * 32, 5, np.uint8))
+    not_text = encode(image).replace(b"mono8", b"mon\xff8")
+    false: dict[int, Any] = {
+        5: not_text,  # what is no CDR at all Cyclone does not even deliver
+        9: picture(9, encoding="32FC1"),
+        11: picture(11, data=[11] * 100),
+        13: picture(13, size=(48, 64)),
+        15: picture(15, size=(24, 24)),
+        17: picture(17, size=(2, 2)),
+        19: picture(19, encoding="\x1b[31m"),
+        21: picture(21, height=2**31, width=2**31),
+    }
+    sent = [false.get(i, each) for i, each in enumerate(good)]
+    frames, node = received(config(camera), sender(peer, camera, sent, interval=0.05))
+    assert numbers(frames)[-1] == 39
+    assert not set(false) & set(numbers(frames))
+    assert node.stats.counts["refused_messages"] == 1
+    assert node.stats.counts["unusable"] >= len(false) - 2  # at a loaded machine some are passed over
+    assert all(text.isprintable() for text in node.stats.warnings)
+
+
+@pytest.mark.parametrize("data", [b"", b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 60, bytes(1000)])
+def test_what_is_no_message_is_refused(camera: str, data: bytes) -> None:
+    node = Ros2Camera(config(camera))
+    node._open()
+    assert node._frame(data) is None
+    assert node.stats.counts == {"refused_messages": 1}
+    with pytest.raises(CdrError):
+        node._images.decode(data)
+
+
+def test_times_that_go_back_or_are_none_are_repaired(peer: Peer, camera: str) -> None:
+    odd = {5: 0.0, 8: 3.0, 12: 2e9}
+    frames, node = received(config(camera), sender(peer, camera, [picture(i, odd.get(i)) for i in range(20)]))
+    assert numbers(frames)[-1] == 19
+    assert all(b.timestamp > a.timestamp for a, b in pairwise(frames))
+    assert node.stats.counts["times_repaired"] >= 2
+
+
+def test_a_reader_that_is_slow_gets_the_newest_and_counts(peer: Peer, camera: str) -> None:
+    node = Ros2Camera(config(camera, queue=5))
+    send = sender(peer, camera, [picture(i) for i in range(40)], interval=0.02)
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    taken = []
+    for message in node.run():
+        if isinstance(message, Frame):
+            taken.append(int(message.image[0, 0, 0]))
+            time.sleep(0.2)
+    thread.join()
+    assert taken[-1] == 39
+    assert len(taken) < 20
+    assert node.stats.counts["dropped"] >= len(taken)
+
+
+def test_a_program_that_is_killed_and_starts_again_goes_on(camera: str) -> None:
+    first = Peer()
+    send = sender(first, camera, [picture(i) for i in range(100, 200)])
+    node = Ros2Camera(config(camera, timeout=15.0))
+    threading.Thread(target=until_killed(send), daemon=True).start()
+    taken: list[int] = []
+    again: Peer | None = None
+    for message in node.run():
+        if not isinstance(message, Frame):
+            continue
+        taken.append(int(message.image[0, 0, 0]))
+        if again is None and taken[-1] >= 105:
+            first.kill()
+            again = Peer()
+            threading.Thread(
+                target=sender(again, camera, [picture(i, 2000.0 + i) for i in range(20)]), daemon=True
+            ).start()
+        if taken[-1] == 19:
+            break
+    assert again is not None
+    again.close()
+    assert taken[-1] == 19
+
+
+def test_nobody_there_is_said_with_what_to_do(camera: str) -> None:
+    with pytest.raises(TimeoutError, match="ROS_LOCALHOST_ONLY=1"):
+        list(Ros2Camera(config(camera, timeout=0.5)).run())
+
+
+def test_a_reader_that_wants_more_than_is_offered_is_told_so(peer: Peer, camera: str) -> None:
+    peer.advertise(f"{camera}/image_raw", IMAGE, reliable=False)
+    with pytest.raises(TimeoutError, match=r"ros2 topic info|nobody publishes"):
+        list(Ros2Camera(config(camera, timeout=1.0, reliable=True)).run())
+
+
+def test_names_and_domains_are_those_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Connection().interface == LOOPBACK
+    assert Connection(namespace="robot1").topic("image") == "/robot1/image"
+    assert Connection(namespace="/robot1/").topic("image") == "/robot1/image"
+    assert Connection(namespace="/robot1").topic("/image") == "/image"
+    assert Connection().topic("image") == "/image"
+    for name in ("", "/", "/camera//image", "/1st", "/camera/", "ä", "/a b", "/x-y"):
+        with pytest.raises(ValueError, match="no name of a topic"):
+            Connection().topic(name)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
+    assert Connection().number == 42
+    assert Connection(domain=7).number == 7
+    for said in ("233", "x", "-1"):
+        monkeypatch.setenv("ROS_DOMAIN_ID", said)
+        with pytest.raises(ValueError, match=r"domain|ROS_DOMAIN_ID"):
+            Connection()
+    monkeypatch.setenv("ROS_DOMAIN_ID", "")
+    assert Connection().number == 0
+    with pytest.raises(ValueError, match="interface"):
+        Connection(interface='lo"/><x')

@@ -1,0 +1,194 @@
+"""A program that stands for one of ROS 2: another process, with Cyclone's own serializer and rosbags' definitions.
+
+It shares no line with what it is to test: types come from rosbags, bytes from cyclonedds.idl, and it is configured as
+ROS_LOCALHOST_ONLY=1 configures rmw_cyclonedds.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Mapping
+from multiprocessing.connection import Connection
+from typing import Any
+
+LOCALHOST_ONLY = (
+    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>'
+    "</Domain></CycloneDDS>"
+)
+OWN_DOMAIN = 1 + os.getpid() % 200  # tests that run beside these have another
+
+
+class Peer:
+    """Calls are carried out by the other process, in order."""
+
+    def __init__(self, domain: int = OWN_DOMAIN) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._end, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, domain), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def advertise(self, topic: str, name: str, **quality: Any) -> None:
+        """quality: reliable, transient_local, depth."""
+        self._call("advertise", topic, name, quality)
+
+    def publish(self, topic: str, message: Mapping[str, Any]) -> None:
+        """Fields that are not given are zero, false and empty."""
+        self._call("publish", topic, message)
+
+    def publish_raw(self, topic: str, data: bytes) -> None:
+        self._call("publish_raw", topic, data)
+
+    def readers(self, topic: str) -> int:
+        return int(self._call("readers", topic))
+
+    def subscribe(self, topic: str, name: str, **quality: Any) -> None:
+        self._call("subscribe", topic, name, quality)
+
+    def taken(self, topic: str) -> list[dict[str, Any]]:
+        """All that came since."""
+        return list(self._call("taken", topic))
+
+    def wait_for_reader(self, topic: str, seconds: float = 20.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not self.readers(topic):
+            assert time.monotonic() < deadline, f"nobody reads {topic}"
+            time.sleep(0.05)
+
+    def wait_for(self, topic: str, count: int = 1, seconds: float = 20.0) -> list[dict[str, Any]]:
+        """At least so many messages."""
+        found: list[dict[str, Any]] = []
+        deadline = time.monotonic() + seconds
+        while len(found) < count:
+            found += self.taken(topic)
+            assert time.monotonic() < deadline, f"{len(found)} messages at {topic}"
+            time.sleep(0.02)
+        return found
+
+    def close(self) -> None:
+        self._end.send(None)
+        self._process.join(10.0)
+        if self._process.is_alive():
+            self._process.kill()
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def _call(self, *request: Any) -> Any:
+        self._end.send(request)
+        answer = self._end.recv()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+def _serve(connection: Connection, domain: int) -> None:
+    program = _Program(domain)
+    while (request := connection.recv()) is not None:
+        try:
+            connection.send(getattr(program, request[0])(*request[1:]))
+        except Exception as error:
+            connection.send(RuntimeError(f"{request[:2]}: {error!r}"))
+
+
+class _Program:
+    def __init__(self, domain: int) -> None:
+        from cyclonedds.domain import Domain, DomainParticipant
+        from rosbags.typesys import Stores, get_typestore
+
+        self._domain = Domain(domain, LOCALHOST_ONLY)
+        self._participant = DomainParticipant(domain)
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._types: dict[str, Any] = {}
+        self._writers: dict[str, Any] = {}
+        self._readers: dict[str, Any] = {}
+
+    def advertise(self, topic: str, name: str, quality: dict[str, Any]) -> None:
+        from cyclonedds.pub import DataWriter
+
+        self._writers[topic] = DataWriter(self._participant, self._topic(topic, name), qos=_qos(**quality))
+
+    def subscribe(self, topic: str, name: str, quality: dict[str, Any]) -> None:
+        from cyclonedds.sub import DataReader
+
+        self._readers[topic] = DataReader(self._participant, self._topic(topic, name), qos=_qos(**quality))
+
+    def publish(self, topic: str, message: Mapping[str, Any]) -> None:
+        writer = self._writers[topic]
+        writer.write(self._filled(writer.data_type, message))
+
+    def publish_raw(self, topic: str, data: bytes) -> None:
+        from cyclonedds._clayer import ddspy_write
+
+        assert ddspy_write(self._writers[topic]._ref, data + bytes(-len(data) % 4)) >= 0
+
+    def readers(self, topic: str) -> int:
+        return len(self._writers[topic].get_matched_subscriptions())
+
+    def taken(self, topic: str) -> list[dict[str, Any]]:
+        return [_plain(sample) for sample in self._readers[topic].take(1000) if sample.sample_info.valid_data]
+
+    def _topic(self, topic: str, name: str) -> Any:
+        from cyclonedds.topic import Topic
+
+        return Topic(self._participant, f"rt{topic}", self._type(name))
+
+    def _type(self, name: str) -> Any:
+        from cyclonedds.idl import make_idl_struct
+
+        if name not in self._types:
+            package, kind, short = name.split("/")
+            members = {member: self._member(spec) for member, spec in self._store.fielddefs[name][1]}
+            self._types[name] = make_idl_struct(f"{short}_", f"{package}::{kind}::dds_::{short}_", members)
+        return self._types[name]
+
+    def _member(self, spec: Any) -> Any:
+        from cyclonedds.idl import types
+
+        kind, what = spec[0].name, spec[1]
+        if kind == "NAME":
+            return self._type(what)
+        if kind == "BASE":
+            return {"string": str, "bool": bool}.get(what[0]) or getattr(types, what[0])
+        element = self._member(what[0])
+        return types.array[element, what[1]] if kind == "ARRAY" else types.sequence[element]
+
+    def _filled(self, message_type: Any, given: Mapping[str, Any]) -> Any:
+        """The message with what is given, and zeros for the rest."""
+        name = next(n for n, t in self._types.items() if t is message_type)
+        return message_type(**{member: self._value(spec, given.get(member)) for member, spec in self._fields(name)})
+
+    def _fields(self, name: str) -> Any:
+        return self._store.fielddefs[name][1]
+
+    def _value(self, spec: Any, given: Any) -> Any:
+        kind, what = spec[0].name, spec[1]
+        if kind == "NAME":
+            return self._filled(self._type(what), given or {})
+        if kind == "BASE":
+            return given if given is not None else {"string": "", "bool": False}.get(what[0], 0)
+        if kind == "ARRAY":
+            return list(given) if given is not None else [self._value(what[0], None)] * what[1]
+        return [self._value(what[0], each) for each in (given if given is not None else ())]
+
+
+def _qos(reliable: bool = True, transient_local: bool = False, depth: int = 10) -> Any:
+    from cyclonedds.core import Policy, Qos
+    from cyclonedds.util import duration
+
+    return Qos(
+        Policy.Reliability.Reliable(duration(milliseconds=100)) if reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if transient_local else Policy.Durability.Volatile,
+        Policy.History.KeepLast(depth),
+    )
+
+
+def _plain(value: Any) -> Any:
+    """A message as nested dictionaries and lists."""
+    if hasattr(value, "__idl__"):
+        return {name: _plain(member) for name, member in vars(value).items() if name != "sample_info"}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value
