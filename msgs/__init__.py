@@ -38,12 +38,23 @@ class _Image:
 
 
 @dataclass(frozen=True)
-class _PosedImage(_Image):
+class _PhotographedImage(_Image):
+    """What every message of an image has that the map is trained on.
+
+    Where the tracker knows the camera's rolling shutter, it says how the image was taken: `readout_time`, and the
+    camera's `velocity`, a twist (translation, rotation) a second in its own axes, in the unit of `scale`.
+    """
+
+    velocity: Annotated[np.ndarray, "float64 6"] | None = field(default=None, kw_only=True)
+    readout_time: float = field(default=0.0, kw_only=True)  # seconds from the photograph's first row to its last
+
+
+@dataclass(frozen=True)
+class _PosedImage(_PhotographedImage):
     """What every message of a keyframe has.
 
-    Those that follow the tracker also carry, where it knows the camera's rolling shutter, the `photograph` as the
-    shutter took it, and how: `readout_time`, and the camera's `velocity`, a twist (translation, rotation) a second in
-    its own axes, in the unit of `scale`. `image` is then as a global shutter would have taken it.
+    Where the rolling shutter is known, `image` is as a global shutter would have taken it, for stereo, and there is
+    the `photograph` as it was taken, too.
     """
 
     world_from_cam: Annotated[np.ndarray, "float64 4 4"]
@@ -52,8 +63,6 @@ class _PosedImage(_Image):
     vignetting: Annotated[np.ndarray, "float32 3"] | None = field(default=None, kw_only=True)
     # as it was taken; None: the image is it
     photograph: Annotated[np.ndarray, "uint8 H W 3"] | None = field(default=None, kw_only=True)
-    velocity: Annotated[np.ndarray, "float64 6"] | None = field(default=None, kw_only=True)
-    readout_time: float = field(default=0.0, kw_only=True)  # seconds from the photograph's first row to its last
 
 
 @dataclass(frozen=True)
@@ -82,10 +91,10 @@ class Keyframe(_PosedImage):
 
 
 @dataclass(frozen=True)
-class TrackedFrame(_Image):
+class TrackedFrame(_PhotographedImage):
     """A frame that became no keyframe, never a held-out one: another view to train the map on.
 
-    Its image is as keyframes' images are. It follows its keyframe wherever that is corrected to.
+    Its image is the photograph. It follows its keyframe wherever that is corrected to.
     """
 
     keyframe: int  # against which its pose was found

@@ -101,7 +101,7 @@ class Mapper(Node):
                 FrameBetween(
                     index=frame.index, timestamp=frame.timestamp, image=frame.image, intrinsics=frame.intrinsics,
                     keyframe=frame.keyframe, keyframe_from_cam=frame.keyframe_from_cam, scale=frame.scale,
-                    exposure=frame.exposure,
+                    exposure=frame.exposure, velocity=frame.velocity, readout_time=frame.readout_time,
                 )
             )  # fmt: skip
         yield from ()

@@ -73,18 +73,18 @@ class Tracker(TrackerNode):
         )
 
     def _between(self, found: Between) -> TrackedFrame:
-        frame = self._frames[found.index]
-        with self.stats.time("rectification"):
-            image = rectified(frame.image, found.image, self._readout_time)
+        frame, velocity = self._frames[found.index], found.velocity if self.config.rectify_rolling_shutter else None
         return TrackedFrame(
             index=frame.index,
             timestamp=frame.timestamp,
-            image=image,
+            image=frame.image,
             intrinsics=self._intrinsics(frame),
             keyframe=found.keyframe,
             keyframe_from_cam=found.keyframe_from_cam,
             scale=self.core.scale(found.keyframe),
             exposure=found.exposure,
+            velocity=velocity,
+            readout_time=0.0 if velocity is None else self._readout_time,
         )
 
     def _intrinsics(self, frame: Frame) -> np.ndarray:

@@ -14,6 +14,7 @@ from mvsgs_core import geometry
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.image_metrics import psnr
+from mvsgs_core.trajectory import Trajectory as CameraTrajectory
 from nodes import Node, handlers, outputs
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker, in_milliseconds
@@ -323,6 +324,17 @@ def check_photographs(keyframes: list[Keyframe], frames: list[Frame]) -> None:
     assert np.median(off) < 0.3, off
 
 
+def check_frames_between(between: list[TrackedFrame], frames: list[Frame], trajectory: Trajectory) -> None:
+    """As they came, with the velocity between the frames beside them, which later corrections hardly change."""
+    assert len(between) > 5
+    final = CameraTrajectory(**vars(trajectory)).velocities_of(np.array([b.index for b in between]))
+    for b, velocity in zip(between, final, strict=True):
+        assert b.image is frames[b.index].image
+        assert b.readout_time == 0.5 / FPS
+        assert b.velocity is not None
+        assert np.linalg.norm(b.velocity - velocity) < 0.1 * np.linalg.norm(velocity)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rectify_rolling_shutter", [True, False])
 def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling_shutter: bool) -> None:
@@ -335,6 +347,7 @@ def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling
         assert trajectory.readout_time == 0.5 / FPS
         check_global_shutter(keyframes, frames)
         check_photographs(keyframes, frames)
+        check_frames_between(of_type(sent, TrackedFrame), frames, trajectory)
         final = of_type(sent, Poses)[-1]
         assert final.readout_time == 0.5 / FPS
         assert final.velocity is not None
@@ -348,6 +361,7 @@ def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling
     else:
         assert trajectory.readout_time == 0.0
         assert all(k.image is frames[k.index].image and k.photograph is None for k in keyframes)
+        assert all(b.velocity is None and b.readout_time == 0.0 for b in of_type(sent, TrackedFrame))
 
 
 @pytest.mark.slow

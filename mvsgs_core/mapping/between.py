@@ -11,7 +11,7 @@ import torch
 from mvsgs_core import geometry
 from mvsgs_core.mapping.exposure import NO_EXPOSURE
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
-from mvsgs_core.mapping.keyframe_checks import checked_keyframe, is_pose
+from mvsgs_core.mapping.keyframe_checks import NO_SHUTTER, checked_keyframe, is_pose, is_read_out
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.photometry import IDENTITY, compose, is_exposure
 from mvsgs_core.stats import Stats
@@ -32,6 +32,8 @@ class FrameBetween:
     keyframe_from_cam: np.ndarray  # (4, 4) float64
     scale: float  # cumulative scale of the map, at that keyframe, that the pose is in
     exposure: np.ndarray | None = None  # (3, 4) from the keyframe's colors; None: no difference
+    velocity: np.ndarray | None = None  # (6,) of the camera, as in `msgs`; None: not known
+    readout_time: float = 0.0  # seconds from the image's first row to its last
 
 
 @dataclass
@@ -71,10 +73,14 @@ class BetweenView(TrainingView):
     keyframe_from_cam: np.ndarray = field(default_factory=lambda: np.eye(4))  # (4, 4), in the world's unit at `scale`
 
     from_keyframe: np.ndarray = field(default_factory=IDENTITY.copy)  # (3, 4) exposure, from the keyframe's colors
+    twist: np.ndarray = field(default_factory=lambda: np.zeros(6))  # (6,) its velocity, in the world's unit at `scale`
 
     def follow(self, keyframe: TrainingView, frame: FrameOfReference) -> None:
         """Stands beside the keyframe where that stands now, in its light, the map's own step of its pose included."""
-        self.keyframe_from_cam = scaled(self.keyframe_from_cam, keyframe.scale / self.scale)
+        change = keyframe.scale / self.scale
+        self.keyframe_from_cam = scaled(self.keyframe_from_cam, change)
+        self.twist = in_unit(self.twist, 1.0 / change)
+        self.velocity = in_unit(self.twist, frame.length)
         self.scale = keyframe.scale
         self.world_from_cam = keyframe.world_from_cam @ self.keyframe_from_cam
         local = keyframe.local_from_cam
@@ -105,6 +111,11 @@ def between_view(
         **vars(plain), keyframe=given.keyframe, keyframe_from_cam=np.asarray(given.keyframe_from_cam, dtype=np.float64)
     )
     view.fixed = True
+    if given.velocity is not None:
+        if is_read_out(given.velocity, given.readout_time):
+            view.twist, view.readout_time = given.velocity, given.readout_time
+        else:
+            log.refuse("photographs", 1, NO_SHUTTER)
     if given.exposure is not None:
         if is_exposure(given.exposure):
             view.from_keyframe = given.exposure.astype(np.float32)
@@ -122,6 +133,11 @@ def scaled(pose: np.ndarray, factor: float) -> np.ndarray:
     moved = pose.copy()
     moved[:3, 3] *= factor
     return moved
+
+
+def in_unit(twist: np.ndarray, unit: float) -> np.ndarray:
+    """The twist (6,), its lengths in this unit."""
+    return twist / np.repeat([unit, 1.0], 3)
 
 
 __all__ = ["BetweenView", "FrameBetween", "FramesBetween", "between_view"]

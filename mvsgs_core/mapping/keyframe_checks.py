@@ -18,6 +18,7 @@ from mvsgs_core.stats import Stats
 MIN_SIDE = 8  # pixels of an image
 FOCAL = (0.05, 100.0)  # focal lengths over the image's larger side: 170 degrees to half a degree
 OFF_CENTER = 1.0  # image sizes that the principal point may lie outside of the image
+NO_SHUTTER = "photographs whose size, velocity or readout time no camera has were trained on without their shutter"
 NO_POSE = "a corrected pose that is not finite, or none at all, was refused"
 
 
@@ -38,17 +39,17 @@ def checked_keyframe(view: RGBDKeyframe, log: Stats) -> RGBDKeyframe | None:
     if confidence is not None and not np.isfinite(confidence).all():
         confidence = np.where(np.isfinite(confidence), confidence, np.float32(0))
     view = replace(view, normals=normals, confidence=confidence)
-    if view.photograph is None or _is_read_out(view):
+    if view.photograph is None:
         return view
-    log.refuse("photographs", 1, "a photograph whose size, velocity or readout time no camera has was left out")
+    if view.photograph.shape == view.image.shape and is_read_out(view.velocity, view.readout_time):
+        return view
+    log.refuse("photographs", 1, NO_SHUTTER)
     return replace(view, photograph=None)
 
 
-def _is_read_out(view: RGBDKeyframe) -> bool:
-    """Whether the photograph is one, and it is known how it was read."""
-    if view.photograph is None or view.velocity is None or view.photograph.shape != view.image.shape:
-        return False
-    return bool(np.isfinite(view.velocity).all() and 0.0 <= view.readout_time <= MAX_READOUT_TIME)
+def is_read_out(velocity: np.ndarray | None, readout_time: float) -> bool:
+    """Whether that is how a camera's rolling shutter reads an image: velocity (6,), seconds."""
+    return velocity is not None and bool(np.isfinite(velocity).all() and 0.0 <= readout_time <= MAX_READOUT_TIME)
 
 
 def is_pose(world_from_cam: np.ndarray, scale: float) -> bool:

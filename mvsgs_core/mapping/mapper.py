@@ -192,13 +192,17 @@ class OnlineMapper:
     def move(self, index: np.ndarray, velocity: np.ndarray, readout_time: float) -> None:
         """Takes velocities (K, 6) of the camera at the keyframes `index` (K,), world units a second, NaN: as it was.
 
-        And the time, seconds, in which their photographs were read; for those that are trained on as they were taken.
+        And the time, seconds, in which their photographs were read; for those that are trained on as they were taken,
+        and for the frames between them, whose velocities stay.
         """
         known = dict(zip(index.tolist(), velocity / np.repeat([self.frame.length, 1.0], 3)))
         for view in self.views:
             found = known.get(view.index)
             if view.readout is not None and found is not None and np.isfinite(found).all():
                 view.velocity, view.readout_time = found, readout_time
+        for between in self.keyframes.between:
+            if between.twist.any():
+                between.readout_time = readout_time
 
     def expose(self) -> int:
         """Brings keyframes and colors to what `photometry` says now; returns the number of splats that changed.

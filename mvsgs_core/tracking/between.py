@@ -6,6 +6,7 @@ better ones. So the frames wait for that keyframe. Held-out frames never go out.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photometry import compose, inverse
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
-from mvsgs_core.tracking.frames import FrameRecord, followed_pose
+from mvsgs_core.tracking.frames import FrameRecord, solve_trajectory
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.photometer import Photometer
@@ -23,14 +24,11 @@ from mvsgs_core.tracking.photometer import Photometer
 class Between:
     """A frame and where it was seen from a keyframe."""
 
-    image: TrackingImage
+    index: int
     keyframe: int
     keyframe_from_cam: np.ndarray  # (4, 4) float64, in the unit of the graph as it is
     exposure: np.ndarray | None  # (3, 4) float32 from the keyframe's colors to its own; None: no difference is known
-
-    @property
-    def index(self) -> int:
-        return self.image.index
+    velocity: np.ndarray | None  # (6,) of the camera, a twist a second, in the same unit; None: no neighbor tells it
 
 
 class FramesBetween:
@@ -64,19 +62,23 @@ class FramesBetween:
         """The keyframes that they are between are given up."""
         self._complete, self._newest = {}, {}
 
-    def settle(self, keyframe: int) -> tuple[Between, ...]:
-        """What waits, posed now that the graph has this keyframe: the frames of its segment that their matches fit."""
-        segment = self.graph.keyframes[keyframe].segment
-        found = []
-        for image, record in [*self._complete.values(), *self._newest.values()]:
-            reference = self.graph.keyframes.get(-1 if record.reference is None else record.reference)
-            if reference is None or reference.segment != segment or image.index in self.graph.keyframes:
+    def settle(self, keyframe: int, records: list[FrameRecord]) -> tuple[Between, ...]:
+        """What waits, posed now that the graph has this keyframe: the frames of its segment that their matches fit.
+
+        records: of all frames so far; what comes before and after a frame tells its velocity.
+        """
+        segment, waiting = self.graph.keyframes[keyframe].segment, self.waiting
+        around = _with_neighbors(records, waiting)
+        track, found = solve_trajectory(around, self.graph, self.solver), []
+        velocities = track.velocities_of(track.index)
+        for k in np.flatnonzero(track.posed & (track.segment == segment) & ~track.keyframe):
+            record = around[k]
+            if record.index not in waiting or record.reference is None:
                 continue
-            pose = followed_pose(record, self.graph, self.solver)
-            if pose is not None:
-                found.append(
-                    Between(image, reference.index, reference.cam_from_world @ pose, self._exposure(record, reference))
-                )
+            reference = self.graph.keyframes[record.reference]
+            pose, exposure = reference.cam_from_world @ track.world_from_cam[k], self._exposure(record, reference)
+            velocity = velocities[k] if np.isfinite(velocities[k]).all() else None
+            found.append(Between(record.index, reference.index, pose, exposure, velocity))
         self.forget()
         return tuple(found)
 
@@ -92,6 +94,17 @@ class FramesBetween:
         order = sorted(self._newest)
         first = min(range(len(order) - 1), key=lambda k: order[k + 1] - order[k])
         return min(order[first : first + 2], key=lambda index: _detail(self._newest[index][0].gray))
+
+
+def _with_neighbors(records: list[FrameRecord], indices: set[int]) -> list[FrameRecord]:
+    """Of these frames, of those before and after them, and of what these did not move against."""
+
+    def place(index: int) -> int:
+        return bisect_left(records, index, key=lambda record: record.index)
+
+    near = {n for index in indices for n in range(max(place(index) - 1, 0), min(place(index) + 2, len(records)))}
+    near |= {place(origin) for origin in (records[n].same_as for n in near) if origin is not None}
+    return [records[n] for n in sorted(near)]
 
 
 def _detail(gray: np.ndarray) -> float:

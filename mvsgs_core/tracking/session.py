@@ -372,7 +372,7 @@ class Session:
         with self.stats.time("frames between keyframes"):
             if self.between.waiting and len(keyframes) > 1:
                 self.recovery.fill_in([record for record in self.records if record.index >= keyframes[0]])
-            found = self.between.settle(keyframes[-1])
+            found = self.between.settle(keyframes[-1], self.records)
         return tuple(frame for frame in found if frame.keyframe in self.publisher.published)
 
     def _settle(self) -> tuple[int, ...]:

@@ -9,6 +9,7 @@ import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.between import FrameBetween
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.small_maps import CONFIG, mapped, score
@@ -92,6 +93,49 @@ def test_a_view_before_the_unit_is_known_gets_its_velocity_in_it() -> None:
     assert mapper.frame.unit is not None
     assert first.velocity is not None
     np.testing.assert_allclose(mapper.views[0].velocity[:3], first.velocity[:3] / mapper.frame.unit)
+
+
+def beside(keyframe: RGBDKeyframe, **changes: object) -> FrameBetween:
+    """A frame beside the keyframe, which moved as that did."""
+    relative = geometry.se3_exp(np.array([0.01, 0.0, 0.0, 0.0, 0.02, 0.0]))
+    found = FrameBetween(
+        99, 9.9, keyframe.image, keyframe.intrinsics, keyframe.index, relative, keyframe.scale,
+        velocity=keyframe.velocity, readout_time=keyframe.readout_time,
+    )  # fmt: skip
+    return replace(found, **changes)  # type: ignore[arg-type]
+
+
+def test_a_frame_between_keyframes_is_rendered_as_its_shutter_saw_it() -> None:
+    """Its velocity follows the scale of its keyframe, its readout time what the tracker says of the camera later."""
+    keyframe = shaking(50.0)[0]
+    mapper = mapped([keyframe])
+    assert mapper.add_between(beside(keyframe))
+    (view,) = mapper.keyframes.between
+    expected = READOUT_TIME * keyframe.velocity / np.repeat([mapper.frame.length, 1.0], 3)
+    np.testing.assert_allclose(view.readout, expected)
+    mapper.correct(np.array([0]), keyframe.world_from_cam[None], np.array([3.0]))
+    mapper.move(np.array([7]), np.ones((1, 6)), 0.03)
+    mapper._chosen(view)
+    np.testing.assert_allclose(view.readout, 1.5 * expected * np.repeat([3.0, 1.0], 3))
+
+
+def test_a_frame_between_keyframes_without_a_velocity_stays_as_it_is() -> None:
+    keyframe = shaking()[0]
+    mapper = mapped([keyframe])
+    mapper.add_between(beside(keyframe, velocity=None, readout_time=0.0))
+    mapper.move(np.array([0]), np.ones((1, 6)), 0.03)
+    assert mapper.keyframes.between[0].readout is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"velocity": np.full(6, np.inf)}, {"readout_time": -0.01}, {"readout_time": float("nan")}]
+)
+def test_a_shutter_of_a_frame_between_that_no_camera_has_is_left_out(change: dict) -> None:
+    keyframe = shaking()[0]
+    mapper = mapped([keyframe])
+    mapper.add_between(beside(keyframe, **change))
+    assert mapper.log.counts["refused_photographs"] == 1
+    assert mapper.keyframes.between[0].readout is None
 
 
 @pytest.mark.parametrize(
