@@ -12,7 +12,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.photometer import observed
-from mvsgs_core.tracking.places.localization import localize
+from mvsgs_core.tracking.places.localization import localize_by
 from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
@@ -21,7 +21,7 @@ AGREEMENT = 0.7  # of a frame's points, all of which agreed once: fewer after th
 
 @dataclass(slots=True)
 class FrameRecord:
-    """A frame's state and where it was seen from one keyframe; 1.3 kilobytes, kept for every frame of the stream."""
+    """A frame's state and where it was seen from one keyframe, or two; 2.1 kilobytes, kept for every frame."""
 
     index: int
     timestamp: float  # seconds
@@ -29,6 +29,8 @@ class FrameRecord:
     reference: int | None = None  # keyframe that the frame's pose was found against; None: no pose, or as `same_as`
     points: bytes = b""  # of its matches, see sample.py
     cam_from_reference: bytes = b""  # (4, 4) float32: where the search for the pose begins
+    after: int | None = None  # keyframe after the frame that it was matched with, too
+    points_after: bytes = b""
     same_as: int | None = None  # frame that this one did not move against
     light: bytes = b""  # what its gray levels say of its exposure, see photometer.py
 
@@ -43,17 +45,30 @@ class FrameRecord:
         """Keeps what gives the frame's pose (4, 4) and exposure again, from its matches of a keyframe's points."""
         self.light = observed(graph, reference, image, matches)
         self.reference, self.same_as = reference, None
-        self.points = sample(graph, reference, matches, cam_from_world)
-        relative = cam_from_world @ graph.world_from_cam(reference)
-        self.cam_from_reference = relative.astype(np.float32).tobytes()
+        self.after, self.points_after = None, b""
+        self._stand(graph, matches, cam_from_world)
+
+    def follow_both(
+        self, graph: KeyframeGraph, matches: Matches, after: int, matches_after: Matches, cam_from_world: np.ndarray
+    ) -> None:
+        """The same, with matches of another keyframe's points beside those of the reference."""
+        self._stand(graph, matches, cam_from_world)
+        self.after, self.points_after = after, sample(graph, after, matches_after, cam_from_world)
 
     def forget(self) -> None:
         """The frame has no pose."""
         self.reference, self.same_as, self.points, self.cam_from_reference, self.light = None, None, b"", b"", b""
+        self.after, self.points_after = None, b""
+
+    def _stand(self, graph: KeyframeGraph, matches: Matches, cam_from_world: np.ndarray) -> None:
+        assert self.reference is not None
+        self.points = sample(graph, self.reference, matches, cam_from_world)
+        relative = cam_from_world @ graph.world_from_cam(self.reference)
+        self.cam_from_reference = relative.astype(np.float32).tobytes()
 
 
 def followed_pose(record: FrameRecord, graph: KeyframeGraph, solver: Solver) -> np.ndarray | None:
-    """A frame's pose (4, 4) world_from_cam from its matches, against its reference as it is now.
+    """A frame's pose (4, 4) world_from_cam from its matches, against its keyframes as they are now.
 
     None where there is no reference, or too few of the matches agree with it any more.
     """
@@ -61,8 +76,11 @@ def followed_pose(record: FrameRecord, graph: KeyframeGraph, solver: Solver) -> 
         return None
     reference = graph.keyframes[record.reference]
     relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
-    matches = restored(record.points, len(reference.inverse_depth))
-    found = localize(graph, record.reference, matches, relative @ reference.cam_from_world, solver)
+    cells = len(reference.inverse_depth)
+    matches = {record.reference: restored(record.points, cells)}
+    if record.after is not None and record.after in graph.keyframes:
+        matches[record.after] = restored(record.points_after, cells)
+    found = localize_by(graph, matches, relative @ reference.cam_from_world, solver)
     return None if found.failure or found.inliers < AGREEMENT else geometry.inverse(found.cam_from_world)
 
 

@@ -20,6 +20,7 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.back_end import BackEnd
 from mvsgs_core.tracking.between import Between, FramesBetween
+from mvsgs_core.tracking.both_sides import BothSides
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.estimation.calibration import REESTIMATED_AT, Calibration
@@ -78,6 +79,7 @@ class Session:
             self.graph, config.tolerance, lambda index: self.graph.keyframes[index].segment, self.photometer
         )
         self.between = FramesBetween(self.graph, self.photometer, config.frames_between, threads)
+        self.both_sides = BothSides(self.graph, self.matcher, threads)
         self._since = 0  # frames since the last keyframe
         self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
 
@@ -147,6 +149,7 @@ class Session:
         """The first keyframe of a segment, if the image has any texture."""
         self.phase = Phase.INITIALIZING
         self.between.forget()
+        self.both_sides.forget()
         record.state = TrackingState.NOT_INITIALIZED
         if not self._has_texture(frame):
             self.diagnosis.no_texture(frame)
@@ -165,7 +168,7 @@ class Session:
             if only and is_held_out(step.reference) and not is_held_out(frame.index):  # this one is as good
                 self.initializer.abandon()
                 return self._begin_segment(frame, record)
-            self.between.add(frame, record)
+            self._wait(frame, record)
             return Update(record.state)
         self.between.end()
         with self.stats.time("start"):
@@ -232,7 +235,7 @@ class Session:
             return Update(record.state)
         if not wanted:
             self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
-            self.between.add(frame, record)
+            self._wait(frame, record)
             return Update(record.state)
         return self._add_keyframe(frame, step, record) or self._lose(frame, record)
 
@@ -367,11 +370,17 @@ class Session:
     def _publish(self, keyframes: list[int]) -> tuple[int, ...]:
         return self.publisher.publish_all(keyframes, self.calibration.settled)
 
+    def _wait(self, frame: TrackingImage, record: FrameRecord) -> None:
+        """No keyframe: the next one poses it, and it may go out then."""
+        self.both_sides.add(frame, record)
+        self.between.add(frame, record)
+
     def _settle_between(self, keyframes: list[int]) -> tuple[Between, ...]:
         """The frames before these keyframes are posed, those of the start matched first; of what was published."""
         with self.stats.time("frames between keyframes"):
-            if self.between.waiting and len(keyframes) > 1:
+            if len(keyframes) > 1:
                 self.recovery.fill_in([record for record in self.records if record.index >= keyframes[0]])
+            self.stats.count("frames posed from both sides", self.both_sides.settle(keyframes))
             found = self.between.settle(keyframes[-1], self.records)
         return tuple(frame for frame in found if frame.keyframe in self.publisher.published)
 

@@ -1,7 +1,8 @@
-"""The pose of one frame against a keyframe whose depths are known: motion-only bundle adjustment."""
+"""The pose of one frame against keyframes whose depths are known: motion-only bundle adjustment."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,36 +25,43 @@ INLIER = 2.0  # pixels: a match that is further from where the pose puts it does
 
 
 def localize(graph: KeyframeGraph, index: int, matches: Matches, start: np.ndarray, solver: Solver) -> Localization:
-    """The pose (4, 4) that explains where the points of keyframe `index` were found, from a start near it.
+    """`localize_by` the points of keyframe `index` alone."""
+    return localize_by(graph, {index: matches}, start, solver)
+
+
+def localize_by(
+    graph: KeyframeGraph, matches: Mapping[int, Matches], start: np.ndarray, solver: Solver
+) -> Localization:
+    """The pose (4, 4) that explains where the points of keyframes, by index, were found, from a start near it.
 
     Points that were never triangulated are left out: in a pure rotation their depths would invent a translation.
     """
-    keyframe = graph.keyframes[index]
-    weight = np.where(keyframe.triangulated, matches.weight, 0.0)
+    keyframes, count = [graph.keyframes[index] for index in matches], len(matches)
+    weight = np.stack([np.where(k.triangulated, m.weight, 0.0) for k, m in zip(keyframes, matches.values())])
     if (weight > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
-        weight = matches.weight
-    target = np.nan_to_num(_rectified(matches, graph.readout_time).T)
-    cells = len(keyframe.inverse_depth)
+        weight = np.stack([m.weight for m in matches.values()])
+    target = np.stack([np.nan_to_num(_rectified(m, graph.readout_time).T) for m in matches.values()])
+    cells = weight.shape[1]
     problem = Graph(
-        cam_from_world=np.stack([keyframe.cam_from_world, start]),
-        inverse_depth=np.stack([keyframe.inverse_depth, np.ones(cells)]),
-        pixels=np.stack([graph.pixels(index), np.zeros((2, cells))]),
+        cam_from_world=np.stack([*(k.cam_from_world for k in keyframes), start]),
+        inverse_depth=np.stack([*(k.inverse_depth for k in keyframes), np.ones(cells)]),
+        pixels=np.stack([*(graph.pixels(index) for index in matches), np.zeros((2, cells))]),
         intrinsics=graph.intrinsics,
-        source=np.array([0], np.int32),
-        to=np.array([1], np.int32),
-        target=target[None],
-        information=(keyframe.image.cells.information.T * weight)[None],
-        free_pose=np.array([False, True]),
-        free_depth=np.zeros(2, bool),
+        source=np.arange(count, dtype=np.int32),
+        to=np.full(count, count, np.int32),
+        target=target,
+        information=np.stack([k.image.cells.information.T * w for k, w in zip(keyframes, weight)]),
+        free_pose=np.arange(count + 1) == count,
+        free_depth=np.zeros(count + 1, bool),
     )
     solution = adjust(problem, solver)
     pixels, z = reproject(
         solution.cam_from_world, problem.inverse_depth, problem.pixels, graph.intrinsics, problem.source, problem.to
     )
-    error = np.where(z[0] > 0, np.linalg.norm(pixels[0] - target, axis=0), np.inf)[weight > 0]
+    error = np.where(z > 0, np.linalg.norm(pixels - target, axis=1), np.inf)[weight > 0]
     if len(error) == 0:
         return Localization(start, 0.0, "no match has a known depth")
-    return Localization(solution.cam_from_world[1], float(np.mean(error < INLIER)), solution.failure)
+    return Localization(solution.cam_from_world[count], float(np.mean(error < INLIER)), solution.failure)
 
 
 def located(
@@ -74,4 +82,4 @@ def _rectified(matches: Matches, readout_time: float) -> np.ndarray:
     return matches.target if matches.shift is None else matches.target - readout_time * matches.shift
 
 
-__all__ = ["INLIER", "Localization", "localize", "located"]
+__all__ = ["INLIER", "Localization", "localize", "localize_by", "located"]
