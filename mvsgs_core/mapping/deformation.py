@@ -34,6 +34,11 @@ class Similarity:
         change = abs(self.scale - 1.0) + float(np.abs(self.rotation - np.eye(3)).max())
         return change + float(np.abs(self.translation).max()) / length > tolerance
 
+    def shifts(self, points: np.ndarray) -> np.ndarray:
+        """Distances (N,) by which points (N, 3) move."""
+        moved = self.scale * points @ self.rotation.T + self.translation
+        return np.asarray(np.linalg.norm(moved - points, axis=1))
+
 
 @torch.no_grad()
 def move_with_anchors(state: MapState, similarities: dict[int, Similarity]) -> int:

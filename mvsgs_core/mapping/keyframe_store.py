@@ -49,6 +49,12 @@ class KeyframeStore:
         """All that is trained on: keyframes, then the frames between them."""
         return [*self.with_image, *self.between]
 
+    def owed(self, limit: int) -> list[int]:
+        """Positions in `with_image` of the keyframes that are owed iterations, see `TrainingView.owed`: that with the
+        fewest since its correction first."""
+        owed = [k for k, view in enumerate(self.with_image) if view.owed(limit)]
+        return sorted(owed, key=lambda k: self.with_image[k].visits_here)
+
     def of(self, index: int) -> TrainingView | None:
         """The keyframe of this frame index."""
         return self._by_index.get(index)

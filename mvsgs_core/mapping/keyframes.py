@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -72,6 +73,7 @@ class TrainingView:
     visits_here: int = 0  # of these since its pose was last corrected
     loss_fast: float = field(default=float("nan"))  # running means of the loss of these
     loss_slow: float = field(default=float("nan"))
+    loss_before: float = field(default=float("nan"))  # the last correction, to come back to; NaN: it has
 
     @property
     def refined_from_cam(self) -> np.ndarray:
@@ -101,6 +103,14 @@ class TrainingView:
     def intrinsics_at(self, size: tuple[int, int]) -> np.ndarray:
         """(4,) at another size (height, width)."""
         return camera.scale_intrinsics(self.image_intrinsics, self.image_size, size)
+
+    def footprint(self) -> np.ndarray:
+        """(4, 3) corners of what it sees, at its median depth, in the mapper's frame."""
+        fx, fy, cx, cy = self.intrinsics
+        height, width = self.size
+        x, y = (np.array([0, width - 1, 0, width - 1]) - cx) / fx, (np.array([0, 0, height - 1, height - 1]) - cy) / fy
+        corners = self.median_depth * np.stack([x, y, np.ones(4)], axis=-1)
+        return np.asarray(corners @ self.local_from_cam[:3, :3].T + self.local_from_cam[:3, 3])
 
     def drop_image(self) -> None:
         """Frees what only the training needs; pose, scale and exposure stay."""
@@ -145,6 +155,8 @@ class TrainingView:
     def record(self, loss: float) -> None:
         """Takes in the loss of an iteration."""
         self.visits_here += 1
+        if loss <= self.loss_before:
+            self.loss_before = float("nan")
         if self.visits_here == 1:
             self.loss_fast = self.loss_slow = loss
             return
@@ -157,9 +169,18 @@ class TrainingView:
             return False
         return (self.loss_slow - self.loss_fast) / self.loss_slow < config.improvement
 
-    def begin_anew(self) -> None:
-        """Its pose has changed: what was known of its convergence says nothing any more."""
+    def begin_anew(self, moved: bool = False) -> None:
+        """Its pose has changed: what was known of its convergence says nothing any more.
+
+        moved: by so much that what it sees was trained at the wrong place; it is trained until its loss is back.
+        """
+        if moved and math.isnan(self.loss_before):
+            self.loss_before = self.loss_fast
         self.visits_here, self.loss_fast, self.loss_slow = 0, float("nan"), float("nan")
+
+    def owed(self, limit: int) -> bool:
+        """Whether its loss has not come back yet since its pose was corrected, in fewer than `limit` visits."""
+        return not math.isnan(self.loss_before) and self.visits_here < limit
 
 
 def training_view(

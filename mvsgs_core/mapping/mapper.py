@@ -79,8 +79,10 @@ class OnlineMapper:
     @property
     def figures(self) -> dict[str, int]:
         """For the live display and the report."""
+        owed = len(self.keyframes.owed(self.config.iterations))  # at least one each
         return {
-            "splats": len(self.state), "iterations": self.iterations, "iterations_pending": self.schedule.pending,
+            "splats": len(self.state), "iterations": self.iterations,
+            "iterations_pending": self.schedule.pending + owed,
             "image_bytes": self.keyframes.image_bytes,
         }  # fmt: skip
 
@@ -140,13 +142,14 @@ class OnlineMapper:
         return True
 
     def step(self) -> bool:
-        """One pending iteration; False when none is."""
-        if self.schedule.pending == 0 or not self.views or len(self.state) == 0:
+        """One iteration that is pending, or owed to a keyframe that was corrected; False when none is."""
+        owed = self.keyframes.owed(self.config.iterations)
+        if (self.schedule.pending == 0 and not owed) or not self.views or len(self.state) == 0:
             self.schedule.drop()
             return False
         with self.log.time("optimization"):
             images, convergence = self.keyframes.trained, self.config.convergence
-            view = self._chosen(images[self.schedule.next(len(self.keyframes.with_image), len(images))])
+            view = self._chosen(images[self.schedule.next(len(self.keyframes.with_image), len(images), owed)])
             done = convergence.skip and view.converged(convergence)
             if done and not self.schedule.chance(convergence.keep):
                 self.log.skip("iterations_converged")
@@ -167,7 +170,8 @@ class OnlineMapper:
     def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> int:
         """Takes corrected absolute poses (K, 4, 4) and cumulative scales (K,) of the keyframes `index` (K,).
 
-        Splats move with their anchor keyframe; returns how many did. Poses that are not finite are refused and counted.
+        Splats move with their anchor keyframe; returns how many did. A keyframe of which what it sees moves by more
+        than a pixel is trained until its loss is back. Poses that are not finite are refused and counted.
         """
         moved: dict[int, Similarity] = {}
         by_index = {view.index: view for view in self.views}
@@ -179,11 +183,14 @@ class OnlineMapper:
             view = by_index.get(key)
             if view is None:
                 continue
+            seen, pixel = view.footprint(), view.median_depth / view.intrinsics[0]
             similarity = view.place(pose, self.frame.local(pose), s)
             if similarity.moves(max(view.median_depth, 1e-6)):
                 moved[key] = similarity
-                for changed in (view, *(b for b in self.keyframes.between if b.keyframe == key)):
-                    changed.begin_anew()
+                view.begin_anew(moved=bool(similarity.shifts(seen).max() > pixel))
+                for between in self.keyframes.between:
+                    if between.keyframe == key:
+                        between.begin_anew()
         with self.log.time("correction"):
             count = move_with_anchors(self.state, moved)
         self.log.count("corrected_keyframes", len(moved))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -34,13 +35,16 @@ class Schedule:
         """The positions have changed: begins new rounds."""
         self._local, self._all = [], []
 
-    def next(self, count: int, trained: int | None = None) -> int:
+    def next(self, count: int, trained: int | None = None, owed: Sequence[int] = ()) -> int:
         """Position of the next of `count` > 0 keyframes; takes one off the pending iterations.
 
         trained: images in all, the keyframes' first, of which the half on all takes its turns; None: keyframes alone.
+        owed: positions to which the half on all goes first, and all iterations where none is pending.
         """
-        self.pending = max(0, self.pending - 1)
+        pending, self.pending = self.pending, max(0, self.pending - 1)
         self._turn += 1
+        if owed and (pending == 0 or self._turn % 2 == 0):
+            return owed[0]
         if self._turn % 2:
             if not self._local:
                 first = max(0, count - self.window)

@@ -37,14 +37,15 @@ VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in Trainin
     "pose_delta": (np.float64, (4, 4)), "pose_moments": (np.float64, (2, 6)), "pose_steps": (np.int64, ()),
     "velocity": (np.float64, (6,)), "readout_time": (np.float64, ()), "fixed": (np.bool_, ()),
     "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_here": (np.int64, ()),
-    "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "intrinsics": (np.float64, (4,)),
+    "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "loss_before": (np.float64, ()),
+    "intrinsics": (np.float64, (4,)),
 }  # fmt: skip
 BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
     "keyframe": (np.int64, ()), "keyframe_from_cam": (np.float64, (4, 4)), "from_keyframe": (np.float32, (3, 4)),
     "twist": (np.float64, (6,)),
 }  # fmt: skip
 NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "readout_time")
-MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "measured")
+MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
 
 
 class Arrays:

@@ -17,6 +17,7 @@ from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 from tests.support.rasterizer_scenes import POSE, intrinsics, random_splats
+from tests.support.small_maps import mapped
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (60, 80)
@@ -36,15 +37,6 @@ def photographed(
         light = light * vignetting_factor(vignetting, view.intrinsics, size)[..., None]
     image = np.round(255.0 * light.clip(0.0, 1.0)).astype(np.uint8)
     return replace(view, image=image, **({"exposure": exposure, "vignetting": vignetting} if told else {}))
-
-
-def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:
-    mapper = OnlineMapper(config)
-    for view in views:
-        mapper.add_keyframe(view)
-    while mapper.step():
-        pass
-    return mapper
 
 
 def arc(*times: float) -> list[RGBDKeyframe]:
@@ -93,8 +85,8 @@ def test_colors_of_the_map_undo_exposure_and_vignetting_and_enlarge_no_noise() -
 
 def test_a_keyframe_of_another_exposure_lays_no_second_skin_and_leaves_the_colors_as_they_are() -> None:
     first, second = arc(0.0, 0.1)
-    steady = mapped([first, second])
-    told, untold = (mapped([first, photographed(second, DIM, told=told)]) for told in (True, False))
+    steady = mapped([first, second], CONFIG)
+    told, untold = (mapped([first, photographed(second, DIM, told=told)], CONFIG) for told in (True, False))
     assert told.log.counts["inserted"] < steady.log.counts["inserted"] + 0.02 * untold.log.counts["inserted"]
     assert untold.log.counts["inserted"] > 1.5 * steady.log.counts["inserted"]
     assert error(told, 0) < 1.15 * error(steady, 0)
@@ -104,8 +96,8 @@ def test_a_keyframe_of_another_exposure_lays_no_second_skin_and_leaves_the_color
 
 def test_vignetting_is_in_the_renders_and_not_in_the_map() -> None:
     views = arc(0.0, 0.1, 0.2)
-    steady = mapped(views).snapshot()
-    told, untold = (mapped([photographed(v, None, DARK, told=told) for v in views]) for told in (True, False))
+    steady = mapped(views, CONFIG).snapshot()
+    told, untold = (mapped([photographed(v, None, DARK, told=told) for v in views], CONFIG) for told in (True, False))
     plain = steady.render(views[1].world_from_cam, views[1].intrinsics, (48, 64)).color
     for mapper, differs in ((told, False), (untold, True)):
         color = mapper.snapshot().render(views[1].world_from_cam, views[1].intrinsics, (48, 64)).color
@@ -133,7 +125,7 @@ def test_white_pulls_up_and_never_down() -> None:
 
 
 def test_a_render_beyond_white_has_no_gradient_where_the_photograph_is_white_only() -> None:
-    mapper = mapped([photographed(arc(0.0)[0], 2.5 * IDENTITY)])
+    mapper = mapped([photographed(arc(0.0)[0], 2.5 * IDENTITY)], CONFIG)
     view = mapper.views[0]
     with torch.no_grad():
         mapper.state.splats.sh[:, 0] += 3.0  # all is far beyond white
@@ -175,7 +167,7 @@ def test_without_exposures_the_map_is_that_of_exposure_off_to_the_bit() -> None:
     views = arc(0.0, 0.2, 0.4)
     off = mapped(views, replace(CONFIG, training=TrainingConfig(exposure=False)))
     for given in (views, [replace(v, exposure=IDENTITY, vignetting=np.zeros(3, np.float32)) for v in views]):
-        on = mapped(given)
+        on = mapped(given, CONFIG)
         for name, value in off.state.tensors().items():
             assert torch.equal(on.state.tensors()[name], value), name
         np.testing.assert_array_equal(on.snapshot().exposures, np.stack([IDENTITY] * 3))
@@ -187,7 +179,7 @@ def test_without_exposures_the_map_is_that_of_exposure_off_to_the_bit() -> None:
 def test_a_common_change_of_gauge_changes_no_render_and_a_late_exposure_is_as_one_known_at_once() -> None:
     first, second = arc(0.0, 0.3)
     exposed = [photographed(first, AFFINE), photographed(second, DIM)]
-    mapper = mapped(exposed)
+    mapper = mapped(exposed, CONFIG)
     before = [mapper.render(view).color for view in mapper.views]
     gauge = np.array([[0.8, 0, 0, 0.01], [0, 0.9, 0, 0], [0, 0, 1.1, -0.02]])
     changed = np.stack([compose(e.exposure, inverse(gauge)) for e in exposed if e.exposure is not None])
@@ -200,10 +192,10 @@ def test_a_common_change_of_gauge_changes_no_render_and_a_late_exposure_is_as_on
         torch.testing.assert_close(mapper.render(view).color[solid], image[solid], atol=3e-3, rtol=0)
     assert mapper.expose() == 0
 
-    late = mapped([replace(exposed[0], exposure=None)])
+    late = mapped([replace(exposed[0], exposure=None)], CONFIG)
     late.photometry.take([0], AFFINE[None], None, Stats())
     late.expose()
-    at_once = mapped([exposed[0]])
+    at_once = mapped([exposed[0]], CONFIG)
     colors = [m.snapshot().render(first.world_from_cam, first.intrinsics, (48, 64)).color for m in (late, at_once)]
     assert float((colors[0] - colors[1]).abs().mean()) < 0.02
     late.photometry.take([0], np.full((1, 3, 4), np.nan, np.float32), None, Stats())
@@ -213,7 +205,7 @@ def test_a_common_change_of_gauge_changes_no_render_and_a_late_exposure_is_as_on
 
 
 def test_what_a_keyframe_learned_beside_the_measured_exposure_stays_with_a_correction() -> None:
-    mapper = mapped([photographed(arc(0.0)[0], AFFINE)])
+    mapper = mapped([photographed(arc(0.0)[0], AFFINE)], CONFIG)
     view = mapper.views[0]
     trained = compose(AFFINE, np.array([[1.02, 0, 0, 0], [0, 0.99, 0, 0], [0, 0, 1, 0]]))
     view.exposure = torch.tensor(trained, dtype=torch.float32)
@@ -226,7 +218,9 @@ def test_what_a_keyframe_learned_beside_the_measured_exposure_stays_with_a_corre
 def test_what_no_camera_has_is_refused_and_counted_and_the_map_stays_sound(value: float) -> None:
     wrong = IDENTITY.copy()
     wrong[1, 1] = value
-    mapper = mapped([replace(arc(0.0)[0], exposure=wrong, vignetting=np.array([value or -3.0, 0, 0], np.float32))])
+    mapper = mapped(
+        [replace(arc(0.0)[0], exposure=wrong, vignetting=np.array([value or -3.0, 0, 0], np.float32))], CONFIG
+    )
     assert mapper.log.counts["refused_exposures"] == 2
     assert any("no camera has" in text for text in mapper.log.warnings)
     assert mapper.views[0].measured is None

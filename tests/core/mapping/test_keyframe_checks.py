@@ -13,21 +13,13 @@ from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.insertion import InsertionConfig, unoccupied
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
+from tests.support.small_maps import mapped
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
-CONFIG = MapperConfig(iterations=2, threads=1)
+CONFIG = MapperConfig(iterations=2, refinement=0, threads=1)
 VIEWS = [
     replace(rgbd_keyframe(k, pose_on_arc(k / 4), (24, 32)), confidence=np.ones((24, 32), np.float32)) for k in range(4)
 ]
-
-
-def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:
-    mapper = OnlineMapper(config)
-    for view in views:
-        mapper.add_keyframe(view)
-    while mapper.step():
-        pass
-    return mapper
 
 
 def is_sound(mapper: OnlineMapper) -> bool:
@@ -59,7 +51,7 @@ def test_a_far_pixel_of_doubtful_depth_is_left_out_too() -> None:
     unfiltered = np.full((24, 32), 1e9, np.float32)
     depth = VIEWS[1].depth.copy()
     depth[:, 16:] = 0
-    mapper = mapped([VIEWS[0], replace(VIEWS[1], depth=depth, unfiltered=unfiltered)])
+    mapper = mapped([VIEWS[0], replace(VIEWS[1], depth=depth, unfiltered=unfiltered)], CONFIG)
     assert is_sound(mapper)
     assert float(mapper.state.splats.means.detach().abs().max()) < 1e6
 
@@ -95,16 +87,16 @@ def test_a_keyframe_that_no_camera_gives_is_refused_by_its_reason(problem: str, 
     bad = replace(VIEWS[1], **BAD[problem])
     if first and "far away" in problem:
         pytest.skip("the first one is where the map begins")
-    mapper = mapped([bad, VIEWS[0], VIEWS[2]] if first else [VIEWS[0], bad, VIEWS[2]])
+    mapper = mapped([bad, VIEWS[0], VIEWS[2]] if first else [VIEWS[0], bad, VIEWS[2]], CONFIG)
     assert [view.index for view in mapper.views] == [0, 2]
     assert mapper.log.counts["refused_views"] == 1
     assert problem.strip() in mapper.log.warnings[0]
-    calm = mapped([VIEWS[0], VIEWS[2]])
+    calm = mapped([VIEWS[0], VIEWS[2]], CONFIG)
     assert torch.equal(mapper.state.splats.means, calm.state.splats.means)
 
 
 def test_a_correction_that_is_no_pose_is_refused() -> None:
-    mapper = mapped(VIEWS[:2])
+    mapper = mapped(VIEWS[:2], CONFIG)
     before = mapper.state.splats.means.detach().clone()
     far, flat = pose_on_arc(0.25), np.diag([1.0, 1.0, 0.0, 1.0])
     far[0, 3] = 1e300
