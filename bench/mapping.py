@@ -142,12 +142,12 @@ def run(scene: Scene, config: MapperConfig, checkpoints: int = 10, period: float
 
 
 def all_skips_off(config: MapperConfig) -> MapperConfig:
-    """Every keyframe's every pixel inserted (through the voxel filter), every iteration whole."""
+    """Every keyframe's every pixel inserted (in rectangles), every iteration whole."""
     return replace(
         config,
         convergence=replace(config.convergence, skip=False),
         training=replace(config.training, selective=False),
-        insertion=replace(config.insertion, unexplored=False, map_voxel=0.0),
+        insertion=replace(config.insertion, unexplored=False),
     )
 
 
@@ -157,11 +157,11 @@ def variants(config: MapperConfig) -> dict[str, MapperConfig]:
     training = config.training
     return {
         "no unexplored mask": replace(config, insertion=replace(insertion, unexplored=False)),
-        "unexplored below 40 dB (paper)": replace(config, insertion=replace(insertion, unexplored_psnr=40.0)),
-        "no voxel filter": replace(config, insertion=replace(insertion, voxel=0.0)),
-        "no voxel filter against the map": replace(config, insertion=replace(insertion, map_voxel=0.0)),
-        "nothing added to a voxel of the map": replace(
-            config, insertion=replace(insertion, map_voxel_error=float("inf"))
+        "unexplored below 40 dB (paper)": replace(config, insertion=replace(insertion, price=0.11, median_errors=0.0)),
+        "splats without a price": replace(config, insertion=replace(insertion, price=0.0)),
+        "whole error": replace(config, insertion=replace(insertion, median_errors=0.0)),
+        "nothing added where the map shows something": replace(
+            config, insertion=replace(insertion, median_errors=float("inf"))
         ),
         "density control none": replace(config, density_control=replace(density, mode="none")),
         "no skip of converged keyframes": replace(config, convergence=replace(convergence, skip=False)),

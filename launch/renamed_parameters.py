@@ -40,11 +40,7 @@ RENAMED: tuple[tuple[str, str], ...] = (  # what it was, what it is with a node 
     ("mapper.selective", "mapper.training.selective"),
     ("mapper.skip_converged", "mapper.convergence.skip"),
     ("mapper.unexplored", "mapper.insertion.unexplored"),
-    ("mapper.unexplored_psnr", "mapper.insertion.unexplored_psnr"),
-    ("mapper.voxel", "mapper.insertion.voxel"),
-    ("mapper.map_voxel", "mapper.insertion.map_voxel"),
-    ("mapper.map_voxel_error", "mapper.insertion.map_voxel_error"),
-    ("mapper.fill", "mapper.insertion.fill"),
+    ("mapper.insertion.unexplored_opacity", "mapper.insertion.min_opacity"),
     ("mapper.density_control", "mapper.density_control.mode"),
     ("mapper.max_splats", "mapper.density_control.max_splats"),
     ("tracker.stride", "tracker.constants.stride"),
@@ -54,11 +50,27 @@ RENAMED: tuple[tuple[str, str], ...] = (  # what it was, what it is with a node 
     ("tracker.window", "tracker.constants.frontend_window"),
     ("tracker.backend_every", "tracker.constants.backend_every"),
 )
+PRICE = "how many splats an image gets is mapper.insertion.price now: a lower one gives more splats"
 GONE: Mapping[str, str] = {
     "mapper.coarse_to_fine": "it gained nothing that could be measured",
     "mapper.skip_tiles": "it gained nothing that could be measured",
     "mapper.map_views": "it was for mvs=skipping",
     "mapper.insertion.min_confidence": "depth comes filtered already",
+    **{
+        f"{path}.{name}": why
+        for path in ("mapper", "mapper.insertion")
+        for name, why in {
+            "unexplored_psnr": PRICE,
+            "voxel": PRICE,
+            "map_voxel": "write mapper.insertion.median_errors=0 for a splat wherever it saves its price",
+            "map_voxel_error": "it is mapper.insertion.median_errors now, of every pixel that the map shows",
+            "fill": "write mapper.insertion.doubtful=false where holes are to stay, and else nothing",
+        }.items()
+    },
+    **dict.fromkeys(
+        (f"mapper.insertion.{name}" for name in ("fill_below", "fill_opacity", "fill_scale")),
+        "splats of doubtful depth begin as all others: min_opacity, initial_opacity, initial_scale",
+    ),
     "mvs.skip_certain": "it cost precision and saved no time",
     "mvs.skip_explained": "it passed over no keyframe of a camera's stream",
     "mvs.tolerance": "it was of mvs=skipping",

@@ -26,7 +26,7 @@ class ParameterError(ValueError):
 class Parameter:
     """One that is no dataclass itself."""
 
-    path: str  # as a user writes it: mapper.insertion.fill
+    path: str  # as a user writes it: mapper.insertion.price
     owner: type  # the dataclass that declares it
     name: str
     annotation: Any

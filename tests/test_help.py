@@ -156,5 +156,5 @@ def test_a_parameter_that_is_gone_is_refused_with_the_reason(old: str) -> None:
 def test_a_node_of_one_s_own_may_have_a_parameter_of_an_old_name() -> None:
     graph = compose(["mapper._target_=tests.test_help.Dense", "mapper.density=2", "evaluator._target_=null"])
     assert graph.slots["mapper"].config == {"density": 2}
-    with pytest.raises(GraphError, match=r"mapper.fill: tests.test_help.Dense has no parameter 'fill'; it has:"):
-        compose(["mapper._target_=tests.test_help.Dense", "mapper.fill=2", "evaluator._target_=null"])
+    with pytest.raises(GraphError, match=r"mapper.unexplored: tests.test_help.Dense has no parameter 'unexplored'; it"):
+        compose(["mapper._target_=tests.test_help.Dense", "mapper.unexplored=2", "evaluator._target_=null"])

@@ -200,7 +200,7 @@ def test_unfiltered_depth_reaches_the_map() -> None:
     depth = message.depth.copy()
     depth[:, :16] = 0.0
     list(node.on_fused_keyframe(replace(message, depth=depth, unfiltered=message.depth)))
-    assert node.stats.counts["filled"] == 6 * 4
+    assert node.stats.counts["pixels_filled"] == 24 * 16
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A keyframe's new splats: at its depth where the map does not show it, sparse ones where it would stay empty."""
+"""A keyframe's new splats: where the map does not show its image, as many as the image needs there."""
 
 from __future__ import annotations
 
@@ -8,29 +8,20 @@ import cv2
 import numpy as np
 import torch
 
-from mvsgs_core import camera
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
-from mvsgs_core.mapping.filling import continued_depth, fill_points
+from mvsgs_core.mapping.filling import continued_depth
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
-from mvsgs_core.mapping.insertion import (
-    Points,
-    depth_colors,
-    near_points,
-    outliers,
-    points_from_depth,
-    splats_from_points,
-    unexplored_mask,
-    unoccupied,
-    voxel_filter,
-)  # fmt: skip
+from mvsgs_core.mapping.insertion import Points, depth_colors, points_of_rectangles, splats_from_points
 from mvsgs_core.mapping.keyframe_store import KeyframeStore
-from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, checked_image
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.partition import EMPTY, partition
 from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.stats import Stats
 
 SOLID = 0.9  # opacity from which the map's depth at a pixel is its surface's
+FAR = 1e6  # median depths from which float32 does not hold a splat beside the others
 
 
 class Densifier:
@@ -38,10 +29,9 @@ class Densifier:
 
     def __init__(
         self, config: MapperConfig, state: MapState, frame: FrameOfReference, keyframes: KeyframeStore,
-        render: Callable[[TrainingView, tuple[int, int]], Render], photometry: ImageFormation, log: Stats,
+        render: Callable[[TrainingView], Render], photometry: ImageFormation, log: Stats,
     ) -> None:  # fmt: skip
-        """render: of `state` as a keyframe's camera photographs it, at a size (height, width). What is given here
-        changes by itself."""
+        """render: of `state` as a keyframe's camera photographs it. What is given here changes by itself."""
         self.config, self.state, self.frame, self.keyframes = config.insertion, state, frame, keyframes
         self.render, self.photometry, self.log = render, photometry, log
         self._kernel = config.training.kernel
@@ -49,90 +39,76 @@ class Densifier:
 
     def add(self, keyframe: RGBDKeyframe, view: TrainingView, depth: np.ndarray) -> int:
         """Adds the splats of the store's newest keyframe; returns their number. depth: (h, w), checked, world units."""
-        inserted = self._insert(keyframe, view, depth) if (depth > 0).any() else 0
-        return inserted + self._fill(keyframe, view)
-
-    def _insert(self, keyframe: RGBDKeyframe, view: TrainingView, depth: np.ndarray) -> int:
-        """Adds splats where `depth` is known and the map does not show the image yet."""
-        config = self.config
-        size = (depth.shape[0], depth.shape[1])
-        median_depth = self.keyframes.median_depth
-        mask = valid = (depth > 0) & _valid_pixels(view, size)
-        standing_out = np.zeros(size, dtype=bool)
-        occupancy = config.map_voxel > 0 and len(self.state) > 0
-        if (config.unexplored or occupancy) and len(self.state):
-            at = _coarsest(view.size, size)
-            render = self.render(view, at)
-            images = render.color.cpu().numpy(), render.opacity.cpu().numpy(), _colors(keyframe, view, at)
-            if config.unexplored:
-                mask = valid & _resized(unexplored_mask(*images, config), size)
-                self.log.skip("points_explored", int(valid.sum() - mask.sum()))
-            if occupancy and config.map_voxel_error < float("inf"):
-                standing_out = _resized(outliers(*images, config), size)
-        intrinsics = camera.scale_intrinsics(keyframe.intrinsics, keyframe.image.shape[:2], size)
-        points = points_from_depth(
-            depth / self.frame.length, intrinsics, self._map_colors(view, size), keyframe.normals, mask
-        )
-        near = self._near(points, median_depth)
-        points, standing_out = points.where(near), standing_out[mask][near]
-        if occupancy and len(points):
-            pose = view.local_from_cam
-            positions = points.positions @ pose[:3, :3].T + pose[:3, 3]
-            means = self.state.splats.means.detach().cpu().numpy()
-            free = unoccupied(positions, means, config.map_voxel * median_depth) | standing_out
-            self.log.skip("points_occupied", int((~free).sum()))
-            points = points.where(free)
-        if config.voxel > 0 and len(points):
-            before = len(points)
-            points = voxel_filter(points, config.voxel * median_depth)
-            self.log.skip("points_voxel_filter", before - len(points))
-        return self._append(points, view, config.initial_opacity, config.initial_scale)
-
-    def _fill(self, keyframe: RGBDKeyframe, view: TrainingView) -> int:
-        """Adds sparse splats wherever the map shows nothing, what was just inserted included: at the depth before the
-        filters, and where that says nothing continued from what surrounds it."""
-        config, unit = self.config, self.frame.unit
-        if config.fill == 0 or keyframe.unfiltered is None or unit is None:
+        size = view.size
+        image = view.target.cpu().numpy()
+        valid = np.ones(size, dtype=bool) if view.valid is None else view.valid.cpu().numpy()
+        residual, shown = self._residual(view, image)
+        depth = _nearest(self._near(depth / np.float32(self.frame.length)), size)
+        known = wanted = (depth > 0) & valid
+        confidence = np.ones(size, dtype=np.float32)
+        if self.config.doubtful and keyframe.unfiltered is not None and self.frame.unit is not None:
+            doubtful, confidence = self._doubtful_depth(keyframe, view, shown)
+            filled = ~known & valid & (doubtful > 0) & (residual >= EMPTY)
+            depth, wanted = np.where(filled, doubtful, depth), known | filled
+        if not wanted.any():
             return 0
-        depth = checked_depth(keyframe.unfiltered, self.log) * np.float32(view.scale / keyframe.scale / unit)
+        focal = float(np.sqrt(view.intrinsics[0] * view.intrinsics[1]))
+        parts = partition(image, residual, wanted, depth, known, 1.0 / focal, self.config.price)
+        self.log.skip("pixels_explored", int((known & (parts.labels < 0)).sum()))
+        self.log.count("pixels_filled", int((~known & (parts.labels >= 0)).sum()))
+        normals = None if keyframe.normals is None else _nearest(keyframe.normals, size)
+        colors = self.photometry.colors_of_map(depth_colors(view.image.cpu().numpy(), size), view)
+        points = points_of_rectangles(parts, depth, known, confidence, view.intrinsics, colors, normals)
+        return self._append(points, view)
+
+    def _residual(self, view: TrainingView, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Squared error (H, W), mean over RGB, of what the map shows of an image, and its depth there, 0: nothing.
+
+        It counts beyond `median_errors` times the median alone: that is what blur, noise, exposure and a pose's error
+        do to this view, which no splat mends. On a clean view it is small, and detail that the map lacks stands out.
+        """
+        residual, shown = np.full(view.size, EMPTY, dtype=np.float32), np.zeros(view.size, dtype=np.float32)
+        if not len(self.state):
+            return residual, shown
+        render = self.render(view)
+        opacity = render.opacity.cpu().numpy()
+        shown = np.where(opacity > SOLID, render.depth.cpu().numpy(), np.float32(0))
+        mapped = opacity >= self.config.min_opacity
+        if self.config.unexplored and mapped.any():
+            squared = np.mean((render.color.cpu().numpy() - image) ** 2, axis=-1)
+            usual = self.config.median_errors**2 * np.median(squared[mapped])
+            residual[mapped] = np.where(squared > usual, squared - usual, 0.0)[mapped]
+        return residual, shown
+
+    def _doubtful_depth(
+        self, keyframe: RGBDKeyframe, view: TrainingView, shown: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Depth before the filters and its confidence, (H, W) at the view's size, in the mapper's unit; where matching
+        says nothing it is continued from what surrounds it."""
+        assert keyframe.unfiltered is not None
+        depth = checked_depth(keyframe.unfiltered, self.log)
+        depth = self._near(depth * np.float32(view.scale / keyframe.scale / self.frame.length))
         size = (depth.shape[0], depth.shape[1])
-        empty, shown = _valid_pixels(view, size), np.zeros(size, dtype=np.float32)
-        if len(self.state):
-            render = self.render(view, _coarsest(view.size, size))
-            opacity = render.opacity.cpu().numpy()
-            empty = empty & _resized(opacity < config.fill_below, size)
-            solid = np.where(opacity > SOLID, render.depth.cpu().numpy(), 0.0).astype(np.float32)
-            shown = np.asarray(cv2.resize(solid, size[::-1], interpolation=cv2.INTER_NEAREST))
         confidence = np.ones(size, dtype=np.float32) if keyframe.confidence is None else keyframe.confidence
-        intrinsics = camera.scale_intrinsics(keyframe.intrinsics, keyframe.image.shape[:2], size)
-        depth = continued_depth(depth, confidence, shown, depth_colors(view.image.cpu().numpy(), size))
-        points = fill_points(depth, confidence, intrinsics, self._map_colors(view, size), empty, config.fill)
-        points = points.where(self._near(points, self.keyframes.median_depth))
-        filled = self._append(points, view, config.fill_opacity, config.fill_scale)
-        self.log.count("filled", filled)
-        return filled
-
-    def _map_colors(self, view: TrainingView, size: tuple[int, int]) -> np.ndarray:
-        """The keyframe's colors (h, w, 3) as the map has them."""
         colors = depth_colors(view.image.cpu().numpy(), size)
-        return self.photometry.colors_of_map(colors, view)
+        depth = continued_depth(depth, confidence, _nearest(shown, size), colors)
+        return _nearest(depth, view.size), _nearest(confidence, view.size)
 
-    def _near(self, points: Points, median_depth: float) -> np.ndarray:
-        near = near_points(points, self.config, median_depth)
-        if not near.all():
-            self.log.refuse("far_points", int((~near).sum()), "points too far away for the map's voxels were left out")
-        return near
+    def _near(self, depth: np.ndarray) -> np.ndarray:
+        """Depth with 0 for what is too far away to be held beside the rest."""
+        far = depth >= FAR * self.keyframes.median_depth
+        if far.any():
+            self.log.refuse("far_points", int(far.sum()), "points too far away for the map's numbers were left out")
+        return np.where(far, np.float32(0), depth)
 
-    def _append(self, points: Points, view: TrainingView, opacity: float, scale: float) -> int:
+    def _append(self, points: Points, view: TrainingView) -> int:
         """Makes splats of camera-frame points, as many as the map has room for; returns their number."""
         room = self._max_splats - len(self.state)
         if len(points) > room:
             self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
             points = points.first(max(0, room))
-        new = splats_from_points(
-            points, view.local_from_cam, self.state.splats.sh.shape[1], self._kernel, self.config,
-            opacity, scale,
-        )  # fmt: skip
+        bases = self.state.splats.sh.shape[1]
+        new = splats_from_points(points, view.local_from_cam, bases, self._kernel, self.config)
         self.state.append(new, torch.full((len(points),), view.index, dtype=torch.int64))
         return len(points)
 
@@ -145,31 +121,6 @@ def checked_depth(depth: np.ndarray, log: Stats) -> np.ndarray:
     return np.where(bad, 0.0, depth).astype(np.float32)
 
 
-def _half(size: tuple[int, int]) -> tuple[int, int]:
-    return max(1, size[0] >> 1), max(1, size[1] >> 1)
-
-
-def _coarsest(image: tuple[int, int], depth: tuple[int, int]) -> tuple[int, int]:
-    """Half the image's size where that still has the depth map's resolution."""
-    half = _half(image)
-    return half if half[0] >= depth[0] else image
-
-
-def _colors(keyframe: RGBDKeyframe, view: TrainingView, size: tuple[int, int]) -> np.ndarray:
-    """The keyframe's colors (h, w, 3) float32 in [0, 1], as its camera saw them, at the training size or half of it."""
-    if size == view.size:
-        return view.target.cpu().numpy()
-    image = torch.from_numpy(np.array(camera.resize_image(checked_image(keyframe.image)[0], size)))
-    return np.asarray((image.to(view.image.device, torch.float32) / 255.0).cpu().numpy())
-
-
-def _valid_pixels(view: TrainingView, size: tuple[int, int]) -> np.ndarray:
-    """Pixels (h, w) bool of the depth map whose color is known."""
-    if view.valid is None:
-        return np.ones(size, dtype=bool)
-    return np.asarray(camera.resize_image(view.valid.cpu().numpy().astype(np.float32), size) > 0.999)
-
-
-def _resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A mask (H, W) bool at another size, by majority."""
-    return np.asarray(camera.resize_image(mask.astype(np.float32), size) > 0.5)
+def _nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Values (h, w, ...) at another size, none of them a mean of two."""
+    return np.asarray(cv2.resize(np.ascontiguousarray(values), size[::-1], interpolation=cv2.INTER_NEAREST))

@@ -1,4 +1,4 @@
-"""Sparse points where filtered depth is missing and the map shows nothing: one for each cell of the image.
+"""Depth where the filters left none and the map shows nothing: doubtful, or continued from what surrounds it.
 
 What a filter rejects is doubtful, not unknown: a rough surface there, which the optimization and density control can
 move, split or fade out, is worth more than a hole. Neither can make a splat where there is none. Where matching says
@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvsgs_core import camera
-from mvsgs_core.mapping.insertion import Points
 from mvsgs_core.membrane import membrane
 
 MIN_CONFIDENCE = 0.15  # a depth below is worse than what surrounds it, continued
@@ -33,40 +31,3 @@ def continued_depth(depth: np.ndarray, confidence: np.ndarray, shown: np.ndarray
     sheet = membrane(inverse, weight, np.round(255.0 * image).astype(np.uint8), STIFFNESS, EDGE)
     continued = np.where(sheet > 0, 1.0 / np.maximum(sheet, 1e-30), 0.0)
     return np.where(weight > 0, known, continued).astype(np.float32)
-
-
-def fill_points(
-    depth: np.ndarray,
-    confidence: np.ndarray,
-    intrinsics: np.ndarray,
-    image: np.ndarray,
-    empty: np.ndarray,
-    side: int,
-) -> Points:
-    """Camera-frame points, one for each cell of `side` x `side` pixels a quarter of which or more is empty.
-
-    depth: (h, w), 0 where unknown, confidence (h, w), intrinsics (4,) at that size, image (h, w, 3) in [0, 1], empty
-    (h, w) bool. A point is on the ray of its cell's center, at the depth of the most confident of the empty pixels (a
-    mean would lie between two surfaces), has their mean color and stands for the whole cell; its normal is unknown.
-    Of a cell that the border cuts, what is inside counts.
-    """
-    rows, columns = -(-depth.shape[0] // side), -(-depth.shape[1] // side)
-    beyond = ((0, rows * side - depth.shape[0]), (0, columns * side - depth.shape[1]))
-
-    def cells(values: np.ndarray) -> np.ndarray:
-        """(rows, columns, side^2, ...) of (h, w, ...), 0 beyond the border."""
-        whole = np.pad(values, (*beyond, *[(0, 0)] * (values.ndim - 2)))
-        split = whole.reshape(rows, side, columns, side, *values.shape[2:]).swapaxes(1, 2)
-        return split.reshape(rows, columns, side * side, *values.shape[2:])
-
-    holes = cells(empty)
-    known = holes & (cells(depth) > 0)
-    best = np.argmax(np.where(known, cells(confidence), -np.inf), axis=-1)
-    pixels = cells(np.ones(depth.shape, dtype=bool)).sum(axis=-1)
-    chosen = known.any(axis=-1) & (4 * holes.sum(axis=-1) >= pixels)
-    z = np.take_along_axis(cells(depth), best[..., None], axis=-1)[..., 0]
-    colors = np.sum(cells(image) * holes[..., None], axis=2) / np.maximum(holes.sum(axis=-1), 1)[..., None]
-    at_cells = camera.scale_intrinsics(intrinsics, (rows * side, columns * side), (rows, columns))
-    positions = camera.unproject(z, at_cells)[chosen].astype(np.float64)
-    spacing = positions[:, 2] / float(np.sqrt(at_cells[0] * at_cells[1]))
-    return Points(positions, np.zeros_like(positions), colors[chosen].astype(np.float64), spacing)

@@ -1,7 +1,7 @@
-"""New splats from the depth of a keyframe: where the map does not show the image yet, thinned by a voxel filter.
+"""What new splats look like: the points of a keyframe's depth, those of one rectangle of its image taken together.
 
-MVS-GS, section III.C, "Online Densification". The paper's threshold (40 dB, an RMS error of 0.01) calls nearly every
-textured pixel unexplored, and its voxel of 0.005 m has no meaning at a monocular scale: here both are relative.
+MVS-GS, section III.C, "Online Densification". The paper makes a splat of each pixel below 40 dB and thins them by a
+voxel filter; here each rectangle of a partition of the image that saves enough error gets one, see `partition`.
 """
 
 from __future__ import annotations
@@ -12,41 +12,37 @@ import numpy as np
 import torch
 
 from mvsgs_core import camera
+from mvsgs_core.mapping.partition import Partition
 from mvsgs_core.rasterizer.kernels import neutral_beta
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
 
-VOXELS = 1 << 21  # along an axis: what three of them in 63 bits can number
-CHUNK = 65536  # of the map's splats that are sorted into voxels at once, in float64
+MIN_COSINE = 0.25  # between ray and normal: a surface seen more slantingly is not stretched further
+DOUBTFUL = 1e-3  # weight of a pixel of doubtful depth beside one of known depth
 
 
 @dataclass(frozen=True)
 class InsertionConfig:
     """Where splats are added and what they look like at first."""
 
-    unexplored: bool = True  # only where the map's render differs from the image; false: at every pixel with depth
-    unexplored_psnr: float = 25.0  # dB of one pixel over RGB; below: unexplored (the paper: 40)
-    unexplored_opacity: float = 0.5  # rendered opacity below: unexplored, whatever the color
-    voxel: float = 0.01  # edge of the voxel filter in median depths; 0: no filter
-    map_voxel: float = 0.01  # edge, in median depths, of the voxels in which one splat of the map is enough; 0: off
-    map_voxel_error: float = 3.0  # there a pixel needs so many times the view's median error for another; .inf: none
-    initial_scale: float = 0.5  # standard deviation in spacings of the points
-    flatten: float = 0.1  # thickness along the normal over the width; 1: isotropic
-    initial_opacity: float = 0.7  # 0 to 1 (Stereo-GS: 0.1)
-    fill: int = 4  # pixels: cells that get a splat of doubtful or continued depth where the map stays empty; 0: off
-    fill_below: float = 0.7  # rendered opacity below: empty; the optimization has no reason to close half a gap
-    fill_opacity: float = 0.55  # of these: doubtful ones must be outshone by what comes later, 0 to 1
-    fill_scale: float = 0.7  # of these, as initial_scale: so transparent, they leave no gap only where they overlap
+    unexplored: bool = True  # only where the map's render differs from the image; false: as if there were no map
+    price: float = 0.225  # dissimilarity, as SSIM's, that a splat must mend (.11: 40 dB of a pixel amid gray ones)
+    median_errors: float = 3.0  # times a view's median error that a pixel of the map may have: blur, noise, pose
+    min_opacity: float = 0.7  # rendered opacity below: the map shows nothing there, whatever the color
+    doubtful: bool = True  # where it shows nothing, splats of doubtful or continued depth, too; false: it stays empty
+    initial_scale: float = 0.6  # standard deviation over the side of the rectangle
+    flatten: float = 0.3  # thickness along the normal over the smaller width; 1: as thick as that
+    initial_opacity: float = 0.5  # 0 to 1 (Stereo-GS: 0.1)
 
 
 @dataclass(frozen=True)
 class Points:
-    """Points to become splats, camera or world frame, float64 unless said otherwise."""
+    """Points to become splats, camera or world frame, float64."""
 
     positions: np.ndarray  # (N, 3)
     normals: np.ndarray  # (N, 3), 0 where unknown
     colors: np.ndarray  # (N, 3) 0 to 1
-    spacing: np.ndarray  # (N,) side of the square of surface that a point stands for, in the positions' unit
+    tangents: np.ndarray  # (N, 2, 3) along the image's rows and columns: sides of the surface that a point stands for
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -57,154 +53,124 @@ class Points:
 
     def where(self, mask: np.ndarray) -> Points:
         """Those of a mask (N,) bool."""
-        return Points(self.positions[mask], self.normals[mask], self.colors[mask], self.spacing[mask])
-
-
-def unexplored_mask(
-    rendered: np.ndarray, opacity: np.ndarray, observed: np.ndarray, config: InsertionConfig
-) -> np.ndarray:
-    """Pixels (H, W) bool that the map does not cover: PSNR of the pixel below the threshold, or low opacity.
-
-    rendered, observed: (H, W, 3) in [0, 1]; opacity: (H, W). A pixel has PSNR 10 log10(1 / mean over RGB of (r - o)^2).
-    """
-    squared = np.mean((rendered - observed) ** 2, axis=-1)
-    return (squared > 10.0 ** (-config.unexplored_psnr / 10.0)) | (opacity < config.unexplored_opacity)
-
-
-def outliers(rendered: np.ndarray, opacity: np.ndarray, observed: np.ndarray, config: InsertionConfig) -> np.ndarray:
-    """Pixels (H, W) bool whose RMS error over RGB is `map_voxel_error` times the median of the pixels that are mapped.
-
-    The median is what blur, noise, exposure and a pose's error do to this view: no splat mends that. Where a view is
-    covered to the decibel it is small, and detail that the map lacks stands out.
-    """
-    squared = np.mean((rendered - observed) ** 2, axis=-1)
-    mapped = opacity >= config.unexplored_opacity
-    if not mapped.any():
-        return np.ones(squared.shape, dtype=bool)
-    return squared > config.map_voxel_error**2 * np.median(squared[mapped])
+        return Points(self.positions[mask], self.normals[mask], self.colors[mask], self.tangents[mask])
 
 
 def points_from_depth(
     depth: np.ndarray, intrinsics: np.ndarray, image: np.ndarray, normals: np.ndarray | None, mask: np.ndarray
 ) -> Points:
-    """Camera-frame points of the masked pixels.
+    """Camera-frame points, one for each pixel of the mask.
 
     depth: (h, w), intrinsics (4,) at that size, image (h, w, 3) in [0, 1], normals (h, w, 3) or None, mask (h, w) bool.
-    A pixel stands for a surface of side z / f, more where the surface is known to be slanted.
     """
-    positions = camera.unproject(depth, intrinsics)[mask]
-    spacing = positions[:, 2] / float(np.sqrt(intrinsics[0] * intrinsics[1]))
+    positions = camera.unproject(depth, intrinsics)[mask].astype(np.float64)
     chosen = np.zeros_like(positions) if normals is None else normals[mask].astype(np.float64)
-    cosine = np.abs(np.sum(chosen * positions, axis=1)) / np.linalg.norm(positions, axis=1)
-    known = np.linalg.norm(chosen, axis=1) > 0.5
-    spacing = np.where(known, spacing / np.sqrt(np.maximum(cosine, 0.25)), spacing)
-    return Points(positions, chosen, image[mask].astype(np.float64), spacing)
+    sides = np.ones((len(positions), 2))
+    return Points(positions, chosen, image[mask].astype(np.float64), _tangents(positions, chosen, intrinsics, sides))
 
 
-def near_points(points: Points, config: InsertionConfig, median_depth: float) -> np.ndarray:
-    """Camera-frame points (N,) bool that are near enough to be numbered by voxels, and for float32 to hold them.
+def points_of_rectangles(
+    parts: Partition, depth: np.ndarray, known: np.ndarray, confidence: np.ndarray, intrinsics: np.ndarray,
+    image: np.ndarray, normals: np.ndarray | None,
+) -> Points:  # fmt: skip
+    """Camera-frame points, one for each rectangle of a partition: the means of its pixels of known depth.
 
-    One far pixel, a mismatch, would else be all that a view adds: its voxels are as many as the rest's are small.
+    depth, confidence: (h, w), of doubtful pixels too; known: (h, w) bool; others as in `points_from_depth`. Where no
+    depth is known the point is on the mean ray at the most confident depth: a mean would lie between two surfaces.
     """
-    edges = [edge for edge in (config.voxel, config.map_voxel) if edge > 0]
-    reach = min([1e6, *((VOXELS / 2 - 2) * edge for edge in edges)]) * median_depth
-    return np.asarray(np.linalg.norm(points.positions, axis=1) < reach)
-
-
-def voxel_filter(points: Points, edge: float) -> Points:
-    """One point a voxel: the mean position, normal and color, and the side of the surface of all together.
-
-    edge: > 0, in the points' unit. Raises ValueError where the points span more than 2^21 voxels along an axis.
-    """
-    if len(points) == 0:
-        return points
-    cells = _cells(points.positions, points.positions.min(axis=0), edge)
-    keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
-    _, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    mask = parts.labels >= 0
+    labels, sure = parts.labels[mask], known[mask]
+    pixels = points_from_depth(depth, intrinsics, image, normals, mask)
+    weights = np.where(sure, 1.0, DOUBTFUL)
+    total = np.bincount(labels, weights, minlength=len(parts))
 
     def mean(values: np.ndarray) -> np.ndarray:
-        sums = np.stack([np.bincount(inverse, column, minlength=len(counts)) for column in values.T], axis=-1)
-        return sums / counts[:, None]
+        sums = [np.bincount(labels, weights * column, minlength=len(parts)) for column in values.T]
+        return np.asarray(np.stack(sums, axis=-1) / total[:, None])
 
-    normals = mean(points.normals)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    area = np.bincount(inverse, points.spacing**2, minlength=len(counts))
-    return Points(
-        mean(points.positions),
-        np.where(length > 0.5, normals / np.maximum(length, 1e-12), 0.0),
-        mean(points.colors),
-        np.sqrt(area),
-    )
-
-
-def unoccupied(positions: np.ndarray, means: np.ndarray, edge: float) -> np.ndarray:
-    """Positions (N, 3) whose voxel of side `edge` holds none of the map's means (M, 3): (N,) bool.
-
-    The surface there is in the map already, and what its color lacks is the optimization's to find. Without this a
-    noisy or blurred keyframe, which no map shows to the decibel, lays a second skin over what is mapped. Raises
-    ValueError where the positions span more than 2^21 voxels along an axis.
-    """
-    if len(positions) == 0 or len(means) == 0:
-        return np.ones(len(positions), dtype=bool)
-    low = positions.min(axis=0)
-    cells = _cells(positions, low, edge)
-    count = cells.max(axis=0) + 1
-
-    def key(cell: np.ndarray) -> np.ndarray:
-        return (cell[:, 0] * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
-
-    taken = []
-    for some in np.array_split(means, -(-len(means) // CHUNK)):
-        others = np.floor((some - low) / edge)
-        taken.append(key(others[((others >= 0) & (others < count)).all(axis=1)].astype(np.int64)))
-    return ~np.isin(key(cells), np.concatenate(taken))
+    positions, normal = mean(pixels.positions), mean(pixels.normals)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.where(length > 0.5, normal / np.maximum(length, 1e-12), 0.0)
+    order = np.lexsort((confidence[mask], labels))
+    surest = order[np.flatnonzero(np.diff(labels[order], append=len(parts)))]
+    doubtful = np.bincount(labels, sure, minlength=len(parts)) == 0
+    positions[doubtful] *= (pixels.positions[surest, 2] / positions[:, 2])[doubtful, None]
+    fraction = np.bincount(labels, minlength=len(parts)) / parts.sides.prod(axis=1)
+    sides = parts.sides * np.sqrt(fraction)[:, None]
+    return Points(positions, normal, mean(pixels.colors), _tangents(positions, normal, intrinsics, sides))
 
 
-def _cells(positions: np.ndarray, low: np.ndarray, edge: float) -> np.ndarray:
-    """Voxels (N, 3) int64 of positions (N, 3) from `low` (3,) on. Raises ValueError beyond `VOXELS`."""
-    cells = np.floor((positions - low) / edge)
-    if not cells.max() < VOXELS:
-        raise ValueError(f"voxels of {edge:g} are too small for points that span {cells.max() * edge:g}: enlarge voxel")
-    return cells.astype(np.int64)
+def _tangents(positions: np.ndarray, normals: np.ndarray, intrinsics: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """(N, 2, 3) what a pixel's steps along its row and its column, `sides` (N, 2) times (rows, columns), are on the
+    surface: facing the camera where the normal is unknown."""
+    z = positions[:, 2]
+    steps = np.zeros((len(positions), 2, 3))
+    steps[:, 0, 0] = z / intrinsics[0] * sides[:, 1]
+    steps[:, 1, 1] = z / intrinsics[1] * sides[:, 0]
+    ray = positions / np.linalg.norm(positions, axis=1, keepdims=True)
+    known = np.linalg.norm(normals, axis=1) > 0.5
+    cosine = np.where(known, np.minimum(np.sum(normals * ray, axis=1), -MIN_COSINE), -1.0)
+    along = np.einsum("nj,nij->ni", normals, steps) / cosine[:, None]
+    return np.asarray(steps - along[..., None] * ray[:, None])
 
 
 def splats_from_points(
-    points: Points,
-    world_from_cam: np.ndarray,
-    sh_bases: int,
-    kernel: str,
-    config: InsertionConfig,
-    opacity: float | None = None,
-    scale: float | None = None,
+    points: Points, world_from_cam: np.ndarray, sh_bases: int, kernel: str, config: InsertionConfig
 ) -> Splats:
     """Splats in the world frame of `world_from_cam` (4, 4), float32 tensors on the CPU.
 
-    opacity: of all; None: `initial_opacity`. Standard deviations are `scale` (None: `initial_scale`) spacings,
-    `flatten` of that along a known normal. The shape starts as a Gaussian: beta = 2, or b = 0 for kernel "ges_scale".
+    The covariance is `initial_scale`^2 times the sum of the tangents' outer products, and along the normal `flatten`
+    of the smaller tangent; all of it where the normal is unknown. The shape starts as a Gaussian: beta = 2, or b = 0
+    for kernel "ges_scale".
     """
     count = len(points)
     rotation, translation = world_from_cam[:3, :3], world_from_cam[:3, 3]
-    means = points.positions @ rotation.T + translation
-    normals = points.normals @ rotation.T
-    known = np.linalg.norm(normals, axis=1) > 0.5
-    scale = config.initial_scale if scale is None else scale
-    log_scales = np.repeat(np.log(np.maximum(points.spacing * scale, 1e-30))[:, None], 3, axis=1)
-    log_scales[known, 2] += np.log(config.flatten)
-    opacity = min(max(config.initial_opacity if opacity is None else opacity, 1e-4), 1.0 - 1e-4)
+    known = np.linalg.norm(points.normals, axis=1) > 0.5
+    deviations, quaternions = ellipses(points.tangents @ rotation.T)
+    thickness = np.linalg.norm(points.tangents, axis=2).min(axis=1, initial=np.inf)
+    thickness = np.where(known, config.flatten, 1.0) * thickness
+    scales = config.initial_scale * np.column_stack([deviations, thickness])
+    opacity = min(max(config.initial_opacity, 1e-4), 1.0 - 1e-4)
     sh = np.zeros((count, sh_bases, 3))
     sh[:, 0] = (points.colors - 0.5) / C0
     return Splats(
-        means=_tensor(means),
-        log_scales=_tensor(log_scales),
-        quaternions=_tensor(np.where(known[:, None], rotation_to(normals), [1.0, 0.0, 0.0, 0.0])),
+        means=_tensor(points.positions @ rotation.T + translation),
+        log_scales=_tensor(np.log(np.maximum(scales, 1e-30))),
+        quaternions=_tensor(quaternions),
         opacity_logits=_tensor(np.full(count, np.log(opacity / (1.0 - opacity)))),
         sh=_tensor(sh),
         betas=_tensor(np.full(count, neutral_beta(kernel))),
     )
 
 
+def ellipses(tangents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Half axes (N, 2) of X X^T + Y Y^T, X and Y the tangents (N, 2, 3), and the turn of them: quaternions (N, 4).
+
+    Those, w first, turn x and y to the axes, z to the normal X x Y. Two tangents that are parallel have a turn, too.
+    """
+    first, second = tangents[:, 0], tangents[:, 1]
+    normals = np.cross(first, second)
+    area = np.linalg.norm(normals, axis=1, keepdims=True)
+    turn = rotation_to(np.where(area > 0, normals / np.maximum(area, 1e-300), [0.0, 0.0, 1.0]))
+    w, x, y, _ = turn.T
+    axes = np.stack([
+        np.stack([1 - 2 * y * y, 2 * x * y, -2 * w * y], axis=-1),
+        np.stack([2 * x * y, 1 - 2 * x * x, 2 * w * x], axis=-1),
+    ], axis=1)  # fmt: skip
+    flat = np.einsum("nij,nkj->nik", tangents, axes)  # the tangents in the plane
+    xx, yy, xy = (flat[..., 0] ** 2).sum(1), (flat[..., 1] ** 2).sum(1), (flat[..., 0] * flat[..., 1]).sum(1)
+    half, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    angle = np.arctan2(2 * xy, xx - yy) / 4  # half the turn: a quaternion's
+    cosine, sine = np.cos(angle), np.sin(angle)
+    quaternions = np.stack([w * cosine, x * cosine + y * sine, y * cosine - x * sine, w * sine], axis=-1)
+    return np.sqrt(np.maximum(np.stack([half + spread, half - spread], axis=-1), 0.0)), quaternions
+
+
 def rotation_to(normals: np.ndarray) -> np.ndarray:
-    """Quaternions (N, 4), w first, that turn the z axis onto unit normals (N, 3); any turn for a normal of -z."""
+    """Quaternions (N, 4), w first, that turn the z axis onto unit normals (N, 3); any turn for a normal of -z.
+
+    The axis of the turn is in the plane of x and y: the last element is 0.
+    """
     x, y, z = normals.T
     w = 1.0 + z
     q = np.stack([w, -y, x, np.zeros_like(w)], axis=-1)

@@ -15,8 +15,8 @@ import torch
 from mvsgs_core import camera
 from mvsgs_core.inverse_depth import enlarge_inverse_depth
 from mvsgs_core.mapping.densifier import SOLID
-from mvsgs_core.mapping.filling import continued_depth, fill_points
-from mvsgs_core.mapping.insertion import Points, depth_colors, splats_from_points
+from mvsgs_core.mapping.filling import continued_depth
+from mvsgs_core.mapping.insertion import Points, depth_colors, points_from_depth, splats_from_points
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.photometry import is_exposure
@@ -113,12 +113,11 @@ class Provisional:
             points = waiting.points.first(room)
             room -= len(points)
             factor = waiting.scale / waiting.view.scale / mapper.frame.unit
-            config = mapper.config.insertion
             parts.append(
                 splats_from_points(
-                    replace(points, positions=points.positions * factor, spacing=points.spacing * factor),
-                    local, mapper.state.splats.sh.shape[1], mapper.config.training.kernel, config,
-                    config.initial_opacity, config.fill_scale,
+                    replace(points, positions=points.positions * factor, tangents=points.tangents * factor),
+                    local, mapper.state.splats.sh.shape[1], mapper.config.training.kernel,
+                    mapper.config.insertion,
                 )
             )  # fmt: skip
         if not sum(len(part.means) for part in parts):
@@ -145,4 +144,4 @@ def _points(waiting: _Waiting, local_from_cam: np.ndarray, mapper: OnlineMapper)
     colors = depth_colors(view.image, size)
     depth = continued_depth(depth, confidence, shown, colors)
     of_map = mapper.photometry.colors_of_map(colors, seen)
-    return fill_points(depth, confidence, view.intrinsics, of_map, ~solid, 1)
+    return points_from_depth(depth, view.intrinsics, of_map, None, ~solid & (depth > 0))

@@ -100,7 +100,7 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
     switches -= {"mvs.pruning.outside_range"}  # what it leaves out cannot be chosen
     assert {"mapper.convergence.skip", "mvs.pruning.outside_cells"} <= switches
     assert switches <= switched
-    others = {f"mapper.insertion.{name}" for name in ("voxel", "map_voxel", "map_voxel_error", "fill")}
+    others = {f"mapper.insertion.{name}" for name in ("price", "median_errors")}
     others |= {f"mapper.{name}" for name in ("density_control.mode", "training.kernel", "training.loss", "sh_degree")}
     assert others <= switched
     assert {

@@ -7,11 +7,13 @@ import torch
 
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.rasterizer.rasterize import rasterize
 
-CONFIG = MapperConfig(iterations=16, refinement=20, threads=1)
+FINE = InsertionConfig(price=0.02)  # of images so small that a rectangle of 8 pixels is a tenth of them
+CONFIG = MapperConfig(iterations=16, refinement=20, threads=1, insertion=FINE)
 
 
 def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:

@@ -104,7 +104,7 @@ def test_a_full_disk_is_said_and_the_checkpoint_before_stays(tmp_path: Path) -> 
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     clock.now += 40.0
     atlas.current.add_keyframe(view(7))
-    with full_after(20_000):
+    with full_after(5_000):
         assert times(checkpoints, atlas) == 2
         checkpoints.keep(atlas)
     assert any("make room" in text and "File too large" in text for text in atlas.current.log.warnings)
@@ -121,7 +121,7 @@ def test_a_final_map_that_cannot_be_written_is_an_error_and_leaves_the_one_befor
     checkpoints = Checkpointing(tmp_path, 30.0, atlas)
     assert times(checkpoints, atlas) == 1
     before = (tmp_path / "map.ply").read_bytes()
-    with full_after(20_000), pytest.raises(OSError, match="File too large"):
+    with full_after(5_000), pytest.raises(OSError, match="File too large"):
         checkpoints.finish(atlas)
     assert (tmp_path / "map.ply").read_bytes() == before
     assert checkpoint_info(tmp_path).splats == len(atlas.largest.state)

@@ -17,14 +17,14 @@ from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 from tests.support.rasterizer_scenes import POSE, intrinsics, random_splats
-from tests.support.small_maps import mapped
+from tests.support.small_maps import FINE, mapped
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (60, 80)
 AFFINE = np.array([[1.3, 0, 0, -0.05], [0, 1.2, 0, 0.02], [0, 0, 0.8, 0.03]], np.float32)
 DIM = np.array([[0.6, 0, 0, 0.01], [0, 0.55, 0, 0.0], [0, 0, 0.65, 0.02]], np.float32)
 DARK = np.array([-0.4, 0.1, -0.2], np.float32)
-CONFIG = MapperConfig(iterations=30, refinement=0, threads=1)
+CONFIG = MapperConfig(iterations=30, refinement=0, threads=1, insertion=FINE)
 
 
 def photographed(
@@ -88,7 +88,7 @@ def test_a_keyframe_of_another_exposure_lays_no_second_skin_and_leaves_the_color
     steady = mapped([first, second], CONFIG)
     told, untold = (mapped([first, photographed(second, DIM, told=told)], CONFIG) for told in (True, False))
     assert told.log.counts["inserted"] < steady.log.counts["inserted"] + 0.02 * untold.log.counts["inserted"]
-    assert untold.log.counts["inserted"] > 1.5 * steady.log.counts["inserted"]
+    assert untold.log.counts["inserted"] < 1.1 * steady.log.counts["inserted"]  # it is in the view's median error
     assert error(told, 0) < 1.15 * error(steady, 0)
     assert error(untold, 0) > 1.5 * error(told, 0)
     assert error(told, 1) < 1.15 * error(steady, 1)

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
-from mvsgs_core.mapping.insertion import unoccupied
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -92,18 +91,6 @@ def _correct() -> list[float]:
     return [found]
 
 
-def _look_up_voxels() -> list[float]:
-    generator = np.random.default_rng(0)
-    means = generator.random((COUNT, 3), dtype=np.float32)
-    positions = generator.random((5000, 3))
-    found: list[np.ndarray] = []
-    bytes_more = peak(lambda: found.append(unoccupied(positions, means, 0.02)))
-    voxels = {tuple(cell) for cell in np.floor((means - positions.min(axis=0)) / 0.02).astype(int)}
-    cells = np.floor((positions - positions.min(axis=0)) / 0.02).astype(int)
-    np.testing.assert_array_equal(found[0], [tuple(cell) not in voxels for cell in cells])
-    return [bytes_more]
-
-
 def test_a_map_whose_splats_all_stay_is_not_copied() -> None:
     state = full_map()
     kept = state.splats.means
@@ -119,7 +106,3 @@ def test_growing_and_shrinking_replaces_one_tensor_after_the_other() -> None:
 
 def test_a_correction_moves_the_map_in_place() -> None:
     assert alone(_correct)[0] < 0.9 * SIZE
-
-
-def test_voxels_are_looked_up_in_parts() -> None:
-    assert alone(_look_up_voxels)[0] < 14e6  # at once: 18 MB

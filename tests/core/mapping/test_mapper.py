@@ -31,7 +31,7 @@ def test_a_view_between_the_keyframes_is_rendered_well() -> None:
     mapper = mapped(tiny_views())
     assert score(mapper, rgbd_keyframe(99, pose_on_arc(0.5))) > 30.0
     assert mapper.iterations <= 4 * 16 + 20
-    assert mapper.log.skipped["points_explored"] > 2000
+    assert mapper.log.skipped["pixels_explored"] > 2000
     assert mapper.log.seconds["refinement"] > 0
     assert not mapper.log.warnings
 
@@ -127,7 +127,7 @@ def test_bad_input_is_refused_counted_and_never_reaches_the_map() -> None:
             replace(views[1], image=image),
             replace(views[2], world_from_cam=pose),
             views[3],
-        ]
+        ],
     )
     mapper.correct(np.array([0, 5]), np.full((2, 4, 4), np.nan), np.ones(2))
     counts = mapper.log.counts
@@ -157,8 +157,10 @@ def test_a_view_without_depth_adds_nothing_but_is_trained_on() -> None:
 def test_depth_smaller_than_the_image_is_used_at_its_own_size() -> None:
     view = tiny_views()[0]
     small = replace(view, depth=view.depth[::2, ::2].copy(), normals=view.normals[::2, ::2].copy())
-    mapper = OnlineMapper(replace(CONFIG, insertion=InsertionConfig(voxel=0.0)))
-    assert mapper.add_keyframe(small) == 24 * 32
+    mapper = OnlineMapper(replace(CONFIG, insertion=InsertionConfig(price=0.0)))
+    assert mapper.add_keyframe(small) == 48 * 64
+    shown = mapper.render(mapper.views[0])
+    assert (shown.opacity.numpy() > 0.5).all()
 
 
 def test_the_map_never_grows_beyond_its_limit_and_says_so() -> None:
@@ -173,7 +175,7 @@ def test_every_skip_can_be_switched_off() -> None:
         CONFIG,
         convergence=ConvergenceConfig(skip=False),
         training=TrainingConfig(selective=False),
-        insertion=InsertionConfig(unexplored=False, voxel=0.0, map_voxel=0.0),
+        insertion=InsertionConfig(unexplored=False),
     )
     mapper = mapped(tiny_views(), config)
     assert mapper.iterations == 4 * 16 + 20

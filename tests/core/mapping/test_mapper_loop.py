@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.small_maps import mapped
@@ -17,7 +18,8 @@ pytestmark = pytest.mark.slow
 
 DRIFT = 0.25  # share by which lengths have shrunk at the end
 REFINEMENT = 60
-CONFIG = MapperConfig(iterations=12, refinement=0, threads=1)
+DENSE = InsertionConfig(price=3e-4)  # about two splats to three pixels, so that the map can show what is wrong with it
+CONFIG = MapperConfig(iterations=12, refinement=0, threads=1, insertion=DENSE)
 
 
 def arc() -> list[RGBDKeyframe]:
