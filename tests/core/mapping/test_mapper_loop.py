@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 DRIFT = 0.25  # share by which lengths have shrunk at the end
 REFINEMENT = 60
-DENSE = InsertionConfig(price=3e-4)  # about two splats to three pixels, so that the map can show what is wrong with it
+DENSE = InsertionConfig(price=3e-4)  # so many splats that what is left of the drift is what limits the map
 CONFIG = MapperConfig(iterations=12, refinement=0, threads=1, insertion=DENSE)
 
 
