@@ -15,6 +15,7 @@ from mvsgs_core.rasterizer.spherical_harmonics import degree_of
 from mvsgs_core.rasterizer.splats import Splats
 
 _MAX_HEADER = 2**16  # bytes
+CHUNK = 16384  # splats that are written at once: the columns of all would take as much memory as the map
 FAR = 1e3  # origins farther than this many scene extents stay a comment: float32 positions would lose the detail
 
 
@@ -26,9 +27,31 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     fold: for viewers that know only Gaussians; the scales are those of the closest Gaussian, and there is no beta. The
     scale is a logarithm: what multiplies the standard deviation is added to it.
     """
-    splats = folded(final.splats, final.kernel) if fold else final.splats
-    origin = relative_origin(final)
-    means = splats.means.numpy().astype(np.float64) + (final.origin - origin)
+    origin, kernel = relative_origin(final), "gaussian" if fold else final.kernel
+
+    def columns(chosen: slice) -> dict[str, np.ndarray]:
+        splats = Splats(**{name: value[chosen] for name, value in final.splats.tensors().items()})
+        return _properties(folded(splats, final.kernel) if fold else splats, final.origin - origin, kernel)
+
+    names, count = list(columns(slice(0, 0))), len(final.splats)
+    header = [
+        "ply", "format binary_little_endian 1.0", f"comment density {kernel}",
+        "comment origin " + " ".join(repr(float(value)) for value in origin), f"element vertex {count}",
+        *(f"property float {name}" for name in names), "end_header\n",
+    ]  # fmt: skip
+    with path.open("wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        for first in range(0, count, CHUNK):
+            some = columns(slice(first, first + CHUNK))
+            rows = np.empty(min(CHUNK, count - first), dtype=[(name, "<f4") for name in names])
+            for name, values in some.items():
+                rows[name] = values
+            file.write(rows.data)
+
+
+def _properties(splats: Splats, shift: np.ndarray, kernel: str) -> dict[str, np.ndarray]:
+    """The columns of the file by name, in its order. shift: (3,) float64, added to the positions."""
+    means = splats.means.numpy().astype(np.float64) + shift
     harmonics = splats.sh.numpy()
     # all of red, then green, then blue
     rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), 3 * (harmonics.shape[1] - 1))
@@ -40,20 +63,9 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     columns |= {f"scale_{k}": splats.log_scales[:, k].numpy() for k in range(3)}
     unit = torch.nn.functional.normalize(splats.quaternions, dim=1).numpy()
     columns |= {f"rot_{k}": unit[:, k] for k in range(4)}
-    kernel = "gaussian" if fold else final.kernel
     if kernel != "gaussian":
         columns["beta"] = splats.betas.numpy()
-    rows = np.empty(len(splats), dtype=[(name, "<f4") for name in columns])
-    for name, values in columns.items():
-        rows[name] = values
-    header = [
-        "ply", "format binary_little_endian 1.0", f"comment density {kernel}",
-        "comment origin " + " ".join(repr(float(value)) for value in origin), f"element vertex {len(splats)}",
-        *(f"property float {name}" for name in columns), "end_header\n",
-    ]  # fmt: skip
-    with path.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(rows.tobytes())
+    return columns
 
 
 def relative_origin(final: Snapshot) -> np.ndarray:

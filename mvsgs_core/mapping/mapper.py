@@ -59,9 +59,13 @@ class OnlineMapper:
         self.keyframes = KeyframeStore(config.max_keyframes, config.window, self.log, views or (), between or ())
         self.schedule = Schedule(config.window, config.seed)
         self.trainer = Trainer(config, self.state, self.log, self.photometry)
-        self.densifier = Densifier(
-            config, self.state, self.frame, self.keyframes, self.render, self.photometry, self.log
-        )
+        trainer, keyframes = self.trainer, self.keyframes
+
+        def render(view: TrainingView, size: tuple[int, int] | None = None) -> Render:
+            return trainer.render(view, keyframes.median_depth, size)
+
+        # no part refers to its mapper: copies of it, for checkpoints, are then freed as soon as they are written
+        self.densifier = Densifier(config, self.state, self.frame, keyframes, render, self.photometry, self.log)
 
     @property
     def views(self) -> list[TrainingView]:

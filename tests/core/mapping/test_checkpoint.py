@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -105,6 +107,19 @@ def test_the_stream_goes_on_while_a_frozen_atlas_stays_as_it_was(tmp_path: Path)
         assert one.image is other.image
         np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
         np.testing.assert_array_equal(one.pose_delta, other.pose_delta)
+
+
+def test_a_frozen_atlas_is_freed_where_it_is_let_go() -> None:
+    """Not when Python's collector comes by: it takes as much memory as the map."""
+    atlas = begun(PLAIN)
+    gc.disable()
+    try:
+        frozen = atlas.frozen()
+        state = weakref.ref(frozen.current.state)
+        del frozen
+        assert state() is None
+    finally:
+        gc.enable()
 
 
 def test_what_a_checkpoint_says_of_itself_needs_no_mapper(tmp_path: Path) -> None:

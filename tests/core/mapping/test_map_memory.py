@@ -6,6 +6,7 @@ import ctypes
 import multiprocessing
 import os
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 import torch
 
+from mvsgs_core.export.ply import read_ply, write_ply
+from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.rasterizer.splats import Splats
@@ -71,6 +74,17 @@ def _free_at_once() -> None:
     torch.set_num_threads(1)
 
 
+def _write_ply() -> list[float]:
+    final = Snapshot(
+        splats(COUNT), np.zeros(COUNT, np.int64), np.zeros(3), "gaussian", 0, np.zeros(0, np.int64),
+        np.zeros((0, 4, 4)), np.zeros(0), np.zeros((0, 3, 4), np.float32),
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        found = peak(lambda: write_ply(Path(folder) / "map.ply", final))
+        assert len(read_ply(Path(folder) / "map.ply").splats) == COUNT
+    return [found]
+
+
 def _grow_and_shrink() -> list[float]:
     state = full_map()
     grown = peak(lambda: state.append(splats(10), torch.zeros(10, dtype=torch.int64)))
@@ -96,6 +110,10 @@ def test_a_map_whose_splats_all_stay_is_not_copied() -> None:
     kept = state.splats.means
     state.keep(torch.ones(len(state), dtype=torch.bool))
     assert state.splats.means is kept
+
+
+def test_a_map_is_written_in_parts() -> None:
+    assert alone(_write_ply)[0] < 0.3 * SIZE  # at once: 1.0
 
 
 def test_growing_and_shrinking_replaces_one_tensor_after_the_other() -> None:
