@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,10 @@ from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
 from nodes.live import LiveSource
+from nodes.stream_frames import StreamFrames
+from nodes.stream_presence import Presence, pauses
 
 POLL = 0.5  # s at most between two looks at whether the stream goes on
-RETRY = 0.5  # s between two attempts to open a device that was lost
-SILENT = 2.0  # s without a picture after which a user is warned, if the camera may be silent that long
 
 
 class CameraError(RuntimeError):
@@ -38,7 +38,7 @@ class Camera(LiveSource):
         intrinsics: list[float] | str = "auto"  # [fx, fy, cx, cy] in pixels of the camera's picture; auto: a guess
         distortion: list[float] = field(default_factory=list)  # [k1, k2, p1, p2] or with k3, as in OpenCV
         crop: int | None = None  # pixels cut off after undistortion; null: zoom to hide the empty border
-        timeout: float = 10.0  # s without a picture before the camera counts as lost
+        timeout: float = 30.0  # s without a usable picture, while it is looked for, before the stream ends
 
     config: Config
 
@@ -46,30 +46,45 @@ class Camera(LiveSource):
         super().__init__(config)
         self._framing = Framing(self.config.size, self.config.crop)
         self._lens: Lens | None = None
+        sender = f"camera {self.config.path}"
+        self._frames = StreamFrames(self.stats, sender, stamped=False)
+        self._presence = Presence(self.stats, sender, self.config.timeout)
 
     def _open(self) -> None:
-        self._feed = _Feed(self.config, self.stats.warn)
+        self._feed = _Feed(self.config, self._presence)
 
     def _close(self) -> None:
         self._feed.close()
 
     def _take(self, first: bool) -> Frame | None:
-        shot = self._feed.newest(self.config.timeout)
-        self.stats.counts["dropped"] = self._feed.dropped
-        if shot is None:
-            if first:
-                raise CameraError(f"camera {self.config.path} gave no picture for {self.config.timeout:g} s")
-            self.stats.warn(f"camera {self.config.path} was lost: no picture for {self.config.timeout:g} s")
-            return None
-        picture, timestamp = shot
-        native = picture.shape[0], picture.shape[1]
+        """The next usable picture. Raises CameraError where none ever comes."""
+        began = time.monotonic()
+        while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
+            shot = self._feed.newest(min(POLL, left))
+            self.stats.counts["dropped"] = self._feed.dropped
+            if shot is None:
+                self._presence.wait(began)
+                continue
+            picture, timestamp = shot
+            lens = self._lens_of(picture)
+            usable = self._frames.accept(Frame(0, timestamp, picture, np.array(lens.intrinsics), lens.guessed))
+            if usable is not None:
+                return usable
+        silence = f"gave no usable picture for {self.config.timeout:g} s"
+        if first:
+            said = f": {self.stats.warnings[-1]}" if self.stats.warnings else ""
+            raise CameraError(f"camera {self.config.path} {silence}{said}")
+        self.stats.warn(f"camera {self.config.path} {silence}: the stream ends here")
+        return None
+
+    def _lens_of(self, picture: np.ndarray) -> Lens:
+        """Of the stream: its first picture's."""
         if self._lens is None:
+            native = picture.shape[0], picture.shape[1]
             self._lens, notes = lens_from_option(self.config.intrinsics, self.config.distortion, native)
             for note in notes:
                 self.stats.warn(note)
-        if native != self._lens.size:
-            raise CameraError(f"camera {self.config.path} changed its picture from {self._lens.size} to {native}")
-        return Frame(0, timestamp, picture, np.array(self._lens.intrinsics), self._lens.guessed)
+        return self._lens
 
     def _framed(self, frame: Frame) -> Frame:
         assert self._lens is not None
@@ -81,66 +96,58 @@ class Camera(LiveSource):
 class _Feed:
     """A thread that reads the camera as fast as it delivers, and keeps the newest picture only.
 
-    `warn` is called when the camera is lost and when it is found again, from either thread.
+    A camera that was lost is opened again, at growing pauses, until it gives pictures.
     """
 
-    def __init__(self, config: Camera.Config, warn: Callable[[str], None]) -> None:
+    def __init__(self, config: Camera.Config, presence: Presence) -> None:
         self.dropped = 0
-        self._warn = warn
-        self._taken = 0
+        self._presence = presence
         self._config = config
-        self._closing = False
+        self._closing = threading.Event()
         self._fresh = threading.Condition()
         self._newest: tuple[np.ndarray, float] | None = None
-        self._capture = _open(config)
+        self._began = time.time() - time.monotonic()  # times go on evenly even if the clock is set
+        self._capture: cv2.VideoCapture | None = _open(config)
         self._thread = threading.Thread(target=self._read, name="camera", daemon=True)
         self._thread.start()
 
     def newest(self, timeout_s: float) -> tuple[np.ndarray, float] | None:
         """The newest picture that was not taken yet and its time; None when none comes in time."""
-        began = time.monotonic()
-        warned = self._taken == 0  # the first picture may take its time
         with self._fresh:
-            while self._newest is None:
-                waited = time.monotonic() - began
-                if waited >= timeout_s:
-                    return None
-                if not warned and waited >= min(SILENT, timeout_s / 2):
-                    warned = True
-                    self._warn(f"camera {self._config.path} gives no picture: it is waited for up to {timeout_s:g} s")
-                self._fresh.wait(min(timeout_s - waited, POLL, timeout_s / 4))
+            self._fresh.wait_for(lambda: self._newest is not None, timeout_s)
             shot, self._newest = self._newest, None
-            self._taken += 1
             return shot
 
     def close(self) -> None:
-        self._closing = True
+        self._closing.set()
         self._thread.join(timeout=2 * POLL)  # a read that hangs must not hold the run back: the thread is a daemon
 
     def _read(self) -> None:
-        while not self._closing:
-            read, picture = self._capture.read()
-            if not read:
-                self._reopen()
+        attempts, size = pauses(self._config.timeout), self._config.resolution
+        while not self._closing.is_set():
+            read, picture = (False, None) if self._capture is None else self._capture.read()
+            if not read or picture is None:
+                if not self._closing.is_set():
+                    self._presence.lost("it gives no picture" if self._capture else "it cannot be opened")
+                    self._reopen(next(attempts), size)
                 continue
+            attempts, size = pauses(self._config.timeout), [picture.shape[0], picture.shape[1]]
+            self._presence.came()
             with self._fresh:
                 self.dropped += self._newest is not None
-                self._newest = picture, time.time()
+                self._newest = picture, self._began + time.monotonic()
                 self._fresh.notify()
-        self._capture.release()
+        if self._capture is not None:
+            self._capture.release()
 
-    def _reopen(self) -> None:
-        if not self._closing:
-            self._warn(f"camera {self._config.path} was lost: it is opened again until it is found")
-        self._capture.release()
-        while not self._closing:
-            time.sleep(RETRY)
-            try:
-                self._capture = _open(self._config)
-            except CameraError:
-                continue
-            self._warn(f"camera {self._config.path} was lost and found again")
-            return
+    def _reopen(self, pause: float, size: list[int] | None) -> None:
+        """An attempt after a pause; pictures of the size that they had are asked for."""
+        if self._capture is not None:
+            self._capture.release()
+        self._capture = None
+        if not self._closing.wait(pause):
+            with suppress(CameraError):
+                self._capture = _open(replace(self._config, resolution=size))
 
 
 def _open(config: Camera.Config) -> cv2.VideoCapture:

@@ -15,6 +15,7 @@ from nodes.live import LiveSource
 from nodes.runtime.addresses import TransportError, check_address, load_keys
 from nodes.runtime.transport import LiveReader
 from nodes.stream_frames import StreamFrames
+from nodes.stream_presence import Presence
 
 POLL = 0.5  # s at most between two looks at the clock
 
@@ -37,6 +38,8 @@ class Robot(LiveSource):
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
         self._frames = StreamFrames(self.stats, "the robot")
+        self._presence = Presence(self.stats, "the robot", self.config.timeout)
+        self._breaks = 0  # of the connection, that were said
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -57,10 +60,10 @@ class Robot(LiveSource):
 
     def _take(self, first: bool) -> Frame | None:
         """The next usable frame. Raises TimeoutError where none ever comes."""
-        deadline = time.monotonic() + self.config.timeout
-        while time.monotonic() < deadline:
+        began = time.monotonic()
+        while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
             try:
-                message = self._reader.receive(POLL)
+                message = self._reader.receive(min(POLL, left))
             except CodecError as error:
                 self.stats.warn(f"the robot sent what is no Frame, it was left out: {error}")
                 continue
@@ -68,9 +71,12 @@ class Robot(LiveSource):
                 self._watch(self._reader)
             if isinstance(message, End):
                 return None
-            usable = self._frames.accept(message) if isinstance(message, Frame) else None
-            if usable is not None:
-                return usable
+            if isinstance(message, Frame):
+                self._presence.came()
+                if (usable := self._frames.accept(message)) is not None:
+                    return usable
+            else:
+                self._presence.wait(began)
         silence = f"no usable frame from {self.config.path} for {self.config.timeout:g} s"
         if first:
             hint = "is the program that publishes there running (see examples/robot.py)?"
@@ -84,9 +90,13 @@ class Robot(LiveSource):
         if reader.reconnected > self.stats.counts.get("reconnected", 0):
             self.stats.counts["reconnected"] = reader.reconnected
             self.stats.warn("the connection to the robot broke, as a frame too large makes it, and was made anew")
+        if reader.breaks > self._breaks:
+            self._breaks = reader.breaks
+            self._presence.lost("its connection broke")
         if reader.renumbered > self.stats.counts.get("renumbered", 0):
             self.stats.counts["renumbered"] = reader.renumbered
             self.stats.warn("the robot's sequence numbers jumped, as they do when its program starts again")
+            self._frames.restarted()
 
     def _framed(self, frame: Frame) -> Frame:
         native = self._frames.native

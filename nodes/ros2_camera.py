@@ -20,6 +20,7 @@ from nodes.ros2.cdr import CdrError
 from nodes.ros2.connection import LOOPBACK, SENSOR_DATA, Connection, check_installed
 from nodes.ros2.messages import CameraInfo, CompressedImage, Image
 from nodes.stream_frames import StreamFrames
+from nodes.stream_presence import Presence
 
 if TYPE_CHECKING:
     from nodes.ros2.dds import Reader
@@ -64,6 +65,7 @@ class Ros2Camera(LiveSource):
         c = self.config
         self._framing = Framing(c.size, c.crop)
         self._frames = StreamFrames(self.stats, "the camera")
+        self._presence = Presence(self.stats, "the camera", c.timeout)
         self._topic = c.topic(c.path)
         self._info_topic = c.topic(c.info_topic) if c.info_topic else camera_info_topic(self._topic)
         self._lens: Lens | None = None
@@ -95,12 +97,16 @@ class Ros2Camera(LiveSource):
 
     def _take(self, first: bool) -> Frame | None:
         """The next usable image. Raises TimeoutError where none ever comes."""
-        deadline = time.monotonic() + self.config.timeout
-        while (left := deadline - time.monotonic()) > 0:
+        began = time.monotonic()
+        while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
             self._images.wait(min(POLL, left))
             waiting = self._images.take()
             if not waiting:
+                if not first and not self._images.writers:
+                    self._presence.lost("nobody publishes its images any more")
+                self._presence.wait(began)
                 continue
+            self._presence.came()
             self.stats.count("dropped", len(waiting) - 1)
             with self.stats.time("image"):
                 frame = self._frame(waiting[-1])

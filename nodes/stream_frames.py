@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -15,33 +16,69 @@ MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
 
 
 class StreamFrames:
-    """The frames of one sender, whom warnings name as `sender`."""
+    """The frames of one sender, whom warnings name as `sender`.
 
-    def __init__(self, stats: Stats, sender: str) -> None:
+    In the counts: `unusable` ones in all, and of these those that were `doubled`, late (`out_of_order`) or of an
+    `other_size`.
+    stamped: the sender says when it took them; one that only hands pictures on may give the same one again.
+    """
+
+    def __init__(self, stats: Stats, sender: str, stamped: bool = True) -> None:
         self.native: tuple[int, int] | None = None  # (height, width) of all, once the first has come
+        self.heard = 0.0  # by time.monotonic: when the last frame came that was no damaged or foreign one
         self._stats = stats
         self._sender = sender
+        self._stamped = stamped
         self._times = StreamTimes()
+        self._newest: Frame | None = None  # as it came
+        self._restarted = False
+
+    def restarted(self) -> None:
+        """The sender's program started again: its clock may be another."""
+        self._restarted = True
 
     def accept(self, frame: Frame) -> Frame | None:
         """The frame at a time after all before it; None, with a warning, if it cannot belong to the same stream."""
         wrong = self._fault(frame)
-        shown = None if wrong else self._times.accept(frame.timestamp)
-        if shown is None:
-            self.refuse(wrong or f"frames whose timestamp is no time in seconds (beyond {LATEST:g}) were left out")
+        if wrong is None:
+            self.heard = time.monotonic()
+        placed = wrong or self._placed(frame)
+        if isinstance(placed, str):
+            self.refuse(placed)
             return None
-        if self._times.repaired > self._stats.counts.get("times_repaired", 0):
-            self._stats.counts["times_repaired"] = self._times.repaired
-            self._stats.warn(
-                f"{self._sender}'s timestamps stood still, went back or leapt: there the time here was taken"
-            )
-        self.native = self.native or (frame.image.shape[0], frame.image.shape[1])
-        return replace(frame, timestamp=shown)
+        self.native, self._newest = (frame.image.shape[0], frame.image.shape[1]), frame
+        return replace(frame, timestamp=placed)
 
     def refuse(self, why: str) -> None:
         """One that was left out."""
         self._stats.count("unusable")
         self._stats.warn(why)
+
+    def _placed(self, frame: Frame) -> float | str:
+        """Its time in the stream, or why it has none."""
+        if self._doubled(frame):
+            self._stats.count("doubled")
+            return f"frames that {self._sender} gave twice were left out"
+        shown = self._times.accept(frame.timestamp, self._restarted)
+        self._restarted = False
+        if shown is None and abs(frame.timestamp) <= LATEST:
+            self._stats.count("out_of_order")
+            return f"frames of {self._sender} from before, or hours after, those that came before were left out"
+        if shown is None:
+            return f"frames whose timestamp is no time in seconds (beyond {LATEST:g}) were left out"
+        if self._times.repaired > self._stats.counts.get("times_repaired", 0):
+            self._stats.counts["times_repaired"] = self._times.repaired
+            self._stats.warn(
+                f"{self._sender}'s timestamps stood still, went back or leapt: there the time here was taken"
+            )
+        return shown
+
+    def _doubled(self, frame: Frame) -> bool:
+        last = self._newest
+        if last is None or (self._stamped and frame.timestamp != last.timestamp):
+            return False
+        same_rows = np.array_equal(frame.image[::16], last.image[::16])  # most pictures differ there
+        return same_rows and np.array_equal(frame.image, last.image)
 
     def _fault(self, frame: Frame) -> str | None:
         native = frame.image.shape[0], frame.image.shape[1]
@@ -50,6 +87,7 @@ class StreamFrames:
         if not MIN_SIDE <= min(native) <= side <= MAX_SIDE:
             return f"frames with sides outside of {MIN_SIDE} to {MAX_SIDE} pixels were left out, such as {native}"
         if self.native not in (None, native):
+            self._stats.count("other_size")
             return f"frames of another size than the first, {self.native}, were left out, such as {native}"
         in_view = np.all((FOCAL_RANGE[0] * side <= focal) & (focal <= FOCAL_RANGE[1] * side))
         if not in_view or not np.all(np.abs(center) <= 2 * side):

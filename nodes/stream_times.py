@@ -8,12 +8,18 @@ from collections.abc import Callable
 LATEST = 1e11  # s: the year 5138; what is beyond it is in other units than seconds, and loses fractions of them
 LEAP = 3600.0  # s that a stream may jump ahead by itself: a recording with gaps is no broken clock
 FASTEST_PLAYBACK = 1000.0  # times the recorded rate
-MIN_STEP = 1e-4  # s between two frames where they came at once
+MIN_STEP = 1e-4  # s between two frames where they came at once; what is nearer is the same time
+ENOUGH = 5  # frames in a row that do not follow from those before: their clock jumped
+PATIENCE = 1.0  # s of such frames, where they come slowly
 
 
 class StreamTimes:
-    """Times of frames as they come. Where the sender's clock stands still, goes back or leaps ahead, the stream's time
-    goes on by as much as passed here, and from there by the sender's clock again."""
+    """Times of frames as they come.
+
+    A frame from before the last one is late, one from hours after it no better. Where several in a row are, it is the
+    sender's clock that was set, as when its program starts again: the stream's time then goes on by as much as passed
+    here, and from there by the sender's clock again. So it does where that clock stands still.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.repaired = 0
@@ -21,21 +27,33 @@ class StreamTimes:
         self._shift = 0.0  # s added to the sender's times
         self._last: float | None = None
         self._came = 0.0
+        self._odd = 0  # frames in a row that did not follow
+        self._odd_since = 0.0
 
-    def accept(self, timestamp: float) -> float | None:
-        """The time of the frame that came now, later than all before it; None for what is no time in seconds."""
+    def accept(self, timestamp: float, restarted: bool = False) -> float | None:
+        """The time of the frame that came now, later than all before it; None for one that does not follow or is at
+        no time in seconds. restarted: it is the first of a sender that began anew."""
         if not abs(timestamp) <= LATEST:
             return None
         now = self._clock()
         shown = timestamp + self._shift
         if self._last is not None:
-            passed = now - self._came
-            if not 0 < shown - self._last <= LEAP + FASTEST_PLAYBACK * passed:
+            passed, step = now - self._came, shown - self._last
+            if not MIN_STEP <= step <= LEAP + FASTEST_PLAYBACK * passed:
+                if not restarted and abs(step) >= MIN_STEP and not self._jumped(now):
+                    return None
                 self.repaired += 1
                 shown = self._last + max(passed, MIN_STEP)
                 self._shift = shown - timestamp
-        self._last, self._came = shown, now
+        self._last, self._came, self._odd = shown, now, 0
         return shown
+
+    def _jumped(self, now: float) -> bool:
+        """Whether it is the clock: enough frames in a row do not follow."""
+        self._odd += 1
+        if self._odd == 1:
+            self._odd_since = now
+        return self._odd >= ENOUGH or (self._odd > 1 and now - self._odd_since >= PATIENCE)
 
 
 __all__ = ["LATEST", "StreamTimes"]

@@ -172,6 +172,11 @@ def test_a_program_that_is_killed_and_starts_again_goes_on(address: str) -> None
     assert times[-1] - times[0] < 10.0
     assert robot.stats.counts["times_repaired"] == 1
     assert robot.stats.counts["renumbered"] == 1
+    assert "out_of_order" not in robot.stats.counts  # its clock is believed from its first frame on
+    assert robot.stats.counts["lost"] == 1
+    told = [text for text in robot.stats.warnings if "the robot" in text and "loss 1" in text]
+    assert told[0] == "the robot was lost (its connection broke; loss 1): it is waited for up to 10 s"
+    assert told[1].startswith("the robot is back after ")
 
 
 def test_times_always_go_forward() -> None:
@@ -188,20 +193,26 @@ def test_times_always_go_forward() -> None:
     assert at(0.1, 1e9 + 0.1) == pytest.approx(1e9 + 0.2)  # the same again
     assert at(0.1, 1e9 + 0.2) == pytest.approx(1e9 + 0.3)
     assert times.repaired == 1
-    assert at(0.1, 0.0) == pytest.approx(1e9 + 0.4)  # back
-    assert at(0.1, 0.1) == pytest.approx(1e9 + 0.5)
+    assert at(0.1, 0.0) is None  # back: late, or the clock was set
+    assert at(0.1, 0.1) is None
+    assert at(0.1, 1e9 + 0.5) == pytest.approx(1e9 + 0.6)  # no, it was late
+    assert [at(0.1, 0.1 * i) for i in range(4)] == [None] * 4
+    assert at(0.1, 0.4) == pytest.approx(1e9 + 1.1)  # five in a row: it was set
+    assert at(0.1, 0.5) == pytest.approx(1e9 + 1.2)
     assert times.repaired == 2
-    assert at(0.1, 9e10) == pytest.approx(1e9 + 0.6)  # ahead, by far more than passed
+    assert [at(1.0, 9e10), at(1.0, 9e10 + 1.0)] == [None, pytest.approx(1e9 + 3.2)]  # ahead by far more than passed
     assert times.repaired == 3
     for absurd in (1e300, -1e300, 1.7e18, float("inf"), float("nan")):
         assert at(0.0, absurd) is None
-    assert at(0.0, 9e10) == pytest.approx(1e9 + 0.6, abs=1e-3)  # at the same moment, and still later
+    assert at(0.0, 9e10 + 1.0) == pytest.approx(1e9 + 3.2, abs=1e-3)  # at the same moment, and still later
+    now[0] += 2.0
+    assert times.accept(3.0, restarted=True) == pytest.approx(1e9 + 5.2, abs=1e-3)  # who began anew is believed
     played_fast = StreamTimes(lambda: now[0])
     assert [played_fast.accept(t) for t in (0.0, 0.5, 1000.0)] == [0.0, 0.5, 1000.0]
     assert played_fast.repaired == 0
 
 
-def test_false_times_are_refused_or_repaired_and_said(address: str) -> None:
+def test_false_times_are_refused_and_said(address: str) -> None:
     odd = {5: 1e300, 8: 0.2, 12: 1.2e18}
 
     def frames() -> Iterator[bytes]:
@@ -215,10 +226,49 @@ def test_false_times_are_refused_or_repaired_and_said(address: str) -> None:
     times = [frame.timestamp for frame in taken]
     assert all(b > a for a, b in pairwise(times))
     assert max(times) < 10
-    assert robot.stats.counts["unusable"] == 2
-    assert robot.stats.counts["times_repaired"] >= 1
+    assert not {8} & set(numbers(taken))
+    assert (robot.stats.counts["unusable"], robot.stats.counts["out_of_order"]) == (3, 1)
+    assert "times_repaired" not in robot.stats.counts
     assert any("no time in seconds" in text for text in robot.stats.warnings)
+    assert any("those that came before were left out" in text for text in robot.stats.warnings)
+
+
+def test_a_clock_that_was_set_back_costs_some_frames_and_not_the_stream(address: str) -> None:
+    def frames() -> Iterator[bytes]:
+        for i in range(40):
+            yield data(i, timestamp=1000 + i / 10 if i < 20 else i / 10)
+        yield END
+
+    taken, robot = received(address, frames())
+    assert numbers(taken)[-1] == 39
+    assert {20, 21, 22, 23} & set(numbers(taken)) == set()
+    assert len(taken) >= 30
+    times = [frame.timestamp for frame in taken]
+    assert all(0 < b - a < 1 for a, b in pairwise(times))
+    assert robot.stats.counts["times_repaired"] == 1
+    assert 1 <= robot.stats.counts["out_of_order"] <= 4
     assert any("stood still, went back or leapt" in text for text in robot.stats.warnings)
+
+
+def test_doubled_frames_and_those_of_another_size_are_counted_and_refused(address: str) -> None:
+    other = Frame(3, 0.35, np.zeros((48, 64, 3), np.uint8), np.array([25.0, 25, 15.5, 11.5]))
+
+    def frames() -> Iterator[bytes]:
+        for i in range(20):
+            yield data(i)
+            if i == 5:
+                yield from [data(i)] * 3
+            if i == 9:
+                yield bytes(encode(other, i, delivery=NEWEST))
+        yield END
+
+    taken, robot = received(address, frames())
+    assert numbers(taken) == sorted(set(numbers(taken)))
+    assert numbers(taken)[-1] == 19
+    assert {frame.image.shape for frame in taken} == {(24, 32, 3)}
+    assert 1 <= robot.stats.counts["doubled"] <= 3
+    assert robot.stats.counts["other_size"] == 1
+    assert robot.stats.counts["unusable"] == robot.stats.counts["doubled"] + 1
 
 
 @pytest.mark.parametrize(

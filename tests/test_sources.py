@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import http.server
 import itertools
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import zmq
 
-import nodes.camera
 from msgs import Depth, Frame, GroundTruth
-from nodes.camera import Camera, CameraError
 from nodes.reader import Reader
 from nodes.robot import Robot
 from nodes.runtime.transport import Publisher
@@ -76,171 +71,6 @@ def test_reader_can_play_at_the_recorded_rate(tmp_path: Path) -> None:
     began = time.monotonic()
     arrivals = [time.monotonic() - began for message in reader.run() if isinstance(message, Frame)]
     assert all(arrival >= 0.1 * i for i, arrival in enumerate(arrivals))  # the clock starts after `began`
-
-
-# ---------------------------------------------------------------- live
-
-
-class FakeCapture:
-    """Stands for cv2.VideoCapture: a picture every `interval` seconds, gray with its number; `script` may fail."""
-
-    interval = 0.01
-    lost_after: int | None = None  # pictures, then no more until opened again
-    dead_after: int | None = None  # pictures over all captures, then never again
-    opened = 0
-    pictures = 0
-
-    def __init__(self, *arguments: object) -> None:
-        type(self).opened += 1
-        self._own = 0
-
-    def isOpened(self) -> bool:
-        return self.dead_after is None or self.pictures < self.dead_after
-
-    def read(self) -> tuple[bool, np.ndarray | None]:
-        time.sleep(self.interval)
-        if not self.isOpened() or (self.lost_after is not None and self._own >= self.lost_after):
-            return False, None
-        self._own += 1
-        type(self).pictures += 1
-        return True, np.full((48, 64, 3), (0, 0, self.pictures % 256), dtype=np.uint8)
-
-    def set(self, *_: object) -> bool:
-        return True
-
-    def release(self) -> None:
-        pass
-
-
-@pytest.fixture
-def capture(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[FakeCapture]]:
-    kind = type("Capture", (FakeCapture,), {})
-    monkeypatch.setattr(nodes.camera.cv2, "VideoCapture", kind)
-    monkeypatch.setattr(nodes.camera, "RETRY", 0.01)
-    yield kind
-    assert not [t for t in threading.enumerate() if t.name == "camera"], "the capture thread outlived its node"
-
-
-def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCapture]) -> None:
-    camera = Camera(Camera.Config(start=2, stop=8, stride=2, size=[24, 32]))
-    messages = list(camera.run())
-    assert [type(m) for m in messages] == [Frame, GroundTruth] * 3
-    assert [m.index for m in messages] == [0, 0, 1, 1, 2, 2]
-    assert messages[0].image.shape == (24, 32, 3)
-    assert messages[0].image[0, 0, 1] == 0  # RGB
-    assert messages[0].image[0, 0, 0] > 0
-    assert messages[0].intrinsics[2] == 15.5
-    assert messages[0].intrinsics_guessed
-    assert messages[1].world_from_cam is None
-    assert any("guess" in w for w in camera.stats.warnings)
-
-
-@pytest.mark.slow
-def test_a_slow_reader_gets_the_newest_picture_and_the_rest_is_counted(capture: type[FakeCapture]) -> None:
-    camera = Camera(Camera.Config(stop=5, intrinsics=[50, 50, 31.5, 23.5]))
-    lag = []
-    seen = 0
-    for message in camera.run():
-        if isinstance(message, Frame):
-            seen = int(message.image[0, 0, 0])
-            lag.append(capture.pictures - seen)
-            time.sleep(0.15)
-    assert camera.stats.warnings == []
-    assert camera.stats.counts["frames"] == 5
-    assert max(lag) <= 2  # never an old picture, although some 15 were taken meanwhile
-    assert camera.stats.counts["dropped"] >= seen - 5 > 10
-
-
-def test_a_camera_that_comes_back(capture: type[FakeCapture]) -> None:
-    capture.lost_after = 4
-    camera = Camera(Camera.Config(stop=10))
-    assert len(list(camera.run())) == 20
-    assert any("was lost and found again" in w for w in camera.stats.warnings)
-
-
-def test_a_loss_is_told_when_it_happens_and_so_is_the_return(capture: type[FakeCapture]) -> None:
-    capture.lost_after = 4
-    camera = Camera(Camera.Config(stop=10))
-    told: list[int] = []  # warnings at each frame
-    for message in camera.run():
-        if isinstance(message, Frame):
-            told.append(sum("lost" in w for w in camera.stats.warnings))
-    assert told[0] == 0
-    assert told[-1] == 2  # lost, found: both while frames still came
-    assert camera.stats.warnings[-2].endswith("was lost: it is opened again until it is found")
-
-
-@pytest.mark.slow
-def test_a_camera_that_hangs_is_told_before_it_is_given_up(capture: type[FakeCapture]) -> None:
-    capture.dead_after = 3
-    camera = Camera(Camera.Config(timeout=1.0))
-    when: dict[str, float] = {}
-    camera.stats.warn = lambda text: when.setdefault(text, time.monotonic()) and None  # type: ignore[method-assign]
-    list(camera.run())
-    given_up = when["camera 0 was lost: no picture for 1 s"]
-    assert given_up - when["camera 0 gives no picture: it is waited for up to 1 s"] > 0.2
-    assert given_up - when["camera 0 was lost: it is opened again until it is found"] > 0.5
-
-
-def test_a_camera_that_dies_ends_the_stream_and_not_the_run(capture: type[FakeCapture]) -> None:
-    capture.dead_after = 3
-    camera = Camera(Camera.Config(timeout=0.3))
-    messages = list(camera.run())
-    assert 2 <= len(messages) <= 6
-    assert "camera 0 was lost: no picture for 0.3 s" in camera.stats.warnings
-
-
-def test_a_camera_that_is_not_there(capture: type[FakeCapture], tmp_path: Path) -> None:
-    capture.dead_after = 0
-    with pytest.raises(CameraError, match="camera 7 cannot be opened: is it connected"):
-        list(Camera(Camera.Config(path="7")).run())
-    with pytest.raises(CameraError, match="rtsp://nowhere/x cannot be opened: is the address right"):
-        list(Camera(Camera.Config(path="rtsp://nowhere/x")).run())
-    capture.dead_after, capture.lost_after = None, 0
-    with pytest.raises(CameraError, match=r"gave no picture for 0\.2 s"):
-        list(Camera(Camera.Config(timeout=0.2)).run())
-    (tmp_path / "walk.mp4").touch()
-    with pytest.raises(CameraError, match="dataset=video"):
-        list(Camera(Camera.Config(path=str(tmp_path / "walk.mp4"))).run())
-
-
-class Stream(http.server.BaseHTTPRequestHandler):
-    """Motion JPEG, as network cameras send it; silent after 20 pictures."""
-
-    def do_GET(self) -> None:
-        self.send_response(200)
-        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=picture")
-        self.end_headers()
-        try:
-            for number in range(20):
-                data = cv2.imencode(".jpg", np.full((48, 64, 3), 10 * number, dtype=np.uint8))[1].tobytes()
-                head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                self.wfile.write(head.encode() + data + b"\r\n")
-                time.sleep(0.02)
-            time.sleep(3.0)
-        except ConnectionError:
-            pass  # the reader left
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-@pytest.mark.slow
-def test_a_network_camera_that_falls_silent() -> None:
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Stream)
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        camera = Camera(Camera.Config(path=f"http://127.0.0.1:{server.server_port}/video.mjpg", timeout=1.5))
-        began = time.monotonic()
-        values = [int(message.image[0, 0, 0]) for message in camera.run() if isinstance(message, Frame)]
-        assert time.monotonic() - began < 8
-    finally:
-        server.shutdown()
-        server.server_close()
-    assert len(values) > 10
-    assert values == sorted(values)
-    assert any("was lost: no picture for 1.5 s" in w for w in camera.stats.warnings)
 
 
 # ---------------------------------------------------------------- remote

@@ -32,6 +32,7 @@ class LiveReader(NewestReader):
     """
 
     monitored = LOST | zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED
+    longest_pause = 2000
 
     def __init__(self, address: str, type: type, **options: Any) -> None:
         self.refused = 0  # frames that are no message
@@ -42,6 +43,7 @@ class LiveReader(NewestReader):
         self._taken_at = 0.0
         self._displaced_before = 0
         self._broken_at: float | None = None
+        self.breaks = 0  # times that the connection to a program that did send broke
         super().__init__(address, type, **options)
 
     def watch(self) -> None:
@@ -75,6 +77,9 @@ class LiveReader(NewestReader):
                 self._refusal = f"the publisher of {self.topic} refused the keys: both ends need the same file"
             elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 self._refusal = f"the publisher of {self.topic} speaks another protocol: keys on one side only?"
+            if event == zmq.EVENT_DISCONNECTED and self.received and not self.ended and self._end is None:
+                self.breaks += 1
+                self._tell()
             if event & (zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED):
                 self._broken_at = None
             else:

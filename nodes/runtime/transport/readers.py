@@ -24,6 +24,7 @@ class _Reader:
 
     delivery: bytes
     monitored = LOST  # events of the connection
+    longest_pause = 0  # ms between two attempts to connect, from 50 on twice as long each time; 0: always 50
 
     def __init__(
         self,
@@ -49,7 +50,7 @@ class _Reader:
         self._lost_at: float | None = None
         self._socket = open_socket(zmq.SUB, address, keys, self._max_bytes)
         self._socket.rcvhwm = self._buffer
-        self._socket.reconnect_ivl = 50
+        self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 50, self.longest_pause
         self.monitor = self._socket.get_monitor_socket(self.monitored)
         self._socket.connect(address)
         self._subscription = token.encode() + self.delivery
@@ -251,9 +252,13 @@ class NewestReader(_Reader):
             else:
                 self.displaced += len(self._frames)
                 self._frames.append(frame)
-            if self._wake.poll(0, zmq.POLLOUT):
-                self._wake.send(b"")
+            self._tell()
         self._wake.close()
+
+    def _tell(self) -> None:
+        """In the thread that reads: who waits in `receive` looks again."""
+        if self._wake.poll(0, zmq.POLLOUT):
+            self._wake.send(b"")
 
 
 def _is_end(frame: zmq.Frame) -> bool:

@@ -1,0 +1,318 @@
+"""A live camera, which drops pictures and is lost and found; a fake one, and a network camera on loopback."""
+
+from __future__ import annotations
+
+import http.server
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import nodes.camera
+import nodes.stream_presence
+from msgs import Frame, GroundTruth
+from mvsgs_core.stats import Stats
+from nodes.camera import Camera, CameraError
+from nodes.stream_presence import Presence, pauses
+
+
+class FakeCapture:
+    """Stands for cv2.VideoCapture: a picture every `interval` seconds, gray with its number; `script` may fail."""
+
+    interval = 0.01
+    lost_after: int | None = None  # pictures, then no more until opened again
+    dead_after: int | None = None  # pictures over all captures, then never again
+    opened = 0
+    pictures = 0
+
+    def __init__(self, *arguments: object) -> None:
+        type(self).opened += 1
+        self._own = 0
+
+    def isOpened(self) -> bool:
+        return self.dead_after is None or self.pictures < self.dead_after
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        time.sleep(self.interval)
+        if not self.isOpened() or (self.lost_after is not None and self._own >= self.lost_after):
+            return False, None
+        self._own += 1
+        type(self).pictures += 1
+        return True, np.full((48, 64, 3), (0, 0, self.pictures % 256), dtype=np.uint8)
+
+    def set(self, *_: object) -> bool:
+        return True
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.fixture
+def capture(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[FakeCapture]]:
+    kind = type("Capture", (FakeCapture,), {})
+    monkeypatch.setattr(nodes.camera.cv2, "VideoCapture", kind)
+    monkeypatch.setattr(nodes.stream_presence, "FIRST_PAUSE", 0.01)
+    yield kind
+    assert not [t for t in threading.enumerate() if t.name == "camera"], "the capture thread outlived its node"
+
+
+def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCapture]) -> None:
+    camera = Camera(Camera.Config(start=2, stop=8, stride=2, size=[24, 32]))
+    messages = list(camera.run())
+    assert [type(m) for m in messages] == [Frame, GroundTruth] * 3
+    assert [m.index for m in messages] == [0, 0, 1, 1, 2, 2]
+    assert messages[0].image.shape == (24, 32, 3)
+    assert messages[0].image[0, 0, 1] == 0  # RGB
+    assert messages[0].image[0, 0, 0] > 0
+    assert messages[0].intrinsics[2] == 15.5
+    assert messages[0].intrinsics_guessed
+    assert messages[1].world_from_cam is None
+    assert any("guess" in w for w in camera.stats.warnings)
+
+
+@pytest.mark.slow
+def test_a_slow_reader_gets_the_newest_picture_and_the_rest_is_counted(capture: type[FakeCapture]) -> None:
+    camera = Camera(Camera.Config(stop=5, intrinsics=[50, 50, 31.5, 23.5]))
+    lag = []
+    seen = 0
+    for message in camera.run():
+        if isinstance(message, Frame):
+            seen = int(message.image[0, 0, 0])
+            lag.append(capture.pictures - seen)
+            time.sleep(0.15)
+    assert camera.stats.warnings == []
+    assert camera.stats.counts["frames"] == 5
+    assert max(lag) <= 2  # never an old picture, although some 15 were taken meanwhile
+    assert camera.stats.counts["dropped"] >= seen - 5 > 10
+
+
+def told(camera: Camera, text: str) -> list[str]:
+    return [warning for warning in camera.stats.warnings if text in warning]
+
+
+def test_a_camera_that_comes_back_goes_on_and_both_are_told_at_once(capture: type[FakeCapture]) -> None:
+    capture.lost_after = 4
+    camera = Camera(Camera.Config(stop=10))
+    lost: list[int] = []  # warnings of it at each frame
+    for message in camera.run():
+        if isinstance(message, Frame):
+            lost.append(len(told(camera, "camera 0 was lost")))
+    assert (lost[0], lost[-1]) == (0, 2)
+    away, back = told(camera, "loss 1")
+    assert away == "camera 0 was lost (it gives no picture; loss 1): it is waited for up to 30 s"
+    assert back.startswith("camera 0 is back after 0.")
+    assert camera.stats.counts["frames"] == 10
+    assert camera.stats.counts["lost"] == 2
+    assert 0 < camera.stats.counts["seconds_lost"] < 5
+
+
+def test_it_is_tried_again_at_growing_pauses_until_its_timeout(
+    capture: type[FakeCapture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nodes.stream_presence, "FIRST_PAUSE", 0.02)
+    capture.dead_after = 3
+    attempts: list[float] = []
+    opened = capture.__init__
+
+    def noted(self: FakeCapture, *arguments: object) -> None:
+        attempts.append(time.monotonic())
+        opened(self, *arguments)
+
+    monkeypatch.setattr(capture, "__init__", noted)
+    camera = Camera(Camera.Config(timeout=1.2))
+    list(camera.run())
+    waited = [b - a for a, b in pairwise(attempts[1:])]
+    assert 4 <= len(waited) <= 9
+    assert all(b > 1.3 * a for a, b in pairwise(waited[:3]))
+    assert max(waited) < 0.6  # a quarter of the timeout, and what the machine adds
+    assert camera.stats.warnings[-1] == "camera 0 gave no usable picture for 1.2 s: the stream ends here"
+    assert camera.stats.counts["lost"] == 1
+
+
+def test_pauses_double_up_to_a_bound() -> None:
+    def first(timeout_s: float) -> list[float]:
+        return [pause for _, pause in zip(range(7), pauses(timeout_s))]
+
+    assert first(60.0) == [0.25, 0.5, 1.0, 2.0, 4.0, 4.0, 4.0]
+    assert first(4.0) == [0.25, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0]
+
+
+def test_a_camera_of_another_size_is_refused_until_it_has_its_own_again(capture: type[FakeCapture]) -> None:
+    asked: list[tuple[int, float]] = []
+    read = capture.read
+    capture.lost_after = 4
+
+    def other(self: FakeCapture) -> tuple[bool, np.ndarray | None]:
+        good, picture = read(self)
+        if good and picture is not None and capture.opened == 2:
+            picture = picture[:24]
+        return good, picture
+
+    def noted(self: FakeCapture, name: int, value: float) -> bool:
+        asked.append((name, value))
+        return True
+
+    capture.read, capture.set = other, noted  # type: ignore[method-assign, assignment]
+    camera = Camera(Camera.Config(stop=7))
+    frames = [message for message in camera.run() if isinstance(message, Frame)]
+    assert len(frames) == 7
+    assert {frame.image.shape for frame in frames} == {(48, 64, 3)}
+    assert camera.stats.counts["other_size"] == camera.stats.counts["unusable"] >= 1
+    assert told(camera, "frames of another size than the first, (48, 64), were left out, such as (24, 64)")
+    assert (cv2.CAP_PROP_FRAME_HEIGHT, 48) in asked  # as it was before it was lost
+
+
+def test_a_picture_that_is_given_again_is_counted_and_refused(capture: type[FakeCapture]) -> None:
+    read = capture.read
+
+    def stuck(self: FakeCapture) -> tuple[bool, np.ndarray | None]:
+        good, picture = read(self)
+        return good, None if picture is None else np.full_like(picture, int(picture.max()) // 4)
+
+    capture.read = stuck  # type: ignore[method-assign]
+    camera = Camera(Camera.Config(stop=4, timeout=0.5))
+    frames = [message for message in camera.run() if isinstance(message, Frame)]
+    assert [int(frame.image.max()) for frame in frames] == sorted({int(frame.image.max()) for frame in frames})
+    assert len(frames) == 4  # a picture that stands still is no lost camera
+    assert camera.stats.counts["doubled"] >= 3
+
+
+def test_a_clock_that_is_set_does_not_move_the_stream(
+    capture: type[FakeCapture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall = time.time
+    monkeypatch.setattr(nodes.camera.time, "time", lambda: wall() - 3600 * (capture.pictures > 3))
+    times = [message.timestamp for message in Camera(Camera.Config(stop=8)).run() if isinstance(message, Frame)]
+    assert all(0 < b - a < 5 for a, b in pairwise(times))
+    assert abs(times[0] - wall()) < 60
+
+
+@pytest.mark.slow
+def test_a_camera_that_hangs_is_told_before_it_is_given_up(capture: type[FakeCapture]) -> None:
+    read = capture.read
+
+    def hanging(self: FakeCapture) -> tuple[bool, np.ndarray | None]:
+        if capture.pictures >= 3:
+            time.sleep(0.8)  # and then it comes to itself, for one picture
+        return read(self)
+
+    capture.read = hanging  # type: ignore[method-assign]
+    camera = Camera(Camera.Config(timeout=1.0, stop=5))
+    assert sum(isinstance(message, Frame) for message in camera.run()) == 5
+    assert told(camera, "camera 0 was lost (nothing came for 0.5 s; loss 1): it is waited for up to 1 s")
+    assert told(camera, "camera 0 is back after 0.")
+
+
+def test_a_stream_of_few_frames_is_no_lost_one() -> None:
+    now = [0.0]
+
+    def at(clock: float, action: Callable[[], Any]) -> int:
+        now[0] = clock
+        action()
+        return int(stats.counts.get("lost", 0))
+
+    stats = Stats()
+    presence = Presence(stats, "it", 60.0, lambda: now[0])
+    assert at(50.0, lambda: presence.wait(0.0)) == 0  # the first may take its time
+    assert at(50.0, presence.came) == 0
+    assert at(54.0, presence.came) == 0  # a frame every 4 s
+    assert at(60.0, lambda: presence.wait(54.0)) == 0
+    assert at(74.0, lambda: presence.wait(54.0)) == 1
+    assert at(80.0, lambda: presence.wait(54.0)) == 1  # said once
+    assert at(84.0, presence.came) == 1
+    assert list(stats.warnings) == [
+        "it was lost (nothing came for 20 s; loss 1): it is waited for up to 60 s",
+        "it is back after 10.0 s (loss 1)",
+    ]
+    assert stats.counts["seconds_lost"] == 10.0
+
+
+def test_a_camera_that_dies_ends_the_stream_and_not_the_run(capture: type[FakeCapture]) -> None:
+    capture.dead_after = 3
+    camera = Camera(Camera.Config(timeout=0.3))
+    messages = list(camera.run())
+    assert 2 <= len(messages) <= 6
+    assert "camera 0 gave no usable picture for 0.3 s: the stream ends here" in camera.stats.warnings
+
+
+def test_a_camera_that_is_not_there(capture: type[FakeCapture], tmp_path: Path) -> None:
+    capture.dead_after = 0
+    with pytest.raises(CameraError, match="camera 7 cannot be opened: is it connected"):
+        list(Camera(Camera.Config(path="7")).run())
+    with pytest.raises(CameraError, match="rtsp://nowhere/x cannot be opened: is the address right"):
+        list(Camera(Camera.Config(path="rtsp://nowhere/x")).run())
+    capture.dead_after, capture.lost_after = None, 0
+    with pytest.raises(CameraError, match=r"gave no usable picture for 0\.2 s: camera 0 was lost"):
+        list(Camera(Camera.Config(timeout=0.2)).run())
+    (tmp_path / "walk.mp4").touch()
+    with pytest.raises(CameraError, match="dataset=video"):
+        list(Camera(Camera.Config(path=str(tmp_path / "walk.mp4"))).run())
+
+
+class Stream(http.server.BaseHTTPRequestHandler):
+    """Motion JPEG, as network cameras send it: 20 pictures, then silence before the connection ends."""
+
+    silence = 3.0  # s
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=picture")
+        self.end_headers()
+        try:
+            for number in range(20):
+                data = cv2.imencode(".jpg", np.full((48, 64, 3), 10 * number, dtype=np.uint8))[1].tobytes()
+                head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                self.wfile.write(head.encode() + data + b"\r\n")
+                time.sleep(0.02)
+            time.sleep(self.silence)
+        except ConnectionError:
+            pass  # the reader left
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def serving(handler: type[http.server.BaseHTTPRequestHandler]) -> Iterator[str]:
+    """The address of a network camera."""
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/video.mjpg"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.mark.slow
+def test_a_network_camera_whose_stream_drops_goes_on() -> None:
+    class Dropping(Stream):
+        silence = 0.0
+
+    with serving(Dropping) as address:
+        camera = Camera(Camera.Config(path=address, timeout=8.0, stop=25))
+        frames = [message for message in camera.run() if isinstance(message, Frame)]
+    assert len(frames) == 25  # of connections that give 20 pictures each
+    assert camera.stats.counts["lost"] >= 1
+    assert told(camera, "is back after")
+
+
+@pytest.mark.slow
+def test_a_network_camera_that_falls_silent() -> None:
+    with serving(Stream) as address:
+        camera = Camera(Camera.Config(path=address, timeout=1.5))
+        began = time.monotonic()
+        values = [int(message.image[0, 0, 0]) for message in camera.run() if isinstance(message, Frame)]
+        assert time.monotonic() - began < 8
+    assert len(values) > 10
+    assert values == sorted(values)
+    assert told(camera, "gave no usable picture for 1.5 s: the stream ends here")
+    assert told(camera, "was lost (")
