@@ -187,6 +187,7 @@ class SplatMap:
     scale: Annotated[np.ndarray, "float64 K"]
     exposures: Annotated[np.ndarray, "float32 K 3 4"]  # color affine [A | b] of each keyframe
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None  # that renders need beside them
+    antialiased: bool = False  # renders scale a splat's opacity by what the pixels' blur makes of its area
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,9 @@ def _snapshot(message: SplatMap) -> Snapshot:
     """Copies: what is kept of a message would keep all of it."""
     arrays = {name: value.copy() for name, value in vars(message).items() if isinstance(value, np.ndarray)}
     splats = Splats(**{f.name: torch.from_numpy(arrays.pop(f.name)) for f in fields(Splats)})
-    return Snapshot(splats, kernel=message.kernel, iterations=message.iterations, **arrays)
+    return Snapshot(
+        splats, kernel=message.kernel, iterations=message.iterations, antialiased=message.antialiased, **arrays
+    )
 
 
 def _fitted(report: dict[str, Any]) -> str:

@@ -211,7 +211,7 @@ class Mapper(Node):
         return SplatMap(
             refined=refined, iterations=final.iterations, kernel=final.kernel, origin=final.origin, **arrays,
             anchors=final.anchors, keyframes=final.keyframes, world_from_cam=final.world_from_cam, scale=final.scale,
-            exposures=final.exposures, vignetting=final.vignetting,
+            exposures=final.exposures, vignetting=final.vignetting, antialiased=final.antialiased,
         )  # fmt: skip
 
     @property

@@ -134,6 +134,7 @@ class Evaluation:
                     tracked.readout_time * moving[k] if rolling else None,
                     None if exposures is None else exposures.affines[k],
                     finished.vignetting,
+                    finished.antialiased,
                 )
             )
         return frames

@@ -34,6 +34,7 @@ class ScoredFrame:
     readout: np.ndarray | None = None  # (6,) twist of the camera while it was read, see `rasterize`; None: all at once
     exposure: np.ndarray | None = None  # (3, 4) color affine of the photograph; None: none
     vignetting: np.ndarray | None = None  # (3,) of the sensor; None: none
+    antialiased: bool = False  # as its map is rendered, see `rasterize`
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def render_frame(splats: Splats, kernel: str, frame: ScoredFrame, size: tuple[in
     with torch.inference_mode():
         render = rasterize(
             splats, frame.world_from_cam, frame.intrinsics, size, exposure=exposure, kernel=kernel, near=frame.near,
-            readout=frame.readout,
+            readout=frame.readout, antialiased=frame.antialiased,
         )  # fmt: skip
     color = render.color.cpu().numpy()
     if frame.vignetting is not None:

@@ -38,6 +38,10 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--drop-unsound", action="store_true", help="leave out splats with NaN or Inf, and say how many"
     )
+    parser.add_argument(
+        "--antialiased", action="store_true",
+        help="the map was trained so by a program that leaves no comment of it in the file",
+    )  # fmt: skip
     parser.add_argument("--cameras", type=Path, help="default: the cameras.json beside the map")
     parser.add_argument("--size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="default: that of the cameras")
     parser.add_argument(
@@ -65,7 +69,8 @@ def read_map(options: argparse.Namespace) -> tuple[Snapshot, str]:
         )
     kept = Splats(**{name: value[sound] for name, value in splats.tensors().items()})
     said = f"; {unsound} splats that are not finite were left out" if unsound else ""
-    return replace(final, splats=kept, anchors=final.anchors[sound.numpy()]), said
+    antialiased = final.antialiased or options.antialiased
+    return replace(final, splats=kept, anchors=final.anchors[sound.numpy()], antialiased=antialiased), said
 
 
 def known_cameras(options: argparse.Namespace) -> Cameras | None:

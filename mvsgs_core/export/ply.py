@@ -25,7 +25,8 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     Positions are world coordinates, the origin added in float64 before the cast; only where the origin is so far away
     that float32 would not hold them are they relative to it. A comment `origin x y z` tells what must be added.
     fold: for viewers that know only Gaussians; the scales are those of the closest Gaussian, and there is no beta. The
-    scale is a logarithm: what multiplies the standard deviation is added to it.
+    scale is a logarithm: what multiplies the standard deviation is added to it. Of an antialiased map a comment
+    `antialiased` says so to who knows it; other programs must be told, or show it too bright.
     """
     origin, kernel = relative_origin(final), "gaussian" if fold else final.kernel
 
@@ -36,7 +37,8 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     names, count = list(columns(slice(0, 0))), len(final.splats)
     header = [
         "ply", "format binary_little_endian 1.0", f"comment density {kernel}",
-        "comment origin " + " ".join(repr(float(value)) for value in origin), f"element vertex {count}",
+        "comment origin " + " ".join(repr(float(value)) for value in origin),
+        *(["comment antialiased"] if final.antialiased else []), f"element vertex {count}",
         *(f"property float {name}" for name in names), "end_header\n",
     ]  # fmt: skip
     with path.open("wb") as file:
@@ -101,6 +103,7 @@ def _parse(data: bytes) -> Snapshot:
     if "format binary_little_endian 1.0" not in header:
         raise ValueError("only binary_little_endian PLY files are read")
     count, names, origin, kernel = _parse_header(header)
+    antialiased = "comment antialiased" in header
     available = {name for name, _ in names}
     needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{k}" for k in range(3)),
               *(f"rot_{k}" for k in range(4))]  # fmt: skip
@@ -133,7 +136,7 @@ def _parse(data: bytes) -> Snapshot:
     return Snapshot(
         splats=splats, anchors=np.full(count, -1, dtype=np.int64), origin=origin, kernel=kernel, iterations=0,
         keyframes=np.zeros(0, dtype=np.int64), world_from_cam=np.zeros((0, 4, 4)), scale=np.zeros(0),
-        exposures=np.zeros((0, 3, 4), dtype=np.float32),
+        exposures=np.zeros((0, 3, 4), dtype=np.float32), antialiased=antialiased,
     )  # fmt: skip
 
 

@@ -27,6 +27,7 @@ class Snapshot:
     scale: np.ndarray  # (K,) float64
     exposures: np.ndarray  # (K, 3, 4) float32
     vignetting: np.ndarray | None = None  # (3,) float32 of the camera, see `photometry`; None: none
+    antialiased: bool = False  # rendered, and so trained, as `rasterize` does with antialiased=True
 
     def relative_pose(self, world_from_cam: np.ndarray) -> np.ndarray:
         """(4, 4) of a pose in the world (4, 4): relative to `origin`, as the splats are."""
@@ -41,7 +42,9 @@ class Snapshot:
         """The map from a pose in the world (4, 4); intrinsics (4,) and size (height, width) as for `rasterize`, whose
         other options may be given."""
         pose = self.relative_pose(world_from_cam)
-        return rasterize(self.splats, pose, intrinsics, size, kernel=self.kernel, **options)
+        return rasterize(
+            self.splats, pose, intrinsics, size, kernel=self.kernel, antialiased=self.antialiased, **options
+        )
 
     def scaled(self, factor: float) -> Snapshot:
         """The same map in another unit."""

@@ -27,7 +27,7 @@ class TrainingConfig:
     refine_poses: bool = False  # train the keyframes' poses too, the first one's excepted
     pose_rate: float = 4e-5  # learning rate of them, radians and median depths a step
     pose_visits: int = 5  # iterations on a keyframe before its pose is trained: new splats show nothing new
-    antialiased: bool = False  # scale opacities such that a splat smaller than a pixel does not grow brighter
+    antialiased: bool = False  # for maps that are seen from afar: a splat smaller than a pixel does not grow brighter
     near: float = 1e-3  # splats nearer than this many median depths are left out
     backend: Literal["auto", "reference", "cpu", "triton"] = "auto"  # of the rasterizer
 

@@ -264,9 +264,11 @@ class OnlineMapper:
 
     def snapshot(self) -> Snapshot:
         """The map in world units, relative to its origin."""
+        training = self.config.training
         return snapshot(
-            self.state, self.views, self.frame, self.config.training.kernel, self.iterations, self.photometry.vignetting
-        )
+            self.state, self.views, self.frame, training.kernel, self.iterations, self.photometry.vignetting,
+            training.antialiased,
+        )  # fmt: skip
 
     def _chosen(self, view: TrainingView) -> TrainingView:
         """To train on now: a frame between keyframes where its keyframe stands."""

@@ -23,6 +23,7 @@ def snapshot(
     kernel: str,
     iterations: int,
     vignetting: np.ndarray | None = None,
+    antialiased: bool = False,
 ) -> Snapshot:
     """The state in world units."""
     local = state.detached()
@@ -45,6 +46,7 @@ def snapshot(
         scale=np.array([view.scale for view in views], dtype=np.float64),
         exposures=exposures,
         vignetting=None if vignetting is None else vignetting.astype(np.float32),
+        antialiased=antialiased,
     )
 
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.rasterizer.rasterize import rasterize
 
 FINE = InsertionConfig(price=0.02)  # of images so small that a rectangle of 8 pixels is a tenth of them
 CONFIG = MapperConfig(iterations=16, refinement=20, threads=1, insertion=FINE)
@@ -28,12 +26,6 @@ def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMa
 
 
 def score(mapper: OnlineMapper, view: RGBDKeyframe) -> float:
-    final = mapper.snapshot()
-    pose = view.world_from_cam.copy()
-    pose[:3, 3] -= final.origin
-    length = mapper.frame.length
-    with torch.no_grad():
-        render = rasterize(
-            final.splats, pose, view.intrinsics, view.image.shape[:2], kernel=final.kernel, near=1e-3 * length
-        )
+    near = 1e-3 * mapper.frame.length
+    render = mapper.snapshot().render(view.world_from_cam, view.intrinsics, view.image.shape[:2], near=near)
     return psnr(render.color.clamp(0, 1).numpy(), view.image.astype(np.float32) / 255.0)

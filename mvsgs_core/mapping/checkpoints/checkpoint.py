@@ -18,7 +18,7 @@ from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.stats import Stats
 
 # What the state's arrays depend on; everything else may be another one when a run goes on, and then is said.
-FIXED = ("sh_degree", "max_pixels", "training.kernel")
+FIXED = ("sh_degree", "max_pixels", "training.kernel", "training.antialiased")
 OF_THE_MACHINE = ("device", "threads", "training.backend")
 LOGGED = ("counts", "skipped", "seconds", "warnings")
 

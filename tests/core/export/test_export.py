@@ -62,6 +62,26 @@ def test_a_saved_map_is_read_back(tmp_path: Path, kernel: str) -> None:
         torch.testing.assert_close(getattr(again.splats, name), value.float(), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_a_saved_map_says_that_it_is_antialiased_and_is_rendered_so(
+    tmp_path: Path, antialiased: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    final = replace(final_map(1), antialiased=antialiased)
+    write_ply(tmp_path / "map.ply", final)
+    again = read_ply(tmp_path / "map.ply")
+    assert again.antialiased == antialiased
+    pose, k = np.eye(4), np.array([25.0, 25.0, 15.5, 11.5])
+    pose[:3, 3] = ORIGIN
+    seen = [m.render(pose, k, (24, 32)).color for m in (final, again)]
+    torch.testing.assert_close(seen[0], seen[1], atol=1e-4, rtol=0)
+    other = replace(final, antialiased=not antialiased).render(pose, k, (24, 32)).color
+    assert float((seen[0] - other).abs().max()) > 0.01
+    assert export.main([str(tmp_path / "map.ply"), str(tmp_path / "map.splat")]) == 0
+    assert ("antialiased" in capsys.readouterr().out) == antialiased
+    assert export.main([str(tmp_path / "map.ply"), str(tmp_path / "again.ply"), "--antialiased"]) == 0
+    assert read_ply(tmp_path / "again.ply").antialiased
+
+
 def test_a_far_origin_stays_a_comment_so_that_no_detail_is_lost(tmp_path: Path) -> None:
     final = final_map(1, origin=np.array([1e6, 0.0, -2e6]))
     write_ply(tmp_path / "map.ply", final)
