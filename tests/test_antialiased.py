@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +41,16 @@ def test_a_map_is_rendered_as_it_was_trained(antialiased: bool, tmp_path: Path) 
     saved = read_ply(tmp_path / "map.ply")
     for view, frame, pose in zip(own.views, evaluator.evaluation.scored_frames(), poses, strict=True):
         trained = own.render(view).color.clamp(0.0, 1.0).numpy()
-        np.testing.assert_allclose(
-            render_frame(finished.splats, finished.kernel, frame, SIZE).color, trained, atol=2e-3
+        scored, other = (
+            render_frame(finished.splats, finished.kernel, f, SIZE).color
+            for f in (frame, replace(frame, antialiased=not antialiased))
         )
-        color = saved.render(pose, view.intrinsics, SIZE).color.clamp(0.0, 1.0).numpy()
-        np.testing.assert_allclose(color, trained, atol=2e-3)
+        opened = saved.render(pose, view.intrinsics, SIZE).color.clamp(0.0, 1.0).numpy()
+        # splats at the same depth may change places in another unit
+        assert max(rms(scored, trained), rms(opened, trained)) < 2e-3
+        assert rms(other, trained) > 4e-3
     list(evaluator.on_end())
+
+
+def rms(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((one - other) ** 2)))
