@@ -230,10 +230,10 @@ def ply(folder: Path) -> None:
     splats = Splats(
         **{name: torch.randn(shape, generator=draw) for name, shape in shapes.items()}, betas=torch.full((n,), 2.0)
     )
-    none = {"keyframes": np.zeros(0, np.int64), "world_from_cam": np.zeros((0, 4, 4)), "scale": np.zeros(0)}
     snapshot = Snapshot(
-        splats, np.zeros(n, np.int64), np.zeros(3), "exact", 0, **none, exposures=np.zeros((0, 3, 4), np.float32)
-    )
+        splats, np.zeros(n, np.int64), np.zeros(3), "exact", 0, keyframes=np.zeros(0, np.int64),
+        world_from_cam=np.zeros((0, 4, 4)), scale=np.zeros(0), exposures=np.zeros((0, 3, 4), np.float32),
+    )  # fmt: skip
     write_ply(folder / "map.ply", snapshot)
 
 
