@@ -20,6 +20,7 @@ from nodes.live import LiveSource
 from nodes.stream_frames import StreamFrames
 from nodes.stream_presence import Presence, pauses
 
+ANSWER = 5.0  # s for a network camera to answer, before it is tried again
 POLL = 0.5  # s at most between two looks at whether the stream goes on
 
 
@@ -157,7 +158,7 @@ def _open(config: Camera.Config) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(int(config.path))
         hint = "is it connected, free of other programs, and may you read it (ls -l /dev/video*)?"
     else:
-        milliseconds = int(1000 * config.timeout)
+        milliseconds = int(1000 * min(config.timeout, ANSWER))
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
         capture = cv2.VideoCapture(config.path, cv2.CAP_ANY, limits)
         hint = "is the address right (ffplay shows the same one), and does the network let it through?"

@@ -346,6 +346,28 @@ def test_a_program_that_is_killed_and_starts_again_goes_on(camera: str) -> None:
     assert taken[-1] == 19
 
 
+def test_a_program_that_ends_is_said_to_be_lost_and_so_is_its_return(camera: str) -> None:
+    node = Ros2Camera(config(camera, timeout=20.0, stop=15))
+    programs = [Peer(), Peer()]
+
+    def one_after_the_other() -> None:
+        for number, program in enumerate(programs):
+            start = 100 * number
+            sender(program, camera, [picture(start + i, 1000.0 + start + i / 10) for i in range(10)])()
+            program.close()
+
+    thread = threading.Thread(target=one_after_the_other, daemon=True)
+    thread.start()
+    taken = [message for message in node.run() if isinstance(message, Frame)]
+    thread.join()
+    assert numbers(taken)[0] < 10
+    assert numbers(taken)[-1] >= 100
+    lost, back = (text for text in node.stats.warnings if "loss 1" in text)
+    assert lost == "the camera was lost (nobody publishes its images any more; loss 1): it is waited for up to 20 s"
+    assert back.startswith("the camera is back after")
+    assert node.stats.counts["lost"] == 1
+
+
 def test_nobody_there_is_said_with_what_to_do(camera: str) -> None:
     with pytest.raises(TimeoutError, match="ROS_LOCALHOST_ONLY=1"):
         list(Ros2Camera(config(camera, timeout=0.5)).run())
