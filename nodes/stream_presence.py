@@ -9,7 +9,7 @@ from mvsgs_core.stats import Stats
 
 SILENT = 2.0  # s without a frame after which a stream that came faster counts as lost
 SLOW = 5.0  # times the last interval: a stream of few frames is no silent one
-FIRST_PAUSE, LONGEST_PAUSE = 0.25, 4.0  # s between two attempts to reach a sender; each is twice the one before
+FIRST_PAUSE, LONGEST_PAUSE = 0.25, 2.0  # s between two attempts to reach a sender; each is twice the one before
 
 
 def pauses(timeout_s: float) -> Iterator[float]:

@@ -140,7 +140,7 @@ def test_pauses_double_up_to_a_bound() -> None:
     def first(timeout_s: float) -> list[float]:
         return [pause for _, pause in zip(range(7), pauses(timeout_s))]
 
-    assert first(60.0) == [0.25, 0.5, 1.0, 2.0, 4.0, 4.0, 4.0]
+    assert first(60.0) == [0.25, 0.5, 1.0, 2.0, 2.0, 2.0, 2.0]
     assert first(4.0) == [0.25, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0]
 
 
