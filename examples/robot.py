@@ -5,8 +5,13 @@
     python examples/robot.py --dataset tum ../shared/data/tum_fr1_xyz
     python launch/run_all.py dataset=robot dataset.path=tcp://127.0.0.1:5555
 
-This uses the project's own transport. A robot in another language writes the same bytes to a ZeroMQ XPUB or PUB socket:
-msgs/WIRE.md has them. Beyond this machine (--address tcp://0.0.0.0:5555) keys are required, see --keys.
+With --ros2 it stands for a camera of ROS 2, as far as dataset=ros2 is concerned (pip install cyclonedds):
+
+    python examples/robot.py --video walk.mp4 --ros2 /camera/image_raw
+    python launch/run_all.py dataset=ros2 dataset.path=/camera/image_raw
+
+Otherwise this uses the project's own transport. A robot in another language writes the same bytes to a ZeroMQ XPUB or
+PUB socket: msgs/WIRE.md has them. Beyond this machine (--address tcp://0.0.0.0:5555) keys are required, see --keys.
 """
 
 from __future__ import annotations
@@ -19,9 +24,15 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+import numpy as np
+
 from msgs import Frame, GroundTruth
 from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets.ros import camera_info_topic
 from nodes.camera import Camera
+from nodes.ros2 import forms
+from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, check_installed
+from nodes.ros2.messages import CameraInfo, Image
 from nodes.runtime.addresses import TransportError, load_keys
 from nodes.runtime.transport import LivePublisher
 
@@ -52,6 +63,32 @@ def frames(arguments: argparse.Namespace) -> Iterator[Frame]:
         say(f"warning: {warning}")
 
 
+class Ros2Camera:
+    """Images with their CameraInfo, in $ROS_DOMAIN_ID, on this machine alone unless `interface` says more."""
+
+    def __init__(self, topic: str, interface: str) -> None:
+        from nodes.ros2.dds import Participant
+
+        connection = Connection(interface=interface)
+        participant = Participant(connection)
+        self.topic = connection.topic(topic)
+        self._images = participant.writer(self.topic, Image, DEFAULT)
+        self._infos = participant.writer(camera_info_topic(self.topic), CameraInfo, DEFAULT)
+
+    def wait_for_reader(self) -> None:
+        while not (self._images.readers and self._infos.readers):
+            time.sleep(0.1)
+
+    def send(self, frame: Frame) -> None:
+        at = forms.header(frame.timestamp, "camera_optical_frame")
+        k = np.zeros(4) if frame.intrinsics_guessed else frame.intrinsics  # zeros: nobody calibrated it
+        self._infos.write(forms.camera_info(at, k, frame.image.shape[:2]))
+        self._images.write(forms.rgb_image(at, frame.image))
+
+    def close(self) -> None:
+        del self._images, self._infos  # reliable readers get what they still lack
+
+
 def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
@@ -75,6 +112,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     source.add_argument("--dataset", nargs=2, metavar=("NAME", "PATH"), help="data set, such as tum DIR")
     parser.add_argument("--intrinsics", nargs=4, type=float, metavar=("FX", "FY", "CX", "CY"), help="in pixels")
     parser.add_argument("--address", default="tcp://127.0.0.1:5555", help="where to publish (default: %(default)s)")
+    parser.add_argument("--ros2", metavar="TOPIC", help="publish to ROS 2 instead, with CameraInfo beside the images")
+    parser.add_argument(
+        "--interface", default=LOOPBACK, help="with --ros2: auto for the network (default: %(default)s)"
+    )
     parser.add_argument("--keys", type=Path, help="folder with CURVE keys, needed beyond this machine")
     parser.add_argument("--fast", action="store_true", help="as fast as frames can be read, not at their own rate")
     return parser.parse_args(arguments)
@@ -82,15 +123,23 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def main() -> None:
     arguments = parse()
+    publisher: LivePublisher | Ros2Camera
     try:
-        keys = None if arguments.keys is None else load_keys(arguments.keys)
-        publisher = LivePublisher(arguments.address, keys=keys)
-    except TransportError as error:
+        if arguments.ros2 is not None:
+            check_installed()
+            publisher = Ros2Camera(arguments.ros2, arguments.interface)
+        else:
+            keys = None if arguments.keys is None else load_keys(arguments.keys)
+            publisher = LivePublisher(arguments.address, keys=keys)
+    except (TransportError, ValueError) as error:
         sys.exit(f"error: {error}")
     sent = 0
     try:
-        print(f"publishing at {arguments.address}, waiting for a reader; Ctrl-C ends", flush=True)
-        wait_for_reader(publisher, arguments.keys)
+        print(f"publishing at {arguments.ros2 or arguments.address}, waiting for a reader; Ctrl-C ends", flush=True)
+        if isinstance(publisher, Ros2Camera):
+            publisher.wait_for_reader()
+        else:
+            wait_for_reader(publisher, arguments.keys)
         for frame in frames(arguments):
             if frame.intrinsics_guessed and not sent:
                 say(f"warning: {GUESSED}")

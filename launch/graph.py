@@ -21,7 +21,7 @@ from nodes.parameters import ParameterError, build, did_you_mean, parameter_name
 # A tracker that never corrects itself, poses keyframes alone or knows no path need not send these: readers work on what
 # they have. Where some slot is their origin, an edge that misses them is an error all the same: corrections would be
 # lost in silence.
-OPTIONAL_MESSAGES = (msgs.Poses, msgs.TrackedFrame, msgs.TrackerPhase, msgs.Trajectory)
+OPTIONAL_MESSAGES = (msgs.Poses, msgs.TrackedFrame, msgs.CameraPose, msgs.TrackerPhase, msgs.Trajectory)
 
 
 @dataclass(frozen=True)

@@ -142,6 +142,21 @@ class Poses:
 
 
 @dataclass(frozen=True)
+class CameraPose:
+    """Where the tracker sees the camera, as soon as it does; nothing where it does not. For who steers or watches.
+
+    Never sent again: later corrections are in Poses. The motion from the frame before, of which both poses are in the
+    map as it is now, is free of the corrections between them.
+    """
+
+    index: int
+    timestamp: float  # seconds
+    world_from_cam: Annotated[np.ndarray, "float64 4 4"]
+    segment: int  # part of the map, see Keyframe
+    world_from_previous: Annotated[np.ndarray, "float64 4 4"] | None = None  # the frame before; None: it has no pose
+
+
+@dataclass(frozen=True)
 class TrackerPhase:
     """What the tracker does from a frame on, where it changes; it begins with "initializing". For who watches."""
 
@@ -224,6 +239,7 @@ Message = (
     | Depth
     | FusedKeyframe
     | Poses
+    | CameraPose
     | TrackerPhase
     | Trajectory
     | SplatMap

@@ -1,4 +1,4 @@
-"""Frame -> Keyframe, Poses, TrackerPhase, Trajectory: the weight-free tracker (mvsgs_core.tracking)."""
+"""Frame -> Keyframe, Poses, CameraPose, TrackerPhase, Trajectory: the weight-free tracker (mvsgs_core.tracking)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msgs import Frame, Keyframe, TrackedFrame
+from msgs import CameraPose, Frame, Keyframe, TrackedFrame
 from mvsgs_core import geometry
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.coarse_depth import coarse_map
@@ -71,6 +71,10 @@ class Tracker(TrackerNode):
             velocity=velocity,
             readout_time=0.0 if velocity is None else self._readout_time,
         )
+
+    def _camera_pose(self, frame: Frame) -> CameraPose | None:
+        found = self.core.newest_pose()
+        return None if found is None else CameraPose(frame.index, frame.timestamp, **found._asdict())
 
     def _between(self, found: Between) -> TrackedFrame:
         frame, velocity = self._frames[found.index], found.velocity if self.config.rectify_rolling_shutter else None

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, Protocol
 
-from msgs import Frame, Keyframe, Poses, TrackedFrame, TrackerPhase, Trajectory
+from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame, TrackerPhase, Trajectory
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.phase import Phase
@@ -65,9 +65,12 @@ class TrackerNode(Node, ABC):
         """Seconds of the rolling shutter that was taken out of the keyframes' images."""
         return 0.0
 
-    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame | TrackerPhase]:
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase]:
         self._frames[frame.index] = frame
-        yield from self._send(self._add(frame))
+        update = self._add(frame)
+        if CameraPose not in self.unread and (pose := self._camera_pose(frame)) is not None:
+            yield pose  # first: who waits for it steers by it
+        yield from self._send(update)
         if self.core.phase != self._phase:
             self._phase = self.core.phase
             yield TrackerPhase(frame.index, frame.timestamp, self._phase.value)
@@ -80,6 +83,10 @@ class TrackerNode(Node, ABC):
             self.stats.nothing(self.core.nothing)
         found = {"focal_factor": self._focal_factor, "readout_time": self._readout_time}
         yield Trajectory(**vars(self.core.trajectory()) | found)
+
+    def _camera_pose(self, frame: Frame) -> CameraPose | None:
+        """Of a tracker that knows the pose of a frame as it comes."""
+        return None
 
     def _between(self, found: Between) -> TrackedFrame:
         """Of a tracker that poses frames between keyframes while the stream runs."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import msgs
-from msgs import Frame, Keyframe, Poses, TrackedFrame, TrackerPhase, TrackingState, Trajectory
+from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame, TrackerPhase, TrackingState, Trajectory
 from nodes import handlers, outputs
 from nodes.droid_tracker import DroidTracker
 from tests.support.sequences import synthetic
@@ -26,7 +26,7 @@ def run(config: DroidTracker.Config, count: int = COUNT) -> tuple[DroidTracker, 
 
 def test_contract() -> None:
     assert handlers(DroidTracker).keys() == {Frame}
-    assert set(outputs(DroidTracker)) == {Keyframe, Poses, TrackedFrame, TrackerPhase, Trajectory}
+    assert set(outputs(DroidTracker)) == {Keyframe, Poses, TrackedFrame, CameraPose, TrackerPhase, Trajectory}
 
 
 @pytest.mark.slow

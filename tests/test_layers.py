@@ -41,7 +41,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "nodes/ros2": (),
     "nodes": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "mvsgs_core/*"),
     "launch": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "mvsgs_core/mapping", "mvsgs_core/evaluation"),
-    "examples": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes", "mvsgs_core/datasets"),
+    "examples": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "nodes", "mvsgs_core/datasets"),
     "bench": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "nodes", "launch", "mvsgs_core/*"),
 }
 

@@ -84,6 +84,24 @@ def followed_pose(record: FrameRecord, graph: KeyframeGraph, solver: Solver) -> 
     return None if found.failure or found.inliers < AGREEMENT else geometry.inverse(found.cam_from_world)
 
 
+def seen_pose(records: list[FrameRecord], k: int, graph: KeyframeGraph) -> tuple[np.ndarray, int] | None:
+    """Pose (4, 4) world_from_cam of a frame as it was followed, on its keyframe as that is now, and its segment.
+
+    `followed_pose` solves it anew and is exact. None where the frame has none (yet).
+    """
+    record = records[k]
+    if record.same_as is not None:
+        record = next(r for r in reversed(records[:k]) if r.index == record.same_as)
+    own = graph.keyframes.get(record.index)
+    if own is not None:
+        return graph.world_from_cam(record.index), own.segment
+    if record.reference is None or record.reference not in graph.keyframes:
+        return None
+    relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
+    segment = graph.keyframes[record.reference].segment
+    return graph.world_from_cam(record.reference) @ geometry.inverse(relative), segment
+
+
 def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: Solver) -> Trajectory:
     """Final poses: a keyframe's own, else motion-only bundle adjustment against the reference as it is now."""
     n = len(records)
@@ -123,4 +141,4 @@ def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: S
     )
 
 
-__all__ = ["FrameRecord", "followed_pose", "solve_trajectory"]
+__all__ = ["FrameRecord", "followed_pose", "seen_pose", "solve_trajectory"]

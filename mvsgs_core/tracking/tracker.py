@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, check_device
-from mvsgs_core.tracking.frames import solve_trajectory
+from mvsgs_core.tracking.frames import seen_pose, solve_trajectory
 from mvsgs_core.tracking.graph import Keyframe
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT
@@ -27,6 +28,14 @@ from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
 from mvsgs_core.tracking.session import Session
 from mvsgs_core.trajectory import TrackingState, Trajectory
+
+
+class NewestPose(NamedTuple):
+    """Where the camera is, in the map as it is now."""
+
+    world_from_cam: np.ndarray  # (4, 4)
+    segment: int  # part of the map
+    world_from_previous: np.ndarray | None  # (4, 4) of the frame before; None: it has no pose in that part
 
 
 class Tracker:
@@ -82,6 +91,19 @@ class Tracker:
     def vignetting(self) -> np.ndarray | None:
         """(3,) float32 of all images, see `msgs`; None: there is none."""
         return self.session.photometer.vignetting
+
+    def newest_pose(self) -> NewestPose | None:
+        """Of the frame that was added last; None where the camera is not seen in the map."""
+        session = self._session
+        if session is None or session.phase is not Phase.TRACKING:
+            return None
+        newest = len(session.records) - 1
+        seen = seen_pose(session.records, newest, session.graph)
+        if seen is None:
+            return None
+        before = seen_pose(session.records, newest - 1, session.graph) if newest else None
+        same_part = before is not None and before[1] == seen[1]
+        return NewestPose(*seen, before[0] if before is not None and same_part else None)
 
     def trajectory(self) -> Trajectory:
         """Every frame's pose and exposure, after `finish`."""

@@ -1,0 +1,235 @@
+"""CameraPose, Keyframe, Poses, FusedKeyframe, Preview -> ROS 2: poses, path, transforms, depth, the map as points."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from msgs import CameraPose, FusedKeyframe, Keyframe, Poses, Preview
+from mvsgs_core.camera import scale_intrinsics
+from mvsgs_core.datasets.ros import camera_info_topic
+from nodes import Node
+from nodes.odometry import Odometry
+from nodes.ros2 import forms
+from nodes.ros2.connection import DEFAULT, LATCHED, TF, Connection, Quality, check_installed
+from nodes.ros2.messages import CameraInfo, Image, Message, Path, PointCloud2, PoseStamped, TFMessage
+
+if TYPE_CHECKING:
+    from nodes.ros2.dds import Writer
+
+T = TypeVar("T", bound=Message)
+_REMEMBERED = 1000  # frames whose transforms were sent: a keyframe is among the last of them
+
+
+@dataclass(kw_only=True)
+class Frames:
+    """Names of frames of reference: map -> odom -> camera -> optical."""
+
+    map: str = "map"  # of a part of the stream that shares none with the first: map_1, map_2, ...
+    odom: str = "odom"
+    camera: str = "camera"  # x forward, y left, z up
+    optical: str = "camera_optical_frame"  # x right, y down, z forward: of depth maps
+
+
+@dataclass(kw_only=True)
+class Topics:
+    """Names of topics; with an empty one nothing is published."""
+
+    pose: str = "mvsgs/pose"  # PoseStamped of the camera in the map, with every frame that is tracked
+    path: str = "mvsgs/path"  # Path of the keyframes, corrected
+    points: str = (
+        "mvsgs/points"  # PointCloud2 of the map, when it changed (mapper.preview_period); kept for late readers
+    )
+    depth: str = "mvsgs/depth/image"  # Image (32FC1) of each keyframe, its CameraInfo beside it
+    tf: str = "/tf"  # map -> odom -> camera
+    tf_static: str = "/tf_static"  # camera -> optical; empty where the robot's description has it
+
+
+@dataclass
+class _Placed:
+    """A keyframe as it is now."""
+
+    timestamp: float | None  # None: only a correction came so far
+    world_from_cam: np.ndarray
+    scale: float
+    segment: int | None
+
+
+class Ros2Publisher(Node):
+    """What a robot needs, while the map grows. Only watches: the run goes on without it.
+
+    Stamps are those of the images, so that time may be a simulation's. The axes are ROS's; the map begins at the first
+    keyframe's camera, level if that is. Lengths are in the map's unit, which a single camera cannot know: `unit`.
+    """
+
+    @dataclass(kw_only=True)
+    class Config(Connection):
+        frames: Frames = field(default_factory=Frames)
+        topics: Topics = field(default_factory=Topics)
+        unit: float = 1.0  # meters in one unit of the map, where you know it
+        reliable: bool = True  # pose, path and depth; false: best effort, which readers that ask for more do not get
+        queue: int = DEFAULT.depth  # messages of a topic that a slow reader may be behind
+        max_points: int = 100000  # of the map; more are thinned evenly
+        min_opacity: float = 0.5  # of splats that are shown as points
+
+        def __post_init__(self) -> None:
+            super().__post_init__()
+            if not self.unit > 0 or self.queue < 1 or self.max_points < 1:
+                raise ValueError("unit must be above 0, queue and max_points at least 1")
+            names = list(vars(self.frames).values())
+            if not all(names) or len(set(names)) < len(names):
+                raise ValueError(f"frames must have four different names, got {names}")
+            for name in filter(None, vars(self.topics).values()):
+                self.topic(name)
+
+    config: Config
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        from nodes.ros2.dds import Participant
+
+        c, topics = self.config, self.config.topics
+        self._participant = Participant(c)
+        live = Quality(c.reliable, c.queue)
+        self._pose = self._writer(topics.pose, PoseStamped, live)
+        self._path = self._writer(topics.path, Path, live)
+        self._points = self._writer(topics.points, PointCloud2, LATCHED)
+        self._depth = self._writer(topics.depth, Image, live)
+        self._info = self._writer(camera_info_topic(topics.depth) if topics.depth else "", CameraInfo, live)
+        self._tf = self._writer(topics.tf, TFMessage, TF)
+        self._tf_static = self._writer(topics.tf_static, TFMessage, LATCHED)
+        self._odometry = Odometry()
+        self._keyframes: dict[int, _Placed] = {}
+        self._sent: dict[int, None] = {}  # frames with their transforms, the newest last
+        self._newest = float("-inf")  # timestamp of a pose
+        self._by_frame = False  # the tracker sends CameraPose
+        self._shown: tuple[int, int] | None = None  # keyframe and iterations of the map that is published
+        self._write(self._tf_static, self._static_transform())
+        where = f"domain {c.number} on interface={c.interface}"
+        self.stats.values["ros2"] = where
+        logging.info("publishing to ROS 2: %s", where)
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        check_installed()
+
+    def on_camera_pose(self, message: CameraPose) -> Iterator[None]:
+        self._by_frame = True
+        odom_from_cam = self._odometry.follow(message.world_from_cam, message.world_from_previous)
+        self._send_pose(message.index, message.timestamp, message.segment, message.world_from_cam, odom_from_cam)
+        yield from ()
+
+    def on_keyframe(self, message: Keyframe) -> Iterator[None]:
+        before = max((k for k, placed in self._keyframes.items() if placed.timestamp is not None), default=None)
+        placed = self._keyframes.get(message.index)
+        if placed is None:
+            placed = _Placed(None, message.world_from_cam.copy(), message.scale, message.segment)
+            self._keyframes[message.index] = placed
+        placed.timestamp = message.timestamp
+        placed.segment = message.segment if placed.segment is None else placed.segment
+        if message.index not in self._sent:
+            pose = placed.world_from_cam
+            if self._by_frame:  # one of the first, which were solved together
+                odom_from_cam = self._odometry.place(pose)
+            else:
+                last = None if before is None else self._keyframes[before]
+                known = last is not None and last.segment == placed.segment
+                odom_from_cam = self._odometry.follow(pose, last.world_from_cam if last and known else None)
+            self._send_pose(message.index, message.timestamp, placed.segment, pose, odom_from_cam)
+        self._send_path(placed.segment)
+        yield from ()
+
+    def on_poses(self, poses: Poses) -> Iterator[None]:
+        for i, index in enumerate(poses.index.tolist()):
+            segment = None if poses.segment is None else int(poses.segment[i])
+            pose, scale = poses.world_from_cam[i].copy(), float(poses.scale[i])
+            known = self._keyframes.get(index)
+            if known is None:
+                self._keyframes[index] = _Placed(None, pose, scale, segment)
+            else:
+                known.world_from_cam, known.scale = pose, scale
+                known.segment = known.segment if segment is None else segment
+        yield from ()
+
+    def on_fused_keyframe(self, fused: FusedKeyframe) -> Iterator[None]:
+        placed = self._keyframes.get(fused.index)
+        scale = self.config.unit * (1.0 if placed is None else placed.scale / fused.scale)
+        size = fused.depth.shape[0], fused.depth.shape[1]
+        intrinsics = scale_intrinsics(fused.intrinsics, fused.image.shape[:2], size)
+        at = forms.header(fused.timestamp, self.config.frames.optical)
+        self._write(self._info, forms.camera_info(at, intrinsics, size))
+        self._write(self._depth, forms.depth_image(at, np.float32(scale) * fused.depth))
+        yield from ()
+
+    def on_preview(self, preview: Preview) -> Iterator[None]:
+        state = preview.index, preview.iterations
+        if self._points is not None and state != self._shown:
+            self._shown = state
+            self._write(self._points, self._cloud(preview))
+        yield from ()
+
+    def _send_pose(
+        self, index: int, timestamp: float, segment: int, world_from_cam: np.ndarray, odom_from_cam: np.ndarray
+    ) -> None:
+        """Its transforms, and its pose if it is the newest: of an earlier frame nobody asks where the camera is."""
+        frames, unit = self.config.frames, self.config.unit
+        world = self._map(segment)
+        map_from_odom = forms.body_pose(self._odometry.map_from_odom, unit)
+        transforms = [
+            forms.transform(timestamp, world, frames.odom, map_from_odom),
+            forms.transform(timestamp, frames.odom, frames.camera, forms.body_pose(odom_from_cam, unit)),
+        ]
+        self._write(self._tf, TFMessage(transforms))
+        self._sent[index] = None
+        while len(self._sent) > _REMEMBERED:
+            del self._sent[next(iter(self._sent))]
+        if timestamp > self._newest:
+            self._newest = timestamp
+            self._write(self._pose, self._stamped(timestamp, world, world_from_cam))
+
+    def _send_path(self, segment: int) -> None:
+        """The keyframes of a part of the stream as they are now."""
+        if self._path is None:
+            return
+        world = self._map(segment)
+        placed = [p for _, p in sorted(self._keyframes.items()) if p.segment == segment and p.timestamp is not None]
+        poses = [self._stamped(p.timestamp, world, p.world_from_cam) for p in placed if p.timestamp is not None]
+        self._write(self._path, Path(poses[-1].header, poses))
+
+    def _cloud(self, preview: Preview) -> PointCloud2:
+        c = self.config
+        placed = self._keyframes.get(preview.index)
+        segment = 0 if placed is None or placed.segment is None else placed.segment
+        seen = np.flatnonzero((preview.opacities >= c.min_opacity) & np.isfinite(preview.means).all(axis=1))
+        seen = seen[:: max(1, -(-len(seen) // c.max_points))]
+        means = preview.means[seen].astype(np.float64)
+        world = means if preview.origin is None else means + preview.origin
+        at = forms.header(max(self._newest, 0.0), self._map(segment))
+        return forms.point_cloud(at, c.unit * world @ forms.BODY_FROM_OPTICAL[:3, :3].T, preview.colors[seen])
+
+    def _stamped(self, timestamp: float, world: str, world_from_cam: np.ndarray) -> PoseStamped:
+        pose = forms.pose(forms.body_pose(world_from_cam, self.config.unit))
+        return PoseStamped(forms.header(timestamp, world), pose)
+
+    def _static_transform(self) -> TFMessage:
+        frames = self.config.frames
+        return TFMessage([forms.transform(0.0, frames.camera, frames.optical, forms.BODY_FROM_OPTICAL)])
+
+    def _map(self, segment: int) -> str:
+        return self.config.frames.map + (f"_{segment}" if segment else "")
+
+    def _writer(self, topic: str, message_type: type[T], quality: Quality) -> Writer[T] | None:
+        return self._participant.writer(self.config.topic(topic), message_type, quality) if topic else None
+
+    def _write(self, writer: Writer[T] | None, message: T) -> None:
+        if writer is None:
+            return
+        with self.stats.time("publish"):
+            if writer.write(message):
+                self.stats.count("published")
+            else:
+                self.stats.skip("messages that a reader was too slow for")
