@@ -192,8 +192,8 @@ class Ros2Publisher(Node):
             self._write(self._pose, self._stamped(timestamp, world, world_from_cam))
 
     def _send_path(self, segment: int) -> None:
-        """The keyframes of a part of the stream as they are now."""
-        if self._path is None:
+        """The keyframes of a part of the stream as they are now; it grows, and is not made for nobody."""
+        if self._path is None or not self._path.readers:
             return
         world = self._map(segment)
         placed = [p for _, p in sorted(self._keyframes.items()) if p.segment == segment and p.timestamp is not None]
