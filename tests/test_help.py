@@ -111,7 +111,7 @@ def test_the_graph_is_shown_on_one_screen_and_nothing_runs(tmp_path: Path) -> No
     assert ["mvs=plane_sweep", "nodes.mvs.Mvs", "external"] in [line.split() for line in lines]
     assert ["Depth", "->", "depth_fusion", "reliable"] in [line.split() for line in lines]
     assert ["viewer=viser", "nodes.viewer.Viewer", "observer"] in [line.split() for line in lines]
-    assert "off: recorder" in lines
+    assert "off: publisher, recorder" in lines
     assert not (tmp_path / "new").exists()
 
 

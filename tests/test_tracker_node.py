@@ -40,38 +40,6 @@ def test_contracts() -> None:
 
 
 @pytest.mark.slow
-def test_the_cameras_pose_comes_with_each_frame() -> None:
-    frames, truths = messages()
-    node = Tracker()
-    poses: dict[int, CameraPose] = {}
-    for frame in frames:
-        sent = list(node.on_frame(frame))
-        assert len(of_type(sent, CameraPose)) <= 1
-        poses |= {pose.index: pose for pose in of_type(sent, CameraPose)}
-    trajectory = list(node.on_end())[-1]
-    tracked = [int(i) for i in trajectory.index if i in poses]
-    assert len(tracked) >= len(frames) - min(poses)  # each, from the first on
-    scale = np.linalg.norm(trajectory.world_from_cam[-1, :3, 3] - trajectory.world_from_cam[0, :3, 3])
-    for index in tracked:
-        final = trajectory.world_from_cam[index]
-        assert np.linalg.norm(poses[index].world_from_cam[:3, 3] - final[:3, 3]) < 0.05 * scale
-        assert poses[index].segment == trajectory.segment[index]
-        assert poses[index].timestamp == frames[index].timestamp
-    true = [truth.world_from_cam for truth in truths]
-    for before, index in itertools.pairwise(tracked):
-        previous = poses[index].world_from_previous
-        if previous is None:
-            assert index == tracked[0]
-            continue
-        motion, truth = (
-            geometry.inverse(a) @ b for a, b in ((previous, poses[index].world_from_cam), (true[before], true[index]))
-        )
-        assert np.linalg.norm(geometry.so3_log(geometry.inverse(motion)[:3, :3] @ truth[:3, :3])) < 0.01
-    node.unread = frozenset({CameraPose})
-    assert not of_type(list(node.on_frame(frames[-1])), CameraPose)
-
-
-@pytest.mark.slow
 def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
     frames, _ = messages()
     node = Tracker()

@@ -62,16 +62,21 @@ class Connection:
             where = 'address="127.0.0.1"'
         else:
             where = f'{"address" if _is_address(self.interface) else "name"}="{self.interface}"'
-        # beyond the limit a stranger's sample would fill the memory; other programs that use unicast look at 10 ports
+        # beyond the limit a stranger's sample would fill the memory; where this process waits for its turn, images of
+        # some time wait in the kernel, as many as it lets (net.core.rmem_max)
+        internal = (
+            f'<MaxSampleSize>{MAX_SAMPLE_BYTES} B</MaxSampleSize><SocketReceiveBufferSize max="{SOCKET_BUFFER}"/>'
+        )
         ours = (
             f"<CycloneDDS><Domain><General><Interfaces><NetworkInterface {where}/></Interfaces></General>"
-            f"<Internal><MaxSampleSize>{MAX_SAMPLE_BYTES} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
+            f"<Internal>{internal}</Internal></Domain></CycloneDDS>"
         )
         theirs = os.environ.get("CYCLONEDDS_URI", "") if self.interface == ANY else ""
         return ours + (f",{theirs}" if theirs else "")
 
 
 MAX_SAMPLE_BYTES = 2**28 + 2**21  # of a message, as in bags
+SOCKET_BUFFER = "16 MB"
 
 
 @dataclass(frozen=True)
