@@ -359,9 +359,7 @@ def test_a_program_that_ends_is_said_to_be_lost_and_so_is_its_return(camera: str
     thread = threading.Thread(target=one_after_the_other, daemon=True)
     thread.start()
     taken = [message for message in node.run() if isinstance(message, Frame)]
-    thread.join()
-    assert numbers(taken)[0] < 10
-    assert numbers(taken)[-1] >= 100
+    assert numbers(taken)[0] < 10 <= 100 <= numbers(taken)[-1]
     lost, back = (text for text in node.stats.warnings if "loss 1" in text)
     assert lost == "the camera was lost (nobody publishes its images any more; loss 1): it is waited for up to 20 s"
     assert back.startswith("the camera is back after")
