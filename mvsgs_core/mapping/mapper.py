@@ -162,9 +162,14 @@ class OnlineMapper:
         return True
 
     def refine(self, done: int, total: int) -> None:
-        """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates."""
+        """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates.
+
+        Halfway, when the keyframes show what the map needs, it is rid of what it does not; the rest makes up for it.
+        """
         if not self.views or len(self.state) == 0:
             return
+        if done == total // 2:
+            self.trainer.prune(self.keyframes.with_image, self.median_depth)
         with self.log.time("refinement"):
             self.trainer.rate = 0.1 ** (done / max(total, 1))
             images = self.keyframes.trained

@@ -13,6 +13,7 @@ from mvsgs_core.mapping.exposure import ImageFormation, unclipped
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import LossInputs, frequency_of, training_loss, weights_of
 from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.pruning import prune
 from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
@@ -78,15 +79,29 @@ class Trainer:
             for name, count in vars(change).items():
                 self.log.count(name, count)
 
+    def prune(self, views: list[TrainingView], median_depth: float) -> None:
+        """Removes the splats that the images of these keyframes do without, see `pruning`."""
+        config = self.config.density_control
+        if config.mode == "none":
+            return
+
+        def render(splats: Splats, view: TrainingView) -> Render:
+            exposure = None if view.measured is None else view.exposure.detach()
+            return self._rasterize(splats, view, view.intrinsics, view.size, median_depth, exposure, None, weights=True)
+
+        with self.log.time("density_control"):
+            generator = torch.Generator().manual_seed(self.config.seed)
+            self.log.count("needless", prune(self.state, views, render, config.needless, generator))
+
     def _rasterize(
         self, splats: Splats, view: TrainingView, intrinsics: np.ndarray, size: tuple[int, int], median_depth: float,
-        exposure: Tensor | None, twist: Tensor | None,
+        exposure: Tensor | None, twist: Tensor | None, *, weights: bool = False,
     ) -> Render:  # fmt: skip
         training = self.config.training
         render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
             exposure=exposure, pose_delta=twist, readout=view.readout, near=training.near * median_depth,
-            antialiased=training.antialiased, threads=self.config.threads,
+            antialiased=training.antialiased, weights=weights, threads=self.config.threads,
         )  # fmt: skip
         factor = self._vignetting(intrinsics, size)
         if factor is not None:
