@@ -28,7 +28,8 @@ def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
         write_ply(out, final, fold=options.fold)
     else:
         {".splat": write_splat, ".spz": write_spz}[out.suffix](out, final)
-    told = "; antialiased: a viewer must be told, or shows it too bright" if final.antialiased else ""
+    silent = final.antialiased and out.suffix != ".spz"
+    told = "; antialiased: a viewer must be told, or shows it too bright" if silent else ""
     return f"{len(final.splats)} splats, {out.stat().st_size} bytes{told}"
 
 

@@ -15,6 +15,7 @@ from mvsgs_core.rasterizer.spherical_harmonics import C0
 
 SPZ_STEP = 1.0 / 4096.0  # .spz keeps positions as multiples of this
 SPZ_REACH = 2048.0  # in 24 bits
+SPZ_4, SPZ_FLAGS, SPZ_ANTIALIASED = b"NGSP\x04\0\0\0", 14, 1  # magic and version, place of the flags, one of them
 
 
 def write_splat(path: Path, final: Snapshot) -> None:
@@ -74,6 +75,18 @@ def write_spz(path: Path, final: Snapshot) -> None:
         cloud.point["f_rest"] = tensor(splats.sh[:, 1:].numpy())
     if not o3d.t.io.write_point_cloud(str(path), cloud):
         raise OSError(f"open3d could not write {path}")
+    if final.antialiased:
+        _flag_antialiased(path)
+
+
+def _flag_antialiased(path: Path) -> None:
+    """Sets that flag in the header of a .spz of version 4, which open3d leaves 0."""
+    with path.open("r+b") as file:
+        head = bytearray(file.read(SPZ_FLAGS + 1))
+        if head[:8] != SPZ_4 or len(head) <= SPZ_FLAGS:
+            raise OSError(f"{path}: open3d wrote no .spz of version 4, in which a map is said to be antialiased")
+        file.seek(SPZ_FLAGS)
+        file.write(bytes([head[SPZ_FLAGS] | SPZ_ANTIALIASED]))
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

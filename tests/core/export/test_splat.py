@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import shutil
 import subprocess
 from dataclasses import replace
@@ -105,6 +106,16 @@ def test_a_converter_that_is_installed_agrees_on_all_formats(tmp_path: Path) -> 
         np.testing.assert_allclose(np.sort(read["map.splat"][name]), np.sort(read["map.ply"][name]), atol=1e-5)
     for k in range(45):
         np.testing.assert_allclose(read["map.spz"][f"f_rest_{k}"], read["map.ply"][f"f_rest_{k}"], atol=1.0 / 8)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_spz_says_whether_the_map_is_antialiased(tmp_path: Path, antialiased: bool) -> None:
+    write_spz(tmp_path / "map.spz", replace(few_splats(), antialiased=antialiased))
+    (tmp_path / "converted.spz").write_bytes(CONVERTED)
+    ours, other = (tmp_path / "map.spz").read_bytes(), gzip.decompress(CONVERTED)
+    assert ours[8:14] == other[8:14]  # number of splats, degree, bits of a fraction: the header is where it is read
+    assert ours[14] == int(antialiased)
+    assert_close(read_spz(tmp_path / "map.spz"), read_spz(tmp_path / "converted.spz"))
 
 
 def test_spz_read_by_another_program_renders_as_the_map_from_the_turned_pose(tmp_path: Path) -> None:
