@@ -28,7 +28,7 @@ class DensityControlConfig:
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
     prune_opacity: float = 0.02  # 0 to 1; below: removed
     prune_scale: float = 0.5  # maximum standard deviation in median depths; above: removed
-    needless: float = 0.05  # of the keyframes' squared error that splats taken out at the end may add; 0: none are
+    needless: float = 0.02  # of the keyframes' squared error that splats taken out at the end may add; 0: none are
     max_splats: int = 1_000_000  # no growth beyond
 
 
