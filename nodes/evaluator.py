@@ -180,10 +180,7 @@ def _exposure(found: dict[str, Any] | None) -> str:
     if found is None:
         return ""
     vignetting = "" if found["vignetting"] is None else " and its vignetting"
-    return (
-        f"Renders have each frame's exposure{vignetting} as the tracker estimated it from matches to keyframes, with "
-        f"what training added to the keyframes' (median {100 * found['remainder']:.1f} %) interpolated in time. "
-    )
+    return f"Renders have each frame's exposure{vignetting} as the tracker estimated it from matches to keyframes. "
 
 
 def _plain(value: Any) -> Any:

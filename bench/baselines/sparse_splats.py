@@ -2,8 +2,8 @@
 
 Kerbl et al. 2023: one isotropic splat a point, as large as the mean distance to its three nearest, opacity 0.1; random
 views at full resolution; clone, split and prune. No opacity reset, as in the online mapper, whose thresholds it shares.
-Where a view has an exposure, what the map needs beside it is trained, as the online mapper trains it; a view that is
-only rendered has of that what its neighbors in time have.
+Where a view has an exposure, what the map needs beside it is trained; a view that is only rendered has of that what its
+neighbors in time have.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
+
+EXPOSURE_RATE = 1e-3  # learning rate of a view's affine
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class SparseMap:
         self.unit = _median_depth(views, points)
         self.state = MapState(1, torch.device("cpu"))
         self._photometry = ImageFormation(vignetting=vignetting)
-        self._trainer = Trainer(config.mapper, self.state, Stats(), self._photometry)
+        self._trainer = Trainer(config.mapper, self.state, Stats(), self._photometry, EXPOSURE_RATE)
         self.seconds = 0.0
         self._random = np.random.default_rng(config.mapper.seed)
         self._given = views

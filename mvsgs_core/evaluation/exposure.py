@@ -1,7 +1,7 @@
-"""Exposure and white balance of every frame: the tracker's, in the gauge of the map, with what the map trained beside.
+"""Exposure and white balance of every frame: the tracker's, in the gauge of the map.
 
-Nothing is fitted to a frame that is scored: the tracker's exposure comes from the frame's matches to keyframes, and
-what the map found for its keyframes beside the tracker's is interpolated in time.
+Nothing is fitted to a frame that is scored: the tracker's exposure comes from the frame's matches to keyframes. What a
+map has for its keyframes beside the tracker's, the gauge and what was trained, is interpolated in time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ class FrameExposures:
     """Color affines of N frames, from the map's colors to the photographs'."""
 
     affines: np.ndarray  # (N, 3, 4) float32
-    remainders: np.ndarray  # (K, 3, 4) float64 of keyframes: what the map's affine does before the tracker's
 
 
 def frame_exposures(
@@ -39,7 +38,7 @@ def frame_exposures(
         tracked = _interpolated(timestamps, timestamps[known], measured[known])
     remainders = compose(inverse(tracked[rows]), affines)
     found = compose(tracked, _interpolated(timestamps, timestamps[rows], remainders))
-    return FrameExposures(found.astype(np.float32), remainders)
+    return FrameExposures(found.astype(np.float32))
 
 
 def gains(affines: np.ndarray) -> np.ndarray:
@@ -52,16 +51,13 @@ def summary(
 ) -> dict[str, Any] | None:
     """For report.json, of the keyframes `keyframes` (K,) and the map's affines (K, 3, 4) of them; None: nothing known.
 
-    `gain`: of red, green and blue for each keyframe. `remainder`: the median, over the keyframes, of the relative
-    difference between the map's gain and the tracker's, one factor common to all aside.
+    `gain`: of red, green and blue for each keyframe.
     """
     if found is None and vignetting is None:
         return None
-    beside = 1.0 if found is None else gains(found.remainders).mean(axis=1)
     return {
         "keyframes": keyframes.tolist(),
         "gain": gains(affines).tolist(),
-        "remainder": float(np.median(np.abs(beside / np.median(beside) - 1.0))),
         "vignetting": None if vignetting is None else vignetting.tolist(),
     }
 

@@ -23,7 +23,6 @@ class TrainingConfig:
     frequency_horizon: int = 60  # visits of a keyframe over which the frequency-modulated mask runs through its bands
     selective: bool = True  # step only the splats that were seen
     exposure: bool = True  # use the exposures and the vignetting that the tracker estimates
-    exposure_rate: float = 1e-3  # learning rate of what a keyframe's differs from that
     refine_poses: bool = False  # train the keyframes' poses too, the first one's excepted
     pose_rate: float = 4e-5  # learning rate of them, radians and median depths a step
     pose_visits: int = 5  # iterations on a keyframe before its pose is trained: new splats show nothing new

@@ -29,11 +29,14 @@ class Trainer:
     """
 
     def __init__(
-        self, config: MapperConfig, state: MapState, log: Stats, photometry: ImageFormation | None = None
+        self, config: MapperConfig, state: MapState, log: Stats, photometry: ImageFormation | None = None,
+        exposure_rate: float = 0.0,
     ) -> None:  # fmt: skip
-        """photometry: None: no camera is known to have an exposure."""
+        """photometry: None: no camera is known to have an exposure. exposure_rate: learning rate of the exposures, for
+        views of which nobody measured any; 0: they stay as they are."""
         self.config, self.state, self.log = config, state, log
         self.photometry = ImageFormation() if photometry is None else photometry
+        self.exposure_rate = exposure_rate
         self.iterations = 0
         self.rate = 1.0  # factor on all learning rates: falls during the final refinement
         self.generator = torch.Generator().manual_seed(config.seed)  # of density control
@@ -56,7 +59,7 @@ class Trainer:
     def step(self, view: TrainingView, median_depth: float, *, refining: bool = False) -> None:
         """One iteration on a keyframe. median_depth: of the scene; refining: no splat is added or removed."""
         training = self.config.training
-        exposure = None if view.measured is None else view.exposure.requires_grad_(True)
+        exposure = None if view.measured is None else view.exposure.requires_grad_(self.exposure_rate > 0.0)
         moving = training.refine_poses and not view.fixed and view.visits >= training.pose_visits
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
         render = self._rasterize(self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist)
@@ -157,8 +160,8 @@ class Trainer:
     def _step_camera(self, view: TrainingView, twist: Tensor | None, median_depth: float) -> None:
         """Adam on the keyframe's exposure and pose, where they are trained."""
         training = self.config.training
-        if view.measured is not None:
-            step_exposure(view, training.exposure_rate)
+        if view.measured is not None and self.exposure_rate > 0.0:
+            step_exposure(view, self.exposure_rate)
         if twist is not None and twist.grad is not None:
             angle = training.pose_rate * self.rate
             if not step_pose(view, twist.grad.numpy(), angle, angle * median_depth):

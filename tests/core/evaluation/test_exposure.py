@@ -39,7 +39,6 @@ def test_what_the_map_trained_beside_is_linear_in_time_between_keyframes() -> No
     assert report is not None
     assert report["keyframes"] == [7, 9]
     np.testing.assert_allclose(report["gain"], [[0.55] * 3, [1.8] * 3], atol=1e-6)
-    np.testing.assert_allclose(report["remainder"], 0.1, atol=1e-6)
     assert report["vignetting"] == [-0.1, 0, 0]
 
 

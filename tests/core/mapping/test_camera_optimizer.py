@@ -23,8 +23,9 @@ def views(unit: float = 1.0) -> list[RGBDKeyframe]:
     return [rgbd_keyframe(5 * k, pose_on_arc(t), unit=unit) for k, t in enumerate(TIMES)]
 
 
-def mapped(given: list[RGBDKeyframe], training: TrainingConfig) -> OnlineMapper:
+def mapped(given: list[RGBDKeyframe], training: TrainingConfig, exposure_rate: float = 0.0) -> OnlineMapper:
     mapper = OnlineMapper(MapperConfig(iterations=25, refinement=0, training=training))
+    mapper.trainer.exposure_rate = exposure_rate
     for view in given:
         mapper.add_keyframe(view)
     for _ in range(100):
@@ -93,7 +94,7 @@ def test_what_an_exposure_is_off_by_is_told_from_the_map_and_the_mean_stays_the_
     given = [replace(view, exposure=1.01 * np.eye(3, 4, dtype=np.float32)) for view in views()]
     bright = np.clip(np.round(given[1].image * 1.15), 0, 255).astype(np.uint8)
     given[1] = replace(given[1], image=bright)
-    mapper = mapped(given, replace(TRAINING, refine_poses=False, exposure_rate=3e-3))
+    mapper = mapped(given, replace(TRAINING, refine_poses=False), exposure_rate=3e-3)
     final = mapper.snapshot()
     np.testing.assert_allclose(final.exposures.mean(axis=0), np.eye(3, 4), atol=1e-5)
     gains = final.exposures[:, :3, :3].sum(axis=2).mean(axis=1)
