@@ -169,7 +169,7 @@ def bytes_of_rosbags() -> list[Row]:
 def _examples() -> list[Any]:
     """One of each type that is read or written."""
     at = Header(Time(7, 8), "camera")
-    pose = forms.pose(np.eye(4))
+    (pose,) = forms.poses(np.eye(4)[None])
     transform = forms.transform(7.0, "map", "odom", np.eye(4))
     stamped = messages.PoseStamped(at, pose)
     image = _picture(0)[:5, :7]

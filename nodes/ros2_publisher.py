@@ -189,7 +189,8 @@ class Ros2Publisher(Node):
             del self._sent[next(iter(self._sent))]
         if timestamp > self._newest:
             self._newest = timestamp
-            self._write(self._pose, self._stamped(timestamp, world, world_from_cam))
+            (stamped,) = self._stamped([timestamp], world, world_from_cam[None])
+            self._write(self._pose, stamped)
 
     def _send_path(self, segment: int) -> None:
         """The keyframes of a part of the stream as they are now; it grows, and is not made for nobody."""
@@ -197,7 +198,8 @@ class Ros2Publisher(Node):
             return
         world = self._map(segment)
         placed = [p for _, p in sorted(self._keyframes.items()) if p.segment == segment and p.timestamp is not None]
-        poses = [self._stamped(p.timestamp, world, p.world_from_cam) for p in placed if p.timestamp is not None]
+        stamps = [p.timestamp for p in placed if p.timestamp is not None]
+        poses = self._stamped(stamps, world, np.stack([p.world_from_cam for p in placed]))
         self._write(self._path, Path(poses[-1].header, poses))
 
     def _cloud(self, preview: Preview) -> PointCloud2:
@@ -211,9 +213,10 @@ class Ros2Publisher(Node):
         at = forms.header(max(self._newest, 0.0), self._map(segment))
         return forms.point_cloud(at, c.unit * world @ forms.BODY_FROM_OPTICAL[:3, :3].T, preview.colors[seen])
 
-    def _stamped(self, timestamp: float, world: str, world_from_cam: np.ndarray) -> PoseStamped:
-        pose = forms.pose(forms.body_pose(world_from_cam, self.config.unit))
-        return PoseStamped(forms.header(timestamp, world), pose)
+    def _stamped(self, timestamps: list[float], world: str, world_from_cam: np.ndarray) -> list[PoseStamped]:
+        """Of poses (N, 4, 4)."""
+        poses = forms.poses(forms.body_pose(world_from_cam, self.config.unit))
+        return [PoseStamped(forms.header(t, world), pose) for t, pose in zip(timestamps, poses, strict=True)]
 
     def _static_transform(self) -> TFMessage:
         frames = self.config.frames

@@ -41,9 +41,11 @@ def header(seconds: float, frame: str) -> Header:
     return Header(Time.of(seconds), frame)
 
 
-def pose(parent_from_child: np.ndarray) -> Pose:
-    w, x, y, z = quaternion_from_rotation(parent_from_child[:3, :3]).tolist()
-    return Pose(Point(*parent_from_child[:3, 3].tolist()), Quaternion(x, y, z, w))
+def poses(parent_from_child: np.ndarray) -> list[Pose]:
+    """(N, 4, 4)."""
+    orientations = quaternion_from_rotation(parent_from_child[:, :3, :3])[:, [1, 2, 3, 0]].tolist()
+    positions = parent_from_child[:, :3, 3].tolist()
+    return [Pose(Point(*position), Quaternion(*orientation)) for position, orientation in zip(positions, orientations)]
 
 
 def transform(seconds: float, parent: str, child: str, parent_from_child: np.ndarray) -> TransformStamped:
