@@ -19,7 +19,6 @@ from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
 from nodes.ros2 import messages
 from nodes.ros2.cdr import CdrError, encode
-from nodes.ros2.connection import LOOPBACK, Connection
 from nodes.ros2_camera import Ros2Camera
 from tests.support.ros2_peer import OWN_DOMAIN, Peer
 
@@ -375,25 +374,3 @@ def test_a_reader_that_wants_more_than_is_offered_is_told_so(peer: Peer, camera:
     peer.advertise(f"{camera}/image_raw", IMAGE, reliable=False)
     with pytest.raises(TimeoutError, match=r"ros2 topic info|nobody publishes"):
         list(Ros2Camera(config(camera, timeout=1.0, reliable=True)).run())
-
-
-def test_names_and_domains_are_those_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Connection().interface == LOOPBACK
-    assert Connection(namespace="robot1").topic("image") == "/robot1/image"
-    assert Connection(namespace="/robot1/").topic("image") == "/robot1/image"
-    assert Connection(namespace="/robot1").topic("/image") == "/image"
-    assert Connection().topic("image") == "/image"
-    for name in ("", "/", "/camera//image", "/1st", "/camera/", "ä", "/a b", "/x-y"):
-        with pytest.raises(ValueError, match="no name of a topic"):
-            Connection().topic(name)
-    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
-    assert Connection().number == 42
-    assert Connection(domain=7).number == 7
-    for said in ("233", "x", "-1"):
-        monkeypatch.setenv("ROS_DOMAIN_ID", said)
-        with pytest.raises(ValueError, match=r"domain|ROS_DOMAIN_ID"):
-            Connection()
-    monkeypatch.setenv("ROS_DOMAIN_ID", "")
-    assert Connection().number == 0
-    with pytest.raises(ValueError, match="interface"):
-        Connection(interface='lo"/><x')
