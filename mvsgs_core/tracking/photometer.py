@@ -39,7 +39,7 @@ class Seen(Protocol):
 
 
 def observed(graph: KeyframeGraph, reference: int, image: TrackingImage, matches: Matches) -> bytes:
-    """What a frame's matches of a keyframe's points say of its light: 152 bytes, none where it is too little."""
+    """What a frame's matches of a keyframe's points say of its light: 224 bytes, none where it is too little."""
     moments = _compared(graph, reference, image, matches.target, matches.alive)
     if moments is None:
         return b""
@@ -68,7 +68,7 @@ class Photometer:
         """(3,) float32, see `msgs`; None: there is none."""
         if not np.any(self.photometry.vignetting):
             return None
-        return vignetting_polynomial(self.photometry.vignetting).astype(np.float32)
+        return vignetting_polynomial(self.photometry.vignetting, self.photometry.vignetting_response).astype(np.float32)
 
     def exposure(self, index: int) -> np.ndarray | None:
         """(3, 4) float32 color affine of a keyframe; None where exposures do not vary."""

@@ -18,8 +18,9 @@ from mvsgs_core.tracking.estimation.response import BRIGHTEST, DARKEST, offset_t
 NOISE = 1.0 / 255.0  # of a window's mean, gray levels 0 to 1: quantization and what is left of the sensor's noise
 SHARE = 1.0  # of a window's spread that counts as its error: a match beside may be off by a window
 MIN_SAMPLES = 30
-TERMS = 6  # 1, what an offset adds, three of the radius, the log ratio
+TERMS = 9  # 1, what an offset adds, three of the radius, what an offset adds to these, the log ratio
 _STEPS = 4  # of reweighting
+_RIDGE = 1e-4  # share of the whole: few samples tell the terms apart
 
 
 class Levels:
@@ -73,11 +74,13 @@ class Samples:
 def log_ratio_moments(
     a: Samples, b: Samples, radial: tuple[np.ndarray, np.ndarray], dark: np.ndarray
 ) -> np.ndarray | None:
-    """Weighted moments (3, 6, 6), a channel each, of z = (1, offset term, radial terms' change, log b / a).
+    """Weighted moments (3, 9, 9), a channel each, of z = (1, offset term, radial terms' change, that of their products
+    with the offset term, log b / a).
 
     radial: terms (N, 3) in a and b. dark (3,): the vignetting as far as it is known, log V = dark · radial; without it
-    the mean levels of the offset term are. Weights are those of independent samples, outliers down-weighted (Cauchy),
-    so that the moments are information. None where there are too few samples.
+    the mean levels of the offset term are, and half of it those of the products. Weights are those of independent
+    samples, outliers from what light changes down-weighted (Cauchy), so that the moments are information. None where
+    there are too few samples.
     """
     known = np.isfinite(a.level).all(axis=1) & np.isfinite(b.level).all(axis=1)
     if known.sum() < MIN_SAMPLES:
@@ -86,27 +89,41 @@ def log_ratio_moments(
     log_a, log_b = np.log(a.level), np.log(b.level)
     ratio, variance = log_b - log_a, a.variance + b.variance
     mean_ratio, sigma = ratio.mean(axis=1), np.sqrt(variance.mean(axis=1))
+    at_a, at_b = (r[known] for r in radial)
+    even = 0.5 * (log_a + log_b - ((at_a + at_b) @ dark)[:, None])  # noise of the ratio is not in it
+    z = np.zeros((3, len(sigma), TERMS))
+    z[..., 0] = 1.0
+    z[..., 1] = offset_term(np.exp(even)).T
+    z[..., 2:5] = at_b - at_a
+    light = z[..., :5].mean(axis=0)  # what it can change: what is off by that is no outlier
     robust, scale = np.ones(len(sigma)), 1.0
     for _ in range(_STEPS):
         weight = robust / sigma**2
-        error = (mean_ratio - (weight @ mean_ratio) / weight.sum()) / sigma
+        normal = (light.T * weight) @ light
+        change = np.linalg.solve(normal + _RIDGE * np.trace(normal) * np.eye(5), light.T @ (weight * mean_ratio))
+        error = (mean_ratio - light @ change) / sigma
         scale = 1.4826 * float(np.median(np.abs(error))) + 1e-9
         robust = 1.0 / (1.0 + (error / (2.0 * scale)) ** 2)
-    z = np.empty((3, len(sigma), TERMS))
-    z[..., 0] = 1.0
-    at_a, at_b = (r[known] for r in radial)
-    even = 0.5 * (log_a + log_b - ((at_a + at_b) @ dark)[:, None])  # noise of the ratio is not in it
-    z[..., 1] = offset_term(np.exp(even)).T
-    z[..., 2:5] = at_b - at_a
-    z[..., 5] = ratio.T
+    half = 0.5 * (weight @ ratio) / weight.sum()  # of the ratio, without the noise of a sample's own
+    for at, sign in ((at_a, -1.0), (at_b, 1.0)):
+        term = offset_term(np.exp(even + sign * half + 0.5 * (at @ dark)[:, None]))
+        z[..., 5:8] += sign * term.T[..., None] * at
+    z[..., 8] = ratio.T
     weight = (robust[:, None] / (variance * scale**2)).T
     return np.asarray(np.einsum("cni,cn,cnj->cij", z, weight, z, optimize=True))
 
 
+def of_response(moments: np.ndarray, response: float) -> np.ndarray:
+    """Moments' columns (..., 9) as those (..., 6) of (1, offset term, radial terms, log ratio), for a vignetting that
+    lifts dark levels `response` times as much as it brightens."""
+    radial = moments[..., 2:5] + response * moments[..., 5:8]
+    return np.concatenate([moments[..., :2], radial, moments[..., 8:]], axis=-1)
+
+
 def backward(moments: np.ndarray) -> np.ndarray:
     """The same seen from b to a: log ratio and radial terms change their sign."""
-    sign = np.array([1.0, 1.0, -1.0, -1.0, -1.0, -1.0])
+    sign = np.array([1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0])
     return np.asarray(moments * sign * sign[:, None])
 
 
-__all__ = ["MIN_SAMPLES", "TERMS", "Levels", "Samples", "backward", "log_ratio_moments"]
+__all__ = ["MIN_SAMPLES", "TERMS", "Levels", "Samples", "backward", "log_ratio_moments", "of_response"]

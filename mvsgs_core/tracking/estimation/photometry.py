@@ -1,8 +1,9 @@
 """Photometric calibration of a graph of images from the gray levels of their matches (Bergmann et al. 2018, DSO 2017).
 
 Of an edge from image a to b, the log ratio of a point's gray levels is, with t(I) = m / I - 1 (response.py),
-    log I_b - log I_a = (g_b - g_a) + (h_b - h_a) t(I) + log V(r_b) - log V(r_a) + u + w t(I) + noise
-with gain g and lift h of an image and the vignetting V (three parameters). What a whole edge is off together (light
+    log I_b - log I_a = (g_b - g_a) + (h_b - h_a) t(I) + (1 + k t(I)) (v(r_b) - v(r_a)) + u + w t(I) + noise
+with gain g and lift h of an image, v(r) the log gain of mid gray by the vignetting (three parameters), and k that of
+the response: vignetting, too, is of the light. What a whole edge is off together (light
 that surfaces send elsewhere, glare, wrong matches) are random effects u and w of its own, whose sizes the edges'
 disagreement over the graph tells: so that the uncertainties are those of edges and not of pixels. All is linear, and an
 edge takes part by its moments (gray_levels.py): a solution is as cheap as a pose graph's.
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvsgs_core.tracking.estimation.gray_levels import TERMS
+from mvsgs_core.tracking.estimation.gray_levels import of_response
 from mvsgs_core.tracking.estimation.response import affine, change, vignetting_change
 
 EDGE_SIGMA = 0.005  # what an edge is off, as a log ratio, before the edges tell it; it counts as ...
@@ -38,7 +39,7 @@ class PhotometricEdges:
 
     source: np.ndarray  # (E,) int
     to: np.ndarray  # (E,) int
-    moments: np.ndarray  # (E, 3, 6, 6) float64, see `gray_levels.log_ratio_moments`
+    moments: np.ndarray  # (E, 3, 9, 9) float64, see `gray_levels.log_ratio_moments`
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,9 @@ class PhotometricCalibration:
     lifts: np.ndarray  # (K,) what dark levels gain over it, see response.py
     white: np.ndarray  # (K, 3) log gain of the channels over the gain
     sigma: np.ndarray  # (K,) standard deviation of the gains
-    vignetting: np.ndarray  # (3,) of log V = l1 r² + l2 r⁴ + l3 r⁶
-    response: float  # lift over gain, of the sensor
+    vignetting: np.ndarray  # (3,) of the log gain of mid gray l1 r² + l2 r⁴ + l3 r⁶
+    vignetting_response: float  # lift over gain of the vignetting
+    response: float  # of the exposures: the sensor's
     own_lifts: bool  # lifts are the images' own: more than the response says
     edge_sigma: tuple[float, float]  # of u and w, log ratios
 
@@ -59,7 +61,7 @@ class PhotometricCalibration:
         """Of `count` images of which nothing is known to change."""
         zero = np.zeros(count)
         edge = (EDGE_SIGMA, EDGE_SIGMA)
-        return PhotometricCalibration(zero, zero, np.zeros((count, 3)), zero, np.zeros(_GLOBAL), 0.0, False, edge)
+        return PhotometricCalibration(zero, zero, np.zeros((count, 3)), zero, np.zeros(_GLOBAL), 0.0, 0.0, False, edge)
 
     @property
     def varies(self) -> bool:
@@ -71,8 +73,9 @@ class PhotometricCalibration:
         return np.column_stack([self.gains, self.lifts, self.white])
 
     def step(self, moments: np.ndarray) -> np.ndarray:
-        """Light (5,) of an edge's end less that of its start, from its moments (3, 6, 6), or their first two rows."""
-        pooled = _pooled(moments[:, :2])
+        """Light (5,) of an edge's end less that of its start, from its moments (3, 9, 9), or their first two rows."""
+        moments = of_response(moments[:, :2], self.vignetting_response)
+        pooled = _pooled(moments)
         ratio = pooled[:, 5] - pooled[:, 2:5] @ self.vignetting
         if self.own_lifts:
             gain, lift = np.linalg.solve(pooled[:, :2] + 1e-9 * np.eye(2), ratio)
@@ -101,7 +104,7 @@ class _Solver:
     def __init__(self, edges: PhotometricEdges, count: int, known: np.ndarray) -> None:
         """known (K,): log exposures, NaN where they are not known."""
         self.edges, self.count = edges, count
-        self.moments = _pooled(edges.moments)
+        self.moments = _pooled(_square(edges.moments, 0.0))
         self.known = np.flatnonzero(np.isfinite(known))
         self.logs = known[self.known] - known[self.known].mean() if len(self.known) else known[:0]
         self.trust = np.ones(len(self.moments))
@@ -119,6 +122,20 @@ class _Solver:
             self._weigh()
             if before.shape == self.solution.shape and np.abs(before - self.solution).max() < 1e-5:
                 break
+
+    def follow(self, response: float) -> bool:
+        """Has the vignetting follow a response where that explains the edges better; their weights stay."""
+        before, moments = self.explained(), self.moments
+        self.moments = _pooled(_square(self.edges.moments, response))
+        if self.explained() > before:
+            return True
+        self.moments = moments
+        return False
+
+    def explained(self) -> float:
+        """What the best solution, with the vignetting, takes off the edges' weighted squares."""
+        information, right = self._equations(True)
+        return float(right @ np.linalg.solve(information, right))
 
     @property
     def nodes(self) -> np.ndarray:
@@ -190,7 +207,7 @@ class _Solver:
     def _weigh(self) -> None:
         """What edges are off, from their disagreement, and the trust in each (Cauchy): a wrong match is one edge."""
         n, a, b = self.count, self.edges.source, self.edges.to
-        rest = np.zeros((len(self.moments), TERMS))
+        rest = np.zeros((len(self.moments), 6))
         for k in (0, 1):
             rest[:, k] = self.solution[a + k * n] - self.solution[b + k * n]
         rest[:, 2:5], rest[:, 5] = -self.vignetting, 1.0
@@ -223,18 +240,25 @@ def solve_photometry(edges: PhotometricEdges, count: int, known: np.ndarray | No
         return PhotometricCalibration.steady(count)
     solver = _Solver(edges, count, np.full(count, np.nan) if known is None else known)
     solver.solve(True)
-    vignetting = np.zeros(_GLOBAL)
+    vignetting, follows = np.zeros(_GLOBAL), 0.0
     if solver.vignetting_shows():
+        _, response, _ = _chosen(solver.nodes, solver.of_nodes(), count, len(edges.source))
+        if solver.follow(response):
+            follows = response
+            solver.solve(True)
         vignetting = solver.vignetting
     else:
         solver.solve(False)
     information = solver.of_nodes()
     nodes, response, own_lifts = _chosen(solver.nodes, information, count, len(edges.source))
     gains, lifts = nodes[:count], nodes[count:]
-    white = _white_balance(edges, gains, lifts, vignetting, response)
+    first = of_response(edges.moments[:, :, 0], follows)
+    white = _white_balance(edges, first, (gains, lifts), vignetting, response)
     u, w = np.sqrt(solver.effects)
     sigma = np.sqrt(np.diag(np.linalg.inv(_centered(information[:count, :count]))))
-    found = PhotometricCalibration(gains, lifts, white, sigma, vignetting, response, own_lifts, (float(u), float(w)))
+    found = PhotometricCalibration(
+        gains, lifts, white, sigma, vignetting, follows, response, own_lifts, (float(u), float(w))
+    )
     if not all(np.isfinite(v).all() for v in (gains, lifts, white, sigma, vignetting)):
         raise ValueError("the photometric solution is not finite")
     return found
@@ -280,6 +304,11 @@ def _gains_along(nodes: np.ndarray, information: np.ndarray, response: float) ->
     return np.asarray(np.linalg.solve(inner + 1e-9 * np.trace(inner) / n * np.eye(n), both @ nodes))
 
 
+def _square(moments: np.ndarray, response: float) -> np.ndarray:
+    """Moments (..., 9, 9) as those (..., 6, 6) of a sensor whose vignetting follows its response."""
+    return np.swapaxes(of_response(np.swapaxes(of_response(moments, response), -1, -2), response), -1, -2)
+
+
 def _pooled(moments: np.ndarray) -> np.ndarray:
     """The channels' moments (..., 3, R, 6) as one, (..., R, 6): their errors are one and count once; what channels
     differ by is marginalized, or a change of color would be taken for one of the dark levels."""
@@ -290,11 +319,13 @@ def _pooled(moments: np.ndarray) -> np.ndarray:
 
 
 def _white_balance(
-    edges: PhotometricEdges, gains: np.ndarray, lifts: np.ndarray, vignetting: np.ndarray, response: float
-) -> np.ndarray:
-    """(K, 3) log gains of the channels over the image's, from what gains leave of each; zeros if they do not show."""
+    edges: PhotometricEdges, first: np.ndarray, lights: tuple[np.ndarray, np.ndarray], vignetting: np.ndarray,
+    response: float,
+) -> np.ndarray:  # fmt: skip
+    """(K, 3) log gains of the channels over the image's, from what gains and lifts leave of each, by the first row
+    (E, 3, 6) of the edges' moments; zeros if they do not show."""
+    gains, lifts = lights
     a, b, n = edges.source, edges.to, len(gains)
-    first = edges.moments[:, :, 0]  # (E, 3, 6)
     left = first[..., 5] - first[..., 2:5] @ vignetting
     left -= (gains[b] - gains[a])[:, None] * first[..., 0] + (lifts[b] - lifts[a])[:, None] * first[..., 1]
     left /= first[..., 0] + response * first[..., 1]  # a channel's gain has its lift, by the response

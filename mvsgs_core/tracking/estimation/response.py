@@ -37,10 +37,12 @@ def affine(gain: np.ndarray, lift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.exp(rate), MIDDLE * lift * mean
 
 
-def vignetting_polynomial(logarithm: np.ndarray) -> np.ndarray:
-    """(3,) v of 1 + v1 r² + v2 r⁴ + v3 r⁶, nearest to exp(l1 r² + l2 r⁴ + l3 r⁶) of (3,) l over the image."""
+def vignetting_polynomial(logarithm: np.ndarray, response: float) -> np.ndarray:
+    """(3,) v of 1 + v1 r² + v2 r⁴ + v3 r⁶, nearest over the image to what a log gain l1 r² + l2 r⁴ + l3 r⁶ of (3,) l,
+    with `response` times that as lift, makes of mid gray."""
     powers = np.stack([_RADII**2, _RADII**4, _RADII**6], axis=1)
-    return np.asarray(np.linalg.lstsq(powers, np.expm1(powers @ logarithm), rcond=None)[0])
+    slope, offset = affine(powers @ logarithm, response * (powers @ logarithm))
+    return np.asarray(np.linalg.lstsq(powers, slope + offset / MIDDLE - 1.0, rcond=None)[0])
 
 
 def change(gain: np.ndarray, lift: np.ndarray) -> float:

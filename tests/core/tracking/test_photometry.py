@@ -24,6 +24,8 @@ class Camera:
     lift: float = 0.0  # amplitude of what the lifts have of their own
     white: float = 0.0
     vignetting: float = 0.0
+    of_light: bool = False  # the vignetting is of the light: the response makes gray levels of it
+    dark_known: bool = True  # the edges are looked at with the vignetting in hand
     noise: float = 1.0 / 255.0
 
     def __post_init__(self) -> None:
@@ -51,7 +53,7 @@ class Camera:
             if n % 11 == 5 and n // 11 < wrong:
                 seen[1] = Samples(seen[1].level * 1.3, seen[1].spread)
             powers = [np.stack([r**2, r**4, r**6], axis=1) for r in radii]
-            found = log_ratio_moments(seen[0], seen[1], (powers[0], powers[1]), dark[0])
+            found = log_ratio_moments(seen[0], seen[1], (powers[0], powers[1]), dark[0] * self.dark_known)
             assert found is not None
             moments.append(found)
         source, to = np.array(pairs).T
@@ -60,7 +62,11 @@ class Camera:
     def _seen(self, surface: np.ndarray, index: int, radius: np.ndarray, random: np.random.Generator) -> Samples:
         white = self.whites[index]
         slope, offset = affine(self.gains[index] + white, self.lifts[index] + self.response * white)
-        level = (surface * slope + offset) * (1.0 - self.vignetting * radius**2)[:, None]
+        dark = (1.0 - self.vignetting * radius**2)[:, None]
+        level = (surface * slope + offset) * (1.0 if self.of_light else dark)
+        if self.of_light:
+            slope, offset = affine(np.log(dark), self.response * np.log(dark))
+            level = level * slope + offset
         noisy = level + self.noise * random.standard_normal(level.shape)
         return Samples(np.where((noisy > 0.03) & (noisy < 0.95), noisy, np.nan), np.full(len(level), 1.0 / 255.0))
 
@@ -82,9 +88,33 @@ def test_gains_response_and_vignetting_are_found_with_wrong_edges_too(wrong: int
     assert abs(found.response - 0.3) < 0.02
     assert not found.own_lifts
     radius = np.linspace(0.0, 1.0, 21)
-    brightness = 1.0 + np.stack([radius**2, radius**4, radius**6], axis=1) @ vignetting_polynomial(found.vignetting)
+    assert found.vignetting_response == 0.0
+    brightness = 1.0 + np.stack([radius**2, radius**4, radius**6], axis=1) @ vignetting_polynomial(
+        found.vignetting, 0.0
+    )
     np.testing.assert_allclose(brightness, 1.0 - 0.3 * radius**2, atol=0.01)
     assert not found.white.any()
+
+
+@pytest.mark.parametrize(("dark_known", "off"), [(True, 0.02), (False, 0.04)])
+def test_vignetting_of_the_light_follows_the_response(dark_known: bool, off: float) -> None:
+    """Also where nothing is known of it when the edges are looked at: what it changes there is no outlier. Their gray
+    levels are then not those of the middle of the image, which the response is off by."""
+    camera = Camera(gain=0.3, response=0.3, vignetting=0.5, of_light=True, dark_known=dark_known)
+    found = solve_photometry(camera.edges(), camera.count)
+    assert abs(found.vignetting_response - 0.3) < off
+    radius = np.linspace(0.0, 1.0, 21)
+    logarithm = np.stack([radius**2, radius**4, radius**6], axis=1) @ found.vignetting
+    np.testing.assert_allclose(np.exp(logarithm), 1.0 - 0.5 * radius**2, rtol=0.006)
+    for level in (0.2, 0.4, 0.7):
+        (slope, offset), dark = affine(logarithm, found.vignetting_response * logarithm), np.log(1 - 0.5 * radius**2)
+        true_slope, true_offset = affine(dark, 0.3 * dark)
+        np.testing.assert_allclose(
+            level * slope + offset, level * true_slope + true_offset, rtol=0.005, atol=0.15 * off
+        )
+    middle = 1.0 + np.stack([radius**2, radius**4, radius**6], axis=1) @ vignetting_polynomial(found.vignetting, 0.3)
+    slope, offset = affine(logarithm, 0.3 * logarithm)
+    np.testing.assert_allclose(middle, slope + offset / MIDDLE, rtol=0.005)
 
 
 def test_lifts_of_their_own_and_white_balance_are_found() -> None:
@@ -128,7 +158,7 @@ def test_known_exposures_hold_what_few_matches_leave_open() -> None:
 
 
 def test_no_edges_say_nothing() -> None:
-    nothing = PhotometricEdges(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3, 6, 6)))
+    nothing = PhotometricEdges(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3, 9, 9)))
     assert not solve_photometry(nothing, 5).varies
 
 
