@@ -1,6 +1,6 @@
 """The offline map of COLMAP's poses and points: in the way that is its best, at our processor time, and longer.
 
-A way is a choice of training frames, of exposures and of when the learning rates begin to fall. One choice after the
+A way is a choice of training frames, of exposures, of rates and of when these begin to fall. One choice after the
 other takes what is best by held-out PSNR: with hindsight, which an offline user does not have.
 """
 
@@ -19,7 +19,11 @@ from bench.baselines.ours import Ours
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
 from mvsgs_core import image_metrics
 from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.optimizer import OptimizerConfig
 
+RATES = {  # of places and extents: splats that begin at sparse points need not like what dense ones do
+    "small": OptimizerConfig(means=5e-4, log_scales=0.03), "ours": OptimizerConfig(),
+}  # fmt: skip
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end
 
 
@@ -31,11 +35,12 @@ class Way:
     exposure: str = (
         "none"  # "none"; "trained": an affine a frame; "tracker": the same, beside what our tracker measured
     )
-    settle: float = 0.5  # last fraction of the time in which learning rates fall
+    rates: str = "small"  # learning rates: of `RATES`
+    settle: float = 0.5  # last fraction of the time in which they fall
 
     @property
     def name(self) -> str:
-        return f"{self.frames}, exposure {self.exposure}, settles over {self.settle:g}"
+        return f"{self.frames}, exposure {self.exposure}, rates {self.rates}, settles over {self.settle:g}"
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ Train = Callable[[Way, float], Trained]  # in so many processor seconds
 def choices(ours: Ours) -> dict[str, tuple[Any, ...]]:
     """What there is of each part of a way, the first ones the start."""
     exposures = ("none", "trained") if ours.exposures is None else ("none", "trained", "tracker")
-    return {"frames": ("keyframes", "all"), "exposure": exposures, "settle": (0.5, 0.25, 0.1)}
+    return {"frames": ("keyframes", "all"), "exposure": exposures, "rates": tuple(RATES), "settle": (0.5, 0.25, 0.1)}
 
 
 def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> Trained:
@@ -73,7 +78,8 @@ def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> T
         return Posed(index, frame.image, frame.intrinsics, poses[index], frame.timestamp, exposure)
 
     chosen = ours.keyframes if way.frames == "keyframes" else ours.not_held_out
-    config = SparseConfig(seconds=seconds, settle=way.settle, mapper=MapperConfig(threads=threads))
+    mapper = MapperConfig(threads=threads, optimizer=RATES[way.rates])
+    config = SparseConfig(seconds=seconds, settle=way.settle, mapper=mapper)
     vignetting = ours.vignetting if way.exposure == "tracker" else None
     fitted = SparseMap([posed(i) for i in chosen if i in poses], model.points, model.colors, config, vignetting)
     fitted.optimize()
