@@ -73,7 +73,7 @@ class TrainingView:
     visits_here: int = 0  # of these since its pose was last corrected
     loss_fast: float = field(default=float("nan"))  # running means of the loss of these
     loss_slow: float = field(default=float("nan"))
-    loss_before: float = field(default=float("nan"))  # the last correction, to come back to; NaN: it has
+    loss_before: float = field(default=float("nan"))  # its pose was corrected, to come back to; NaN: nothing is owed
 
     @property
     def refined_from_cam(self) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import count, pairwise
 from typing import Any
@@ -31,13 +31,6 @@ K = [25.0, 0, 15.5, 0, 25.0, 11.5, 0, 0, 1]
 INFO = {"height": 24, "width": 32, "distortion_model": "plumb_bob", "d": [0.0] * 5, "k": K, "p": [0.0] * 12}
 IMAGE, COMPRESSED, CALIBRATION = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 _numbers = count()
-
-
-@pytest.fixture(scope="module")
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
 
 
 @pytest.fixture

@@ -30,13 +30,6 @@ KEPT = ("points", "tf_static")
 _numbers = count()
 
 
-@pytest.fixture(scope="module")
-def peer() -> Iterator[Peer]:
-    peer = Peer()
-    yield peer
-    peer.close()
-
-
 class Graph:
     """A publisher in a namespace of its own, and what a program gets of it."""
 
