@@ -71,7 +71,7 @@ class Watchdog:
     def _silent(self, watched: _Watched, now: float) -> str | None:
         """Names a node that has not been heard of; a reason once that has lasted too long."""
         child, silence = watched.child, now - watched.child.heard
-        if child.status.state == "starting":
+        if child.status.state == "starting" and silence >= self.limits.silent and not child.frozen:
             silence -= STARTING_SECONDS
         if silence < self.limits.silent:
             if watched.named:

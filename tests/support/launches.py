@@ -62,11 +62,12 @@ class Launch:
         return next(p for p in map(psutil.Process, self.nodes()) if f"/{name}.json" in " ".join(p.cmdline()))
 
     def wait_until_running(self) -> None:
-        """Until the sink's log says so: by then every node is."""
+        """Until the sink's log says so, and every node's that it is past its start: they come up in any order."""
         until = time.monotonic() + 30
-        log = self.output / "logs" / "sink.log"
+        logs = self.output / "logs"
         while time.monotonic() < until and self.process.poll() is None:
-            if log.exists() and "running" in log.read_text():
+            said = {log.stem: log.read_text() for log in logs.glob("*.log")}
+            if "running" in said.get("sink", "") and all("waiting" in text for text in said.values()):
                 return
             time.sleep(0.05)
         raise AssertionError(f"the graph did not come up: {self.process.communicate(timeout=10)}")
