@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from bench.baselines.colmap_poses import Model
 from bench.baselines.ours import Ours
@@ -83,7 +82,6 @@ def train(model: Model, ours: Ours, way: Way, seconds: float, threads: int) -> T
     config = SparseConfig(seconds=seconds, settle=way.settle, mapper=mapper)
     vignetting = ours.vignetting if way.exposure == "tracker" else None
     fitted = SparseMap([posed(i) for i in chosen if i in poses], model.points, model.colors, config, vignetting)
-    torch.set_num_threads(threads)  # a second one that waits would count as processor time, too
     fitted.optimize()
     psnr, ssim = score((view, fitted.render(view)) for view in (posed(i) for i in ours.held_out if i in poses))
     return Trained(fitted.seconds, psnr, ssim, len(fitted.state), fitted.iterations, seconds, way.name)

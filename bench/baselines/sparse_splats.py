@@ -85,6 +85,8 @@ class SparseMap:
 
     def optimize(self) -> None:
         """As long as the configuration says."""
+        if self.config.mapper.threads:
+            torch.set_num_threads(self.config.mapper.threads)  # one more that only waits would count as processor time
         order: list[int] = []
         start = time.process_time()
         while (done := self._done(time.process_time() - start)) < 1.0:

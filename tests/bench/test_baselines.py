@@ -167,6 +167,20 @@ def test_offline_splatting_of_sparse_points_gets_better() -> None:
         SparseMap(views, np.zeros((2, 3)), np.zeros((2, 3), np.uint8), SparseConfig())
 
 
+def test_what_only_waits_is_not_counted_as_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torch's own threads spin while they wait, and a process's time is that of all its threads."""
+    views, _, points, colors = room(4)
+    before, seen = torch.get_num_threads(), []
+    step = SparseMap._step
+    monkeypatch.setattr(SparseMap, "_step", lambda *args: (seen.append(torch.get_num_threads()), step(*args))[1])
+    try:
+        torch.set_num_threads(2)
+        SparseMap(views, points, colors, SparseConfig(iterations=2, mapper=MapperConfig(threads=1))).optimize()
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1, 1]
+
+
 @pytest.mark.slow
 def test_a_known_exposure_is_of_use_to_the_offline_map() -> None:
     """Light that changes by the frame: frames between have the exposure that is known of them, and what was trained."""
