@@ -36,7 +36,7 @@ RUN_SECONDS = 600.0
 
 def measure(quick: bool) -> list[Row]:
     if quick:
-        return _decoder(2_000) + _graph(500, 60)
+        return _decoder(2_000) + _graph(500, 120)
     return _decoder(150_000) + _graph(20_000, 240)
 
 
