@@ -61,11 +61,9 @@ class StreamFrames:
             return f"frames that {self._sender} gave twice were left out"
         shown = self._times.accept(frame.timestamp, self._restarted)
         self._restarted = False
-        if shown is None and abs(frame.timestamp) <= LATEST:
+        if shown is None:
             self._stats.count("out_of_order")
             return f"frames of {self._sender} from before, or hours after, those that came before were left out"
-        if shown is None:
-            return f"frames whose timestamp is no time in seconds (beyond {LATEST:g}) were left out"
         if self._times.repaired > self._stats.counts.get("times_repaired", 0):
             self._stats.counts["times_repaired"] = self._times.repaired
             self._stats.warn(
@@ -90,6 +88,8 @@ class StreamFrames:
             self._stats.count("other_size")
             return f"frames of another size than the first, {self.native}, were left out, such as {native}"
         in_view = np.all((FOCAL_RANGE[0] * side <= focal) & (focal <= FOCAL_RANGE[1] * side))
+        if not abs(frame.timestamp) <= LATEST:
+            return f"frames whose timestamp is no time in seconds (beyond {LATEST:g}) were left out"
         if not in_view or not np.all(np.abs(center) <= 2 * side):
             return f"frames without valid intrinsics were left out, such as {frame.intrinsics.tolist()} for {native}"
         return None

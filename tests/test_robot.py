@@ -300,17 +300,23 @@ def test_a_frame_that_no_camera_takes_is_left_out_even_as_the_first(
 def test_only_garbage_is_no_stream_and_the_error_says_what_came(address: str) -> None:
     robot = Robot(Robot.Config(path=address, timeout=1.0))
     program = Program(address, (data(i, timestamp=1e18) for i in range(1000)))
+    began = time.monotonic()
     with pytest.raises(TimeoutError, match="no time in seconds"):
         list(robot.run())
+    assert time.monotonic() - began < 10.0  # garbage for 20 s does not keep the stream open
     program.close()
 
 
 # ---------------------------------------------------------------- the program in examples/
 
 
-def example(*arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, str(ROOT / "examples/robot.py"), *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def example(*arguments: str, errors: Path | None = None) -> subprocess.Popen[str]:
+    """Errors go to that file, or to a pipe."""
+    command = [sys.executable, "-u", str(ROOT / "examples/robot.py"), *arguments]
+    if errors is None:
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    with errors.open("w") as file:
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=file, text=True)
 
 
 @pytest.fixture
@@ -340,17 +346,20 @@ def test_a_reader_with_other_keys_is_named_at_both_ends(address: str, video: Pat
     other = "its keys are not those in"
     for ours, theirs, text in ((None, "a", other), ("b", "a", other), ("a", None, "it has keys")):
         given = [] if theirs is None else ["--keys", str(tmp_path / theirs)]
-        with example("--video", str(video), "--address", address, *given) as program:
+        said = tmp_path / "said"
+        with example("--video", str(video), "--address", address, *given, errors=said) as program:
             try:
                 config = Robot.Config(path=address, timeout=10.0, keys=None if ours is None else str(tmp_path / ours))
                 with pytest.raises(TransportError, match="keys"):
                     list(Robot(config).run())
-                time.sleep(0.5)
+                until = time.monotonic() + 10.0
+                while text not in said.read_text() and time.monotonic() < until:
+                    time.sleep(0.1)
             finally:
                 os.kill(program.pid, signal.SIGINT)
-                errors = program.communicate(timeout=20)[1]
-        assert text in errors
-        assert "Traceback" not in errors
+                program.communicate(timeout=20)
+        assert text in said.read_text()
+        assert "Traceback" not in said.read_text()
 
 
 def test_the_launcher_refuses_a_robot_without_its_keys(tmp_path: Path) -> None:
