@@ -62,7 +62,7 @@ def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: b
 
     `all_choices_known` is False where choices can come from other directories: Hydra refuses them then.
     """
-    choices = {slot: sorted(path.stem for path in (conf / slot).glob("*.yaml")) for slot in slots_of(conf)}
+    choices = {slot: choices_of(slot, conf) for slot in slots_of(conf)}
     return [_prepare(text, choices, parameter_names(Settings), all_choices_known) for text in overrides]
 
 
@@ -90,6 +90,11 @@ def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str],
             f"there are: {', '.join([*choices, 'external'])}"
         )
     return text
+
+
+def choices_of(slot: str, conf: Path = CONF) -> list[str]:
+    """The choices of a slot."""
+    return sorted(path.stem for path in (conf / slot).glob("*.yaml"))
 
 
 def slots_of(conf: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Starts the whole graph: `python launch/run_all.py dataset=tum dataset.path=... mapper.iterations=300 viewer=off`.
+"""Starts the whole graph: `python launch/run_all.py walk.mp4 mapper.iterations=300`; the command `mvsgs` runs it.
 
 From any directory. `--help` lists slots, choices and parameters, `--graph` shows what is composed; `-m` sweeps;
 `--inline` runs all in this process; `resume=DIR` goes on with an interrupted run in its own directory.
@@ -29,10 +29,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from launch.children import python_environment
-from launch.compose import CONF, graph_of, prepare
+from launch.compose import CONF, choices_of, graph_of, prepare
 from launch.graph_text import graph_text
 from launch.help_text import help_text
 from launch.jobs import Job, refused, run
+from launch.named_input import SLOT, with_named_input
 from launch.refusal import GraphError
 from launch.resume import WORD as RESUME
 from launch.resume import leave_out_refused, resumed_config
@@ -94,6 +95,7 @@ def hydra_arguments(arguments: Sequence[str]) -> list[str]:
     """The command line as Hydra takes it. Raises GraphError for overrides that name nothing there is."""
     words = ["inline=true" if word == "--inline" else word for word in arguments]
     conf = Path(_option(words, "--config-path", "-cp") or CONF).absolute()
+    words = with_named_input(words, choices_of(SLOT, conf))
     overrides = [word for word in words if "=" in word and not word.startswith("-")]
     elsewhere = _option(words, "--config-dir", "-cd") or any(word.startswith("hydra.searchpath") for word in overrides)
     prepared = prepare(overrides, conf, all_choices_known=not elsewhere)

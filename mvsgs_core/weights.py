@@ -219,13 +219,13 @@ def _show() -> None:
     Console().print(table)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m mvsgs_core.weights", description="Network weights")
+def main(words: list[str] | None = None, prog: str = "python -m mvsgs_core.weights") -> int:
+    parser = argparse.ArgumentParser(prog=prog, description="Network weights")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="all registered weights and where they are found")
     commands.add_parser("fetch", help="download one").add_argument("name")
     commands.add_parser("check", help="say which weights a file holds").add_argument("file", type=Path)
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     try:
         if arguments.command == "list":
             _show()

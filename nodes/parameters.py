@@ -44,7 +44,7 @@ def build(config: type[T], given: Mapping[str, Any], where: str = "", base: T | 
         if name not in declared:
             raise ParameterError(
                 f"{_path(where, name)}: {_owner(config)} has no parameter {name!r}"
-                f"{_meant(config, where, name, given)}; it has:\n{describe(config)}"
+                f"{_meant(config, where, name, given)}; it has: {describe(config)}"
             )
     values = {}
     for name, field in declared.items():
@@ -104,17 +104,17 @@ def nested_in(annotation: Any) -> type | None:
 
 
 def describe(config: type) -> str:
-    """One line a parameter: name, type, default; of nested ones the names."""
+    """All parameters in one line: name, type, default; of nested ones the names."""
     hints = typing.get_type_hints(config)
-    lines = []
+    described = []
     for field in fields(config):
         default = _default(field, None)
         if default is MISSING:
-            text = "  (must be given)"
+            text = " (must be given)"
         else:
             text = "" if is_dataclass(default) else f" = {plain_values(default)}"
-        lines.append(f"  {field.name}: {type_name(hints[field.name])}{text}")
-    return "\n".join(lines) or "  (no parameters)"
+        described.append(f"{field.name}: {type_name(hints[field.name])}{text}")
+    return ", ".join(described) or "no parameters"
 
 
 def did_you_mean(word: str, valid: Iterable[str]) -> str:

@@ -22,7 +22,7 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "README.md", ROOT / "msgs" / "WIRE.md",
 ]  # fmt: skip
 WIDEST, MAX_COLUMNS, LONGEST_PAGE = 120, 8, 150
-FOLDERS = ("bench", "docs", "examples", "launch", "msgs", "mvsgs_core", "nodes", "tests")
+FOLDERS = ("bench", "docs", "examples", "launch", "msgs", "mvsgs", "mvsgs_core", "nodes", "tests")
 GENERATED = re.compile(r"<!-- bench:([\w/.-]+) -->.*?<!-- /bench:\1 -->", re.DOTALL)
 EVERY = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: str(document.relative_to(ROOT)))
 
@@ -72,8 +72,8 @@ def test_modules_that_are_run_or_imported_exist(document: Path) -> None:
 @pytest.mark.slow
 @EVERY
 def test_commands_compose(document: Path) -> None:
-    """Every `launch/run_all.py` command that a document shows: its slots, choices and parameters are there."""
-    for line in re.findall(r"^ *python \S*launch/run_all\.py (.+)$", by_hand(document), re.MULTILINE):
+    """Every run that a document shows, by launch/run_all.py or mvsgs: its slots, choices and parameters are there."""
+    for line in re.findall(r"^ *(?:python \S*launch/run_all\.py|mvsgs) (.+)$", by_hand(document), re.MULTILINE):
         words = re.findall(r'(?:[^\s"]|"[^"]*")+', line.partition("  #")[0])
         overrides = [word.strip('"') for word in words if "=" in word]
         if any(text in line for text in ("resume=", "_target_", "PATH/TO")):

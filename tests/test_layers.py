@@ -40,7 +40,16 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "nodes/runtime": ("msgs", PARAMETERS, CONTRACT),
     "nodes/ros2": (),
     "nodes": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "mvsgs_core/*"),
-    "launch": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "mvsgs_core/mapping", "mvsgs_core/evaluation"),
+    "launch": (
+        "msgs",
+        CONTRACT,
+        PARAMETERS,
+        "nodes/runtime",
+        "mvsgs_core/datasets",
+        "mvsgs_core/mapping",
+        "mvsgs_core/evaluation",
+    ),
+    "mvsgs": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes", "launch", "mvsgs_core/*"),
     "examples": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "nodes", "mvsgs_core/datasets"),
     "bench": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "nodes", "launch", "mvsgs_core/*"),
 }

@@ -87,7 +87,7 @@ def test_plain_values_become_what_the_annotations_say() -> None:
     [
         ({}, "sample.required must be given: tests.test_parameters.Sample has no default for it (int)"),
         ({"required": 1, "requird": 1}, "sample.requird: tests.test_parameters.Sample has no parameter 'requird'"),
-        ({"required": 1, "requird": 1}, "(did you mean required?); it has:\n  required: int  (must be given)\n"),
+        ({"required": 1, "requird": 1}, "(did you mean required?); it has: required: int (must be given), "),
         ({"required": 1.5}, "sample.required=1.5: must be int"),
         ({"required": True}, "sample.required=True: must be int"),
         ({"required": 1, "flag": 1}, "sample.flag=1: must be bool"),

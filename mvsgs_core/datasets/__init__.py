@@ -1,6 +1,7 @@
 """Readers of image sequences: pure, one file a format, all yielding the same `Item`.
 
-A format is a file here whose class is marked with `@dataset`; `dataset=NAME` is the file's name.
+A format is a file here whose class is marked with `@dataset`; `dataset=NAME` is the file's name. Where the class has a
+static `recognizes(path)`, a path alone is enough to name the format.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import pkgutil
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -42,6 +44,7 @@ class Sequence(Protocol):
     def __iter__(self) -> Iterator[Item]: ...
 
 
+PLAIN = "images"  # the layout that asks for nothing but images, as any other has them
 _READERS: dict[str, type] = {}  # of the files that were imported so far
 
 
@@ -56,6 +59,16 @@ def formats() -> list[str]:
     for name in _files():
         importlib.import_module(f"{__name__}.{name}")
     return sorted(_READERS)
+
+
+def recognized(path: Path) -> list[str]:
+    """The formats in whose layout an existing file or folder is, by its names alone; none reads what is in it.
+
+    A folder of images in no other layout is "images". Raises OSError for a folder that cannot be listed.
+    """
+    found = [name for name in formats() if getattr(_READERS[name], "recognizes", _nothing)(path)]
+    special = [name for name in found if name != PLAIN]
+    return special or found
 
 
 def check(name: str, **options: Any) -> None:
@@ -92,6 +105,10 @@ def options_of(name: str) -> tuple[type, ...]:
     reader = _reader(name, {})
     found: tuple[type, ...] = getattr(reader, "OPTIONS", (reader,))
     return found
+
+
+def _nothing(path: Path) -> bool:
+    return False
 
 
 def _files() -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,6 +45,10 @@ class Bag(FileReader):
 
     topic: str | None = None  # of the images; null: the only color one
     info_topic: str | None = None  # of their calibration; null: camera_info beside the images
+
+    @staticmethod
+    def recognizes(path: Path) -> bool:
+        return path.suffix.lower() == ".bag" if path.is_file() else (path / "metadata.yaml").is_file()
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -32,7 +32,7 @@ class Layout:
     source: str
 
     def missing(self, what: str) -> FileNotFoundError:
-        return FileNotFoundError(f"{what}\n{self.name} expects: {self.files}\nWhere to get it: {self.source}")
+        return FileNotFoundError(f"{what}; {self.name} expects: {self.files}; where to get it: {self.source}")
 
     def present(self, path: str | Path | None) -> Path:
         """`path` as a folder or file that is there. Raises FileNotFoundError saying where the data can be had."""

@@ -35,10 +35,15 @@ class IclNuim(ImageSequence):
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
+    @staticmethod
+    def recognizes(path: Path) -> bool:
+        known = _truth_files(path) and (path / "depth").is_dir() and not (path / "rgb.txt").exists()
+        return bool(known and _numbered(path / "rgb"))
+
     def _find(self) -> Found:
         folder = LAYOUT.folder(self.path)
         rgb = folder / "rgb"
-        images = [p for p in images_in(rgb) if p.stem.isascii() and p.stem.isdecimal()] if rgb.is_dir() else []
+        images = _numbered(rgb)
         if not images:
             raise LAYOUT.missing(f"{rgb} has no 0.png, 1.png, ...")
         lens = self._lens(images, _PUBLISHED)
@@ -59,8 +64,17 @@ def _mirror(pose: np.ndarray) -> np.ndarray:
     return np.asarray(_Y_DOWN @ pose @ _Y_DOWN)
 
 
+def _numbered(rgb: Path) -> list[Path]:
+    """0.png, 1.png, ... of a folder, which may be none."""
+    return [p for p in images_in(rgb) if p.stem.isascii() and p.stem.isdecimal()] if rgb.is_dir() else []
+
+
+def _truth_files(folder: Path) -> list[Path]:
+    return [p for p in (folder / "groundtruth.txt", *sorted(folder.glob("*.gt.freiburg"))) if p.is_file()]
+
+
 def _poses(folder: Path) -> tuple[dict[int, np.ndarray], list[str]]:
-    files = [p for p in (folder / "groundtruth.txt", *sorted(folder.glob("*.gt.freiburg"))) if p.is_file()]
+    files = _truth_files(folder)
     if not files:
         return {}, ["groundtruth.txt is missing: the trajectory is not scored"]
     numbers, poses = read_trajectory(files[0])

@@ -23,6 +23,7 @@ LAYOUT = Layout(
     "subfolder images/; beside them, if there is one, a COLMAP model (sparse/0), a transforms.json or .camera files",
     "your own camera; frames of a video: ffmpeg -i video.mp4 -qscale:v 2 images/%05d.jpg (or dataset=video directly)",
 )
+_NOT_READ = (".heic", ".heif")  # images all the same
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
 
 
@@ -39,6 +40,11 @@ class Images(ImageSequence):
 
     model: str | Path | None = None  # COLMAP model folder, transforms.json or folder of .camera files, if elsewhere
     rate: float = 30.0  # images per second, for the timestamps
+
+    @staticmethod
+    def recognizes(path: Path) -> bool:
+        places = [place for place in _places(path) if place.is_dir()]
+        return any(file.suffix.lower() in (*IMAGE_SUFFIXES, *_NOT_READ) for place in places for file in place.iterdir())
 
     def _find(self) -> Found:
         if self.rate <= 0:
@@ -76,14 +82,19 @@ class Images(ImageSequence):
         return read_exif_exposure(record.image)
 
 
+def _places(folder: Path) -> list[Path]:
+    """Where the images may be."""
+    return [folder, *(folder / name for name in _SUBFOLDERS)]
+
+
 def _find_images(folder: Path) -> list[Path]:
-    for candidate in (folder, *(folder / name for name in _SUBFOLDERS)):
+    for candidate in _places(folder):
         images = images_in(candidate) if candidate.is_dir() else []
         if images:
             return images
     below = [p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
     if not below:
-        heic = any(p.suffix.lower() in (".heic", ".heif") for p in folder.rglob("*"))
+        heic = any(p.suffix.lower() in _NOT_READ for p in folder.rglob("*"))
         hint = (
             ", only HEIC files: convert them (heif-convert, or the phone's setting `most compatible`)" if heic else ""
         )

@@ -33,6 +33,10 @@ _FRAME_RATE = 30.0  # the set has no timestamps
 class Replica(ImageSequence):
     """A room of Replica. Raises FileNotFoundError and ValueError, which say what was expected."""
 
+    @staticmethod
+    def recognizes(path: Path) -> bool:
+        return any((path / "results").glob("frame*.*"))
+
     def _find(self) -> Found:
         folder = LAYOUT.folder(self.path)
         images = [p for p in (folder / "results").glob("frame*.*") if re.search(r"[0-9]", p.stem)]

@@ -49,6 +49,10 @@ class SevenScenes(ImageSequence):
     # (585 pixels) for both, as many published results have it
     registered: bool = True
 
+    @staticmethod
+    def recognizes(path: Path) -> bool:
+        return any(next(path.glob(pattern), None) for pattern in ("frame-*.color.*", "seq-*/frame-*.color.*"))
+
     def _find(self) -> Found:
         folder = _sequence_folder(LAYOUT.folder(self.path), self.sequence)
         images = [p for p in folder.glob("frame-*.color.*") if re.search(r"[0-9]", p.name.split(".")[0])]

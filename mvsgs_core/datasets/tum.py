@@ -49,6 +49,10 @@ class Tum(ImageSequence):
     camera: str | None = None
     max_difference: float = 0.02  # seconds between an image and its pose or depth map
 
+    @staticmethod
+    def recognizes(path: Path) -> bool:
+        return (path / "rgb.txt").is_file()
+
     def _find(self) -> Found:
         folder = LAYOUT.folder(self.path)
         images = _read_list(folder, LAYOUT.file(folder / "rgb.txt"))

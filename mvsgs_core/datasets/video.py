@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,6 +21,10 @@ LAYOUT = Layout(
     "one file that OpenCV's FFmpeg opens: mp4, mov, mkv, avi, webm, ...",
     "your own camera or phone; walk slowly, move sideways rather than turn on the spot, lock exposure and focus",
 )
+SUFFIXES = (  # by which a file is taken for a video where its format was not said
+    ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts", ".3gp", ".wmv", ".flv",
+    ".ogv", ".mjpg", ".mjpeg", ".y4m", ".h264", ".hevc", ".insv", ".lrv",
+)  # fmt: skip
 _DEFAULT_RATE = 30.0
 _MAX_COUNT = 2**40  # frames: more is no count
 # A container's frame count is an estimate: of mkv its duration times a rate, of mp4 with the frames that are not shown.
@@ -37,6 +42,10 @@ class Video(FileReader):
     Frames of another shape than the first are left out and counted, those of another size scaled to it.
     Raises FileNotFoundError and ValueError, which say what was expected, BadFileError for a file that has no frame.
     """
+
+    @staticmethod
+    def recognizes(path: Path) -> bool:
+        return path.is_file() and path.suffix.lower() in SUFFIXES
 
     def __post_init__(self) -> None:
         super().__post_init__()

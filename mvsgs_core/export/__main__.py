@@ -64,8 +64,8 @@ def export(options: argparse.Namespace) -> str:
     return f"{out}: {write(out, final.scaled(options.scale), options)}{left_out}"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m mvsgs_core.export", description=__doc__)
+def main(arguments: list[str] | None = None, prog: str = "python -m mvsgs_core.export") -> int:
+    parser = argparse.ArgumentParser(prog=prog, description=__doc__)
     input_arguments(parser)
     parser.add_argument("out", type=Path, help="file.ply, .splat, .spz, .glb, .obj, or a folder for a COLMAP model")
     parser.add_argument("--fold", action="store_true", help="fold the shape into the scales (.ply)")

@@ -27,14 +27,20 @@ def run(
     try:
         print(command(options))
     except (ValueError, OSError, ImportError) as error:
-        print(f"{parser.prog.rpartition('.')[2]}: {error}", file=sys.stderr)
+        print(f"{parser.prog.replace('.', ' ').split()[-1]}: {error}", file=sys.stderr)
         return 1
     return 0
 
 
+def map_file(text: str) -> Path:
+    """A map.ply, or that in the folder that was named."""
+    path = Path(text).expanduser()
+    return path / "map.ply" if path.is_dir() else path
+
+
 def input_arguments(parser: argparse.ArgumentParser) -> None:
     """The map and the camera, for `read_map`, `lens` and `cameras_of_map`."""
-    parser.add_argument("map", type=Path, help="map.ply")
+    parser.add_argument("map", type=map_file, help="map.ply, or the output folder of a run")
     parser.add_argument(
         "--drop-unsound", action="store_true", help="leave out splats with NaN or Inf, and say how many"
     )
@@ -55,6 +61,8 @@ def read_map(options: argparse.Namespace) -> tuple[Snapshot, str]:
 
     Raises ValueError where there are such and --drop-unsound was not given.
     """
+    if not options.map.is_file():
+        raise FileNotFoundError(f"{options.map} is missing: a map is a map.ply, or the output folder of a run")
     final = read_ply(options.map)
     splats = final.splats
     sound = torch.ones(len(splats), dtype=torch.bool)

@@ -52,8 +52,8 @@ def render_path(options: argparse.Namespace) -> str:
     return f"{options.out}: {count} frames{left_out}"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m mvsgs_core.export.render_path", description=__doc__)
+def main(arguments: list[str] | None = None, prog: str = "python -m mvsgs_core.export.render_path") -> int:
+    parser = argparse.ArgumentParser(prog=prog, description=__doc__)
     input_arguments(parser)
     parser.add_argument("trajectory", type=Path, help="poses, TUM format: time tx ty tz qx qy qz qw")
     parser.add_argument("out", type=Path, help="video.mp4")

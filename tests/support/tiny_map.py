@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from mvsgs_core.export.cameras import Cameras, write_cameras
+from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.insertion import InsertionConfig, points_from_depth, splats_from_points
 from mvsgs_core.trajectory_file import write_trajectory
@@ -64,3 +65,13 @@ def write_poses(path: Path, times: list[float]) -> np.ndarray:
     poses = poses_around(times)
     write_trajectory(path, np.arange(len(times), dtype=np.float64), poses)
     return poses
+
+
+def write_tiny_run(folder: Path) -> Path:
+    """The output folder of a run: map.ply, cameras.json, trajectory.txt."""
+    folder.mkdir()
+    times = [0.0, 0.5, 1.0]
+    write_ply(folder / "map.ply", final_map())
+    save_cameras(folder, times)
+    write_poses(folder / "trajectory.txt", times)
+    return folder

@@ -1,0 +1,1 @@
+"""The command `mvsgs`: everything that a user starts, by one word."""
