@@ -98,7 +98,7 @@ class TrainingView:
     @property
     def target(self) -> Tensor:
         """Image (H, W, 3) float32 in [0, 1]."""
-        return self.image.to(torch.float32) / 255.0
+        return self.image.to(torch.float32).div_(255.0)
 
     def intrinsics_at(self, size: tuple[int, int]) -> np.ndarray:
         """(4,) at another size (height, width)."""

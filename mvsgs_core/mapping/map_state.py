@@ -86,8 +86,8 @@ class MapState:
 
     @torch.no_grad()
     def accumulate_means2d(self, gradient: Tensor, visible: Tensor) -> None:
-        """Adds the norms (N,) of the screen-space gradients of one view, where it saw the splat."""
-        self.means2d_gradient += torch.where(visible, gradient, 0.0)
+        """Adds the norms (N,) of the screen-space gradients of one view, finite, where it saw the splat."""
+        self.means2d_gradient.addcmul_(gradient, visible.to(gradient))
         self.means2d_views += visible
 
     def reset_means2d(self) -> None:

@@ -79,6 +79,7 @@ def removal_cost(
             signed = (image.color * (counted[..., None] * signs)).sum()
             (slope,) = torch.autograd.grad(signed, [leaf], retain_graph=True)
             total += (slope / (1.0 - opacity)).to(torch.float64) ** 2 / probes  # dC/dlogit = o (1 - o) dC/do
+        del image, signed, slope  # with what the rasterizer keeps for them, which the next view takes over
     shown = (seen > 0) & (weight >= HIDDEN * opacity)
     cost = total * len(views) / seen.clamp(min=1.0)
     return torch.where(shown & torch.isfinite(cost), cost, math.inf), error

@@ -144,8 +144,8 @@ class Trainer:
             text = "gradients of splats that were not finite were set to 0 in the rasterizer's backward pass"
             log.refuse("gradients", render.backward.refused, text)
         if render.means2d.grad is not None:
-            gradient = render.means2d.grad.norm(dim=1)
-            self.state.accumulate_means2d(torch.where(torch.isfinite(gradient), gradient, 0.0), render.visible)
+            gradient = render.means2d.grad.norm(dim=1).nan_to_num_(0.0, 0.0, 0.0)
+            self.state.accumulate_means2d(gradient, render.visible)
         selective = config.training.selective
         stepped = render.visible if selective else torch.ones_like(render.visible)
         groups = optimizer.groups(

@@ -8,6 +8,7 @@ and fail as well. SIGTERM ends it in the same way at the next safe point, with e
 
 from __future__ import annotations
 
+import gc
 import logging
 import queue
 import random
@@ -116,6 +117,7 @@ class _Process:
         for publisher in self._publishers.values():
             publisher.start()
         self.status.set("running")
+        gc.freeze()  # modules and the node stay: the collector need not walk through them again and again
         messages = self._source(runner, inbox) if is_source(node_type) else self._answers(runner, inbox)
         for message in messages:
             self._send(message)
