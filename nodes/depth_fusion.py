@@ -77,7 +77,6 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             unfiltered=found.unfiltered,
             exposure=message.exposure,
             vignetting=message.vignetting,
-            photograph=message.photograph,
         )
         return self._exposed(fused)
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msgs import CameraPose, Frame, Keyframe, TrackedFrame
+from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame
 from mvsgs_core import geometry
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified
-from mvsgs_core.tracking.publish import Update
+from mvsgs_core.tracking.publish import Correction, Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
 from nodes.tracking import TrackerNode
 
@@ -31,6 +32,7 @@ class Tracker(TrackerNode):
         super().__init__(config)
         self.core = CoreTracker(self.config)
         self._readout_times: list[float] = []  # seconds, what was taken out of each keyframe's image
+        self._without_shutter: set[int] = set()  # keyframes that were sent before the readout time was known
 
     def _add(self, frame: Frame) -> Update:
         guessed = frame.intrinsics_guessed
@@ -44,10 +46,36 @@ class Tracker(TrackerNode):
     def _readout_time(self) -> float:
         return self.core.readout_time if self.config.rectify_rolling_shutter else 0.0
 
+    def _send(self, update: Update) -> Iterator[Keyframe | Poses | TrackedFrame]:
+        if update.correction is not None:
+            update = replace(update, correction=self._with_shutter(update.correction))
+        yield from super()._send(update)
+
+    def _with_shutter(self, correction: Correction) -> Correction:
+        """Corrected keyframes that were sent before the readout time was known get it, and their velocities."""
+        if not self.config.rectify_rolling_shutter:
+            return replace(correction, velocity=None, readout_time=0.0)
+        late = self._without_shutter.intersection(correction.index.tolist()) if self._readout_time else set()
+        if correction.velocity is not None or not late:
+            return correction
+        self._without_shutter -= late
+        found = np.full((len(correction.index), 6), np.nan)
+        for k, index in enumerate(correction.index.tolist()):
+            velocity = self._velocity(index) if index in late else None
+            if velocity is not None:
+                found[k] = velocity
+        return replace(correction, velocity=found, readout_time=self._readout_time)
+
+    def _velocity(self, index: int) -> np.ndarray | None:
+        """(6,) of the camera at a keyframe, in the unit of its depths now; None: not known."""
+        return camera_velocity(self.core.keyframe(index), self.core.session.graph.intrinsics)
+
     def _keyframe(self, index: int) -> Keyframe:
         frame, keyframe = self._frames[index], self.core.keyframe(index)
         inverse_depth, weight = coarse_map(keyframe)
-        velocity = camera_velocity(keyframe, self.core.session.graph.intrinsics) if self._readout_time else None
+        velocity = self._velocity(index) if self._readout_time else None
+        if not self._readout_time:
+            self._without_shutter.add(index)
         with self.stats.time("rectification"):
             image = rectified(frame.image, keyframe.image, self._readout_time)
         self._readout_times.append(0.0 if keyframe.image.velocity is None else self._readout_time)

@@ -70,13 +70,20 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         return replace(message, exposure=exposure, vignetting=vignetting)
 
     def _moved(self, message: Keyframe | Depth, now: WindowedKeyframe) -> dict[str, Any]:
-        """What corrections change of a message: pose, scale and velocity, as its keyframe has them now."""
+        """What corrections change of a message: pose, scale and velocity, as its keyframe has them now.
+
+        One that was sent before the rolling shutter was known is its own photograph.
+        """
         velocity, scale, readout_time = message.velocity, message.scale, message.readout_time
+        velocity, scale, readout_time = self._velocities.get(message.index, (velocity, scale, readout_time))
+        photograph = message.photograph
         if velocity is not None:
-            velocity, scale, readout_time = self._velocities.get(message.index, (velocity, scale, readout_time))
             velocity = velocity * np.repeat([now.scale / scale, 1.0], 3)
-        moved = {"world_from_cam": now.world_from_cam, "scale": now.scale}
-        return moved | {"velocity": velocity, "readout_time": readout_time}
+            photograph = message.image if photograph is None else photograph
+        return {
+            "world_from_cam": now.world_from_cam, "scale": now.scale,
+            "photograph": photograph, "velocity": velocity, "readout_time": readout_time,
+        }  # fmt: skip
 
     def _corrected(self, keyframe: K) -> K:
         """With its newest pose, where that came before the keyframe."""

@@ -197,7 +197,7 @@ def test_a_photograph_passes_through_and_its_velocity_follows_the_maps_scale() -
 def test_a_velocity_that_is_known_better_reaches_keyframes_on_their_way() -> None:
     mvs, depth_fusion = stereo(), fusion()
     sent = [replace(k, photograph=k.image, velocity=np.ones(6), readout_time=0.02) for k in map(keyframe, range(4))]
-    sent[3] = keyframe(3)  # has no photograph
+    sent[3] = keyframe(3)  # sent before the shutter was known: the image is the photograph
     depths = [d for k in sent for d in mvs.on_keyframe(k)]
     poses = np.stack([k.world_from_cam for k in sent])
     better = np.full((4, 6), 5.0)
@@ -207,7 +207,8 @@ def test_a_velocity_that_is_known_better_reaches_keyframes_on_their_way() -> Non
         list(node.on_poses(correction))
     views = [v for d in [*depths, *mvs.on_end()] for v in depth_fusion.on_depth(d)] + list(depth_fusion.on_end())
     found = [(None if v.velocity is None else v.velocity.tolist(), v.readout_time) for v in views]
-    assert found == [([5.0] * 6, 0.03), ([1.0] * 6, 0.02), ([5.0] * 6, 0.03), (None, 0.0)]
+    assert found == [([5.0] * 6, 0.03), ([1.0] * 6, 0.02), ([5.0] * 6, 0.03), ([5.0] * 6, 0.03)]
+    np.testing.assert_array_equal(views[3].photograph, sent[3].image)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -362,6 +362,38 @@ def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling
         assert trajectory.readout_time == 0.0
         assert all(k.image is frames[k.index].image and k.photograph is None for k in keyframes)
         assert all(b.velocity is None and b.readout_time == 0.0 for b in of_type(sent, TrackedFrame))
+        assert all(p.velocity is None and p.readout_time == 0.0 for p in of_type(sent, Poses))
+
+
+@pytest.mark.slow
+def test_keyframes_sent_before_the_readout_time_was_known_get_it_with_their_next_correction() -> None:
+    """As the tracker finds it: 0 where the first keyframes do not tell it, and later what they do."""
+    frames, _ = rolling_messages(40)
+    node = Tracker(Tracker.Config(readout_time=0.0))
+    early: list[msgs.Message] = []
+    for n, frame in enumerate(frames):
+        if n == 25:
+            node.core.session.graph.readout_time = 0.5 / FPS
+            break
+        early += node.on_frame(frame)
+    late = [m for frame in frames[25:] for m in node.on_frame(frame)]
+    without = {k.index for k in of_type(early, Keyframe)}
+    assert without
+    assert all(k.photograph is None and k.velocity is None for k in of_type(early, Keyframe))
+    assert all(p.velocity is None for p in of_type(early, Poses))
+    told: dict[int, np.ndarray] = {}
+    for poses in of_type(late, Poses):
+        if poses.velocity is not None:
+            assert poses.readout_time == 0.5 / FPS
+            told |= {int(i): v for i, v in zip(poses.index, poses.velocity) if np.isfinite(v).all()}
+    assert told
+    assert set(told) <= without
+    final = of_type(list(node.on_end()), Poses)[-1]
+    assert final.velocity is not None
+    known = dict(zip(final.index.tolist(), final.velocity))
+    off = [np.linalg.norm(v[3:] - known[i][3:]) / np.linalg.norm(known[i][3:]) for i, v in told.items()]
+    assert np.median(off) < 0.3, off
+    assert np.isfinite([known[i] for i in without]).all()
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import numpy as np
 
 from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.mapping.owed import Owed
 from mvsgs_core.stats import Stats
 
 
@@ -26,6 +27,8 @@ class KeyframeStore:
         self.with_image = [view for view in self.views if view.has_image]
         self.between = list(between)
         self._by_index = {view.index: view for view in self.views}
+        self.owed = Owed()
+        self.owed.count(self.with_image)
 
     def __len__(self) -> int:
         return len(self.views)
@@ -49,12 +52,6 @@ class KeyframeStore:
     def trained(self) -> list[TrainingView]:
         """All that is trained on: keyframes, then the frames between them."""
         return [*self.with_image, *self.between]
-
-    def owed(self, limit: int) -> list[int]:
-        """Positions in `with_image` of the keyframes that are owed iterations, see `TrainingView.owed`: that with the
-        fewest since its correction first."""
-        owed = [k for k, view in enumerate(self.with_image) if view.owed(limit)]
-        return sorted(owed, key=lambda k: self.with_image[k].visits_here)
 
     def of(self, index: int) -> TrainingView | None:
         """The keyframe of this frame index."""
@@ -86,6 +83,7 @@ class KeyframeStore:
         self.between = sorted(self.between + other.between, key=index)
         self._by_index |= other._by_index
         self._bound_images()
+        self.owed.count(self.with_image)
 
     def place_anew(self, local: Callable[[np.ndarray], np.ndarray], unit: float = 1.0) -> None:
         """The frame of reference has another unit: `local` takes poses (4, 4) of the world to it. unit: its length in

@@ -66,7 +66,8 @@ class TrainingView:
     pose_steps: int = 0
     fixed: bool = False  # its pose is not refined: it holds the frame of reference
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))  # of the camera, twist a second, mapper's unit
-    readout_time: float = 0.0  # seconds from the image's first row to its last; 0: all rows at once
+    readout_time: float = 0.0  # seconds from the image's first row to its last; 0: all rows at once, or not known
+    as_taken: bool = True  # no shutter is taken out of the image: renders are as that saw it, as soon as it is known
     median_depth: float = 0.0  # of its depth map, in the mapper's unit; 0: it has none
     valid: Tensor | None = None  # (H, W) bool; None: every pixel is
     visits: int = 0  # training iterations so far
@@ -131,6 +132,7 @@ class TrainingView:
         """
         resized = torch.from_numpy(np.array(camera.resize_image(photograph, self.size)))
         self.image, self.velocity, self.readout_time = resized.to(self.image.device), velocity, readout_time
+        self.as_taken = True
 
     def place(self, world_from_cam: np.ndarray, local_from_cam: np.ndarray, scale: float) -> Similarity:
         """A corrected pose and scale; returns how what was seen from it moves, in the mapper's frame."""

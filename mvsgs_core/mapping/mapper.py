@@ -83,7 +83,7 @@ class OnlineMapper:
     @property
     def figures(self) -> dict[str, int]:
         """For the live display and the report."""
-        owed = len(self.keyframes.owed(self.config.iterations))  # at least one each
+        owed = min(len(self.keyframes.owed), self.schedule.beside)  # at least
         return {
             "splats": len(self.state), "iterations": self.iterations,
             "iterations_pending": self.schedule.pending + owed,
@@ -120,6 +120,7 @@ class OnlineMapper:
             self.schedule.reset()
         with self.log.time("insertion"):
             inserted = self.densifier.add(checked, view, depth)
+        view.as_taken = keyframe.photograph is None and keyframe.velocity is None
         if checked.photograph is not None and checked.velocity is not None and view.has_image:
             per_unit = scale / (checked.scale * self.frame.length)
             velocity = checked.velocity * ([per_unit] * 3 + [1.0] * 3)
@@ -146,14 +147,20 @@ class OnlineMapper:
         return True
 
     def step(self) -> bool:
-        """One iteration that is pending, or owed to a keyframe that was corrected; False when none is."""
-        owed = self.keyframes.owed(self.config.iterations)
-        if (self.schedule.pending == 0 and not owed) or not self.views or len(self.state) == 0:
+        """One iteration that is pending, or owed to a keyframe that was corrected; False when none is due.
+
+        What is owed takes at most a keyframe's budget beside what is pending; the rest waits for the next keyframe,
+        and for the final refinement.
+        """
+        owed = self.keyframes.owed.first(self.config.iterations)
+        if not self.schedule.due(owed is not None) or not self.views or len(self.state) == 0:
             self.schedule.drop()
             return False
         with self.log.time("optimization"):
             images, convergence = self.keyframes.trained, self.config.convergence
-            view = self._chosen(images[self.schedule.next(len(self.keyframes.with_image), len(images), owed)])
+            position = self.schedule.next(len(self.keyframes.with_image), len(images), owed is not None)
+            view = owed if position is None else self._chosen(images[position])
+            assert view is not None
             done = convergence.skip and view.converged(convergence)
             if done and not self.schedule.chance(convergence.keep):
                 self.log.skip("iterations_converged")
@@ -162,7 +169,8 @@ class OnlineMapper:
         return True
 
     def refine(self, done: int, total: int) -> None:
-        """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates.
+        """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates; half of
+        them on those that are owed iterations, while any is.
 
         Halfway, when the keyframes show what the map needs, it is rid of what it does not; the rest makes up for it.
         """
@@ -172,24 +180,25 @@ class OnlineMapper:
             self.trainer.prune(self.keyframes.with_image, self.median_depth)
         with self.log.time("refinement"):
             self.trainer.rate = 0.1 ** (done / max(total, 1))
-            images = self.keyframes.trained
-            view = self._chosen(images[self.schedule.next_of_all(len(images))])
+            view = self.keyframes.owed.first(self.config.iterations) if done % 2 else None
+            if view is None:
+                images = self.keyframes.trained
+                view = self._chosen(images[self.schedule.next_of_all(len(images))])
             self.trainer.step(view, self.median_depth, refining=True)
 
     def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> int:
         """Takes corrected absolute poses (K, 4, 4) and cumulative scales (K,) of the keyframes `index` (K,).
 
         Splats move with their anchor keyframe; returns how many did. A keyframe of which what it sees moves by more
-        than a pixel is trained until its loss is back. Poses that are not finite are refused and counted.
+        than a pixel is trained until its loss is back, see `step`. Poses that are not finite are refused and counted.
         """
         moved: dict[int, Similarity] = {}
-        by_index = {view.index: view for view in self.views}
         for key, pose, s in zip(index.tolist(), np.asarray(world_from_cam, dtype=np.float64), scale.tolist()):
             if not is_pose(pose, s) or not self.frame.holds(pose):
                 self.log.refuse("poses", 1, NO_POSE)
                 continue
             self.corrections[key] = (pose, s)
-            view = by_index.get(key)
+            view = self.keyframes.of(key)
             if view is None:
                 continue
             seen, pixel = view.footprint(), view.median_depth / view.intrinsics[0]
@@ -197,9 +206,10 @@ class OnlineMapper:
             if similarity.moves(max(view.median_depth, 1e-6)):
                 moved[key] = similarity
                 view.begin_anew(moved=bool(similarity.shifts(seen).max() > pixel))
-                for between in self.keyframes.between:
-                    if between.keyframe == key:
-                        between.begin_anew()
+        for between in self.keyframes.between:
+            if between.keyframe in moved:
+                between.begin_anew()
+        self.keyframes.owed.count(self.keyframes.with_image)
         with self.log.time("correction"):
             count = move_with_anchors(self.state, moved)
         self.log.count("corrected_keyframes", len(moved))
@@ -209,12 +219,12 @@ class OnlineMapper:
         """Takes velocities (K, 6) of the camera at the keyframes `index` (K,), world units a second, NaN: as it was.
 
         And the time, seconds, in which their photographs were read; for those that are trained on as they were taken,
-        and for the frames between them, whose velocities stay.
+        whether that was known of them before or not, and for the frames between them, whose velocities stay.
         """
         known = dict(zip(index.tolist(), velocity / np.repeat([self.frame.length, 1.0], 3)))
         for view in self.views:
             found = known.get(view.index)
-            if view.readout is not None and found is not None and np.isfinite(found).all():
+            if view.as_taken and found is not None and np.isfinite(found).all():
                 view.velocity, view.readout_time = found, readout_time
         for between in self.keyframes.between:
             if between.twist.any():

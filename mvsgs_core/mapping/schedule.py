@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,19 +10,23 @@ import numpy as np
 class Schedule:
     """Pending iterations and the order of the keyframes, drawn without replacement, seeded.
 
-    Keyframes are given by their position in the mapper's list. `pending` counts down to 0.
+    Keyframes are given by their position in the mapper's list. `pending` counts down to 0, then `beside` does: what
+    corrected keyframes, which are owed iterations, may get beside the pending ones until the next keyframe comes.
     """
 
     def __init__(self, window: int, seed: int) -> None:
         self.window = window
         self.pending = 0
+        self.beside = 0
         self._random = np.random.default_rng(seed)
         self._local: list[int] = []
         self._all: list[int] = []
         self._turn = 0
 
     def add_budget(self, iterations: int) -> None:
+        """Of a new keyframe. As many may go to what is owed beside them, so that none waits for more than that."""
         self.pending += iterations
+        self.beside = iterations
         self._local = []  # the window has moved
 
     def drop(self) -> int:
@@ -35,16 +38,21 @@ class Schedule:
         """The positions have changed: begins new rounds."""
         self._local, self._all = [], []
 
-    def next(self, count: int, trained: int | None = None, owed: Sequence[int] = ()) -> int:
-        """Position of the next of `count` > 0 keyframes; takes one off the pending iterations.
+    def due(self, owed: bool) -> bool:
+        """Whether an iteration is to be done before the next keyframe. owed: whether one is to any keyframe."""
+        return self.pending > 0 or (owed and self.beside > 0)
+
+    def next(self, count: int, trained: int | None = None, owed: bool = False) -> int | None:
+        """Position of the next of `count` > 0 keyframes, None: the one that is owed; takes one off those that are due.
 
         trained: images in all, the keyframes' first, of which the half on all takes its turns; None: keyframes alone.
-        owed: positions to which the half on all goes first, and all iterations where none is pending.
+        owed: the half on all goes to the keyframe that is owed iterations, and all where none is pending.
         """
-        pending, self.pending = self.pending, max(0, self.pending - 1)
+        pending = self.pending
+        self.pending, self.beside = max(0, pending - 1), self.beside - (pending == 0)
         self._turn += 1
         if owed and (pending == 0 or self._turn % 2 == 0):
-            return owed[0]
+            return None
         if self._turn % 2:
             if not self._local:
                 first = max(0, count - self.window)
@@ -64,7 +72,7 @@ class Schedule:
     def state(self) -> dict[str, Any]:
         """All that the next draws depend on, as JSON has it."""
         return {
-            "pending": self.pending, "turn": self._turn, "local": list(self._local), "all": list(self._all),
+            "pending": self.pending, "beside": self.beside, "turn": self._turn, "local": list(self._local), "all": list(self._all),
             "random": self._random.bit_generator.state,
         }  # fmt: skip
 
@@ -73,7 +81,9 @@ class Schedule:
 
         Raises ValueError for what it never returns.
         """
-        self.pending, self._turn = (_at_least_zero(state.get(name)) for name in ("pending", "turn"))
+        self.pending, self.beside, self._turn = (
+            _at_least_zero(state.get(name)) for name in ("pending", "beside", "turn")
+        )
         self._local, self._all = _positions(state.get("local"), count), _positions(state.get("all"), trained)
         try:
             self._random.bit_generator.state = state["random"]

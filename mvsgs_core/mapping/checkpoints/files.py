@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 FOLDER, KEYFRAMES = "checkpoint", "keyframes"
-FORMAT, VERSION = "mvsgs checkpoint", 6
+FORMAT, VERSION = "mvsgs checkpoint", 7
 MAX_META = 64 << 20  # bytes of JSON
 NEIGHBORS = 16  # keyframes before the newest one that stereo and fusion of the next ones may look at, at most
 

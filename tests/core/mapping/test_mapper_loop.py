@@ -9,8 +9,9 @@ import pytest
 
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.keyframes import RGBDKeyframe
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.owed import Owed
 from tests.support.small_maps import mapped
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
@@ -87,22 +88,93 @@ def test_a_correction_below_a_pixel_is_owed_nothing() -> None:
     assert mapper.log.counts["corrected_keyframes"] > 0
 
 
-def test_a_keyframe_whose_loss_does_not_come_back_is_owed_the_budget_of_one() -> None:
-    mapper = mapped(arc()[:3], CONFIG)
+def hopeless(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:
+    """A map whose keyframes have all moved, and whose losses never come back."""
+    mapper = mapped(views, config)
     for view in mapper.views:
         view.loss_fast = 0.0
         view.begin_anew(moved=True)
-    visits = [view.visits for view in mapper.views]
-    assert mapper.figures["iterations_pending"] == 3
-    assert settled(mapper) == 3 * CONFIG.iterations
-    assert [view.visits - before for view, before in zip(mapper.views, visits)] == [CONFIG.iterations] * 3
+    mapper.keyframes.owed.count(mapper.views)
+    return mapper
+
+
+def test_what_a_correction_owes_holds_the_next_keyframe_back_by_the_budget_of_one() -> None:
+    views = arc()
+    mapper = hopeless(views[:6])
+    before = [view.visits for view in mapper.views]
+    assert mapper.figures["iterations_pending"] == 6
+    assert settled(mapper) == CONFIG.iterations
+    assert [view.visits - visits for view, visits in zip(mapper.views, before)] == [CONFIG.iterations // 6] * 6
     assert mapper.figures["iterations_pending"] == 0
+    for view in views[6:]:  # the rest is spread over what follows
+        mapper.add_keyframe(view)
+        assert settled(mapper) == 2 * CONFIG.iterations
+
+
+def test_corrections_between_two_keyframes_owe_no_more_than_one() -> None:
+    mapper = hopeless(arc()[:3])
+    done = settled(mapper)
+    for view in mapper.views:
+        view.begin_anew(moved=True)
+    mapper.keyframes.owed.count(mapper.views)
+    assert done + settled(mapper) == CONFIG.iterations
+
+
+def test_no_keyframe_is_owed_more_than_the_budget_of_one() -> None:
+    mapper = hopeless(arc()[:1])
+    assert settled(mapper) == CONFIG.iterations == mapper.views[0].visits_here
+    mapper.add_keyframe(arc()[1])
+    assert settled(mapper) == CONFIG.iterations
+
+
+def test_the_final_refinement_gives_half_of_its_iterations_to_what_is_still_owed() -> None:
+    mapper = mapped(arc(), CONFIG)
+    moved = mapper.views[3]
+    moved.loss_fast = 0.0
+    moved.begin_anew(moved=True)
+    mapper.keyframes.owed.count(mapper.views)
+    iterations = mapper.iterations
+    for done in range(16):
+        mapper.refine(done, 16)
+    assert mapper.iterations - iterations == 16  # no more than without
+    assert 8 <= moved.visits_here <= 8 + 2  # two more where the round over all eight keyframes comes to it
+
+
+def test_the_next_keyframe_that_is_owed_is_found_without_a_look_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same as by a look at all of them, whatever happens to them meanwhile."""
+    looks = 0
+    plain = TrainingView.owed
+
+    def counted(view: TrainingView, limit: int) -> bool:
+        nonlocal looks
+        looks += 1
+        return plain(view, limit)
+
+    one = mapped(arc()[:1], CONFIG).views[0]
+    views = [replace(one, index=k, loss_before=0.0, visits_here=k % 5) for k in range(400)]
+    owed, random, iterations = Owed(), np.random.default_rng(0), 0
+    owed.count(views)
+    monkeypatch.setattr(TrainingView, "owed", counted)
+    while (found := owed.first(12)) is not None:
+        if iterations % 50 == 0:
+            expected = min((v for v in views if v.has_image and plain(v, 12)), key=lambda v: (v.visits_here, v.index))
+            assert found is expected
+        found.record(1.0)
+        other = views[random.integers(len(views))]  # in its turn of the round over all
+        other.record(float(random.choice([0.0, 1.0, 1.0])))
+        if iterations == 100:
+            views[7].drop_image()
+        iterations += 1
+    assert not any(v.has_image and plain(v, 12) for v in views)
+    assert iterations > 1000
+    assert looks < 4 * iterations
 
 
 def test_what_is_owed_takes_the_half_on_all_of_what_is_pending() -> None:
     mapper = mapped(arc(), CONFIG)
     first = mapper.views[0]
     first.loss_before, first.visits_here = 0.0, 0
+    mapper.keyframes.owed.count(mapper.views)
     mapper.schedule.add_budget(6)
     visits = first.visits
     for _ in range(6):

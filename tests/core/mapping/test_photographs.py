@@ -85,6 +85,32 @@ def test_a_velocity_that_is_known_better_replaces_the_first() -> None:
     np.testing.assert_allclose(mapper.views[1].readout, 0.03 * in_unit)
 
 
+def test_keyframes_sent_before_the_readout_time_was_known_get_it_when_it_is() -> None:
+    """What was trained without the shutter is then refined with it."""
+    views = shaking()
+    unknown = [replace(v, image=v.photograph, photograph=None, velocity=None, readout_time=0.0) for v in views]
+    mapper, never = mapped(unknown), mapped(unknown)
+    assert all(view.readout is None for view in mapper.views)
+    mapper.move(np.array([view.index for view in views]), np.stack([view.velocity for view in views]), READOUT_TIME)
+    for view, sent in zip(mapper.views, views):
+        assert sent.velocity is not None
+        expected = READOUT_TIME * sent.velocity / np.repeat([mapper.frame.length, 1.0], 3)
+        np.testing.assert_allclose(view.readout, expected)
+    for done in range(40):
+        mapper.refine(done, 40)
+        never.refine(done, 40)
+    between = rgbd_keyframe(99, pose_on_arc(0.5))
+    assert score(mapper, between) > score(never, between) + 2.0
+
+
+def test_an_image_that_is_free_of_the_shutter_stays_so() -> None:
+    """Its photograph was refused, so that what it was rectified by is not known."""
+    mapper = OnlineMapper(CONFIG)
+    mapper.add_keyframe(replace(shaking()[0], readout_time=float("nan")))
+    mapper.move(np.array([0]), np.ones((1, 6)), READOUT_TIME)
+    assert mapper.views[0].readout is None
+
+
 def test_a_view_before_the_unit_is_known_gets_its_velocity_in_it() -> None:
     first, second = shaking()[:2]
     mapper = OnlineMapper(CONFIG)
