@@ -72,8 +72,8 @@ class Schedule:
     def state(self) -> dict[str, Any]:
         """All that the next draws depend on, as JSON has it."""
         return {
-            "pending": self.pending, "beside": self.beside, "turn": self._turn, "local": list(self._local), "all": list(self._all),
-            "random": self._random.bit_generator.state,
+            "pending": self.pending, "beside": self.beside, "turn": self._turn, "local": list(self._local),
+            "all": list(self._all), "random": self._random.bit_generator.state,
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any], count: int, trained: int) -> None:
