@@ -144,6 +144,7 @@ class Mapper(Node):
     def on_end(self) -> Iterator[SplatMap | Preview]:
         self._settle(realtime=False)
         self.atlas.finish()
+        self._settle(realtime=False)
         yield self._map(refined=False)
         while self.atlas.refine():
             self._keep()

@@ -76,9 +76,13 @@ class Atlas:
         return self.current.step()
 
     def finish(self) -> None:
-        """The stream has ended: of parts that stayed apart, the largest is gone on with."""
+        """The stream has ended: of parts that stayed apart, the largest is gone on with.
+
+        What its corrected keyframes are still owed may take as many iterations as the final refinement does, by `step`.
+        """
         self.stream_ended = True
         self.take_between()
+        self.largest.end()
         parts, log = list(self.parts.values()), self.current.log
         log.values["segments_apart"] = max(0, len(parts) - 1)  # beside the map that is shown
         if len(parts) < 2:

@@ -149,8 +149,8 @@ class OnlineMapper:
     def step(self) -> bool:
         """One iteration that is pending, or owed to a keyframe that was corrected; False when none is due.
 
-        What is owed takes at most a keyframe's budget beside what is pending; the rest waits for the next keyframe,
-        and for the final refinement.
+        What is owed takes at most a keyframe's budget beside what is pending; the rest waits for the next keyframe, or
+        for the `end`.
         """
         owed = self.keyframes.owed.first(self.config.iterations)
         if not self.schedule.due(owed is not None) or not self.views or len(self.state) == 0:
@@ -167,6 +167,10 @@ class OnlineMapper:
             else:
                 self.trainer.step(view, self.median_depth)
         return True
+
+    def end(self) -> None:
+        """The stream has ended: no keyframe waits for what is owed, it may take as many iterations as `refine` does."""
+        self.schedule.beside = self.config.refinement
 
     def refine(self, done: int, total: int) -> None:
         """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates; half of

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
@@ -125,6 +126,15 @@ def test_no_keyframe_is_owed_more_than_the_budget_of_one() -> None:
     assert settled(mapper) == CONFIG.iterations == mapper.views[0].visits_here
     mapper.add_keyframe(arc()[1])
     assert settled(mapper) == CONFIG.iterations
+
+
+def test_at_the_streams_end_what_is_owed_takes_as_many_iterations_as_the_refinement() -> None:
+    mapper = hopeless(arc()[:4])
+    assert settled(mapper) == CONFIG.iterations
+    mapper.config = replace(CONFIG, refinement=20)
+    atlas = Atlas(mapper, {0: mapper})
+    atlas.finish()
+    assert settled(mapper) == 20 < 4 * CONFIG.iterations - CONFIG.iterations
 
 
 def test_the_final_refinement_gives_half_of_its_iterations_to_what_is_still_owed() -> None:
