@@ -36,6 +36,7 @@ class Command:
 COMMANDS = {
     "run": Command("INPUT ...", "the same as without this word"),
     "demo": Command("...", "maps the embedded room", words=("dataset=synthetic",)),
+    "view": Command("MAP", "a saved map in the browser: keyframes, renders, depth", "mvsgs.view"),
     "export": Command("MAP OUT", "to .ply, .splat, .spz, .glb, .obj or a COLMAP folder", "mvsgs_core.export.__main__"),
     "render": Command("MAP PATH OUT.mp4", "a video along a trajectory", "mvsgs_core.export.render_path"),
     "weights": Command("list", "network weights: where they are found and had", "mvsgs_core.weights"),

@@ -119,8 +119,8 @@ def test_map_is_shown_at_unit_distance_whatever_its_scale(viewer: Viewer) -> Non
     splats = viewer.server.scene.get_handle_by_name("/splats")
     assert splats is not None
     assert np.median(np.linalg.norm(splats.centers, axis=1)) == pytest.approx(1.0, rel=1e-3)
-    assert viewer.unit == pytest.approx(2e4, rel=0.1)
-    expected = preview(0, scale=1e4).covariances[0, 0, 0] / viewer.unit**2
+    assert viewer.page.unit == pytest.approx(2e4, rel=0.1)
+    expected = preview(0, scale=1e4).covariances[0, 0, 0] / viewer.page.unit**2
     assert splats.covariances[0, 0, 0] == pytest.approx(expected, rel=2e-3)  # half precision
 
 
@@ -137,9 +137,9 @@ def test_map_grows_and_oldest_frustums_go(viewer: Viewer) -> None:
 def test_frustums_follow_corrections(viewer: Viewer) -> None:
     for index in (0, 1):
         show(viewer, preview(index))
-    assert viewer.unit is not None
+    assert viewer.page.unit is not None
     poses = np.stack([np.eye(4), np.eye(4)])
-    poses[0, :3, 3] = viewer.unit * np.array([0.0, 3.0, 0.0])
+    poses[0, :3, 3] = viewer.page.unit * np.array([0.0, 3.0, 0.0])
     poses[1, :3, 3] = preview(2).world_from_cam[:3, 3]
     moved = replace(preview(2), keyframes=np.array([0, 2]), keyframe_poses=poses, origin=np.zeros(3))
     show(viewer, moved)

@@ -34,7 +34,6 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
     shown = {name: value[::stride] for name, value in final.tensors().items()}
     if provisional is not None:
         shown = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in shown.items()}
-    shapes = zip(shown["quaternions"].split(CHUNK), shown["log_scales"].split(CHUNK))
     poses = np.stack([view.world_from_cam for view in mapper.views])
     poses[:, :3, 3] -= origin
     return {
@@ -43,10 +42,10 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
         "world_from_cam": poses[-1],
         "intrinsics": newest.intrinsics,
         "image": newest.image.cpu().numpy(),
-        "render": _bytes(mapper.render(newest).color),
+        "render": as_bytes(mapper.render(newest).color),
         "means": (shown["means"] * unit).cpu().numpy(),
-        "covariances": torch.cat([_covariances(q, s, unit) for q, s in shapes]).cpu().numpy(),
-        "colors": _bytes(0.5 + C0 * shown["sh"][:, 0]),
+        "covariances": covariances(shown["quaternions"], shown["log_scales"], unit).cpu().numpy(),
+        "colors": as_bytes(0.5 + C0 * shown["sh"][:, 0]),
         "opacities": torch.sigmoid(shown["opacity_logits"]).cpu().numpy(),
         "keyframes": np.array([view.index for view in mapper.views], dtype=np.int64),
         "keyframe_poses": poses,
@@ -54,11 +53,15 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
     }
 
 
-def _covariances(quaternions: torch.Tensor, log_scales: torch.Tensor, unit: float) -> torch.Tensor:
-    """(N, 3, 3) in world units, of quaternions (N, 4) and log scales (N, 3)."""
-    axes = rotation_matrices(quaternions) * (log_scales.exp() * unit)[:, None, :]
-    return axes @ axes.transpose(1, 2)
+def covariances(quaternions: torch.Tensor, log_scales: torch.Tensor, unit: float) -> torch.Tensor:
+    """(N, 3, 3) in world units, of quaternions (N, 4) and log scales (N, 3) in a unit of so many of them."""
+    made = []
+    for q, s in zip(quaternions.split(CHUNK), log_scales.split(CHUNK)):
+        axes = rotation_matrices(q) * (s.exp() * unit)[:, None, :]
+        made.append(axes @ axes.transpose(1, 2))
+    return torch.cat(made)
 
 
-def _bytes(color: torch.Tensor) -> np.ndarray:
+def as_bytes(color: torch.Tensor) -> np.ndarray:
+    """Of values from 0 to 1; what is beyond is cut."""
     return np.asarray((color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy())

@@ -1,0 +1,106 @@
+"""`mvsgs view`: the page of a saved map has its splats and keyframes, and the slider shows what each sees."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvsgs import view
+from mvsgs.view import SavedMapView
+from mvsgs_core.export.cameras import read_cameras
+from mvsgs_core.export.keyframe_images import write_image
+from mvsgs_core.export.ply import read_ply
+from nodes.map_page import MapPage
+from tests.support.shared_data import ROOT
+from tests.support.tiny_map import SIZE, write_tiny_run
+from tests.test_viewer import free_port, page
+
+
+@pytest.fixture
+def shown(tmp_path: Path) -> Iterator[SavedMapView]:
+    run = write_tiny_run(tmp_path / "run")
+    write_image(run / "keyframes", 7, np.full((*SIZE, 3), 200, np.uint8))
+    opened = MapPage("127.0.0.1", free_port())
+    yield SavedMapView(opened, read_ply(run / "map.ply"), read_cameras(run / "cameras.json"), run / "keyframes", "tiny")
+    opened.server.stop()
+
+
+def test_the_page_has_splats_keyframes_and_the_path(shown: SavedMapView) -> None:
+    got = page(shown.page.url)
+    for name in ("GaussianSplats", "/splats", "/keyframes/0", "/keyframes/14", "/path", "3 keyframes", "Close"):
+        assert name in got, name
+
+
+def test_each_keyframe_shows_its_render_depth_and_photograph(shown: SavedMapView) -> None:
+    renders = {}
+    for k in (0, 1, 2):
+        shown.show(k)
+        renders[k] = shown._pictures["render"].image
+        assert shown._pictures["photograph"].visible == (k == 1)
+    assert renders[0].shape == (*SIZE, 3)
+    assert not np.array_equal(renders[0], renders[2])
+    shown.show(1)
+    assert (shown._pictures["photograph"].image == 200).all()
+    assert "keyframe **7**, 32x24; depth" in shown._caption.content
+    marked = shown.page.frustums[7].color
+    assert [shown.page.frustums[index].color == marked for index in (0, 7, 14)] == [False, True, False]
+
+
+def test_the_render_is_in_the_photographs_exposure(tmp_path: Path) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    final, cameras = read_ply(run / "map.ply"), read_cameras(run / "cameras.json")
+    opened = MapPage("127.0.0.1", free_port())
+    try:
+        plain = SavedMapView(opened, final, cameras, run, "tiny")._pictures["render"].image.astype(int)
+        cameras.exposures[0, :, :3] *= 0.5
+        darker = SavedMapView(opened, final, cameras, run, "tiny")._pictures["render"].image.astype(int)
+        assert np.abs(plain - 2 * darker)[plain < 255].max() <= 2  # what is brighter is cut
+        assert np.median(plain) > 50
+    finally:
+        opened.server.stop()
+
+
+def test_a_map_of_another_program_is_shown_without_keyframes(tmp_path: Path) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    opened = MapPage("127.0.0.1", free_port())
+    try:
+        SavedMapView(opened, read_ply(run / "map.ply"), None, run, "tiny")
+        got = page(opened.url)
+        assert "/splats" in got
+        assert "no cameras.json beside this map" in got
+    finally:
+        opened.server.stop()
+
+
+@pytest.mark.slow
+def test_the_command_says_where_the_page_is_and_ends_by_ctrl_c(tmp_path: Path) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    code = "import sys; from mvsgs.command import main; sys.exit(main())"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "view", str(run), "--port", str(free_port())],
+        stdout=subprocess.PIPE, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        said = process.stdout.readline()
+        assert said.startswith(f"{run / 'map.ply'}: http://127.0.0.1:")
+        assert "/splats" in page(said.split()[1].rstrip(";"))
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 0
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_what_cannot_be_shown_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert view.main([str(tmp_path / "nothing.ply")]) == 1
+    assert capsys.readouterr().err.startswith(f"view: {tmp_path / 'nothing.ply'} is missing: a map is")
