@@ -7,6 +7,7 @@ import contextlib
 import io
 import signal
 import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ class SavedMapView:
     def __init__(self, page: MapPage, final: Snapshot, cameras: Cameras | None, photographs: Path, name: str) -> None:
         """photographs: folder with the keyframes' images, or one that is not there."""
         self.page, self.closed = page, threading.Event()
+        self._showing = threading.Lock()
         self._final, self._cameras, self._photographs = final, cameras, photographs
         gui, splats = page.server.gui, final.splats
         means, colors = splats.means.numpy(), as_bytes(0.5 + C0 * splats.sh[:, 0])
@@ -73,11 +75,11 @@ class SavedMapView:
     def _show_keyframes(self, cameras: Cameras) -> None:
         for k, index in enumerate(cameras.keyframes.tolist()):
             frustum = self.page.add_keyframe(index, self._poses[k], cameras.intrinsics[k], cameras.sizes[k].tolist())
-            frustum.on_click(lambda _, k=k: self._choose(k))
+            frustum.on_click(partial(self._choose, k))
         self.page.show_path()
         gui, last = self.page.server.gui, len(cameras) - 1
         if last > 0:
-            self._slider = gui.add_slider("keyframe", 0, last, 1, 0)
+            self._slider: viser.GuiInputHandle[int] = gui.add_slider("keyframe", 0, last, 1, 0)
             self._slider.on_update(lambda _: self.show(int(self._slider.value)))
         self._caption = gui.add_markdown("")
         gui.add_button("Look from here").on_click(self._look)
@@ -85,14 +87,18 @@ class SavedMapView:
         self._pictures = {name: gui.add_image(blank, label=name) for name in ("photograph", "render", "depth")}
         self.show(0)
 
-    def _choose(self, k: int) -> None:
+    def _choose(self, k: int, _: Any) -> None:
         if len(self._poses) > 1:
-            self._slider.value = k  # which shows it
+            self._slider.value = k  # type: ignore[misc]  # viser's setter; it shows the keyframe
         else:
             self.show(k)
 
     def show(self, k: int) -> None:
         """Keyframe number k, from 0: its frustum is marked, its pictures are beside the scene."""
+        with self._showing:  # the page calls from threads
+            self._show(k)
+
+    def _show(self, k: int) -> None:
         assert self._cameras is not None
         assert self.page.unit is not None
         self._shown = k

@@ -54,6 +54,13 @@ def test_each_keyframe_shows_its_render_depth_and_photograph(shown: SavedMapView
     assert [shown.page.frustums[index].color == marked for index in (0, 7, 14)] == [False, True, False]
 
 
+def test_a_frustum_that_is_clicked_is_shown_and_moves_the_slider(shown: SavedMapView) -> None:
+    shown._choose(2, None)
+    assert shown._slider.value == 2
+    assert "keyframe **14**" in shown._caption.content
+    assert shown.page.frustums[14].color != shown.page.frustums[0].color
+
+
 def test_the_render_is_in_the_photographs_exposure(tmp_path: Path) -> None:
     run = write_tiny_run(tmp_path / "run")
     final, cameras = read_ply(run / "map.ply"), read_cameras(run / "cameras.json")
