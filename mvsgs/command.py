@@ -39,6 +39,7 @@ COMMANDS = {
     "view": Command("MAP", "a saved map in the browser: keyframes, renders, depth", "mvsgs.view"),
     "export": Command("MAP OUT", "to .ply, .splat, .spz, .glb, .obj or a COLMAP folder", "mvsgs_core.export.__main__"),
     "render": Command("MAP PATH OUT.mp4", "a video along a trajectory", "mvsgs_core.export.render_path"),
+    "doctor": Command("", "what this machine has for a run, and a self-test of ten seconds", "mvsgs.doctor"),
     "weights": Command("list", "network weights: where they are found and had", "mvsgs_core.weights"),
     "graph": Command("...", "what a command line composes", words=("--graph",)),
     "parameters": Command("...", "all slots, choices and parameters of a command line", words=("--help",)),

@@ -1,0 +1,47 @@
+"""`mvsgs doctor`: it sees what is there and what is not, and its self-test fails where a run does."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from mvsgs import doctor
+from mvsgs_core import native, weights
+
+
+def test_it_names_kernels_packages_and_weights(capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor.main(["--no-test"]) == 0
+    said = capsys.readouterr().out
+    assert "rasterizer, mapping, tracking, mvs, fusion, scene: " in said
+    assert said.count("\nweights ") == len(weights.REGISTRY)
+    assert said.endswith("all is well\n")
+
+
+def test_kernels_that_are_not_built_are_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing(name: str) -> None:
+        raise ImportError(f"`_{name}` are not built")
+
+    monkeypatch.setattr(native, "load", missing)
+    assert doctor.main(["--no-test"]) == 1
+    said = capsys.readouterr().out
+    assert "! kernels              `_rasterizer` are not built" in said
+    assert said.endswith("to be looked at: kernels\n")
+
+
+@pytest.mark.slow
+def test_the_self_test_maps_the_room(tmp_path: Path) -> None:
+    reached, right = doctor.self_test(tmp_path)
+    assert right, reached
+    assert reached.startswith("30 of 30 frames tracked, held-out PSNR 3")
+
+
+def test_a_run_that_fails_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(command, 1, "", "error: no\nmore")
+
+    monkeypatch.setattr(doctor.subprocess, "run", failing)
+    assert doctor.self_test(tmp_path) == ("failed with code 1: error: no", False)
