@@ -176,11 +176,12 @@ class OnlineMapper:
         """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates; half of
         them on those that are owed iterations, while any is.
 
-        Halfway, when the keyframes show what the map needs, it is rid of what it does not; the rest makes up for it.
+        A sixth of the way, when the newest splats have settled, the map is rid of those that no keyframe needs; what
+        is left makes up for them, and each iteration costs less.
         """
         if not self.views or len(self.state) == 0:
             return
-        if done == total // 2:
+        if done == total // 6:
             self.trainer.prune(self.keyframes.with_image, self.median_depth)
         with self.log.time("refinement"):
             self.trainer.rate = 0.1 ** (done / max(total, 1))
