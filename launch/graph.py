@@ -7,8 +7,9 @@ choices and edges all come from `conf/`.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import msgs
@@ -37,6 +38,8 @@ class Settings:
     """The keys that belong to no slot."""
 
     output: str = ""  # directory of everything a run writes; none given: runs/<time>-<dataset>
+    map: str | None = None  # output of a run with keep_map=true: its map is gone on with; null: a new map
+    keep_map: bool | None = None  # leave the map in the output, for another run to begin on; null: where `map` is given
     device: str = "auto"  # auto, cpu, cuda or cuda:1: for every node that has a `device` and leaves it at auto
     seed: int = 0  # of every random choice
     inline: bool = False  # true (or --inline): all nodes in this process, one message at a time, for a debugger
@@ -49,7 +52,12 @@ class Settings:
     supervise: Supervise = field(default_factory=Supervise)
 
 
-FROM_SETTINGS = ("output", "seed")  # nodes that have such a parameter and are given none of their own get these
+FROM_SETTINGS = (
+    "output",
+    "seed",
+    "map",
+    "keep_map",
+)  # nodes that have such a parameter and are given none of their own get these
 
 
 @dataclass(frozen=True)
@@ -154,6 +162,7 @@ def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) ->
     resolved |= {name: _section(slots[name]) if name in slots else {"_target_": None} for name in sections}
     graph = Graph({name: slots[name] for name in names}, edges, settings, resolved, warnings)
     _check_observers(graph)
+    _check_map(graph)
     return graph
 
 
@@ -165,6 +174,12 @@ def _settings(config: Mapping[str, Any]) -> tuple[Settings, dict[str, Mapping[st
     supervise = settings.supervise
     if not 0.0 < supervise.silent < supervise.dead:
         raise GraphError(f"supervise.silent={supervise.silent:g}: must be above 0 and below dead={supervise.dead:g}")
+    if settings.map is not None:
+        settings = replace(settings, map=str(Path(settings.map).expanduser().absolute()))
+        if settings.map == settings.output:
+            raise GraphError(f"map={settings.map} is the output too: a new map is written, give another output=DIR")
+    if settings.keep_map is None:
+        settings = replace(settings, keep_map=settings.map is not None)
     return settings, sections
 
 
@@ -321,6 +336,18 @@ def _check_observers(graph: Graph) -> None:
                 f"{edge.reader} reads {edge.message.__name__} from {edge.sender}, which may fail alone: set "
                 f"{edge.sender}.observer=false, or {edge.reader}.observer=true"
             )
+
+
+def _check_map(graph: Graph) -> None:
+    """Who begins a map on another one, or keeps it, does so in all its parts: the poses', and the splats'."""
+    asked = "map" if graph.settings.map is not None else "keep_map" if graph.settings.keep_map else None
+    if asked is None:
+        return
+    for name, slot in graph.slots.items():
+        sent = set(_outputs(name, slot.node))
+        makes = msgs.SplatMap in sent or (msgs.Poses in sent and msgs.Poses not in slot.reads)
+        if makes and asked not in slot.config:
+            raise GraphError(f"{asked}: {slot.target} in {name} cannot; tracker=dense and mapper=ges can")
 
 
 def _handlers(name: str, node: type[nodes.Node]) -> dict[type, str]:

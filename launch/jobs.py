@@ -107,7 +107,7 @@ def _scored(graph: Graph) -> bool:
 
 def _kept(graph: Graph) -> bool:
     """Whether the checkpoint is to stay after a complete run."""
-    return any(slot.config.get("keep_checkpoint") for slot in graph.slots.values())
+    return any(slot.config.get("keep_map") for slot in graph.slots.values())
 
 
 def _check_nodes(graph: Graph) -> None:

@@ -22,7 +22,8 @@ from omegaconf import OmegaConf
 from launch.outcome import Outcome
 from launch.refusal import GraphError
 from mvsgs_core.atomic_file import replace_text
-from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info
+from mvsgs_core.kept_map import FOLDER
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 
 LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
 MAP = ("map.ply", "trajectory.txt", FOLDER)  # what is worth keeping of an earlier run

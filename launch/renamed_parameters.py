@@ -42,6 +42,7 @@ RENAMED: tuple[tuple[str, str], ...] = (  # what it was, what it is with a node 
     ("mapper.unexplored", "mapper.insertion.unexplored"),
     ("mapper.insertion.unexplored_opacity", "mapper.insertion.min_opacity"),
     ("mapper.density_control", "mapper.density_control.mode"),
+    ("mapper.keep_checkpoint", "mapper.keep_map"),
     ("mapper.max_splats", "mapper.density_control.max_splats"),
     ("tracker.stride", "tracker.constants.stride"),
     ("tracker.filter_threshold", "tracker.constants.filter_threshold"),

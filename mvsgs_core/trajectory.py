@@ -49,12 +49,14 @@ class Trajectory:
         return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
 
     def velocities_of(self, index: np.ndarray) -> np.ndarray:
-        """(K, 6) of the camera at the frames `index` (K,), see `velocities`; NaN where no neighbor tells it."""
+        """(K, 6) of the camera at the frames `index` (K,), see `velocities`; NaN where no neighbor tells it, and of
+        frames of another stream."""
         found = np.zeros((len(self.index), 6))
         for segment in np.unique(self.segment[self.posed]):
             found += velocities(self.timestamp, self.world_from_cam, self.posed & (self.segment == segment))
         found[~found.any(axis=1)] = np.nan
-        return np.asarray(found[np.searchsorted(self.index, index)])
+        place = np.minimum(np.searchsorted(self.index, index), len(self.index) - 1)
+        return np.where((self.index[place] == index)[:, None], found[place], np.nan)
 
     def main(self) -> np.ndarray:
         """(N,) bool: frames with a pose in the part of the map that has most frames."""

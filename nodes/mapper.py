@@ -10,9 +10,11 @@ from pathlib import Path
 from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap, TrackedFrame
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
+from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.between import FrameBetween
 from mvsgs_core.mapping.checkpoints import checkpoint
+from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.replay import Replay
@@ -46,7 +48,8 @@ class Mapper(Node):
         preview_splats: int = 100000  # at most so many in a preview
         output: str | None = None  # folder for map.ply and cameras.json; null: none is written
         checkpoint: float = 30.0  # seconds of the stream or the clock between checkpoints in the output; 0: none
-        keep_checkpoint: bool = False  # of the finished map, after a complete run
+        keep_map: bool = False  # the finished map's checkpoint stays, for another run to begin on
+        map: str | None = None  # output of a run whose map is gone on with; null: a new map
         resume: str | None = None  # output of a run whose checkpoint is gone on with; null: a new map
         save_images: bool = False  # write each keyframe's image to output/keyframes, for a COLMAP model
 
@@ -59,6 +62,8 @@ class Mapper(Node):
         if self.config.resume is not None:
             self.atlas, resumed = checkpoint.load(Path(self.config.resume), self.config, self.stats)
             self._replay = Replay(self.atlas)
+        elif self.config.map is not None:
+            self.atlas = begin_on(Path(self.config.map), self.config, self.stats)
         self._checkpoints: Checkpointing | None = None
         if self.config.output is not None:
             self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.atlas, resumed)
@@ -69,6 +74,9 @@ class Mapper(Node):
     def check(cls, config: Config) -> None:
         if config.resume is not None:
             checkpoint_info(config.resume)
+        elif config.map is not None:
+            check_kept_map(config.map)
+            checkpoint_info(config.map)
 
     def on_fused_keyframe(self, fused: FusedKeyframe) -> Iterator[Preview]:
         self._provisional.came(fused.index)
@@ -155,7 +163,7 @@ class Mapper(Node):
         yield from self._preview(due=True)  # who watches is left with the map as it is now
         yield self._map(refined=True)
         if self._checkpoints is not None:
-            self._checkpoints.close(self.atlas, keep=self.config.keep_checkpoint)
+            self._checkpoints.close(self.atlas, keep=self.config.keep_map)
             self._checkpoints = None
 
     def on_abort(self, reason: str) -> None:

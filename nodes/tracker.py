@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame
+from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame, Trajectory
 from mvsgs_core import geometry
+from mvsgs_core.kept_map import STREAM, check_kept_map, tracker_file
+from mvsgs_core.tracking import known_map
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import TrackerConfig
@@ -24,15 +26,37 @@ class Tracker(TrackerNode):
     @dataclass(frozen=True)
     class Config(TrackerConfig):
         rectify_rolling_shutter: bool = True  # take account of it after the tracker: rectify the images of stereo
+        map: str | None = None  # output of a run whose map is gone on with; null: a new map
+        output: str | None = None  # folder of the map that is kept
+        keep_map: bool = False  # for another run to begin on
 
     config: Config
     core: CoreTracker
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
-        self.core = CoreTracker(self.config)
+        known = None if self.config.map is None else known_map.load(tracker_file(self.config.map)).renumbered(STREAM)
+        self.core = CoreTracker(self.config, known=known)
         self._readout_times: list[float] = []  # seconds, what was taken out of each keyframe's image
         self._without_shutter: set[int] = set()  # keyframes that were sent before the readout time was known
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        if config.map is not None:
+            check_kept_map(config.map)
+            known_map.load(tracker_file(config.map))
+
+    def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
+        yield from super().on_end()
+        if self.config.keep_map and self.config.output is not None:
+            self._keep_map(self.config.output)
+
+    def _keep_map(self, output: str) -> None:
+        """A disk that is full costs the map of tomorrow, not today's."""
+        try:
+            self.core.keep_map(tracker_file(output))
+        except (OSError, ValueError) as error:
+            self.stats.warn(f"no other run can begin on this map: {error}")
 
     def _add(self, frame: Frame) -> Update:
         guessed = frame.intrinsics_guessed

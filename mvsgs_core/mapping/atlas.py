@@ -40,8 +40,12 @@ class Atlas:
 
     @property
     def largest(self) -> OnlineMapper:
-        """The part with the most keyframes; the current one where there is none yet."""
-        return max(self.parts.values(), key=lambda part: len(part.views), default=self.current)
+        """The part with the most keyframes, of those that the stream has seen if it has; the current one of none."""
+
+        def keyframes(part: OnlineMapper) -> tuple[bool, int]:
+            return _seen(part), len(part.views)
+
+        return max(self.parts.values(), key=keyframes, default=self.current)
 
     @property
     def segments(self) -> set[int]:
@@ -89,9 +93,12 @@ class Atlas:
             return
         self.current = self.largest
         total = sum(len(part.views) for part in parts)
+        known = [part for part in parts if part.views and part.views[0].index < 0]
+        lost = "tracking was lost"
+        if known and not any(map(_seen, known)):
+            lost = "the camera was not found in the map that the run began on"
         log.warn(
-            f"tracking was lost: the map shows the largest of {len(parts)} parts, "
-            f"{len(self.current.views)} of {total} keyframes"
+            f"{lost}: the map shows the largest of {len(parts)} parts, {len(self.current.views)} of {total} keyframes"
         )
 
     def refine(self) -> bool:
@@ -181,3 +188,8 @@ class Atlas:
             dict(self.segment_of), self.newest_view, self.stream_seconds, self.revision, self.stream_ended,
             FramesBetween(taken=set(self.between.taken)), self.refined,
         )  # fmt: skip
+
+
+def _seen(part: OnlineMapper) -> bool:
+    """Whether the stream has given the part a keyframe: those of a map that it began on are numbered below 0."""
+    return bool(part.views) and part.views[-1].index >= 0

@@ -106,12 +106,23 @@ class Publisher:
 
     def publish(self, index: int) -> None:
         """A keyframe was sent as it is now, with scale 1."""
+        self.known(index, None if self.light is None else self.light.exposure(index))
+
+    def known(self, index: int, exposure: np.ndarray | None) -> None:
+        """Readers have a keyframe as it is now, with scale 1 and this exposure (3, 4); None: the identity."""
         keyframe, segment = self.graph.keyframes[index], self._segment(index)
         known, pose = keyframe.triangulated.copy(), self.graph.world_from_cam(index)
-        exposure = None if self.light is None else self.light.exposure(index)
         self._published[index] = _Published(pose, 1.0, keyframe.inverse_depth.copy(), known, segment, exposure)
         self._lit |= exposure is not None
         self.highest_segment = max(self.highest_segment, segment)
+
+    def known_vignetting(self, vignetting: np.ndarray) -> None:
+        """Readers have this vignetting (3,); zeros: none."""
+        self._vignetting = vignetting.astype(np.float32)
+
+    def exposure(self, index: int) -> np.ndarray | None:
+        """(3, 4) of a keyframe as it was published last; None: the identity."""
+        return self._published[index].exposure
 
     def scale(self, index: int) -> float:
         """Depths of a published keyframe now, over those when it was first published."""

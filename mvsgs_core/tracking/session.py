@@ -119,9 +119,9 @@ class Session:
 
     def _handle(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The phase decides what becomes of a frame, and what becomes of it decides the next phase."""
-        if self.front_end.reference is None:
-            return self._begin_segment(frame, record)
         initializing = self.phase is Phase.INITIALIZING
+        if self.front_end.reference is None:  # a stream that goes on in a map begins lost
+            return self._begin_segment(frame, record) if initializing else self._lose(frame, record)
         with self.stats.time("front end"):
             step = self.front_end.follow(frame, with_pose=not initializing)
         followed = not self.front_end.is_lost(step)

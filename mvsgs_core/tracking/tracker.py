@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -21,13 +22,20 @@ from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, check_device
 from mvsgs_core.tracking.frames import seen_pose, solve_trajectory
+from mvsgs_core.tracking.going_on import go_on
 from mvsgs_core.tracking.graph import Keyframe
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT
+from mvsgs_core.tracking.known_map import KnownMap, save
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
 from mvsgs_core.tracking.session import Session
 from mvsgs_core.trajectory import TrackingState, Trajectory
+
+NOT_FOUND = (
+    "the camera was not found at once in the map to go on in: a part of its own was begun, which is joined to it where "
+    "the camera comes by"
+)
 
 
 class NewestPose(NamedTuple):
@@ -39,13 +47,23 @@ class NewestPose(NamedTuple):
 
 
 class Tracker:
-    def __init__(self, config: TrackerConfig | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
-        """clock: what the stages are timed with, in seconds. Raises ValueError where there is no such device."""
+    def __init__(
+        self,
+        config: TrackerConfig | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        known: KnownMap | None = None,
+    ) -> None:
+        """clock: what the stages are timed with, in seconds. known: a map to go on in; None: a new one.
+
+        Raises ValueError where there is no such device.
+        """
         config = config or TrackerConfig()
         self.config = replace(config, device=resolve_device(config.device))
         check_device(self.config.device)
         self.stats = Stats(clock=clock)
         self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
+        self._known = known
+        self._seeking = known is not None  # the camera was not found in it yet, and no other map was begun
         self._session: Session | None = None  # from the first frame on
         self._trajectory = Trajectory.empty()
 
@@ -110,9 +128,23 @@ class Tracker:
         return self._trajectory
 
     def begin(self, size: tuple[int, int], intrinsics: np.ndarray, guessed: bool = False) -> Session:
-        """A stream of frames (height, width) with intrinsics (4,); the first frame does it, where nobody did before."""
-        self._session = Session(self.config, self.stats, size, intrinsics, guessed)
-        return self._session
+        """A stream of frames (height, width) with intrinsics (4,); the first frame does it, where nobody did before.
+
+        Raises ValueError for another camera than that of the map to go on in.
+        """
+        session = Session(self.config, self.stats, size, intrinsics, guessed)
+        if self._known is not None:
+            with self.stats.time("taking up the map"):
+                go_on(session, self._known)
+            self._known = None
+        self._session = session
+        return session
+
+    def keep_map(self, file: Path) -> None:
+        """Writes the map as it is, for another stream to go on in. Raises OSError; ValueError where there is none."""
+        if self._session is None:
+            raise ValueError("there is no keyframe to keep a map of")
+        save(file, self._session.graph, self._session.publisher, self.vignetting)
 
     def add(
         self,
@@ -136,7 +168,12 @@ class Tracker:
             color = session.matcher.flow.needs_color
             frame = TrackingImage.of(index, timestamp, image, session.size, color, exposure)
         self.stats.count("frames")
-        return session.add(frame)
+        update = session.add(frame)
+        if self._seeking and session.phase in (Phase.INITIALIZING, Phase.TRACKING):
+            self._seeking = False
+            if session.phase is Phase.INITIALIZING:
+                self.stats.warn(NOT_FOUND)
+        return update
 
     def finish(self) -> Iterator[Update]:
         """The stream has ended: last keyframes, global bundle adjustment, every frame's pose, and what to warn of."""
@@ -157,7 +194,7 @@ class Tracker:
         exposure = session.photometer.of_frames(session.records, trajectory.posed)
         self._trajectory = replace(trajectory, exposure=exposure, vignetting=session.photometer.vignetting)
         stats.count("frames posed in the end", found)
-        stats.count(HELD_OUT, sum(is_held_out(index) for index in graph.keyframes))
+        stats.count(HELD_OUT, sum(is_held_out(index) for index in graph.keyframes if index >= 0))
         tracking = session.phase is not Phase.INITIALIZING
         if tracking:
             session.calibration.check(session.members)

@@ -93,7 +93,7 @@ def test_the_ablation_switches_everything_that_can_be_skipped() -> None:
 
     switched = set().union(*(keys(name) for name in ablation.TABLE_III + ablation.SKIPS + ablation.OTHERS))
     switches = {p.path for p in parameters(Mapper.Config, "mapper") if isinstance(p.default, bool)}
-    switches -= {"mapper.keep_checkpoint", "mapper.save_images"}  # what is written beside the map
+    switches -= {"mapper.keep_map", "mapper.save_images"}  # what is written beside the map
     switches -= {"mapper.training.antialiased"}  # for maps seen from afar, which no scene here scores
     stereo = [parameter for parameter in parameters(Mvs.Config, "mvs") if isinstance(parameter.default, bool)]
     switches |= {parameter.path for parameter in stereo if parameter.path.startswith("mvs.pruning.")}

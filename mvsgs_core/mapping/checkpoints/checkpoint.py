@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from mvsgs_core.array_file import Arrays
 from mvsgs_core.atomic_file import replacing
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.between import FramesBetween
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, nothing_there, read_state, state_files, write_state
-from mvsgs_core.mapping.checkpoints.state import Arrays, Corrections, pack, photometry_of, unpack, whole
+from mvsgs_core.mapping.checkpoints.state import Corrections, pack, photometry_of, unpack, whole
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.stats import Stats
 
@@ -61,16 +62,16 @@ def save(
         write_state(aside, meta, arrays)
 
 
-def load(output: Path, config: MapperConfig, log: Stats) -> tuple[Atlas, Path]:
+def load(output: Path, config: MapperConfig, log: Stats, *, counted: bool = True) -> tuple[Atlas, Path]:
     """The atlas of the newest whole checkpoint in a run's output directory, and its file.
 
-    `log` gets what that run had counted, and warnings of what was wrong with newer checkpoints and of what of `config`
-    is not as it was. Raises ValueError where there is none, or `config` does not fit.
+    `log` gets what that run had counted, where it is wanted, and warnings of what was wrong with newer checkpoints and
+    of what of `config` is not as it was. Raises ValueError where there is none, or `config` does not fit.
     """
     problems: list[str] = []
     for file in state_files(output):
         try:
-            atlas = _load(file, config, log)
+            atlas = _load(file, config, log, counted)
         except ValueError as error:
             problems.append(f"{file}: {error}")
             continue
@@ -98,7 +99,7 @@ def described(config: Any, kind: type[Any] = MapperConfig, prefix: str = "") -> 
     return found
 
 
-def _load(file: Path, config: MapperConfig, log: Stats) -> Atlas:
+def _load(file: Path, config: MapperConfig, log: Stats, counted: bool) -> Atlas:
     meta, raw = read_state(file)
     arrays, parts = Arrays(raw), meta.get("mappers")
     differing = list(_differences(meta.get("config"), config))
@@ -124,7 +125,8 @@ def _load(file: Path, config: MapperConfig, log: Stats) -> Atlas:
         meta["stream_seconds"], meta["revision"], meta["stream_ended"],
         FramesBetween(taken=set(arrays.take("between", np.int64, (None,)).tolist())), whole(meta["refined"], "refined"),
     )  # fmt: skip
-    log.include(logged)
+    if counted:
+        log.include(logged)
     if differing:
         log.warn(f"the run goes on with other parameters than it had: {', '.join(differing)}")
     return atlas

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.atlas import Atlas
-from mvsgs_core.mapping.checkpoints.files import FOLDER
 from mvsgs_core.mapping.checkpoints.results import write_results
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.keyframes import TrainingView
@@ -79,12 +79,14 @@ class Checkpointing:
         return write_results(self._output, atlas.current)
 
     def close(self, atlas: Atlas, *, keep: bool) -> None:
-        """After the map is finished. keep: its checkpoint is made too; else the last one stays, for a run whose report
-        is still to be made. Of a map without splats nothing stays."""
+        """After the map is finished. keep: its checkpoint is made too, and stays alone; else the last one stays, for a
+        run whose report is still to be made. Of a map without splats nothing stays."""
         mapped = len(atlas.largest.state) > 0
-        if keep and self._period > 0 and mapped:
+        if keep and mapped:
             self._writer.submit(atlas.frozen())
         self._writer.wait()
+        if keep and mapped:
+            self._writer.keep_newest()
         self._pass_problems_on(atlas.current.log)
         if not mapped:
             shutil.rmtree(self._output / FOLDER, ignore_errors=True)

@@ -3,17 +3,15 @@
     OUTPUT/checkpoint/state-00000007.npz    all that goes on, newest number last; the one before is kept
     OUTPUT/checkpoint/keyframes/*.png       the keyframes' images, each written once; its name ends in its checksum
 
-A state is an uncompressed .npz: arrays, and `meta`, which is JSON. Nothing is unpickled, and every part has a CRC-32.
+    OUTPUT/checkpoint/tracker.npz           of a map that is kept: what the tracker needs to go on in it
+
+A state is arrays and JSON, see `array_file`.
 """
 
 from __future__ import annotations
 
-import io
-import json
 import math
 import re
-import struct
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +19,11 @@ from typing import Any
 
 import numpy as np
 
-FOLDER, KEYFRAMES = "checkpoint", "keyframes"
+from mvsgs_core.array_file import read_arrays, write_arrays
+from mvsgs_core.kept_map import FOLDER
+
+KEYFRAMES = "keyframes"
 FORMAT, VERSION = "mvsgs checkpoint", 7
-MAX_META = 64 << 20  # bytes of JSON
 NEIGHBORS = 16  # keyframes before the newest one that stereo and fusion of the next ones may look at, at most
 
 
@@ -69,7 +69,7 @@ def nothing_there(output: Path) -> str:
         return f"{output} is no directory: give the output directory of a run"
     return (
         f"{output / FOLDER} has no checkpoint: the run ended before its first map, had mapper.checkpoint=0, or was "
-        "finished (the checkpoint is removed then, unless mapper.keep_checkpoint=true)"
+        "finished (the checkpoint is removed then, unless keep_map=true)"
     )
 
 
@@ -91,62 +91,17 @@ def number_of(file: Path) -> int:
 
 def write_state(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Raises OSError; ValueError for a number in `meta` that is not finite."""
-    head = {"format": FORMAT, "version": VERSION, **meta}
-    text = json.dumps(head, allow_nan=False).encode()
-    with path.open("wb") as file:
-        np.savez(file, meta=np.frombuffer(text, dtype=np.uint8), **arrays)  # type: ignore[arg-type]  # stub: allow_pickle
+    write_arrays(path, FORMAT, VERSION, meta, arrays)
 
 
 def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """`meta` and the arrays, read-only. Raises ValueError for what is no whole state of this version."""
-    try:
-        arrays = _members(path)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, RuntimeError, EOFError, LookupError, struct.error, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    text = arrays.pop("meta", np.zeros(0, np.uint8)).tobytes()
-    if not 0 < len(text) <= MAX_META:
-        raise ValueError(f"{path} is no checkpoint of a mapper")
-    try:
-        meta = json.loads(text, parse_constant=_refuse)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
-        raise ValueError(f"{path} is no checkpoint of a mapper")
-    if meta.get("version") != VERSION:
-        raise ValueError(f"{path} has version {meta.get('version')!r} of the format: this program reads {VERSION}")
+    meta, arrays = read_arrays(path, FORMAT, VERSION, "checkpoint of a mapper")
     try:
         _check_head(meta, arrays.get("keyframes"))
     except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     return meta, arrays
-
-
-def _members(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an .npz: never more memory than the file is long, whatever its headers say."""
-    arrays = {}
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.infolist():
-            if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-                raise ValueError(f"{entry.filename!r} is compressed or encrypted")
-            if entry.file_size > path.stat().st_size:
-                raise ValueError(f"{entry.filename!r} is longer than the file")
-            arrays[entry.filename.removesuffix(".npy")] = _array(archive.read(entry), entry.filename)
-    return arrays
-
-
-def _array(data: bytes, name: str) -> np.ndarray:
-    """Of the bytes of an .npy."""
-    stream = io.BytesIO(data)
-    if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError(f"{name!r} has another version of the .npy format")
-    shape, by_column, dtype = np.lib.format.read_array_header_1_0(stream)
-    if dtype.hasobject or (by_column and len(shape) > 1):
-        raise ValueError(f"{name!r} has an array of a kind that no checkpoint has")
-    if any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
-        raise ValueError(f"{name!r} has another size than it says")
-    return np.frombuffer(data, dtype=dtype, offset=stream.tell()).reshape(shape)
 
 
 def _info(file: Path) -> CheckpointInfo:
@@ -168,7 +123,3 @@ def _check_head(meta: dict[str, Any], keyframes: np.ndarray | None) -> None:
     seconds = meta.get("stream_seconds")
     if type(seconds) is not float or not math.isfinite(seconds) or type(meta.get("stream_ended")) is not bool:
         raise ValueError("how far the stream had come is not said")
-
-
-def _refuse(constant: str) -> float:
-    raise ValueError(f"{constant} in its JSON")

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mvsgs_core.array_file import Arrays
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info, read_state
 from mvsgs_core.mapping.checkpoints.images import read_image
-from mvsgs_core.mapping.checkpoints.state import Arrays, keyframe_rows
+from mvsgs_core.mapping.checkpoints.state import keyframe_rows
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,8 @@ class Replay:
         return not self.problem
 
     def _disagreement(self) -> str:
+        if self._newest < 0:
+            return ""  # nothing of the stream was in the map yet
         compared = 0
         for part in self._atlas.parts.values():
             length = part.median_depth * part.frame.length

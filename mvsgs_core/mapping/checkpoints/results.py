@@ -18,13 +18,14 @@ from mvsgs_core.trajectory_file import write_trajectory
 def write_results(output: Path, mapper: OnlineMapper, *, sync: bool = True) -> int:
     """Replaces them by what the mapper has now; the bytes of map.ply. Raises OSError.
 
-    trajectory.txt: the keyframes' poses as the mapper has them, TUM format; those without a timestamp are left out.
+    trajectory.txt: the stream's keyframes' poses as the mapper has them, TUM format; those without a timestamp are left
+    out.
     The map comes last: where there is one, there are the others.
     """
     output.mkdir(parents=True, exist_ok=True)
     final = mapper.snapshot()
     seconds = np.array([view.timestamp for view in mapper.views], dtype=np.float64)
-    known = np.isfinite(seconds)
+    known = np.isfinite(seconds) & (final.keyframes >= 0)
     with replacing(output / "trajectory.txt", sync=sync) as aside:
         write_trajectory(aside, seconds[known], final.world_from_cam[known])
     write_cameras(output / "cameras.json", cameras_of(final, mapper.views))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from mvsgs_core.array_file import Arrays
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.checkpoints.images import read_image
@@ -47,30 +48,6 @@ BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
 }  # fmt: skip
 NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "readout_time")
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
-
-
-class Arrays:
-    """The arrays of a state, each checked as it is taken. Every method raises ValueError for what does not fit."""
-
-    def __init__(self, arrays: Mapping[str, np.ndarray], prefix: str = "") -> None:
-        self._arrays, self._prefix = arrays, prefix
-
-    def of(self, prefix: str) -> Arrays:
-        return Arrays(self._arrays, f"{self._prefix}{prefix}/")
-
-    def take(self, name: str, dtype: type, shape: tuple[int | None, ...], *, nan: bool = False) -> np.ndarray:
-        """An array of this dtype and shape (None: any size), finite unless NaN is allowed."""
-        full = self._prefix + name
-        value = self._arrays.get(full)
-        if value is None:
-            raise ValueError(f"{full} is missing")
-        fits = len(value.shape) == len(shape) and all(s is None or s == n for s, n in zip(shape, value.shape))
-        if value.dtype != dtype or not fits:
-            wanted = f"{np.dtype(dtype)} {shape}"
-            raise ValueError(f"{full} is {value.dtype} {value.shape}: expected {wanted}")
-        if value.dtype.kind == "f" and (np.isinf(value).any() or (not nan and np.isnan(value).any())):
-            raise ValueError(f"{full} has values that are not finite")
-        return value
 
 
 def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections, photometry: ImageFormation) -> OnlineMapper:

@@ -9,9 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import images_of, save
-from mvsgs_core.mapping.checkpoints.files import FOLDER, KEYFRAMES, number_of, state_file, state_files
+from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, number_of, state_file, state_files
 from mvsgs_core.mapping.checkpoints.images import image_name, write_image
 from mvsgs_core.mapping.checkpoints.results import write_results
 from mvsgs_core.mapping.config import MapperConfig
@@ -62,6 +63,11 @@ class CheckpointWriter:
         """Whether all that was begun is done, by then. None: however long it takes."""
         with self._changed:
             return self._changed.wait_for(lambda: self._left == 0, seconds)
+
+    def keep_newest(self) -> None:
+        """Removes all but the newest checkpoint, where one was written; nothing is being written."""
+        if self._before is not None:
+            self._remove_others({self._before}, self._images_before)
 
     def _do(self, job: Callable[[], object]) -> None:
         with self._changed:

@@ -6,6 +6,7 @@ Nothing is removed afterwards, so every keyframe that was ever published keeps i
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,10 @@ class CovisibleKeyframes:
         """A keyframe was made and is the reference now."""
         self._made[index] = self._references
         self._refer(None)
+
+    def known(self, keyframes: Iterable[int]) -> None:
+        """Keyframes that were there before the stream: old ones."""
+        self._made |= dict.fromkeys(keyframes, -self.config.min_age)
 
     def limit(self, reference: int, usual: float) -> float:
         """Median flow, as a fraction of the width, at which another keyframe is needed; usual: that of a young one."""

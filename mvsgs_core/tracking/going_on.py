@@ -1,0 +1,68 @@
+"""A session that goes on in a map: its keyframes are the session's from the start, and the camera is looked for there.
+
+The first frames are searched for in the map as those of a camera that was lost are. Where they are not found, the
+session begins a segment of its own, and a loop may join it later.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core.tracking.known_map import KnownMap
+from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.session import Session
+
+MAX_OFFSET = 0.01  # of the image's width: by which a camera's rays may miss those of the map's camera
+LOST_AT_FIRST = "frames before the camera was found in the map"
+
+
+def go_on(session: Session, known: KnownMap) -> None:
+    """Gives a session that has seen no frame the keyframes of a map.
+
+    The map's intrinsics hold: those of the frames must be near them, unless they are a guess. Raises ValueError for
+    another camera.
+    """
+    _check_camera(session, known)
+    graph = session.graph
+    graph.intrinsics, graph.vignetting = known.intrinsics.copy(), known.vignetting.copy()
+    if session.calibration.readout_time is None:
+        graph.readout_time = known.readout_time
+    session.calibration.settled = True
+    session.calibration.guessed = False
+    for keyframe in known.keyframes:
+        graph.add(keyframe)
+    graph.edges |= known.edges
+    session.photometer.update()
+    for keyframe in known.keyframes:
+        session.loops.add(keyframe.index)
+        session.publisher.known(keyframe.index, known.exposures.get(keyframe.index))
+        keyframe.image.release()
+    session.publisher.known_vignetting(known.published_vignetting)
+    session.covisible_keyframes.known(graph.keyframes)
+    session.segment = known.keyframes[-1].segment
+    session.phase = Phase.RELOCALIZING
+
+
+def _check_camera(session: Session, known: KnownMap) -> None:
+    if session.matcher.flow.needs_color and any(keyframe.image.color is None for keyframe in known.keyframes):
+        raise ValueError("the map was tracked in gray, and tracker.flow needs its colors: use the flow of that run")
+    if known.size != session.size:
+        raise ValueError(
+            f"the map was tracked at {known.size[1]}x{known.size[0]} pixels, these frames are at {session.size[1]}x"
+            f"{session.size[0]}: give frames of the same shape and the tracker.area of that run"
+        )
+    height, width = known.size
+    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+    if session.calibration.guessed:
+        return
+    rays = (corners - session.intrinsics[2:]) / session.intrinsics[:2]
+    off = np.abs(rays * known.intrinsics[:2] + known.intrinsics[2:] - corners).max()
+    if off > MAX_OFFSET * width:
+        fx, fy, cx, cy = known.intrinsics
+        raise ValueError(
+            f"the map was made by another camera: at {width}x{height} pixels its intrinsics are [{fx:.1f}, {fy:.1f}, "
+            f"{cx:.1f}, {cy:.1f}], and those of these frames are {np.round(session.intrinsics, 1).tolist()}"
+        )
+
+
+__all__ = ["LOST_AT_FIRST", "go_on"]

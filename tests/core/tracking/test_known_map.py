@@ -1,0 +1,156 @@
+"""A map that is kept and gone on in: the camera is found at once, tracked in its frame, and nowhere where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvsgs_core import geometry
+from mvsgs_core.array_file import read_arrays, write_arrays
+from mvsgs_core.datasets import Item
+from mvsgs_core.kept_map import STREAM
+from mvsgs_core.tracking.known_map import FORMAT, VERSION, WHAT, KnownMap, load
+from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.tracker import Tracker
+from tests.support.sequences import synthetic, tracked_room
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("map") / "checkpoint" / "tracker.npz"
+    tracked_room()[0].keep_map(path)
+    return path
+
+
+def returning(known: KnownMap, items: list[Item]) -> Tracker:
+    """A tracker that has gone on in the map with these frames, numbered anew."""
+    tracker = Tracker(known=known.renumbered(STREAM))
+    for n, item in enumerate(items):
+        tracker.add(n, n / 20.0, item.image, item.intrinsics, item.intrinsics_guessed)
+    return tracker
+
+
+def back() -> list[Item]:
+    """The way back, in another light, of frames that were no keyframes."""
+    items = synthetic(frames=80)[70:20:-1]
+    return [replace(i, image=(0.7 * i.image).astype(np.uint8)) for i in items if i.index % 5 == 0]
+
+
+def test_a_map_comes_back_as_it_was(file: Path) -> None:
+    graph, known = tracked_room()[0].session.graph, load(file)
+    assert [keyframe.index for keyframe in known.keyframes] == sorted(graph.keyframes)
+    assert known.edges.keys() == graph.edges.keys()
+    assert np.array_equal(known.intrinsics, graph.intrinsics)
+    for keyframe in known.keyframes:
+        was = graph.keyframes[keyframe.index]
+        assert np.array_equal(keyframe.cam_from_world, was.cam_from_world)
+        assert np.array_equal(keyframe.inverse_depth, was.inverse_depth)
+        assert np.array_equal(keyframe.triangulated, was.triangulated)
+        assert np.array_equal(keyframe.image.gray, was.image.gray)
+        assert np.array_equal(keyframe.points, was.points)
+    for pair, edge in known.edges.items():
+        assert np.array_equal(edge.target, graph.edges[pair].target)
+        assert np.array_equal(edge.weight, graph.edges[pair].weight)
+
+
+def test_the_camera_is_found_and_tracked_in_the_frame_of_the_map(file: Path) -> None:
+    """From the other direction, darker, at larger steps: poses are the first run's, to a hundredth of a depth."""
+    items, first = back(), {int(i): pose for i, pose in zip(tracked_room()[1].index, tracked_room()[1].world_from_cam)}
+    known = load(file)
+    tracker = returning(known, items)
+    found = tracker.newest_pose()
+    assert found is not None
+    assert found.segment == known.keyframes[0].segment
+    updates = list(tracker.finish())
+    trajectory = tracker.trajectory()
+    assert trajectory.posed.all()
+    assert set(trajectory.segment.tolist()) == {known.keyframes[0].segment}
+    depth = np.median([keyframe.median_depth for keyframe in known.keyframes])
+    true = np.stack([np.asarray(item.world_from_cam)[:3, 3] for item in items])
+    before = np.stack([first[item.index][:3, 3] for item in items])
+    assert np.median(np.linalg.norm(trajectory.world_from_cam[:, :3, 3] - before, axis=1)) < 0.01 * depth
+    s, r, t = geometry.umeyama(trajectory.world_from_cam[:, :3, 3], true)
+    assert np.abs(s * trajectory.world_from_cam[:, :3, 3] @ r.T + t - true).max() < 0.01
+    assert updates[-1].correction is not None
+    assert {keyframe.index - STREAM for keyframe in known.keyframes} <= set(updates[-1].correction.index.tolist())
+    assert updates[-1].correction.exposure is not None, "the light is another"
+    assert not tracker.stats.warnings
+
+
+def test_another_scene_is_not_found_and_gets_a_part_of_its_own(file: Path) -> None:
+    known, items = load(file), list(synthetic(frames=40, scene="aerial"))
+    items = [replace(i, intrinsics=synthetic(frames=80)[0].intrinsics) for i in items]
+    tracker = returning(known, items)
+    list(tracker.finish())
+    assert not set(tracker.trajectory().segment.tolist()) & known.segments
+    assert any("was not found at once" in warning for warning in tracker.stats.warnings)
+
+
+def test_a_stream_may_begin_where_nothing_is_seen(file: Path) -> None:
+    """Dark frames, then the room: the camera is looked for as long as nothing else was begun."""
+    items = back()
+    dark = [replace(items[0], image=np.zeros_like(items[0].image)) for _ in range(10)]
+    tracker = Tracker(known=load(file).renumbered(STREAM))
+    for n, item in enumerate(dark):
+        tracker.add(n, n / 20.0, item.image, item.intrinsics)
+    assert tracker.phase is Phase.LOST
+    tracker.add(10, 0.5, items[0].image, items[0].intrinsics)
+    assert tracker.phase is Phase.TRACKING
+
+
+def test_the_map_of_a_map_is_gone_on_in_too(file: Path, tmp_path: Path) -> None:
+    tracker = returning(load(file), back())
+    list(tracker.finish())
+    again = tmp_path / "tracker.npz"
+    tracker.keep_map(again)
+    known = load(again)
+    assert len(known.keyframes) == len(tracker.session.graph.keyframes)
+    third = returning(known, back()[:4])
+    assert third.phase is Phase.TRACKING
+    assert min(third.session.graph.keyframes) < -STREAM
+
+
+def test_a_guessed_focal_length_is_the_maps(file: Path) -> None:
+    items = [replace(i, intrinsics=i.intrinsics * [1.2, 1.2, 1.0, 1.0], intrinsics_guessed=True) for i in back()]
+    tracker = returning(load(file), items[:3])
+    assert tracker.phase is Phase.TRACKING
+    assert tracker.focal_factor == pytest.approx(1.0 / 1.2, rel=1e-3)
+
+
+def test_another_camera_is_refused(file: Path) -> None:
+    item = back()[0]
+    with pytest.raises(ValueError, match="another camera"):
+        returning(load(file), [replace(item, intrinsics=item.intrinsics * [1.2, 1.2, 1.0, 1.0])])
+    with pytest.raises(ValueError, match="same shape"):
+        returning(load(file), [replace(item, image=np.ascontiguousarray(item.image[:, :160]))])
+
+
+def test_what_is_damaged_or_of_another_version_is_refused(file: Path, tmp_path: Path) -> None:
+    meta, arrays = read_arrays(file, FORMAT, VERSION, WHAT)
+    meta = {name: value for name, value in meta.items() if name not in ("format", "version")}
+    bad = tmp_path / "bad.npz"
+    poses = arrays["cam_from_world"].copy()
+    poses[0, :3, :3] *= 1.1
+    wrong = {
+        "poses": {"cam_from_world": poses},
+        "depths": {"inverse_depth": -arrays["inverse_depth"]},
+        "finite": {"intrinsics": np.full(4, np.nan)},
+        "order": {"index": arrays["index"][::-1].copy()},
+        "not there": {"edges": arrays["edges"] + 1000},
+        "gray": {"gray": arrays["gray"][:, :8].copy()},
+    }
+    for said, change in wrong.items():
+        write_arrays(bad, FORMAT, VERSION, meta, {**arrays, **change})
+        with pytest.raises(ValueError, match=f"damaged.*{said}"):
+            load(bad)
+    write_arrays(bad, FORMAT, VERSION + 1, meta, arrays)
+    with pytest.raises(ValueError, match="version"):
+        load(bad)
+    bad.write_bytes(file.read_bytes()[:-1000])
+    with pytest.raises(ValueError, match="damaged"):
+        load(bad)

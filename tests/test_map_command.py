@@ -1,0 +1,81 @@
+"""`map=DIR` and `keep_map=true`: what they compose, what they refuse, and a run that goes on in the map of another."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from launch.compose import compose
+from launch.inline import run_inline
+from launch.refusal import GraphError
+from mvsgs_core.export.cameras import read_cameras
+from mvsgs_core.kept_map import STREAM, tracker_file
+from mvsgs_core.maps.__main__ import main
+from nodes.mapper import Mapper
+from nodes.tracker import Tracker
+
+SMALL = (
+    "device=cpu", "dataset.options.frames=80", "dataset.size=[120,160]", "mapper.iterations=8", "mapper.refinement=8",
+    "mapper.threads=1", "evaluator.fitted=false",
+)  # fmt: skip
+
+
+def test_both_halves_of_a_map_are_told(tmp_path: Path) -> None:
+    graph = compose([f"map={tmp_path}/a", f"output={tmp_path}/b"])
+    for slot in ("tracker", "mapper"):
+        assert graph.slots[slot].config["map"] == f"{tmp_path}/a"
+        assert graph.slots[slot].config["keep_map"] is True, "a new map is written"
+    assert compose([]).slots["mapper"].config["keep_map"] is False
+    assert compose([f"map={tmp_path}/a", "keep_map=false"]).slots["tracker"].config["keep_map"] is False
+
+
+def test_a_map_is_not_overwritten_by_its_own_run(tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match="another output"):
+        compose([f"map={tmp_path}", f"output={tmp_path}"])
+
+
+@pytest.mark.parametrize("word", ["map=there", "keep_map=true"])
+def test_a_tracker_that_keeps_no_map_is_refused(word: str) -> None:
+    with pytest.raises(GraphError, match="tracker=dense"):
+        compose([word, "tracker=ground_truth"])
+
+
+def test_a_run_without_a_map_is_refused_before_anything_starts(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for node in (Tracker, Mapper):
+        with pytest.raises(ValueError, match="keep_map=true"):
+            node.check(node.Config(map=str(tmp_path)))
+        with pytest.raises(ValueError, match="no such directory"):
+            node.check(node.Config(map=str(tmp_path / "nowhere")))
+    assert main(["info", str(tmp_path)]) == 2
+    assert "keep_map=true" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_in_the_map_of_another(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    run_inline(compose([*SMALL, "dataset.stop=40", "keep_map=true", f"output={first}"]))
+    assert tracker_file(first).is_file()
+    assert len(list((first / "checkpoint").glob("state-*.npz"))) == 1, "the finished map alone"
+    graph = compose([*SMALL, "dataset.start=40", f"map={first}", f"output={second}"])
+    for slot in graph.slots.values():
+        slot.node.check(slot.parameters)
+    nodes = run_inline(graph)
+    mapper, tracker = nodes["mapper"], nodes["tracker"]
+    assert tracker.stats.counts["relocalized"] == 1
+    assert tracker.stats.counts["frames while tracking"] == 40
+    assert len(mapper.atlas.parts) == 1
+    views = mapper.atlas.current.views
+    known = read_cameras(first / "cameras.json").keyframes
+    assert [view.index for view in views if view.index < 0] == (known - STREAM).tolist()
+    assert any(view.index >= 0 for view in views)
+    report = json.loads((second / "report.json").read_text())
+    assert report["trajectory"]["frames_tracked"] == 40
+    assert report["rendering"]["held_out"]["psnr"] > 22.0
+    seconds = np.loadtxt(second / "trajectory.txt")[:, 0]
+    assert (np.diff(seconds) > 0).all(), "that of this stream alone"
+    assert main(["info", str(second)]) == 0
+    said = capsys.readouterr().out
+    assert f"{len(views)} of the tracker" in said
