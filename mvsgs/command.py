@@ -37,6 +37,7 @@ COMMANDS = {
     "run": Command("INPUT ...", "the same as without this word"),
     "demo": Command("...", "maps the embedded room", words=("dataset=synthetic",)),
     "view": Command("MAP", "a saved map in the browser: keyframes, renders, depth", "mvsgs.view"),
+    "info": Command("DIR", "what is in the map that a run kept, for map=DIR", "mvsgs_core.maps.info"),
     "export": Command("MAP OUT", "to .ply, .splat, .spz, .glb, .obj or a COLMAP folder", "mvsgs_core.export.__main__"),
     "render": Command("MAP PATH OUT.mp4", "a video along a trajectory", "mvsgs_core.export.render_path"),
     "doctor": Command("", "what this machine has for a run, and a self-test of ten seconds", "mvsgs.doctor"),

@@ -13,7 +13,7 @@ from launch.inline import run_inline
 from launch.refusal import GraphError
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.kept_map import STREAM, tracker_file
-from mvsgs_core.maps.__main__ import main
+from mvsgs_core.maps.info import main
 from nodes.mapper import Mapper
 from nodes.tracker import Tracker
 
@@ -49,7 +49,7 @@ def test_a_run_without_a_map_is_refused_before_anything_starts(tmp_path: Path, c
             node.check(node.Config(map=str(tmp_path)))
         with pytest.raises(ValueError, match="no such directory"):
             node.check(node.Config(map=str(tmp_path / "nowhere")))
-    assert main(["info", str(tmp_path)]) == 2
+    assert main([str(tmp_path)]) == 2
     assert "keep_map=true" in capsys.readouterr().err
 
 
@@ -76,6 +76,6 @@ def test_a_run_goes_on_in_the_map_of_another(tmp_path: Path, capsys: pytest.Capt
     assert report["rendering"]["held_out"]["psnr"] > 22.0
     seconds = np.loadtxt(second / "trajectory.txt")[:, 0]
     assert (np.diff(seconds) > 0).all(), "that of this stream alone"
-    assert main(["info", str(second)]) == 0
+    assert main([str(second)]) == 0
     said = capsys.readouterr().out
     assert f"{len(views)} of the tracker" in said

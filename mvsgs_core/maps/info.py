@@ -1,8 +1,11 @@
-"""What is in a map that a run kept: both of its halves, in words."""
+"""`python -m mvsgs_core.maps.info DIR`: what is in the map that a run with keep_map=true left in its output."""
 
 from __future__ import annotations
 
+import argparse
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,18 @@ import numpy as np
 from mvsgs_core.kept_map import FOLDER, TRACKER, check_kept_map, tracker_file
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.tracking import known_map
+
+
+def main(words: Sequence[str] | None = None, prog: str | None = None) -> int:
+    """Prints it; the exit code, 2 where there is no map."""
+    parser = argparse.ArgumentParser(prog, description="What is in the map that a run with keep_map=true left.")
+    parser.add_argument("folder", type=Path, help="output directory of the run")
+    try:
+        print("\n".join(info(parser.parse_args(words).folder)))
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 def info(output: Path) -> list[str]:
@@ -49,4 +64,7 @@ def _lengths(extent: np.ndarray) -> str:
     return " x ".join(f"{length:.3g}" for length in extent)
 
 
-__all__ = ["info"]
+__all__ = ["info", "main"]
+
+if __name__ == "__main__":
+    sys.exit(main())
