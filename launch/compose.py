@@ -63,7 +63,20 @@ def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: b
     `all_choices_known` is False where choices can come from other directories: Hydra refuses them then.
     """
     choices = {slot: choices_of(slot, conf) for slot in slots_of(conf)}
+    overrides = [*_implied(overrides, choices, conf), *overrides]
     return [_prepare(text, choices, parameter_names(Settings), all_choices_known) for text in overrides]
+
+
+def _implied(overrides: Sequence[str], slots: Mapping[str, list[str]], conf: Path) -> list[str]:
+    """What choices say of other slots, `implies` in their files, where the command line chooses nothing for these."""
+    given = {override.key_or_group: override for override in map(parse, overrides)}
+    found: dict[str, str] = {}
+    for slot, override in given.items():
+        if slot in slots and not override.is_sweep_override() and override.value() in slots[slot]:
+            content = OmegaConf.load(conf / slot / f"{override.value()}.yaml")
+            assert isinstance(content, DictConfig)
+            found |= {str(other): str(choice) for other, choice in (content.get("implies") or {}).items()}
+    return [f"{slot}={choice}" for slot, choice in found.items() if slot not in given]
 
 
 def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str], all_choices_known: bool) -> str:

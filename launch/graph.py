@@ -189,7 +189,7 @@ def _build_slot(
     node = load_node(name, str(section["_target_"]))
     inputs, accepted = _handlers(name, node), parameter_names(node.Config)
     reads = dict(section.get("reads") or {})
-    given = {key: value for key, value in section.items() if key not in ("_target_", "reads")}
+    given = {key: value for key, value in section.items() if key not in ("_target_", "reads", "implies")}
     placement = {key: given.pop(key) for key in Placement.__dataclass_fields__ if key in given and key not in accepted}
     if replaced is not None:
         # The old choice's parameters are not this node's, even where names agree: its own defaults hold.

@@ -154,6 +154,7 @@ class CameraPose:
     world_from_cam: Annotated[np.ndarray, "float64 4 4"]
     segment: int  # part of the map, see Keyframe
     world_from_previous: Annotated[np.ndarray, "float64 4 4"] | None = None  # the frame before; None: it has no pose
+    confidence: float = 0.0  # of the map's points that this pose lets one keyframe show, the fraction that is seen
 
 
 @dataclass(frozen=True)

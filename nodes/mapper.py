@@ -10,6 +10,7 @@ from pathlib import Path
 from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap, TrackedFrame
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
+from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.between import FrameBetween
@@ -215,13 +216,7 @@ class Mapper(Node):
             self.stats.warn(found.warning)
 
     def _map(self, refined: bool) -> SplatMap:
-        final = self.atlas.current.snapshot()
-        arrays = {name: value.numpy() for name, value in final.splats.tensors().items()}
-        return SplatMap(
-            refined=refined, iterations=final.iterations, kernel=final.kernel, origin=final.origin, **arrays,
-            anchors=final.anchors, keyframes=final.keyframes, world_from_cam=final.world_from_cam, scale=final.scale,
-            exposures=final.exposures, vignetting=final.vignetting, antialiased=final.antialiased,
-        )  # fmt: skip
+        return splat_map(self.atlas.current.snapshot(), refined)
 
     @property
     def _previewing(self) -> bool:
@@ -236,3 +231,13 @@ class Mapper(Node):
         with self.stats.time("provisional"):
             provisional = self._provisional.splats(mapper, self.atlas.segments)
         yield Preview(**preview_arrays(mapper, self.config.preview_splats, provisional))
+
+
+def splat_map(final: Snapshot, refined: bool) -> SplatMap:
+    """The message of a map."""
+    arrays = {name: value.numpy() for name, value in final.splats.tensors().items()}
+    return SplatMap(
+        refined=refined, iterations=final.iterations, kernel=final.kernel, origin=final.origin, **arrays,
+        anchors=final.anchors, keyframes=final.keyframes, world_from_cam=final.world_from_cam, scale=final.scale,
+        exposures=final.exposures, vignetting=final.vignetting, antialiased=final.antialiased,
+    )  # fmt: skip

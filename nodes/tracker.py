@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -32,11 +33,12 @@ class Tracker(TrackerNode):
 
     config: Config
     core: CoreTracker
+    frozen: ClassVar[bool] = False  # frames are only found in the map
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         known = None if self.config.map is None else known_map.load(tracker_file(self.config.map)).renumbered(STREAM)
-        self.core = CoreTracker(self.config, known=known)
+        self.core = CoreTracker(self.config, known=known, frozen=self.frozen)
         self._readout_times: list[float] = []  # seconds, what was taken out of each keyframe's image
         self._without_shutter: set[int] = set()  # keyframes that were sent before the readout time was known
 
@@ -48,7 +50,7 @@ class Tracker(TrackerNode):
 
     def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
         yield from super().on_end()
-        if self.config.keep_map and self.config.output is not None:
+        if self.config.keep_map and not self.frozen and self.config.output is not None:
             self._keep_map(self.config.output)
 
     def _keep_map(self, output: str) -> None:

@@ -11,11 +11,17 @@ import pytest
 from launch.compose import compose
 from launch.inline import run_inline
 from launch.refusal import GraphError
+from msgs import CameraPose, Frame, SplatMap
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.kept_map import STREAM, tracker_file
+from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.maps.info import main
+from nodes import Node
+from nodes.frozen_mapper import FrozenMapper
+from nodes.localizer import HEADER, Localizer
 from nodes.mapper import Mapper
 from nodes.tracker import Tracker
+from tests.support.small_atlas import PLAIN, begun, view
 
 SMALL = (
     "device=cpu", "dataset.options.frames=80", "dataset.size=[120,160]", "mapper.iterations=8", "mapper.refinement=8",
@@ -79,3 +85,58 @@ def test_a_run_goes_on_in_the_map_of_another(tmp_path: Path, capsys: pytest.Capt
     assert main([str(second)]) == 0
     said = capsys.readouterr().out
     assert f"{len(views)} of the tracker" in said
+
+
+@pytest.mark.slow
+def test_frames_are_found_in_a_frozen_map(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    run_inline(compose([*SMALL, "dataset.stop=40", "keep_map=true", f"output={first}"]))
+    before = {file: file.read_bytes() for file in first.rglob("*") if file.is_file()}
+    words = ["mapper=frozen", "dataset.start=20", "dataset.stop=40", f"map={first}", f"output={second}"]
+    nodes = run_inline(compose([*SMALL[:3], "mapper.threads=1", "evaluator.fitted=false", *words]))
+    assert isinstance(nodes["tracker"], Localizer)
+    assert nodes["tracker"].stats.counts["frames found in the map"] == 20
+    lines = (second / "localization.csv").read_text().splitlines()
+    assert lines[0] == HEADER
+    rows = np.array([[float(word) for word in line.split(",")] for line in lines[1:]])
+    assert rows[:, 0].tolist() == list(range(20))
+    assert (rows[:, 9] > 0.5).all(), "confidences"
+    report = json.loads((second / "report.json").read_text())
+    assert report["rendering"]["held_out"]["count"] == 4
+    assert report["rendering"]["held_out"]["psnr"] > 22.0
+    assert {file: file.read_bytes() for file in first.rglob("*") if file.is_file()} == before
+    assert not (second / "checkpoint").exists()
+
+
+def test_a_frozen_map_chooses_the_tracker_unless_that_is_chosen(tmp_path: Path) -> None:
+    words = ["mapper=frozen", f"map={tmp_path}"]
+    assert compose(words).slots["tracker"].node is Localizer
+    assert compose([*words, "tracker=dense"]).slots["tracker"].node is Tracker
+    assert compose([f"map={tmp_path}"]).slots["tracker"].node is Tracker
+
+
+@pytest.mark.parametrize("node", [Localizer, FrozenMapper])
+def test_a_frozen_map_must_be_named(node: type[Node]) -> None:
+    with pytest.raises(ValueError, match="map=DIR"):
+        node.check(node.Config())
+
+
+def test_the_frozen_map_is_shown_with_the_camera_in_it(tmp_path: Path) -> None:
+    writer = CheckpointWriter(tmp_path, PLAIN)
+    writer.submit(begun(PLAIN).frozen(), sync=False)
+    assert writer.wait(20.0)
+    tracker_file(tmp_path).touch()
+    given = view(3)
+    node = FrozenMapper(FrozenMapper.Config(map=str(tmp_path), threads=1))
+    splats = len(node.atlas.parts[0].state)
+    list(node.on_frame(Frame(7, 0.7, np.asarray(given.image), given.intrinsics)))
+    (shown,) = node.on_camera_pose(CameraPose(7, 0.7, given.world_from_cam, 0, None, 0.9))
+    assert shown.index == 7
+    assert shown.keyframes is not None
+    assert shown.keyframes[-1] == 7
+    assert (shown.keyframes[:-1] < 0).all()
+    assert shown.render.shape == shown.image.shape
+    assert not list(node.on_camera_pose(CameraPose(8, 0.8, given.world_from_cam, 0, None, 0.9))), "no frame of it came"
+    (sent,) = node.on_end()
+    assert isinstance(sent, SplatMap)
+    assert len(sent.means) == splats

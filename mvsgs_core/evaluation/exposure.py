@@ -28,14 +28,17 @@ def frame_exposures(
 
     measured: (N, 3, 4) the tracker's, NaN where not known (then interpolated in time from those that are); None: it
     has none. rows: (K,) the keyframes among the frames, ascending; affines: (K, 3, 4) the map's of those. Before the
-    first and after the last one theirs holds.
+    first and after the last one theirs holds. Where no frame is a keyframe, as in a map that another stream made, the
+    tracker's hold.
     """
     known = np.zeros(len(timestamps), bool) if measured is None else np.isfinite(measured).all(axis=(1, 2))
-    if not len(rows) or np.array_equal(affines, np.broadcast_to(IDENTITY, affines.shape)):
+    if np.array_equal(affines, np.broadcast_to(IDENTITY, affines.shape)) and (len(rows) or not known.any()):
         return None
     tracked = np.tile(IDENTITY.astype(np.float64), (len(timestamps), 1, 1))
     if measured is not None and known.any():
         tracked = _interpolated(timestamps, timestamps[known], measured[known])
+    if not len(rows):
+        return FrameExposures(tracked.astype(np.float32))
     remainders = compose(inverse(tracked[rows]), affines)
     found = compose(tracked, _interpolated(timestamps, timestamps[rows], remainders))
     return FrameExposures(found.astype(np.float32))

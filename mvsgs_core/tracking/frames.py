@@ -12,7 +12,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.photometer import observed
-from mvsgs_core.tracking.places.localization import localize_by
+from mvsgs_core.tracking.places.localization import confirmed, localize_by
 from mvsgs_core.tracking.sample import restored, sample
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
@@ -32,6 +32,7 @@ class FrameRecord:
     after: int | None = None  # keyframe after the frame that it was matched with, too
     points_after: bytes = b""
     same_as: int | None = None  # frame that this one did not move against
+    confidence: float = 0.0  # of the reference's points that the pose shows, the fraction that was found there
     light: bytes = b""  # what its gray levels say of its exposure, see photometer.py
 
     def follow(
@@ -46,6 +47,7 @@ class FrameRecord:
         self.light = observed(graph, reference, image, matches)
         self.reference, self.same_as = reference, None
         self.after, self.points_after = None, b""
+        self.confidence = confirmed(graph, reference, matches, cam_from_world)
         self._stand(graph, matches, cam_from_world)
 
     def follow_both(

@@ -22,6 +22,7 @@ from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, check_device
 from mvsgs_core.tracking.frames import seen_pose, solve_trajectory
+from mvsgs_core.tracking.frozen_session import FrozenSession
 from mvsgs_core.tracking.going_on import go_on
 from mvsgs_core.tracking.graph import Keyframe
 from mvsgs_core.tracking.image import TrackingImage
@@ -44,6 +45,7 @@ class NewestPose(NamedTuple):
     world_from_cam: np.ndarray  # (4, 4)
     segment: int  # part of the map
     world_from_previous: np.ndarray | None  # (4, 4) of the frame before; None: it has no pose in that part
+    confidence: float  # 0 to 1, see `msgs`
 
 
 class Tracker:
@@ -52,8 +54,10 @@ class Tracker:
         config: TrackerConfig | None = None,
         clock: Callable[[], float] = time.perf_counter,
         known: KnownMap | None = None,
+        frozen: bool = False,
     ) -> None:
-        """clock: what the stages are timed with, in seconds. known: a map to go on in; None: a new one.
+        """clock: what the stages are timed with, in seconds. known: a map to go on in; None: a new one. frozen: the map
+        stays as it is, frames are only found in it.
 
         Raises ValueError where there is no such device.
         """
@@ -62,7 +66,7 @@ class Tracker:
         check_device(self.config.device)
         self.stats = Stats(clock=clock)
         self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
-        self._known = known
+        self._known, self._frozen = known, frozen
         self._seeking = known is not None  # the camera was not found in it yet, and no other map was begun
         self._session: Session | None = None  # from the first frame on
         self._trajectory = Trajectory.empty()
@@ -121,7 +125,10 @@ class Tracker:
             return None
         before = seen_pose(session.records, newest - 1, session.graph) if newest else None
         same_part = before is not None and before[1] == seen[1]
-        return NewestPose(*seen, before[0] if before is not None and same_part else None)
+        record = session.records[newest]
+        if record.same_as is not None:
+            record = next(r for r in reversed(session.records) if r.index == record.same_as)
+        return NewestPose(*seen, before[0] if before is not None and same_part else None, record.confidence)
 
     def trajectory(self) -> Trajectory:
         """Every frame's pose and exposure, after `finish`."""
@@ -132,7 +139,8 @@ class Tracker:
 
         Raises ValueError for another camera than that of the map to go on in.
         """
-        session = Session(self.config, self.stats, size, intrinsics, guessed)
+        kind = FrozenSession if self._frozen else Session
+        session = kind(self.config, self.stats, size, intrinsics, guessed)
         if self._known is not None:
             with self.stats.time("taking up the map"):
                 go_on(session, self._known)
@@ -182,31 +190,34 @@ class Tracker:
             return
         yield from session.last_keyframes()
         graph, stats = session.graph, self.stats
-        with stats.time("global bundle adjustment"):
-            for segment in sorted({k.segment for k in graph.keyframes.values()}):
-                if set(session.local_map.members(segment)) <= session.publisher.published:
-                    session.back_end.put_right(segment, stats)
+        if not self._frozen:
+            with stats.time("global bundle adjustment"):
+                for segment in sorted({k.segment for k in graph.keyframes.values()}):
+                    if set(session.local_map.members(segment)) <= session.publisher.published:
+                        session.back_end.put_right(segment, stats)
         with stats.time("frames without a pose"):
             found = session.recovery.fill_in(session.records)
             solver = Solver(steps=8, threads=self.config.threads or 1)
             trajectory = solve_trajectory(session.records, graph, solver)
-        session.photometer.update(whole=True)
+        session.photometer.update(whole=not self._frozen)
         exposure = session.photometer.of_frames(session.records, trajectory.posed)
         self._trajectory = replace(trajectory, exposure=exposure, vignetting=session.photometer.vignetting)
         stats.count("frames posed in the end", found)
         stats.count(HELD_OUT, sum(is_held_out(index) for index in graph.keyframes if index >= 0))
         tracking = session.phase is not Phase.INITIALIZING
-        if tracking:
+        if tracking and not self._frozen:
             session.calibration.check(session.members)
         stats.counts["matches"] = session.matcher.calls
         stats.counts["matches that needed features"] = session.matcher.feature_calls
         self.nothing = "" if graph.keyframes else f"tracking never started: {session.initializer.reason}"
+        if self._frozen and not trajectory.posed.any():
+            self.nothing = "the camera was found in the map in no frame: is it the place that the map shows?"
         if self.nothing:
             stats.warn(self.nothing)
         warn_of_gaps(stats, self._trajectory)
         warn_of_few_matches(stats, graph, self.config.min_matches)
         state = TrackingState.TRACKED if tracking else TrackingState.NOT_INITIALIZED
-        correction = session.publisher.corrections(everything=True)
+        correction = None if self._frozen else session.publisher.corrections(everything=True)
         if correction is not None and graph.readout_time > 0.0:
             velocity = self._trajectory.velocities_of(correction.index)
             correction = replace(correction, velocity=velocity, readout_time=graph.readout_time)

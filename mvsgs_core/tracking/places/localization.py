@@ -77,9 +77,19 @@ def located(
     return np.asarray(matches.alive & (apart < INLIER))
 
 
+def confirmed(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: np.ndarray) -> float:
+    """How much of the map speaks for a camera (4, 4): of the textured points of keyframe `index` that are in its image,
+    the fraction that was found where it should see them."""
+    cells = graph.keyframes[index].image.cells
+    _, inside = graph.predict_pose(index, cam_from_world)
+    expected = inside & cells.textured
+    found = expected & located(graph, index, matches, cam_from_world)
+    return float(found.sum() / max(1, expected.sum()))
+
+
 def _rectified(matches: Matches, readout_time: float) -> np.ndarray:
     """Targets (M, 2) as a global shutter would have seen them."""
     return matches.target if matches.shift is None else matches.target - readout_time * matches.shift
 
 
-__all__ = ["INLIER", "Localization", "localize", "localize_by", "located"]
+__all__ = ["INLIER", "Localization", "confirmed", "localize", "localize_by", "located"]

@@ -154,3 +154,53 @@ def test_what_is_damaged_or_of_another_version_is_refused(file: Path, tmp_path: 
     bad.write_bytes(file.read_bytes()[:-1000])
     with pytest.raises(ValueError, match="damaged"):
         load(bad)
+
+
+def test_a_frozen_map_stays_as_it_is_and_frames_are_found_in_it(file: Path) -> None:
+    known, items = load(file), back()
+    first = {int(i): pose for i, pose in zip(tracked_room()[1].index, tracked_room()[1].world_from_cam)}
+    depth = np.median([keyframe.median_depth for keyframe in known.keyframes])
+    tracker = Tracker(known=known.renumbered(STREAM), frozen=True)
+    for n, item in enumerate(items):
+        update = tracker.add(n, n / 20.0, item.image, item.intrinsics)
+        found = tracker.newest_pose()
+        assert found is not None
+        assert np.linalg.norm(found.world_from_cam[:3, 3] - first[item.index][:3, 3]) < 0.01 * depth
+        assert 0.5 < found.confidence <= 1.0
+        assert not update.keyframes
+        assert update.correction is None
+    assert len({record.reference for record in tracker.session.records}) > 1, "the reference follows the camera"
+    assert all(update.correction is None for update in tracker.finish())
+    now = tracker.session.graph.keyframes
+    assert {index + STREAM for index in now} == {keyframe.index for keyframe in known.keyframes}
+    for keyframe in known.keyframes:
+        assert np.array_equal(now[keyframe.index - STREAM].cam_from_world, keyframe.cam_from_world)
+        assert np.array_equal(now[keyframe.index - STREAM].inverse_depth, keyframe.inverse_depth)
+    assert tracker.trajectory().posed.all()
+
+
+def test_in_a_frozen_map_another_scene_is_found_nowhere(file: Path) -> None:
+    intrinsics = synthetic(frames=80)[0].intrinsics
+    tracker = Tracker(known=load(file).renumbered(STREAM), frozen=True)
+    for item in synthetic(frames=40, scene="aerial"):
+        tracker.add(item.index, item.timestamp, item.image, intrinsics)
+        assert tracker.newest_pose() is None
+    assert tracker.phase is Phase.RELOCALIZING, "it never begins a part of its own"
+    list(tracker.finish())
+    assert not tracker.trajectory().posed.any()
+    assert "in no frame" in tracker.nothing
+
+
+def test_confidence_falls_with_what_speaks_for_a_pose(file: Path) -> None:
+    item = back()[5]
+    hidden = item.image.copy()
+    hidden[:, :160] = 127
+    seen = []
+    for image in (item.image, hidden):
+        tracker = Tracker(known=load(file).renumbered(STREAM), frozen=True)
+        tracker.add(0, 0.0, item.image, item.intrinsics)
+        tracker.add(1, 0.05, np.roll(image, 3, axis=1), item.intrinsics)
+        found = tracker.newest_pose()
+        assert found is not None
+        seen.append(found.confidence)
+    assert seen[1] < 0.8 * seen[0]

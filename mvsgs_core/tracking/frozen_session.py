@@ -1,0 +1,57 @@
+"""A session that only localizes: each frame is found in a map that stays as it is.
+
+    RELOCALIZING, LOST --- found in the map ---> TRACKING --- a frame can't be followed ---> RELOCALIZING, LOST
+
+A frame is followed from one keyframe of the map; where it has moved away, from the next one that sees what it sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.config import TrackerConfig
+from mvsgs_core.tracking.frames import FrameRecord
+from mvsgs_core.tracking.front_end import Step
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.publish import Update
+from mvsgs_core.tracking.session import Session
+from mvsgs_core.trajectory import TrackingState
+
+
+class FrozenSession(Session):
+    def __init__(
+        self, config: TrackerConfig, stats: Stats, size: tuple[int, int], intrinsics: np.ndarray, guessed: bool
+    ) -> None:
+        """As of `Session`; a map must be given before the first frame, see `go_on`."""
+        every = replace(config.covisibility, min_keyframes=0, min_age=0)  # any keyframe of the map may be followed
+        super().__init__(replace(config, covisibility=every), stats, size, intrinsics, guessed)
+
+    @property
+    def pending(self) -> set[int]:
+        return set()
+
+    def last_keyframes(self) -> Iterator[Update]:
+        """None ever comes."""
+        yield from ()
+
+    def _track(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
+        self.phase = Phase.TRACKING
+        record.state = TrackingState.TRACKED
+        record.follow(self.graph, step.reference, step.matches, step.pose, frame)
+        limit = self.covisible_keyframes.limit(step.reference, self.config.keyframe_choice.max_flow)
+        if self.choice.moved(step, frame.size[1], limit):
+            self._reuse_keyframe(frame, step)
+        return Update(record.state)
+
+    def _relocalize(self, frame: TrackingImage, record: FrameRecord) -> Update:
+        self.phase = Phase.RELOCALIZING
+        place = self._search_map(frame)
+        return Update(record.state) if place is None else self._resume(frame, record, place)
+
+
+__all__ = ["FrozenSession"]

@@ -1,0 +1,109 @@
+"""CameraPose, Frame -> SplatMap, Preview: a map that another run left, as it is, and the camera in it."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from msgs import CameraPose, Frame, Preview, SplatMap
+from mvsgs_core.kept_map import check_kept_map
+from mvsgs_core.mapping.checkpoints.begun import begin_on
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
+from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.preview import as_bytes, preview_arrays
+from mvsgs_core.stats import Stats
+from nodes import Node
+from nodes.mapper import splat_map
+
+NEWEST = 8  # frames that wait for their poses, to be shown
+NO_DEPTH = np.zeros((1, 1), dtype=np.float32)
+
+
+class FrozenMapper(Node):
+    """Trains nothing: the map is sent at the end as it was kept, so that it is scored by the frames found in it.
+
+    A preview shows the newest frame that was found beside the map's render from its pose.
+    """
+
+    @dataclass(frozen=True)
+    class Config(MapperConfig):
+        preview_period: float = 1.0  # seconds between previews; 0: none
+        preview_splats: int = 100000  # at most so many in a preview
+        map: str | None = None  # output of the run that kept the map
+        keep_map: bool = False  # it is kept where it is
+
+    config: Config
+
+    def __init__(self, config: Config | None = None) -> None:
+        super().__init__(config)
+        self.check(self.config)
+        self.atlas = begin_on(Path(self.config.map or ""), self.config, Stats())
+        self._found: Counter[int] = Counter()  # frames in each part of the map
+        self._frames: dict[int, Frame] = {}
+        self._last_preview = 0.0
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        if config.map is None:
+            raise ValueError("which map? give map=DIR, the output directory of a run with keep_map=true")
+        check_kept_map(config.map)
+        checkpoint_info(config.map)
+
+    def on_frame(self, frame: Frame) -> Iterator[Preview]:
+        """For previews alone."""
+        if self._previewing:
+            self._frames[frame.index] = frame
+            for index in sorted(self._frames)[:-NEWEST]:
+                del self._frames[index]
+        yield from ()
+
+    def on_camera_pose(self, pose: CameraPose) -> Iterator[Preview]:
+        self._found[pose.segment] += 1
+        self.stats.values |= {"splats": len(self._mapper.state), "confidence": round(pose.confidence, 3)}
+        now, frame = time.monotonic(), self._frames.get(pose.index)
+        if self._previewing and frame is not None and now - self._last_preview >= self.config.preview_period:
+            self._last_preview = now
+            yield self._preview(pose, frame)
+
+    def on_end(self) -> Iterator[SplatMap | Preview]:
+        yield splat_map(self._mapper.snapshot(), refined=True)
+
+    @property
+    def _mapper(self) -> OnlineMapper:
+        """The part of the map that most frames were found in."""
+        for segment, _ in self._found.most_common():
+            if segment in self.atlas.parts:
+                return self.atlas.parts[segment]
+        return self.atlas.current
+
+    @property
+    def _previewing(self) -> bool:
+        return self.config.preview_period > 0 and Preview not in self.unread
+
+    def _preview(self, pose: CameraPose, frame: Frame) -> Preview:
+        mapper = self._mapper
+        keyframe = RGBDKeyframe(frame.index, frame.image, frame.intrinsics, pose.world_from_cam, NO_DEPTH)
+        local = mapper.frame.local(pose.world_from_cam)
+        view = training_view(keyframe, local, self.config.max_pixels, mapper.state.device)
+        shown = preview_arrays(mapper, self.config.preview_splats)
+        camera = pose.world_from_cam.copy()
+        camera[:3, 3] -= shown["origin"]
+        return Preview(
+            **shown
+            | {
+                "index": frame.index,
+                "world_from_cam": camera,
+                "intrinsics": view.intrinsics,
+                "image": view.image.cpu().numpy(),
+                "render": as_bytes(mapper.render(view).color),
+                "keyframes": np.append(shown["keyframes"], frame.index),
+                "keyframe_poses": np.concatenate([shown["keyframe_poses"], camera[None]]),
+            }
+        )
