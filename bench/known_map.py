@@ -77,7 +77,7 @@ def returns(quick: bool) -> dict[str, Return]:
     """By name; those whose data are here."""
     if quick:
         return {"room": backward(halves(Case("synthetic", {"frames": 80, "threads": 1}).items()))}
-    found = {}
+    found: dict[str, Return] = {}
     for name, case in {"redkitchen": "redkitchen, color camera 525", "tum_fr1_xyz": "tum_fr1_xyz"}.items():
         if CASES[case].there:
             way = halves(CASES[case].items())
