@@ -75,7 +75,7 @@ def removal_cost(
         weight = torch.maximum(weight, image.weight_max.detach())
         for _ in range(probes):
             signs = 2.0 * torch.randint(0, 2, image.color.shape, generator=generator).to(image.color) - 1.0
-            # of a sum: given the gradient of an image, PyTorch loads its symbolic shapes, a second and 40 MB
+            # of a sum: given the gradient of an image, PyTorch loads its symbolic shapes, which takes .4 s
             signed = (image.color * (counted[..., None] * signs)).sum()
             (slope,) = torch.autograd.grad(signed, [leaf], retain_graph=True)
             total += (slope / (1.0 - opacity)).to(torch.float64) ** 2 / probes  # dC/dlogit = o (1 - o) dC/do

@@ -94,6 +94,24 @@ def test_the_cheapest_as_good_as_before_is_what_its_map_costs_now() -> None:
     assert [row.met for row in none] == [False]
 
 
+def test_the_best_map_in_the_time_of_before_tells_what_is_gained_in_it() -> None:
+    def timed(psnr: float, seconds: float) -> list[Run]:
+        frames = [{"index": i, "psnr": psnr, "held_out": True} for i in (0, 5)]
+        made = report(psnr, seconds=seconds)
+        made["rendering"]["frames"] = frames
+        return some("room", made)
+
+    old = timed(30.0, 10.0)
+    candidates = {"30": timed(32.0, 11.0), "20": timed(31.0, 9.0), "10": timed(30.5, 5.0)}
+    rows = by_name(before.at_equal_time("room", old, candidates))
+    assert rows["At before's processor time: room: best"].value == "20"
+    assert rows["At before's processor time: room: mapper's processor time, times before"].value == pytest.approx(0.9)
+    gain = rows["At before's processor time: room: PSNR, change"]
+    assert (gain.value, gain.met) == (pytest.approx(1.0), True)
+    late = before.at_equal_time("room", old, {"30": candidates["30"]})
+    assert [row.met for row in late] == [False]
+
+
 def test_sides_are_checkouts_with_their_iterations() -> None:
     found = before.sides(Path("other"), "10:100")
     assert found["before"] == (Path("other"), ())
