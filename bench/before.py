@@ -234,15 +234,15 @@ def at_equal_quality(scene: str, before: Sequence[Run], candidates: Mapping[str,
 
 
 def at_equal_time(scene: str, before: Sequence[Run], candidates: Mapping[str, Sequence[Run]]) -> list[Row]:
-    """What the best of the candidates gains whose mapper takes no more processor time than that of before, over the
-    frames that are held out in both."""
+    """What the best of the candidates gains whose mapper takes no more processor time than that of before (by no more
+    than the spread over the seeds), over the frames that are held out in both."""
     old = {run.seed: run.report for run in before if run.report}
     found: dict[str, tuple[float, float]] = {}
     for name, runs in candidates.items():
         shares = [SECONDS.change(*pair) for pair in _pairs(SECONDS, before, runs)]
         pairs = [of_common_frames(old[run.seed], run.report) for run in runs if run.report and run.seed in old]
         gains = [pair[1] - pair[0] for pair in pairs if pair is not None]
-        if gains and shares and np.mean(shares) <= 1.0:
+        if gains and shares and np.mean(shares) <= 1.0 + (_spread(np.array(shares)) or 0.0):
             found[name] = float(np.mean(gains)), float(np.mean(shares))
     title = f"At before's processor time: {scene}"
     wanted = GAINS.get(scene, WORSE)
