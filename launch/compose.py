@@ -19,8 +19,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from launch.graph import Graph, Replaced, Settings, build_graph
+from launch.graph import Graph, Replaced, build_graph
 from launch.refusal import GraphError
+from launch.settings import Settings
 from nodes.parameters import did_you_mean, parameter_names, plain_values
 
 CONF = Path(__file__).resolve().parent / "conf"

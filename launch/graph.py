@@ -10,12 +10,13 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgs
 import nodes
 from launch.refusal import GraphError
 from launch.renamed_parameters import refuse_old_names
+from launch.settings import BUFFER, FROM_SETTINGS, LIVE_BUFFER, Settings
 from mvsgs_core.named_modules import import_named
 from nodes.parameters import ParameterError, build, did_you_mean, parameter_names, plain_values
 
@@ -23,41 +24,6 @@ from nodes.parameters import ParameterError, build, did_you_mean, parameter_name
 # they have. Where some slot is their origin, an edge that misses them is an error all the same: corrections would be
 # lost in silence.
 OPTIONAL_MESSAGES = (msgs.Poses, msgs.TrackedFrame, msgs.CameraPose, msgs.TrackerPhase, msgs.Trajectory)
-
-
-@dataclass(frozen=True)
-class Supervise:
-    """What the launcher does about a node that it no longer hears of."""
-
-    silent: float = 10.0  # seconds until it is named
-    dead: float = 60.0  # seconds until the run ends without it, or goes on without it where it only observes
-
-
-@dataclass(frozen=True)
-class Settings:
-    """The keys that belong to no slot."""
-
-    output: str = ""  # directory of everything a run writes; none given: runs/<time>-<dataset>
-    map: str | None = None  # output of a run with keep_map=true: its map is gone on with; null: a new map
-    keep_map: bool | None = None  # leave the map in the output, for another run to begin on; null: where `map` is given
-    device: str = "auto"  # auto, cpu, cuda or cuda:1: for every node that has a `device` and leaves it at auto
-    seed: int = 0  # of every random choice
-    inline: bool = False  # true (or --inline): all nodes in this process, one message at a time, for a debugger
-    buffer: int = 4  # messages that a reliable edge holds before it stops its sender
-    transport: Literal["ipc", "tcp"] = "ipc"
-    host: str = "127.0.0.1"  # tcp: where the nodes' publishers are reached; a slot may have its own `host`
-    port: int | None = None  # tcp: the first of the ports, one a topic; null: free ones, known to nodes started here
-    keys: str | None = None  # directory of CURVE keys: without them nothing listens beyond loopback
-    screen: Literal["auto", "live", "plain", "off"] = "auto"
-    supervise: Supervise = field(default_factory=Supervise)
-
-
-FROM_SETTINGS = (
-    "output",
-    "seed",
-    "map",
-    "keep_map",
-)  # nodes that have such a parameter and are given none of their own get these
 
 
 @dataclass(frozen=True)
@@ -151,6 +117,7 @@ def build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | No
 
 def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) -> Graph:
     settings, sections = _settings(config)
+    settings = _paced(settings, sections)
     device = _Device(settings.device)
     slots: dict[str, Slot] = {}
     for name, section in sections.items():
@@ -183,6 +150,15 @@ def _settings(config: Mapping[str, Any]) -> tuple[Settings, dict[str, Mapping[st
     return settings, sections
 
 
+def _paced(settings: Settings, sections: Mapping[str, Mapping[str, Any]]) -> Settings:
+    """With what depends on whether the camera waits for anybody."""
+    targets = {name: section.get("_target_") for name, section in sections.items()}
+    live = any(load_node(name, str(target)).live for name, target in targets.items() if target is not None)
+    realtime = live if settings.realtime is None else settings.realtime
+    buffer = (LIVE_BUFFER if realtime else BUFFER) if settings.buffer is None else settings.buffer
+    return replace(settings, realtime=realtime, buffer=buffer)
+
+
 def _build_slot(
     name: str, section: Mapping[str, Any], replaced: Replaced | None, settings: Settings, device: _Device
 ) -> Slot:
@@ -211,7 +187,10 @@ def _build_slot(
             raise GraphError(f"{name}.reads.{message}={sender}: must be the name of the slot that sends it")
         if msgs.TYPES[message] not in unused:
             typed[msgs.TYPES[message]] = sender
-    return Slot(name, node, parameters, typed, build(Placement, placement, name))
+    placed = build(Placement, placement, name)
+    if settings.realtime and nodes.is_source(node) and msgs.Frame.__name__ not in placed.best_effort:
+        placed = replace(placed, best_effort=[*placed.best_effort, msgs.Frame.__name__])
+    return Slot(name, node, parameters, typed, placed)
 
 
 def _completed(name: str, node: type[nodes.Node], config: Any) -> dict[str, Any]:

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from launch.field_comments import field_comments
-from launch.graph import Graph, Placement, Settings, Slot
+from launch.graph import Graph, Placement, Slot
+from launch.settings import Settings
 from nodes.parameters import Parameter, parameters, plain_values, type_name
 
 HEADER = """\

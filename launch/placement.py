@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+import msgs
 from launch.graph import Graph
 
 # Share of the cores by work per keyframe; a slot that is not named counts as 1.
@@ -16,6 +17,7 @@ LAST = ("evaluator",)
 # The heaviest slot takes most of a whole run's CPU time (the mapper 76 to 94 % of it, measured on the synthetic room
 # and on TUM's freiburg1_xyz): the others often wait for it, and it goes on when they have finished.
 HEAVIEST_SHARE = 0.75
+BEHIND_THE_POSE, WATCHING = 5, 10  # niceness in real time, of what comes after the tracker and of who only looks
 
 
 def available_cores() -> int:
@@ -45,6 +47,17 @@ def thread_plan(graph: Graph, cores: int | None = None) -> dict[str, int]:
         pinned = len(slot.placement.cpu) if slot.placement.cpu else share
         plan[name] = slot.placement.threads or slot.config.get("threads") or min(share, pinned)
     return plan
+
+
+def niceness(graph: Graph, name: str) -> int:
+    """By how much a node gives way to others. In real time whoever stands nearer to the camera goes first."""
+    if not graph.settings.realtime:
+        return 0
+    newest_only = all(edge.best_effort for edge in graph.into(name))
+    if name in graph.observers:
+        return WATCHING if newest_only else BEHIND_THE_POSE  # what reads every message must not fall far behind
+    near = {*graph.sources, *(edge.reader for edge in graph.edges if edge.message is msgs.Frame)}
+    return 0 if name in near else BEHIND_THE_POSE
 
 
 def thread_environment(threads: int) -> dict[str, str]:

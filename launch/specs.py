@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from launch.graph import Edge, Graph
+from launch.placement import niceness
 from launch.refusal import GraphError
 from nodes.runtime.addresses import TransportError, load_keys
 
@@ -89,6 +90,7 @@ def spec(
         "seed": settings.seed,
         "threads": threads,
         "cpu": slot.placement.cpu,
+        "nice": niceness(graph, name),
         "keys": None if settings.keys is None else str(Path(settings.keys).absolute()),
         "token": token,
         "status_fd": status_fd,

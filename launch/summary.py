@@ -53,6 +53,10 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
         wall, pace = metrics.at("time.wall"), metrics.at("time.keyframes_per_second")
         rate = pace.text(times.get(pace.key), unit=False)
         lines.append(f"time        {wall.text(times['wall'])}, {rate} keyframes/s")
+    for by_name in (_get(report, "latency") or {}).values():
+        for what, found in by_name.items():
+            median, p99 = 1e3 * found.get("median", 0.0), 1e3 * found.get("p99", 0.0)
+            lines.append(f"latency     {what}: {median:.0f} ms, 99 %: {p99:.0f} ms ({found.get('count')})")
     return lines
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 
 from launch.children import Child
-from launch.graph import Supervise
+from launch.settings import Supervise
 from launch.status import printable_lines
 
 STARTING_SECONDS = 20.0  # more that a node has until it is constructed: libraries are loaded in one call, from a disk

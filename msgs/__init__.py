@@ -35,6 +35,8 @@ class _Image:
     timestamp: float  # seconds
     image: Annotated[np.ndarray, "uint8 H W 3"]
     intrinsics: Annotated[np.ndarray, "float64 4"]
+    # when it came from the camera, seconds since 1970 by the host's clock; 0: it is of no live stream
+    captured: float = field(default=0.0, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class Depth(_PosedImage):
     depth: Annotated[np.ndarray, "float32 h w"]
     confidence: Annotated[np.ndarray, "float32 h w"]  # 0 to 1
     segment: int
+    effort: int = 0  # that stereo made: 0 all, more: less, as the node's `efforts` say
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,8 @@ class FusedKeyframe(_PosedImage):
     normals: Annotated[np.ndarray, "float32 h w 3"]  # camera frame, toward the camera; 0 where depth is 0
     segment: int
     unfiltered: Annotated[np.ndarray, "float32 h w"] | None = None  # refined depth before the filters; None: not sent
+    effort: int = 0  # that stereo made, see Depth
+    fusion_effort: int = 0  # that fusion made
 
 
 @dataclass(frozen=True)
@@ -159,11 +164,16 @@ class CameraPose:
 
 @dataclass(frozen=True)
 class TrackerPhase:
-    """What the tracker does from a frame on, where it changes; it begins with "initializing". For who watches."""
+    """What the tracker does from a frame on, where it changes, and of a live stream now and then; for who watches.
+
+    It begins with "initializing".
+    """
 
     index: int
     timestamp: float  # seconds
     phase: str  # initializing, tracking, relocalizing (searching the map for the camera) or lost
+    # of a live stream: seconds from a frame's capture to its pose, median and 99th percentile so far
+    latency: Annotated[np.ndarray, "float64 2"] | None = None
 
 
 @dataclass(frozen=True)
@@ -223,6 +233,10 @@ class Preview:
     keyframes: Annotated[np.ndarray, "int64 K"] | None = None  # all, in the order of the stream; None: not said
     keyframe_poses: Annotated[np.ndarray, "float64 K 4 4"] | None = None  # of those, with every correction so far
     origin: Annotated[np.ndarray, "float64 3"] | None = None  # SplatMap.origin
+    # of a live stream: seconds from a keyframe's capture to the map, median and 99th percentile so far; to a preview
+    latency: Annotated[np.ndarray, "float64 2 2"] | None = None
+    effort: int = 0  # that stereo made for the newest keyframe, see Depth
+    fusion_effort: int = 0  # that fusion made
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,16 @@ class KeyframeWindow(Generic[K]):
             yield self._next()
         del self._keyframes[: max(0, len(self._keyframes) - self._before - self._lag - 1)]
 
+    def release(self) -> Iterator[tuple[K, list[K]]]:
+        """Yields the keyframe that has waited longest, if any, with the others that are there."""
+        if self._waiting:
+            yield self._next()
+
+    @property
+    def waiting(self) -> int | None:
+        """Index of the keyframe that has waited longest."""
+        return self._waiting[0] if self._waiting else None
+
     def flush(self) -> Iterator[tuple[K, list[K]]]:
         """Yields the keyframes that still wait, with the others that are there."""
         while self._waiting:

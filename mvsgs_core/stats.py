@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from mvsgs_core.latency import QUANTILES, Latency
 from mvsgs_core.warned import Warnings
 
 
@@ -21,6 +22,7 @@ class Stats:
     values: dict[str, Any] = field(default_factory=dict)  # latest value: for the live display and the report
     warnings: Warnings = field(default_factory=Warnings)  # what a user should know: fallbacks, lost tracking
     clock: Callable[[], float] = time.perf_counter  # seconds; time.process_time where other processes disturb
+    latencies: dict[str, Latency] = field(default_factory=dict)  # of a live stream, by what was waited for
 
     def count(self, name: str, n: float = 1) -> None:
         self.counts[name] = self.counts.get(name, 0) + n
@@ -40,6 +42,18 @@ class Stats:
     def nothing(self, reason: str) -> None:
         """The stage ends with nothing to show. `reason` is what was measured; the run fails, and says it."""
         self.values["nothing"] = reason
+
+    def arrived(self, what: str, captured: float) -> None:
+        """What came from the camera at `captured`, seconds since 1970, is done now; 0: no camera is waited for."""
+        if captured > 0.0:
+            latency = self.latencies.setdefault(what, Latency())
+            latency.add(time.time() - captured)
+            self.values["latency"] = self.values.get("latency", {}) | {what: latency.figures}
+
+    def latency(self, *what: str) -> list[list[float]]:
+        """[median, 99th percentile] in seconds of each, 0 where nothing arrived yet."""
+        found = (self.latencies.get(name, Latency()) for name in what)
+        return [[latency.quantile(part) for part in QUANTILES.values()] for latency in found]
 
     @contextmanager
     def time(self, name: str) -> Iterator[None]:

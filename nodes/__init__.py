@@ -14,7 +14,7 @@ The parameter's type declares the input, the yielded type the output. Hooks:
 - `on_<anything>(self, message: T) -> Iterator[U | V]`: one per input type; of a union those that `reads` names.
 - `run(self) -> Iterator[U]`: a source instead has this.
 - `on_idle(self) -> list[U] | None`: one slice (well under 100 ms) of background work while no message waits;
-  None when there is nothing to do until the next message.
+  None when there is nothing to do now: it is asked again after the next message, or a quarter of a second.
 - `on_end(self) -> Iterator[U]`: every input has ended.
 - `on_abort(self, reason)`: the run ends early for this node, by SIGTERM, a lost neighbor or an exception of its own:
   save what must not be lost, within 3 s, or be killed. Called once, between two hooks, at a `yield` of one or in a call
@@ -51,6 +51,7 @@ class Node:
         pass
 
     replayable: ClassVar[bool] = False  # sources: the same command gives the same stream once more
+    live: ClassVar[bool] = False  # sources: a camera that waits for nobody
 
     config: Any
 
@@ -60,6 +61,7 @@ class Node:
         self.upstream: dict[str, Any] = {}  # what each node upstream counted, by name: complete when on_end runs
         self.unread: frozenset[type] = frozenset()  # messages that nobody reads here: work for them alone can be spared
         self.rest: Callable[[], object] = _go_on  # to be called in long work where nothing is half changed, see above
+        self.waiting: Callable[[type], int] = _none  # messages of a type that came and were not taken up, about
 
     @classmethod
     def check(cls, config: Any) -> None:
@@ -91,6 +93,11 @@ class Node:
 
 def _go_on() -> None:
     """Nobody asks a node to stop that runs in no process of its own."""
+
+
+def _none(kind: type) -> int:
+    """Nothing waits for a node that runs in no process of its own."""
+    return 0
 
 
 _OUTPUT_HOOKS: tuple[str, ...] = ("run", "on_idle", "on_end")

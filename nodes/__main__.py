@@ -48,9 +48,11 @@ def _die_with_parent() -> None:
 
 def _place(spec: Spec) -> None:
     """Cores and threads, before the libraries that read them are loaded."""
-    if spec.cpu is not None:
-        for task in Path("/proc/self/task").iterdir():  # numpy has started threads already
+    for task in Path("/proc/self/task").iterdir():  # numpy has started threads already
+        if spec.cpu is not None:
             os.sched_setaffinity(int(task.name), spec.cpu)
+        if spec.nice:
+            os.setpriority(os.PRIO_PROCESS, int(task.name), spec.nice)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if spec.threads is not None:
         for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):

@@ -23,6 +23,7 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
         self._depths: dict[int, Depth] = {}  # not sent yet
 
     def on_depth(self, depth: Depth) -> Iterator[FusedKeyframe]:
+        self._take(depth.index, depth.timestamp)
         self._depths[depth.index] = depth
         view = KeyframeDepth(
             index=depth.index,
@@ -34,6 +35,9 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             segment=depth.segment,
         )
         yield from self._messages(self._core.add(self._corrected(view)))
+
+    def on_idle(self) -> list[FusedKeyframe] | None:
+        return self._overdue()
 
     def on_end(self) -> Iterator[FusedKeyframe]:
         yield from self._messages(self._core.flush())
@@ -54,6 +58,9 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             f"all depth of {keyframes} was rejected, by these filters, of the pixels with stereo depth: "
             f"{', '.join(fractions)} (a pixel can fail more than one)"
         )
+
+    def _queue(self) -> int:
+        return self.waiting(Depth)
 
     def _message(self, found: FusedDepth) -> FusedKeyframe:
         message = self._depths.pop(found.view.index)
@@ -77,6 +84,9 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             unfiltered=found.unfiltered,
             exposure=message.exposure,
             vignetting=message.vignetting,
+            captured=message.captured,
+            effort=message.effort,
+            fusion_effort=found.effort,
         )
         return self._exposed(fused)
 

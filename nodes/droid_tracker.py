@@ -43,4 +43,5 @@ class DroidTracker(TrackerNode):
             inverse_depth=coarse.inverse_depth,
             inverse_depth_weight=coarse.weight,
             segment=0,
+            captured=frame.captured,
         )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from msgs import Frame, GroundTruth
 from mvsgs_core.datasets.options import SizedSelection
@@ -13,6 +15,8 @@ from nodes import Node
 
 class LiveSource(Node, ABC):
     """Frame, and GroundTruth with the same image to score renders against."""
+
+    live: ClassVar[bool] = True
 
     @dataclass
     class Config(SizedSelection):
@@ -29,8 +33,9 @@ class LiveSource(Node, ABC):
                 frame = self._take(first=taken == 0)
                 if frame is None:
                     return
+                came = time.time()
                 if self.config.has(taken):
-                    shown = replace(self._framed(frame), index=index)
+                    shown = replace(self._framed(frame), index=index, captured=came)
                     self.stats.count("frames")
                     yield shown
                     yield GroundTruth(index, shown.timestamp, shown.image, shown.intrinsics, None, None)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap, TrackedFrame
 from mvsgs_core.export import keyframe_images
@@ -20,14 +23,18 @@ from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.replay import Replay
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.keyframes import RGBDKeyframe
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
 from mvsgs_core.mapping.self_check import why_nothing
+from mvsgs_core.pace import Effort, Pace
 from nodes import Node
 
 _SLICE = 0.05  # seconds of optimization in one on_idle
+PREVIEWS = 0.1  # of the time that previews may take in real time
+EFFORTS = (Effort("full", 1.0), Effort("new splats as of half the image's size", 0.35))
+LAST_SECONDS = 2.0  # after the last keyframe of a live stream the map is handed out, before its refinement
 
 
 class Mapper(Node):
@@ -58,6 +65,12 @@ class Mapper(Node):
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
+        self._pace = Pace(EFFORTS, self.config.share, self.stats, None if self.config.realtime else (0,))
+        self._pace.waiting = lambda: self.waiting(FusedKeyframe)
+        self._last_captured = 0.0  # of the keyframes that came
+        self._efforts = 0, 0  # that stereo and fusion made for the newest keyframe
+        self._shown = -1  # newest keyframe that a preview showed
+        self._unseen: dict[int, float] = {}  # keyframes that no preview showed yet: when they were captured
         self.atlas, resumed = Atlas(OnlineMapper(self.config, self.stats)), None
         self._replay: Replay | None = None
         if self.config.resume is not None:
@@ -68,7 +81,7 @@ class Mapper(Node):
         self._checkpoints: Checkpointing | None = None
         if self.config.output is not None:
             self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.atlas, resumed)
-        self._last_preview = 0.0
+        self._last_preview = self._preview_seconds = 0.0
         self._provisional = Provisional(self.config.preview_splats)
 
     @classmethod
@@ -87,16 +100,12 @@ class Mapper(Node):
             )
             return
         self._settle()
-        added = self.atlas.add(
-            RGBDKeyframe(
-                index=fused.index, image=fused.image, intrinsics=fused.intrinsics, world_from_cam=fused.world_from_cam,
-                depth=fused.depth, scale=fused.scale, confidence=fused.confidence, normals=fused.normals,
-                unfiltered=fused.unfiltered, timestamp=fused.timestamp, exposure=fused.exposure,
-                vignetting=fused.vignetting, photograph=fused.photograph, velocity=fused.velocity,
-                readout_time=fused.readout_time,
-            ),
-            fused.segment,
-        )  # fmt: skip
+        self._pace.came(fused.timestamp)
+        with self._pace.spend() as effort:
+            added = self._add(fused, small=effort > 0)
+        self.stats.arrived("keyframe to map", fused.captured)
+        self._efforts = fused.effort, fused.fusion_effort
+        self._came(fused)
         self._save_image(fused)
         if self._checkpoints is not None and added is not None:
             self._checkpoints.added(added)
@@ -118,6 +127,7 @@ class Mapper(Node):
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Preview]:
         if not self._previewing:
             return
+        self._came(keyframe)
         self._provisional.see(
             CoarseKeyframe(
                 index=keyframe.index, image=keyframe.image, intrinsics=keyframe.intrinsics, scale=keyframe.scale,
@@ -151,9 +161,10 @@ class Mapper(Node):
         return list(self._preview())
 
     def on_end(self) -> Iterator[SplatMap | Preview]:
-        self._settle(realtime=False)
+        self._settle_last()
         self.atlas.finish()
-        self._settle(realtime=False)
+        self._settle_last()
+        self.stats.arrived("last keyframe to the map before its refinement", self._last_captured)
         yield self._map(refined=False)
         while self.atlas.refine():
             self._keep()
@@ -171,6 +182,19 @@ class Mapper(Node):
         if self._checkpoints is not None:
             self._checkpoints.last(self.atlas)
 
+    def _add(self, fused: FusedKeyframe, small: bool) -> TrainingView | None:
+        return self.atlas.add(
+            RGBDKeyframe(
+                index=fused.index, image=fused.image, intrinsics=fused.intrinsics, world_from_cam=fused.world_from_cam,
+                depth=fused.depth, scale=fused.scale, confidence=fused.confidence, normals=fused.normals,
+                unfiltered=fused.unfiltered, timestamp=fused.timestamp, exposure=fused.exposure,
+                vignetting=fused.vignetting, photograph=fused.photograph, velocity=fused.velocity,
+                readout_time=fused.readout_time,
+            ),
+            fused.segment,
+            small,
+        )  # fmt: skip
+
     def _pass_over(self, counted: str = "") -> None:
         """A message that is not taken in, as the checkpoint has it or the stream does not fit, which is said."""
         if counted:
@@ -179,10 +203,23 @@ class Mapper(Node):
             self.stats.warn(self._replay.problem)
             self.atlas.between.waiting.clear()
 
-    def _settle(self, realtime: bool = True) -> None:
-        """Does the pending iterations. realtime: where the mapper is, it is left for the next keyframe to cancel."""
-        while not (realtime and self.config.realtime) and self.atlas.step():
+    def _settle(self) -> None:
+        """Does the pending iterations. In real time that is left for when nothing else is to be done."""
+        while not self.config.realtime and self.atlas.step():
             self._keep()
+
+    def _settle_last(self) -> None:
+        """The stream has ended: the pending iterations; of a live one as many as its last frame may wait for."""
+        until = self._last_captured + LAST_SECONDS if self._last_captured else math.inf
+        while time.time() < until and self.atlas.step():
+            self._keep()
+
+    def _came(self, keyframe: FusedKeyframe | Keyframe) -> None:
+        """Of a live stream, whose latencies are measured."""
+        if keyframe.captured > 0.0:
+            self._last_captured = max(self._last_captured, keyframe.captured)
+            if self._previewing and keyframe.index > self._shown:
+                self._unseen[keyframe.index] = keyframe.captured
 
     def _keep(self) -> None:
         """Between two iterations, where nothing is half changed."""
@@ -224,13 +261,26 @@ class Mapper(Node):
 
     def _preview(self, due: bool = False) -> Iterator[Preview]:
         now, mapper = time.monotonic(), self.atlas.current
-        due |= now - self._last_preview >= self.config.preview_period
+        period = max(self.config.preview_period, self._preview_seconds / PREVIEWS if self.config.realtime else 0.0)
+        due |= now - self._last_preview >= period
         if not self._previewing or not due or not mapper.views or not len(mapper.state):
             return
         self._last_preview = now
         with self.stats.time("provisional"):
             provisional = self._provisional.splats(mapper, self.atlas.segments)
-        yield Preview(**preview_arrays(mapper, self.config.preview_splats, provisional))
+        live = self.stats.latency("keyframe to map", "keyframe to preview") if self._last_captured else None
+        arrays = preview_arrays(mapper, self.config.preview_splats, provisional)
+        self._preview_seconds = time.monotonic() - now
+        yield Preview(
+            **arrays,
+            latency=None if live is None else np.array(live),
+            effort=self._efforts[0],
+            fusion_effort=self._efforts[1],
+        )
+        shown = {view.index for view in mapper.views} | self._provisional.shown
+        for index in self._unseen.keys() & shown:
+            self.stats.arrived("keyframe to preview", self._unseen.pop(index))
+            self._shown = max(self._shown, index)
 
 
 def splat_map(final: Snapshot, refined: bool) -> SplatMap:

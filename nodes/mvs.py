@@ -23,6 +23,7 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
         self._keyframes: dict[int, Keyframe] = {}  # without depth yet
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
+        self._take(keyframe.index, keyframe.timestamp)
         passed_over = self.config.resume_after is not None and keyframe.index <= self.config.resume_after
         if passed_over:
             self.stats.skip("keyframes that the checkpoint has")
@@ -41,8 +42,14 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
             )
         yield from self._messages(self._core.add(self._corrected(view), wanted=not passed_over))
 
+    def on_idle(self) -> list[Depth] | None:
+        return self._overdue()
+
     def on_end(self) -> Iterator[Depth]:
         yield from self._messages(self._core.flush())
+
+    def _queue(self) -> int:
+        return self.waiting(Keyframe)
 
     def _message(self, found: CascadeDepth) -> Depth:
         keyframe = self._keyframes.pop(found.view.index)
@@ -59,7 +66,7 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
             self.stats.skip(f"hypotheses {what}", found.result.counts.get(what, 0.0))
         self.stats.values["mean confidence"] = float(np.mean(found.result.confidence))
         depth = depth_message(keyframe, found.result.depth, found.result.confidence)
-        depth = replace(depth, **self._moved(depth, found.view))
+        depth = replace(depth, **self._moved(depth, found.view), effort=found.effort)
         return self._exposed(depth)
 
 
@@ -80,6 +87,7 @@ def depth_message(keyframe: Keyframe, depth: np.ndarray, confidence: np.ndarray)
         photograph=keyframe.photograph,
         velocity=keyframe.velocity,
         readout_time=keyframe.readout_time,
+        captured=keyframe.captured,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from msgs import Frame, GroundTruth
@@ -14,6 +14,7 @@ from mvsgs_core.camera import check_intrinsics
 from mvsgs_core.datasets.mcap_file import McapFile, Recorded
 from mvsgs_core.datasets.options import Selection
 from nodes import Node
+from nodes.playback import Playback
 from nodes.recorder import ENCODING
 
 PLAYED = (Frame, GroundTruth)
@@ -30,6 +31,7 @@ class Player(Node):
     @dataclass
     class Config(Selection):
         path: str | None = None  # .mcap file
+        realtime: bool = False  # play at the recorded rate, not as fast as it is read
 
     config: Config
 
@@ -48,6 +50,7 @@ class Player(Node):
         c = self.config
         self.check(c)
         recording = self._recording()
+        playback, due = Playback(), 0.0
         last = -1
         try:
             for record in self._records(recording):
@@ -56,8 +59,10 @@ class Player(Node):
                 if c.has(place):
                     message = self._decoded(record, recording)
                     if message is not None:
+                        if c.realtime and isinstance(message, Frame):
+                            due = playback.wait(message.timestamp)
                         self.stats.count("frames", isinstance(message, Frame))
-                        yield message
+                        yield replace(message, captured=due)  # not when it was recorded
         finally:  # also when the run is interrupted
             for warning in recording.warnings:
                 self.stats.warn(warning)

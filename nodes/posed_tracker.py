@@ -124,6 +124,7 @@ class PosedTracker(Node):
             photograph=None if velocity is None else frame.image,
             velocity=velocity,
             readout_time=0.0 if velocity is None else readout_time,
+            captured=frame.captured,
         )
 
     def _exposed(self, core: CoreTracker) -> Iterator[Poses]:

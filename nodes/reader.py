@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -13,6 +12,7 @@ from mvsgs_core.datasets import Item, check, open_dataset, options_of
 from mvsgs_core.datasets.options import FileOptions
 from nodes import Node
 from nodes.parameters import Parameter, parameter_names, parameters
+from nodes.playback import Playback
 
 
 class Reader(Node):
@@ -23,8 +23,7 @@ class Reader(Node):
     @dataclass
     class Config(FileOptions):
         name: str  # format, a file of mvsgs_core.datasets
-        # play at the recorded rate, not as fast as it is read; with best_effort=[Frame] it is as a live camera
-        realtime: bool = False
+        realtime: bool = False  # play at the recorded rate, not as fast as it is read
         options: dict[str, Any] = field(default_factory=dict)  # of that format: see its class in mvsgs_core.datasets
 
     config: Config
@@ -43,7 +42,7 @@ class Reader(Node):
         sequence = open_dataset(self.config.name, **_options(self.config))
         self.stats.values["frames_expected"] = len(sequence)
         self._pass_warnings_on(sequence)  # those that opening gave; the others are counted until the end
-        pace = _Pace()
+        playback = Playback()
         frames = iter(sequence)
         try:
             while True:
@@ -51,11 +50,12 @@ class Reader(Node):
                     item = next(frames, None)
                 if item is None:
                     return
-                if self.config.realtime:
-                    pace.wait(item.timestamp)
+                captured = playback.wait(item.timestamp) if self.config.realtime else 0.0
                 self.stats.count("frames")
                 guessed, exposure = item.intrinsics_guessed, item.exposure
-                yield Frame(item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure)
+                yield Frame(
+                    item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure, captured=captured
+                )
                 yield _ground_truth(item)
         finally:  # also when the run is interrupted
             self._pass_warnings_on(sequence)
@@ -72,16 +72,3 @@ def _options(c: Reader.Config) -> dict[str, Any]:
 
 def _ground_truth(item: Item) -> GroundTruth:
     return GroundTruth(item.index, item.timestamp, item.image, item.intrinsics, item.world_from_cam, item.depth)
-
-
-class _Pace:
-    """Holds frames back until the time at which they were recorded."""
-
-    def __init__(self) -> None:
-        self._offset: float | None = None  # clock minus timestamp, seconds
-
-    def wait(self, timestamp: float) -> None:
-        now = time.monotonic()
-        if self._offset is None:
-            self._offset = now - timestamp
-        time.sleep(max(0.0, timestamp + self._offset - now))

@@ -62,7 +62,11 @@ class Tracker(TrackerNode):
 
     def _add(self, frame: Frame) -> Update:
         guessed = frame.intrinsics_guessed
-        return self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed, frame.exposure)
+        return self.core.follow(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed, frame.exposure)
+
+    @property
+    def _live(self) -> bool:
+        return self.config.realtime
 
     @property
     def _focal_factor(self) -> float:
@@ -124,6 +128,7 @@ class Tracker(TrackerNode):
             photograph=None if velocity is None else frame.image,
             velocity=velocity,
             readout_time=0.0 if velocity is None else self._readout_time,
+            captured=frame.captured,
         )
 
     def _camera_pose(self, frame: Frame) -> CameraPose | None:

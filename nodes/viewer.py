@@ -42,6 +42,8 @@ class Viewer(Node):
         self.closed = threading.Event()
         self._iterations = 0  # of the map that is shown
         self._phase = "initializing"  # what the tracker does
+        self._pose_latency = ""  # of a live stream, and its other latencies
+        self._map_latency = ""
         self._shown = "waiting for the first keyframe"
         self._status = self.server.gui.add_markdown("")
         self._show_status()
@@ -65,12 +67,20 @@ class Viewer(Node):
             self._photo.image, self._render.image = thumbnail(preview.image), thumbnail(preview.render)
             self._iterations = preview.iterations
             self._shown = f"keyframe **{preview.index}**, {len(preview.means)} splats, {preview.iterations} iterations"
+            if preview.latency is not None:
+                to_map, to_preview = map(_milliseconds, preview.latency)
+                self._map_latency = (
+                    f"; capture to map {to_map}, to preview {to_preview}; effort of stereo and fusion, 0 the most: "
+                    f"{preview.effort}, {preview.fusion_effort}"
+                )
             self._show_status()
         self.stats.count("previews")
         yield from ()
 
     def on_tracker_phase(self, message: TrackerPhase) -> Iterator[None]:
         self._phase = message.phase
+        if message.latency is not None:
+            self._pose_latency = f"; capture to pose {_milliseconds(message.latency)}"
         self._show_status()
         yield from ()
 
@@ -84,7 +94,7 @@ class Viewer(Node):
         yield from ()
 
     def _show_status(self) -> None:
-        self._status.content = f"tracker: **{self._phase}**; {self._shown}"
+        self._status.content = f"tracker: **{self._phase}**{self._pose_latency}; {self._shown}{self._map_latency}"
 
     def _ending(self) -> str:
         """What is shown once nothing more comes: the map as the mapper left it, or an earlier state of it."""
@@ -104,3 +114,8 @@ class Viewer(Node):
                 self.page.move_keyframe(index, poses[index])
             else:
                 self.page.remove_keyframe(index)
+
+
+def _milliseconds(latency: np.ndarray) -> str:
+    median, p99 = 1e3 * latency
+    return f"{median:.0f} ms (99 %: {p99:.0f} ms)"

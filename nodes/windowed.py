@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,16 +12,27 @@ import numpy as np
 
 from msgs import Depth, FusedKeyframe, Keyframe, Poses, TrackedFrame
 from mvsgs_core.keyframe_window import WindowedKeyframe
+from mvsgs_core.pace import Pace
 from nodes import Node
+
+PATIENCE = 0.5  # s that a live keyframe waits for later ones
 
 
 class WindowedCore(Protocol):
+    @property
+    def pace(self) -> Pace: ...
+
+    @property
+    def waiting(self) -> int | None: ...
+
     def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None: ...
+
+    def release(self) -> Iterator[Any]: ...
 
 
 Core = TypeVar("Core", bound=WindowedCore)
 Found = TypeVar("Found")  # what the core finds of a keyframe
-Sent = TypeVar("Sent")  # the message of it
+Sent = TypeVar("Sent", Depth, FusedKeyframe)  # the message of it
 K = TypeVar("K", bound=WindowedKeyframe)
 Lit = TypeVar("Lit", Depth, FusedKeyframe)
 
@@ -33,6 +45,9 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
         self._core = self._make_core()
+        self._core.pace.log = self.stats
+        self._core.pace.waiting = self._queue
+        self._came: dict[int, float] = {}  # when keyframes came that wait for later ones, by a clock of its own
         self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
         self._exposures: dict[int, np.ndarray] = {}  # (3, 4), the same
         self._vignetting: np.ndarray | None = None  # (3,) the newest
@@ -43,6 +58,23 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
 
     @abstractmethod
     def _message(self, found: Found) -> Sent: ...
+
+    @abstractmethod
+    def _queue(self) -> int:
+        """Keyframes that came and were not taken up."""
+
+    def _take(self, index: int, timestamp: float) -> None:
+        """A keyframe is taken up."""
+        self._came[index] = time.monotonic()
+        self._core.pace.came(timestamp)
+
+    def _overdue(self) -> list[Sent] | None:
+        """Of a live stream the keyframe that has waited too long for later ones, if any: the camera may stand still."""
+        oldest = self._core.waiting
+        if not self.config.realtime or oldest is None or time.monotonic() - self._came[oldest] < PATIENCE:
+            return None
+        self.stats.count("keyframes that waited for no later ones")
+        return list(self._messages(self._core.release()))
 
     def on_poses(self, poses: Poses) -> Iterator[Poses]:
         """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
@@ -96,4 +128,6 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
                 one = next(found, None)
             if one is None:
                 return
-            yield self._message(one)
+            sent = self._message(one)
+            self._came.pop(sent.index, None)
+            yield sent

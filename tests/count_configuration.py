@@ -22,7 +22,8 @@ import yaml
 
 import nodes
 from launch.compose import CONF
-from launch.graph import Placement, Settings, load_node
+from launch.graph import Placement, load_node
+from launch.settings import Settings
 from nodes.parameters import Parameter, build, parameter_names, parameters
 
 ROOT = Path(__file__).resolve().parent.parent

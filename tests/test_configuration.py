@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from launch.graph import Settings
+from launch.settings import Settings
 from mvsgs_core.mapping.config import MapperConfig
 from nodes import Node
 from nodes.parameters import parameters

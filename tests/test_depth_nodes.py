@@ -12,6 +12,7 @@ from nodes import handlers, outputs
 from nodes.coarse_depth import CoarseDepth
 from nodes.depth_fusion import DepthFusion
 from nodes.mvs import Mvs
+from nodes.windowed import PATIENCE
 from tests.support.keyframe_messages import SIZE, keyframe
 from tests.support.plane_scene import FAR, NEAR, look, true_depth
 
@@ -224,6 +225,63 @@ def ended(depth_fusion: DepthFusion, depths: list[Depth]) -> DepthFusion:
         list(depth_fusion.on_depth(depth))
     list(depth_fusion.on_end())
     return depth_fusion
+
+
+@pytest.mark.parametrize(("effort", "nearest"), [(1, 0.02), (2, 0.05)])
+def test_less_effort_is_as_right_where_it_is_sure(effort: int, nearest: float) -> None:
+    mvs = stereo(realtime=True)
+    mvs._core.pace.choose = lambda: effort  # type: ignore[method-assign]
+    depths = [d for i in range(5) for d in mvs.on_keyframe(keyframe(i))]
+    depth = depths[2]
+    truth = true_depth(depth.world_from_cam, depth.depth.shape)
+    assert depth.effort == effort
+    assert depth.depth.shape == SIZE
+    sure = depth.confidence > 0.8
+    assert sure.mean() > 0.2
+    assert np.mean(np.abs(depth.depth - truth)[sure] < nearest * truth[sure]) > 0.95
+    assert sum(n for name, n in mvs.stats.skipped.items() if name.startswith("effort")) == len(depths)
+
+
+def test_where_there_is_no_time_for_stereo_the_trackers_depth_fills_holes_alone() -> None:
+    mvs, depth_fusion = stereo(realtime=True), fusion(realtime=True)
+    mvs._core.pace.choose = lambda: 3  # type: ignore[method-assign]
+    depths = [d for i in range(7) for d in mvs.on_keyframe(keyframe(i))]
+    views = [v for d in [*depths, *mvs.on_end()] for v in depth_fusion.on_depth(d)]
+    assert [v.index for v in views] == [0, 1, 2, 3, 4]  # no keyframe is left out
+    for view in views:
+        assert view.unfiltered is not None
+        assert not (view.depth > 0).any()
+        truth = true_depth(view.world_from_cam, view.unfiltered.shape)
+        known = view.unfiltered > 0
+        assert known.mean() > 0.5
+        assert np.median(np.abs(view.unfiltered - truth)[known] / truth[known]) < 0.05
+        assert view.effort == 3
+
+
+def test_a_live_keyframe_waits_for_later_ones_no_longer_than_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("nodes.windowed.time.monotonic", lambda: now[0])
+    live, waiting = stereo(realtime=True), stereo()
+    for node in (live, waiting):
+        assert [d for i in range(2) for d in node.on_keyframe(keyframe(i))] == []
+        assert node.on_idle() is None
+    now[0] += 1.01 * PATIENCE
+    assert [[d.index for d in live.on_idle() or ()] for _ in range(3)] == [[0], [1], []]
+    assert live.on_idle() is None
+    assert waiting.on_idle() is None  # a recording's map does not depend on the clock
+    assert [d.index for i in range(2, 5) for d in live.on_keyframe(keyframe(i))] == [2]
+    assert live.stats.counts["keyframes that waited for no later ones"] == 2
+
+
+def test_effort_follows_what_waits() -> None:
+    live = stereo(realtime=True)
+    live.waiting = lambda kind: 50 if kind is Keyframe else 0
+    efforts = [d.effort for i in range(7) for d in live.on_keyframe(keyframe(i))]
+    assert efforts[0] == 1  # which tells what it costs
+    assert all(effort >= 1 for effort in efforts[1:])
+    live.waiting = lambda kind: 0
+    live._core.pace._cost = 1e-4
+    assert [d.effort for d in live.on_keyframe(keyframe(7))] == [0]
 
 
 def test_depth_that_is_all_rejected_is_nothing_and_the_filters_are_named() -> None:

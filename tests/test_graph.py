@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from launch.compose import CONF, compose, slots_of
 from launch.graph import Edge, Graph
 from launch.inline import run_inline
-from launch.placement import thread_plan
+from launch.placement import niceness, thread_plan
 from launch.refusal import GraphError
 from msgs import Frame, GroundTruth, Keyframe, Poses
 from nodes.parameters import ParameterError, convert
@@ -76,6 +76,22 @@ def test_best_effort_on_either_side() -> None:
     assert ("Frame", True) in best_effort("relay.reads.Frame=source?")
     assert ("Frame", True) in best_effort("source=live")
     assert ("GroundTruth", False) in best_effort("source=live")
+
+
+def test_real_time_is_one_switch_and_the_default_of_live_sources() -> None:
+    plain, paced = compose([]), compose(["realtime=true"])
+    live, unhurried = compose(["dataset=camera"]), compose(["dataset=camera", "realtime=false"])
+    for graph, realtime in ((plain, False), (paced, True), (live, True), (unhurried, False)):
+        assert graph.settings.realtime is graph.resolved["realtime"] is realtime
+        for name in ("mvs", "depth_fusion", "mapper"):
+            assert graph.slots[name].config["realtime"] is realtime
+        assert graph.settings.buffer == (128 if realtime else 4)
+    assert paced.slots["dataset"].config["realtime"] is True
+    (frames,) = [edge for edge in paced.edges if edge.message is Frame]
+    assert frames.best_effort  # as a camera's
+    assert [niceness(paced, name) for name in ("dataset", "tracker", "mapper", "evaluator")] == [0, 0, 5, 5]
+    assert niceness(compose(["realtime=true", "viewer=viser"]), "viewer") == 10
+    assert {niceness(plain, name) for name in plain.slots} == {0}
 
 
 REFUSED = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from nodes.mapper import Mapper
+from nodes.mapper import LAST_SECONDS, Mapper
 from nodes.parameters import build
 from tests.support.mapper_messages import settings, view_message
 from tests.support.shared_data import ROOT
@@ -87,6 +88,57 @@ def test_without_refinement_both_maps_are_the_same() -> None:
     before, after = list(node.on_end())
     assert np.array_equal(before.means, after.means)
     assert before.iterations == after.iterations == 4
+
+
+def test_a_live_map_is_handed_out_soon_after_the_last_frame() -> None:
+    """However many iterations are left: after that it is refined."""
+
+    def maps(age: float) -> tuple[Mapper, SplatMap, SplatMap]:
+        node = Mapper(replace(settings(iterations=100_000, refinement=2), realtime=True))
+        list(node.on_fused_keyframe(replace(view_message(0, 0.5), captured=time.time() - age)))
+        before, after = (message for message in node.on_end() if isinstance(message, SplatMap))
+        assert after.iterations == before.iterations + 2
+        return node, before, after
+
+    began = time.monotonic()
+    node, before, _ = maps(age=0.5 * LAST_SECONDS)
+    assert time.monotonic() - began < 30.0
+    assert 0 < before.iterations < 100_000
+    assert node.stats.values["latency"]["keyframe to map"]["count"] == 1
+    assert maps(age=60.0)[1].iterations == 0
+
+
+def test_where_keyframes_wait_new_splats_get_larger_and_none_is_left_out() -> None:
+    node = Mapper(replace(settings(), realtime=True))
+    node.waiting = lambda kind: 10**6 if kind is FusedKeyframe else 0
+    for index in range(3):
+        list(node.on_fused_keyframe(view_message(7 * index, 0.4 * index)))
+    hurried = node.atlas.current
+    assert len(hurried.views) == 3
+    assert hurried.views[1].size == (24, 32)  # what is trained on is as it came
+    plain = Mapper(settings())
+    list(plain.on_fused_keyframe(view_message(0, 0.0)))
+    first = int((hurried.state.anchors == 0).sum())
+    assert 0.1 * len(plain.atlas.current.state) < first < 0.6 * len(plain.atlas.current.state)
+    assert node.stats.skipped["effort on keyframes: new splats as of half the image's size"] == 3
+
+
+def test_the_preview_of_a_live_stream_says_how_late_it_is() -> None:
+    node = Mapper(replace(settings(), preview_period=1e-9, realtime=True))
+    first = replace(view_message(0, 0.0), captured=time.time() - 1.0, effort=2, fusion_effort=1)
+    (preview,) = node.on_fused_keyframe(first)
+    assert isinstance(preview, Preview)
+    assert preview.latency is not None
+    assert 1.0 < preview.latency[0, 0] <= preview.latency[0, 1] * 1.02 < 60.0
+    assert (preview.effort, preview.fusion_effort) == (2, 1)
+    soon = replace(keyframe_message(7, 1.0), captured=time.time() - 0.25)
+    node._preview_seconds = 60.0
+    assert list(node.on_keyframe(soon)) == []  # previews take a part of the time, and no more
+    node._preview_seconds = 0.0
+    list(node.on_keyframe(soon))
+    shown = node.stats.values["latency"]["keyframe to preview"]  # its coarse depth stands in
+    assert shown["count"] == 2
+    assert node.stats.values["latency"]["keyframe to map"]["count"] == 1
 
 
 def test_an_idle_slice_ends_soon_and_says_when_there_is_nothing_to_do() -> None:

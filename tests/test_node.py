@@ -315,14 +315,15 @@ def test_a_file_that_is_no_specification_is_refused(tmp_path: Path) -> None:
         assert error in done.stderr
 
 
-def test_cores_and_threads_are_set() -> None:
+def test_cores_threads_and_niceness_are_set() -> None:
     core = max(os.sched_getaffinity(0))
     with graph() as g:
-        g.start("left", "tests.support.sample_nodes.Left", {"Frame": "source"}, {}, cpu=[core], threads=1)
+        g.start("left", "tests.support.sample_nodes.Left", {"Frame": "source"}, {}, cpu=[core], threads=1, nice=3)
         left = g.processes["left"]
         left.wait_for(lambda status: status.get("state") == "running")
         for task in Path(f"/proc/{left.popen.pid}/task").iterdir():
             assert os.sched_getaffinity(int(task.name)) == {core}
+            assert os.getpriority(os.PRIO_PROCESS, int(task.name)) == 3
 
 
 def test_no_node_outlives_a_killed_launcher() -> None:

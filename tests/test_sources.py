@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,18 @@ def test_reader_can_play_at_the_recorded_rate(tmp_path: Path) -> None:
     began = time.monotonic()
     arrivals = [time.monotonic() - began for message in reader.run() if isinstance(message, Frame)]
     assert all(arrival >= 0.1 * i for i, arrival in enumerate(arrivals))  # the clock starts after `began`
+
+
+def test_a_played_frame_says_when_it_was_due(tmp_path: Path) -> None:
+    config = Reader.Config(name="tum", path=str(write_tum(tmp_path / "fr3", 4)), realtime=True)
+    due = []
+    for message in Reader(config).run():
+        if isinstance(message, Frame):
+            assert 0.0 <= time.time() - message.captured < 5.0
+            due.append(message.captured)
+            time.sleep(0.15)  # whoever takes the frames is slow: what is due does not wait for that
+    assert np.diff(due) == pytest.approx([0.1] * 3, abs=0.01)
+    assert all(m.captured == 0.0 for m in Reader(replace(config, realtime=False)).run())
 
 
 # ---------------------------------------------------------------- remote

@@ -114,6 +114,16 @@ def test_the_trackers_phase_is_shown(viewer: Viewer) -> None:
     assert "tracker: **relocalizing**; keyframe **9**" in received(viewer)
 
 
+def test_latencies_and_efforts_of_a_live_stream_are_shown(viewer: Viewer) -> None:
+    list(viewer.on_tracker_phase(TrackerPhase(7, 0.35, "tracking", np.array([0.02, 0.08]))))
+    shown = replace(preview(9), latency=np.array([[0.9, 1.8], [0.4, 1.2]]), effort=2, fusion_effort=1)
+    show(viewer, shown)
+    got = received(viewer)
+    assert "capture to pose 20 ms (99 %: 80 ms)" in got
+    assert "capture to map 900 ms (99 %: 1800 ms), to preview 400 ms (99 %: 1200 ms)" in got
+    assert "0 the most: 2, 1" in got
+
+
 def test_map_is_shown_at_unit_distance_whatever_its_scale(viewer: Viewer) -> None:
     show(viewer, preview(0, scale=1e4))
     splats = viewer.server.scene.get_handle_by_name("/splats")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from launch.graph import Supervise
+from launch.settings import Supervise
 from launch.watchdog import STARTING_SECONDS, Watchdog
 
 LIMITS = Supervise(silent=1.0, dead=2.5)

@@ -30,9 +30,13 @@ def load(name: str, area: int) -> Scene:
     return load_tracked(sequence, area) if how else load_scene(sequence, area)
 
 
-def samples(scene: Scene, area: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Features (N, F) and inlier labels (N,) of "stereo" and "fusion", of pixels with depth and truth."""
-    found = run(scene.views, CascadeConfig(area=area), FusionConfig())
+def samples(scene: Scene, area: int, edges: bool = True) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Features (N, F) and inlier labels (N,) of "stereo" and "fusion", of pixels with depth and truth.
+
+    edges: with the choice of surfaces at depth edges.
+    """
+    cascade = CascadeConfig(area=area) if edges else CascadeConfig(area=area, depth_edges=None)
+    found = run(scene.views, cascade, FusionConfig())
     rows: dict[str, list[np.ndarray]] = {"stereo": [], "fusion": []}
     labels: dict[str, list[np.ndarray]] = {"stereo": [], "fusion": []}
     for stereo, fused, truth in zip(found.stereo, found.fused, scene.truths, strict=True):
@@ -116,15 +120,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--area", type=int, default=320 * 240)
     options = parser.parse_args()
-    data = {name: samples(load(name, options.area), options.area) for name in (*FIT, *CHECK)}
-    for kind, module in (("stereo", stereo_confidence), ("fusion", fused_confidence)):
+    data = {}
+    for name in (*FIT, *CHECK):
+        scene = load(name, options.area)
+        data[name] = samples(scene, options.area)
+        data[name]["stereo without gap"] = samples(scene, options.area, edges=False)["stereo"]
+    for kind, inside in (
+        ("stereo", stereo_confidence.WEIGHTS),
+        ("stereo without gap", stereo_confidence.WITHOUT_GAP),
+        ("fusion", fused_confidence.WEIGHTS),
+    ):
         x = np.concatenate([data[name][kind][0] for name in FIT])
         y = np.concatenate([data[name][kind][1] for name in FIT])
         weights = fit(x, y)
         print(f"{kind}: WEIGHTS = np.array({np.round(weights, 3).tolist()})")
         for name in data:
             features, labels = data[name][kind]
-            for tag, w in (("fitted now", weights), ("in the code", module.WEIGHTS)):
+            for tag, w in (("fitted now", weights), ("in the code", inside)):
                 probability = 1.0 / (1.0 + np.exp(-features @ w))
                 print_reliability(name, tag, probability, labels)
 

@@ -39,7 +39,9 @@ NOISE = 0.5  # pixels, of a match; those farther off count less (Cauchy)
 class _Choice(Cascade):
     """The cascade's choice of neighbors, without its stereo."""
 
-    def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
+    def _estimate(
+        self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange, effort: int
+    ) -> StereoDepth:
         return empty_depth(reference.size)
 
 

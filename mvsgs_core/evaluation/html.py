@@ -78,6 +78,20 @@ def figures_table(figures: Mapping[str, Any]) -> str:
     return f"<table>{''.join(rows)}</table>"
 
 
+def latency_table(latency: Mapping[str, Any]) -> list[str]:
+    """How old things are when they are done, since the camera took them; nothing where no camera was waited for."""
+    rows = {
+        what: f"{_seconds(found.get('median'))}; 99 %: {_seconds(found.get('p99'))} ({found.get('count')})"
+        for by_name in latency.values()
+        for what, found in by_name.items()
+    }
+    return ["<h2>Latency, median</h2>", figures_table(rows)] if rows else []
+
+
+def _seconds(value: float | None) -> str:
+    return "–" if value is None else f"{1e3 * value:.0f} ms"
+
+
 def _metrics(prefix: str, entries: Sequence[metrics.Metric], values: Mapping[str, Any]) -> dict[str, str]:
     return {prefix + metric.name: metric.text(values[metric.key]) for metric in entries}
 
@@ -137,6 +151,7 @@ def page(
         *(_row(caption, pictures) for caption, pictures in comparisons),
         "<h2>Figures</h2>",
         figures_table(figures),
+        *latency_table(report.get("latency", {})),
         '<h2>Plots</h2><div class="plots">',
         *(f"<div><b>{escape(name)}</b>{plot}</div>" for name, plot in plots.items()),
         "</div>",

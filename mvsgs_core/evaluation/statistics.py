@@ -18,17 +18,30 @@ def collected(stats: Mapping[str, Any]) -> dict[str, Any]:
     peak = {name: _number(s.get("peak_bytes")) for name, s in nodes.items()}
     reasons = {name: _mapping(s.get("values")).get("nothing") for name, s in nodes.items()}
     nothing = {name: str(reason) for name, reason in reasons.items() if reason}
+    latency = {name: waited for name, s in nodes.items() if (waited := _latencies(_mapping(s.get("values"))))}
     return {
         "time": {
             "stages": {name: _numbers(s.get("seconds")) for name, s in nodes.items()},
             "cpu": {name: seconds for name, seconds in cpu.items() if seconds is not None},
         },
         "memory": {"peak_bytes": {name: size for name, size in peak.items() if size is not None}},
-        "skipped": {name: found for name, s in nodes.items() if (found := _numbers(s.get("skipped")))},
+        "skipped": {name: found for name, s in nodes.items() if (found := _skipped(s))},
         "counts": {name: found for name, s in nodes.items() if (found := _numbers(s.get("counts")))},
         "warnings": {name: texts for name, s in nodes.items() if (texts := _texts(s.get("warnings")))},
+        **({"latency": latency} if latency else {}),
         **({"nothing": nothing} if nothing else {}),
     }
+
+
+def _skipped(stats: Mapping[Any, Any]) -> dict[str, float]:
+    """Work that was spared, and messages that a newer one overtook."""
+    overtaken = {topic: count for topic, count in _numbers(stats.get("best_effort_skipped")).items() if count}
+    return _numbers(stats.get("skipped")) | {f"overtaken by a newer {topic}": n for topic, n in overtaken.items()}
+
+
+def _latencies(values: Mapping[Any, Any]) -> dict[str, dict[str, float]]:
+    """Of a live stream, by what was waited for: median, p99 in seconds, count."""
+    return {str(what): _numbers(figures) for what, figures in _mapping(values.get("latency")).items()}
 
 
 def _mapping(value: Any) -> Mapping[Any, Any]:

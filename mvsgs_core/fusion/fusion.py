@@ -15,8 +15,10 @@ from mvsgs_core.fusion.interface import FuseOptions, FusionBackend
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.keyframe_window import KeyframeWindow
+from mvsgs_core.pace import Effort, Pace
 
 ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
+EFFORTS = (Effort("full", 1.0), Effort("two neighbors", 0.4), Effort("no neighbor", 0.15))
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,9 @@ class FusionConfig:
     speckle: int = 100  # pixels: patches up to this size are not kept; 0: off
     device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
     threads: int | None = None  # of the C++ kernels; null: all
+    realtime: bool = False  # less effort, see `EFFORTS`, where depth maps come faster than they are fused
+    share: float = 0.25  # of a core's time that fusion may take then
+    efforts: tuple[int, ...] | None = None  # those that may be made then, by their place among all; null: all
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,7 @@ class FusedDepth:
     counts: dict[str, float] = field(default_factory=dict)  # pixels kept, and rejected by each filter
     evidence: np.ndarray | None = None  # (F, H, W) float32 what the confidence was computed from
     problem: str = ""  # a limit that had to be relaxed, or why nothing is kept
+    effort: int = 0  # of `EFFORTS`
 
 
 class OnlineFusion:
@@ -64,10 +70,19 @@ class OnlineFusion:
         self.config = config or FusionConfig()
         self._backend = make_fusion_backend(self.config.device, self.config.threads)
         self._window = KeyframeWindow[KeyframeDepth](self.config.window, self.config.lag)
+        c = self.config
+        fewer = replace(c, neighbors=min(2, c.neighbors))
+        self._ways = (c, fewer, replace(c, neighbors=0, check=False))  # one an effort
+        self.pace = Pace(EFFORTS, c.share, only=c.efforts if c.realtime else (0,))
 
     def add(self, view: KeyframeDepth) -> Iterator[FusedDepth]:
         """Fused depth of the keyframe `lag` before this one; of all that wait if a new segment or size starts."""
         for reference, others in self._window.add(view):
+            yield self._fused(reference, others)
+
+    def release(self) -> Iterator[FusedDepth]:
+        """Fused depth of the keyframe that has waited longest, though fewer than `lag` came after it."""
+        for reference, others in self._window.release():
             yield self._fused(reference, others)
 
     def flush(self) -> Iterator[FusedDepth]:
@@ -75,13 +90,23 @@ class OnlineFusion:
         for reference, others in self._window.flush():
             yield self._fused(reference, others)
 
+    @property
+    def waiting(self) -> int | None:
+        """Index of the keyframe that has waited longest for later ones."""
+        return self._window.waiting
+
     def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
         """Corrected poses (world_from_cam (4, 4), scale) by keyframe index: stored depths are scaled with them."""
         self._window.move(poses)
 
     def _fused(self, reference: KeyframeDepth, others: list[KeyframeDepth]) -> FusedDepth:
-        neighbors = nearest_views(reference, others, self.config.neighbors)
-        return fuse(self._prepared(reference, neighbors), neighbors, self.config, self._backend)
+        with self.pace.spend() as effort:
+            found = self._fuse(reference, others, self._ways[effort])
+        return replace(found, effort=effort)
+
+    def _fuse(self, reference: KeyframeDepth, others: list[KeyframeDepth], config: FusionConfig) -> FusedDepth:
+        neighbors = nearest_views(reference, others, config.neighbors)
+        return fuse(self._prepared(reference, neighbors), neighbors, config, self._backend)
 
     def _prepared(self, reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> KeyframeDepth:
         """Where a subclass puts a network in the place of the weight-free refinement."""

@@ -52,16 +52,17 @@ class Atlas:
         """Of the current part: one, or those whose first keyframe is still to come there."""
         return {segment for segment, part in self.parts.items() if part is self.current}
 
-    def add(self, keyframe: RGBDKeyframe, segment: int) -> TrainingView | None:
+    def add(self, keyframe: RGBDKeyframe, segment: int, small: bool = False) -> TrainingView | None:
         """Maps a new keyframe of that segment; returns what is trained on, None where it was refused.
 
+        small: as in `OnlineMapper.add_keyframe`.
         Where the map was being refined already, that begins anew after it.
         """
         # sent on its way before its segment was joined: by keyframe and not by number, as the pose is corrected so, too
         self.enter(self.segment_of.get(keyframe.index, segment))
         self.came(keyframe.index, keyframe.timestamp)
         known = len(self.current.views)
-        self.current.add_keyframe(keyframe)
+        self.current.add_keyframe(keyframe, small)
         self.take_between()
         return self.current.views[-1] if len(self.current.views) > known else None
 
@@ -146,7 +147,7 @@ class Atlas:
         if not self.parts:
             self.parts[segment] = self.current
         if segment not in self.parts:
-            while self.current.step():  # what is pending of the part before
+            while not self.current.config.realtime and self.current.step():  # what is pending of the part before
                 pass
             before = self.current
             self.parts[segment] = OnlineMapper(

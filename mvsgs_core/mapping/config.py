@@ -38,7 +38,8 @@ class MapperConfig:
     iterations: int = 30  # optimization budget of each keyframe, half on the newest, half on all (the paper: 1000)
     refinement: int = 300  # iterations over all keyframes at the end
     window: int = 6  # newest keyframes, on which the local half of the budget goes
-    realtime: bool = False  # a new keyframe cancels the pending iterations of older ones
+    realtime: bool = False  # a new keyframe waits for no iteration: it cancels the pending ones of older keyframes
+    share: float = 0.3  # of a core's time that new splats may take in real time: beyond, they get larger
     max_pixels: int | None = None  # area of the training images; null: as they come
     # images that are kept and trained on; beyond, those of frames between keyframes, then of keyframes are thinned out
     max_keyframes: int = 1000

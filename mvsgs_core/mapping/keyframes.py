@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -104,6 +104,17 @@ class TrainingView:
     def intrinsics_at(self, size: tuple[int, int]) -> np.ndarray:
         """(4,) at another size (height, width)."""
         return camera.scale_intrinsics(self.image_intrinsics, self.image_size, size)
+
+    def half(self) -> TrainingView:
+        """The same keyframe with half as many rows and columns."""
+        height, width = self.size
+        size = max(1, height // 2), max(1, width // 2)
+        image = torch.from_numpy(np.array(camera.resize_image(self.image.cpu().numpy(), size))).to(self.image.device)
+        valid = self.valid
+        if valid is not None:
+            smaller = camera.resize_image(valid.cpu().numpy().astype(np.float32), size) > 0.999
+            valid = torch.from_numpy(np.array(smaller)).to(self.image.device)
+        return replace(self, image=image, valid=valid, intrinsics=self.intrinsics_at(size))
 
     def footprint(self) -> np.ndarray:
         """(4, 3) corners of what it sees, at its median depth, in the mapper's frame."""

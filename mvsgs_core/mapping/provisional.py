@@ -77,6 +77,11 @@ class Provisional:
         self._newest = max(self._newest, index)
         self._waiting = [waiting for waiting in self._waiting if waiting.view.index > self._newest]
 
+    @property
+    def shown(self) -> set[int]:
+        """Keyframes that the last `splats` showed, or had nothing to show of."""
+        return {waiting.view.index for waiting in self._waiting if waiting.points is not None}
+
     def correct(
         self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray, segment: np.ndarray | None
     ) -> None:

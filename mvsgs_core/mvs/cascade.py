@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
+from mvsgs_core.inverse_depth import enlarge_inverse_depth
 from mvsgs_core.keyframe_window import KeyframeWindow
 from mvsgs_core.mvs.backend import make_backend
 from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, search_range
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 from mvsgs_core.mvs.neighbors import NeighborConfig, select_neighbors
 from mvsgs_core.mvs.stereo import StereoConfig, StereoDepth, empty_depth, estimate_depth
+from mvsgs_core.pace import Effort, Pace
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,9 @@ class OnlineStereoConfig:
     ranges: RangeConfig = field(default_factory=RangeConfig)  # of depth, from the tracker's
     device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
     threads: int | None = None  # of the kernels; null: all
+    realtime: bool = False  # less effort, see `efforts`, where keyframes come faster than their depth
+    share: float = 0.5  # of a core's time that stereo may take then
+    efforts: tuple[int, ...] | None = None  # those that may be made then, by their place among all; null: all
 
 
 @dataclass(frozen=True)
@@ -44,15 +50,23 @@ class CascadeDepth:
     neighbors: tuple[int, ...]  # indices of the keyframes that it was matched with
     search: SearchRange | None
     problem: str = ""  # why there is no depth; empty if there is
+    effort: int = 0  # of the stereo's `efforts`
+
+
+FULL = Effort("full", 1.0)
+NO_STEREO = Effort("the tracker's depth in the place of stereo", 0.01, telling=False)
+DOUBTFUL = 0.09  # confidence of the tracker's depth: less than any with which a map takes part in fusion
 
 
 class OnlineStereo(ABC):
     """Feeds on keyframes in stream order; `add` and `flush` yield each keyframe's depth exactly once, in order."""
 
     scales: tuple[int, ...] = (1,)  # sizes of the gray images that a keyframe keeps, as divisors of its own
+    efforts: tuple[Effort, ...] = (FULL, NO_STEREO)  # best first
 
     def __init__(self, config: OnlineStereoConfig) -> None:
         self.config = config
+        self.pace = Pace(self.efforts, config.share, only=config.efforts if config.realtime else (0,))
         self._window = KeyframeWindow[StereoKeyframe](config.window, config.lag)
         self._previous: tuple[tuple[int, tuple[int, int]], SearchRange] | None = None  # segment and size, newest range
 
@@ -68,10 +82,20 @@ class OnlineStereo(ABC):
         for reference, others in self._window.add(view, wanted):
             yield self._depth_of(reference, others)
 
+    def release(self) -> Iterator[CascadeDepth]:
+        """Depth of the keyframe that has waited longest, though fewer than `lag` came after it."""
+        for reference, others in self._window.release():
+            yield self._depth_of(reference, others)
+
     def flush(self) -> Iterator[CascadeDepth]:
         """Depth of the keyframes that still wait, with the neighbors that are there."""
         for reference, others in self._window.flush():
             yield self._depth_of(reference, others)
+
+    @property
+    def waiting(self) -> int | None:
+        """Index of the keyframe that has waited longest for later ones."""
+        return self._window.waiting
 
     def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
         """Corrected poses (world_from_cam (4, 4), scale) by keyframe index, for what is still in the window."""
@@ -90,23 +114,57 @@ class OnlineStereo(ABC):
             return CascadeDepth(reference, empty_depth(reference.size), (), search, "no neighbor with a baseline")
         self._previous = (kind, search)
         views = [n.view for n in chosen]
-        return CascadeDepth(
-            reference, self._estimate(reference, views, search), tuple(v.index for v in views), search
-        )  # fmt: skip
+        with self.pace.spend() as effort:
+            if self.pace.efforts[effort] is NO_STEREO:
+                result, views = coarse_depth(reference), []
+            else:
+                result = self._estimate(reference, views, search, effort)
+        return CascadeDepth(reference, result, tuple(v.index for v in views), search, effort=effort)
 
     @abstractmethod
-    def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
+    def _estimate(
+        self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange, effort: int
+    ) -> StereoDepth:
         """Where depth comes from: at least one neighbor, all of the reference's size."""
 
 
 class Cascade(OnlineStereo):
     """By the plane sweep."""
 
-    def __init__(self, config: CascadeConfig | None = None) -> None:
-        self._stereo = config or CascadeConfig()
-        super().__init__(self._stereo)
-        self.scales = tuple(sorted({stage.scale for stage in self._stereo.stages}))
-        self._backend = make_backend(self._stereo.device, self._stereo.threads)
+    efforts = (
+        FULL,
+        Effort("no choice of surfaces at depth edges", 0.25),
+        Effort("half the size, no choice of surfaces at depth edges", 0.06),
+        NO_STEREO,
+    )
 
-    def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
-        return estimate_depth(reference, neighbors, search, self._stereo, self._backend)
+    def __init__(self, config: CascadeConfig | None = None) -> None:
+        stereo = config or CascadeConfig()
+        super().__init__(stereo)
+        quick = replace(stereo, depth_edges=None)
+        small = replace(quick, stages=tuple(replace(stage, scale=2 * stage.scale) for stage in stereo.stages))
+        self._ways = (stereo, quick, small) if stereo.realtime else (stereo,)  # of the efforts that are stereo
+        self.scales = tuple(sorted({stage.scale for way in self._ways for stage in way.stages}))
+        self._backend = make_backend(stereo.device, stereo.threads)
+
+    def _estimate(
+        self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange, effort: int
+    ) -> StereoDepth:
+        way = self._ways[effort]
+        return enlarged(estimate_depth(reference, neighbors, search, way, self._backend), reference.size)
+
+
+def coarse_depth(reference: StereoKeyframe) -> StereoDepth:
+    """The tracker's depth at the reference's size, with a confidence that lets it fill holes of the map alone."""
+    depth, confidence = enlarge_inverse_depth(reference.inverse_depth, reference.weight, reference.size)
+    return StereoDepth(depth, confidence * np.float32(DOUBTFUL), None)
+
+
+def enlarged(found: StereoDepth, size: tuple[int, int]) -> StereoDepth:
+    """Depth at that size (height, width), none of it a mean over a depth edge."""
+    if found.depth.shape == size:
+        return found
+    depth, confidence = (
+        cv2.resize(values, size[::-1], interpolation=cv2.INTER_NEAREST) for values in (found.depth, found.confidence)
+    )
+    return StereoDepth(np.asarray(depth), np.asarray(confidence), None, found.counts)

@@ -9,6 +9,7 @@ import numpy as np
 
 # Logistic regression on `Evidence.features`, by `python -m bench.depth.calibration`.
 WEIGHTS = np.array([-0.949, 0.995, 0.339, 1.583, 0.681, -0.496, -0.08, 1.558, -1.006, 2.387, 0.919])
+WITHOUT_GAP = np.array([-0.728, 1.001, 0.186, 2.07, 0.488, -0.178, 0.002, 2.586, -1.685, 0.0, 0.604])
 
 BLACK = 128.0 + 10.0  # gray levels: views have 128 taken out; ten more keep the logarithm of black tame
 
@@ -25,7 +26,7 @@ class Evidence:
     texture: np.ndarray  # gray levels: local contrast of the reference
     margin: np.ndarray  # of the last stage: how much worse other hypotheses are
     bend: np.ndarray  # relative change of inverse depth to the median around: high at jumps and where depth is noise
-    gap: np.ndarray  # how much worse other surfaces around the pixel are
+    gap: np.ndarray | None  # how much worse other surfaces around the pixel are; None: they were not looked at
     brightness: np.ndarray  # log of the gray level over the image's median: the dark is noise, and gaps between things
 
     @staticmethod
@@ -37,7 +38,7 @@ class Evidence:
         relative_pixel: np.ndarray,
         gray: np.ndarray,
         inverse_depth: np.ndarray,
-        gap: np.ndarray,
+        gap: np.ndarray | None,
     ) -> Evidence:
         """From ZNCC of each view (N, H, W), -2 where not seen, and maps (H, W)."""
         ordered = np.sort(np.clip(correlation, 0.0, 1.0), axis=0)[::-1]
@@ -70,7 +71,7 @@ class Evidence:
                 np.log(1.0 + self.texture),
                 np.clip(self.margin, 0.0, 0.5),
                 np.clip(cv2.blur(self.bend, (5, 5)) / 0.02, 0.0, 2.0),
-                np.sqrt(np.clip(self.gap, 0.0, 1.0)),
+                np.zeros_like(self.margin) if self.gap is None else np.sqrt(np.clip(self.gap, 0.0, 1.0)),
                 self.brightness,
             ]
         ).astype(np.float32)
@@ -78,5 +79,6 @@ class Evidence:
 
 def probability_of_inlier(evidence: Evidence) -> np.ndarray:
     """(H, W) float32 in [0, 1]."""
-    logit = np.tensordot(WEIGHTS.astype(np.float32), evidence.features(), axes=1)
+    weights = WITHOUT_GAP if evidence.gap is None else WEIGHTS
+    logit = np.tensordot(weights.astype(np.float32), evidence.features(), axes=1)
     return np.asarray(1.0 / (1.0 + np.exp(-logit)), dtype=np.float32)

@@ -93,7 +93,9 @@ class LearnedStereo(OnlineStereo):
         for old in sorted(self._images)[: -(self.config.window + self.config.lag + 2)]:
             del self._images[old]
 
-    def _estimate(self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange) -> StereoDepth:
+    def _estimate(
+        self, reference: StereoKeyframe, neighbors: list[StereoKeyframe], search: SearchRange, effort: int
+    ) -> StereoDepth:
         views = [reference, *neighbors]
         size = self._images[reference.index].shape[:2]
         images = np.stack([self._images[v.index] for v in views])

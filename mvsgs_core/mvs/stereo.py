@@ -85,7 +85,7 @@ def estimate_depth(
 
     # 3. At depth edges, choose between the surfaces around a pixel.
     last, radius = sizes[-1], config.stages[-1].radius
-    surface, gap = swept.surface, np.zeros(last.size, dtype=np.float32)
+    surface, gap = swept.surface, None
     if config.depth_edges is not None:
         pixel = 1.0 / max(last.moved, 1e-12)
         surface, gap = refine_depth_edges(surface, last.images, pixel, config.cost.top_k, config.depth_edges, backend)

@@ -7,6 +7,7 @@ better ones. So the frames wait for that keyframe. Held-out frames never go out.
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Container, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,24 +63,32 @@ class FramesBetween:
         """The keyframes that they are between are given up."""
         self._complete, self._newest = {}, {}
 
-    def settle(self, keyframe: int, records: list[FrameRecord]) -> tuple[Between, ...]:
-        """What waits, posed now that the graph has this keyframe: the frames of its segment that their matches fit.
+    def close(self) -> frozenset[int]:
+        """The next keyframe is there: what waited for it is to be settled."""
+        closed = frozenset(self.waiting)
+        self.forget()
+        return closed
 
-        records: of all frames so far; what comes before and after a frame tells its velocity.
+    def settle(
+        self, waiting: frozenset[int], keyframe: int, records: list[FrameRecord], published: Container[int]
+    ) -> tuple[Between, ...]:
+        """Frames that waited, posed now that the graph has this keyframe.
+
+        Those of its segment that their matches fit, from published keyframes. records: of all frames so far; what comes
+        before and after a frame tells its velocity.
         """
-        segment, waiting = self.graph.keyframes[keyframe].segment, self.waiting
+        segment = self.graph.keyframes[keyframe].segment
         around = _with_neighbors(records, waiting)
         track, found = solve_trajectory(around, self.graph, self.solver), []
         velocities = track.velocities_of(track.index)
         for k in np.flatnonzero(track.posed & (track.segment == segment) & ~track.keyframe):
             record = around[k]
-            if record.index not in waiting or record.reference is None:
+            if record.index not in waiting or record.reference is None or record.reference not in published:
                 continue
             reference = self.graph.keyframes[record.reference]
             pose, exposure = reference.cam_from_world @ track.world_from_cam[k], self._exposure(record, reference)
             velocity = velocities[k] if np.isfinite(velocities[k]).all() else None
             found.append(Between(record.index, reference.index, pose, exposure, velocity))
-        self.forget()
         return tuple(found)
 
     def _exposure(self, record: FrameRecord, reference: Keyframe) -> np.ndarray | None:
@@ -96,7 +105,7 @@ class FramesBetween:
         return min(order[first : first + 2], key=lambda index: _detail(self._newest[index][0].gray))
 
 
-def _with_neighbors(records: list[FrameRecord], indices: set[int]) -> list[FrameRecord]:
+def _with_neighbors(records: list[FrameRecord], indices: Set[int]) -> list[FrameRecord]:
     """Of these frames, of those before and after them, and of what these did not move against."""
 
     def place(index: int) -> int:

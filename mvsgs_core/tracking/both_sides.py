@@ -6,7 +6,8 @@ keyframe after it gives the reference better depths and brings matches of its ow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -39,14 +40,14 @@ class BothSides:
         """No keyframe comes that they could be seen from."""
         self._waiting = {}
 
-    def settle(self, keyframes: Sequence[int]) -> int:
-        """What waits, posed now that the graph has these keyframes, in order; returns how many frames were."""
+    def settle(self, keyframes: Sequence[int]) -> list[Callable[[], bool]]:
+        """What poses the frames that wait, now that the graph has these keyframes, in order: each says if it could."""
         waiting, self._waiting = self._waiting, {}
-        return sum(
-            self._pose(image, record, next(k for k in keyframes if k > index))
+        return [
+            partial(self._pose, image, record, next(k for k in keyframes if k > index))
             for index, (image, record) in waiting.items()
             if index < keyframes[-1] and index not in self.graph.keyframes
-        )
+        ]
 
     def _pose(self, image: TrackingImage, record: FrameRecord, after: int) -> bool:
         """Whether matches with its reference and the keyframe after it agree on a pose; else it has the one it had."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
 from mvsgs_core.tracking.between import Between
+from mvsgs_core.tracking.settling import Settling
 from mvsgs_core.trajectory import TrackingState
 
 GRAY_LEVEL = 1.0 / 255.0
@@ -58,6 +59,18 @@ class Update:
     keyframes: tuple[int, ...] = ()  # indices of frames that became keyframes, in order
     correction: Correction | None = None  # of keyframes published before
     between: tuple[Between, ...] = ()  # frames that are no keyframes, posed against ones that were published
+    # what is left to do before the next frame, and takes longer: the frame's pose is known already
+    rest: Callable[[], Update] | None = field(default=None, compare=False)
+    later: Settling | None = field(default=None, compare=False)  # what gives `between`, before the next keyframe
+
+    def begun(self) -> Update:
+        """With the rest of it done, and not what can be done later."""
+        return self if self.rest is None else self.rest().begun()
+
+    def whole(self) -> Update:
+        """With all of it done."""
+        update = self.begun()
+        return update if update.later is None else replace(update, between=update.later.whole(), later=None)
 
 
 @dataclass

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.back_end import BackEnd
-from mvsgs_core.tracking.between import Between, FramesBetween
+from mvsgs_core.tracking.between import FramesBetween
 from mvsgs_core.tracking.both_sides import BothSides
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.diagnosis import Diagnosis
@@ -43,6 +44,7 @@ from mvsgs_core.tracking.places.recovery import Recovery
 from mvsgs_core.tracking.places.relocalization import Relocalizer
 from mvsgs_core.tracking.places.retrieval import Retrieval
 from mvsgs_core.tracking.publish import Publisher, Update
+from mvsgs_core.tracking.settling import Settling
 from mvsgs_core.trajectory import TrackingState
 
 
@@ -84,7 +86,7 @@ class Session:
         self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
 
     def add(self, frame: TrackingImage) -> Update:
-        """The next frame of the stream."""
+        """The next frame of the stream; its pose is known then, and the update's `rest` is still to be done."""
         record = FrameRecord(frame.index, frame.timestamp, TrackingState.NOT_INITIALIZED)
         self.records.append(record)
         self._since += 1
@@ -205,7 +207,7 @@ class Session:
         self.stats.count("keyframes", len(keyframes))
         record.state = TrackingState.TRACKED
         published = self._publish(keyframes)
-        return Update(record.state, published, between=self._settle_between(keyframes))
+        return Update(record.state, published, later=self._settle_between(keyframes))
 
     def _force_initialization(self) -> Iterator[Update]:
         """The stream ended before there was a map: what was collected, with weaker criteria."""
@@ -237,7 +239,7 @@ class Session:
             self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
             self._wait(frame, record)
             return Update(record.state)
-        return self._add_keyframe(frame, step, record) or self._lose(frame, record)
+        return Update(record.state, rest=lambda: self._add_keyframe(frame, step, record) or self._lose(frame, record))
 
     def _add_keyframe(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update | None:
         """A tracked frame becomes a keyframe; None, and it is none, where the map contradicts its pose."""
@@ -267,7 +269,7 @@ class Session:
         self._refer_to(frame, self.graph.keyframes[frame.index].cam_from_world)
         correction = self.publisher.corrections()
         published = self._publish([frame.index])
-        return Update(record.state, published, correction, self._settle_between([frame.index]))
+        return Update(record.state, published, correction, later=self._settle_between([frame.index]))
 
     def _reuse_keyframe(self, frame: TrackingImage, step: Step) -> bool:
         """An old keyframe sees this: it becomes the reference, and no further one is made."""
@@ -375,14 +377,13 @@ class Session:
         self.both_sides.add(frame, record)
         self.between.add(frame, record)
 
-    def _settle_between(self, keyframes: list[int]) -> tuple[Between, ...]:
-        """The frames before these keyframes are posed, those of the start matched first; of what was published."""
-        with self.stats.time("frames between keyframes"):
-            if len(keyframes) > 1:
-                self.recovery.fill_in([record for record in self.records if record.index >= keyframes[0]])
-            self.stats.count("frames posed from both sides", self.both_sides.settle(keyframes))
-            found = self.between.settle(keyframes[-1], self.records)
-        return tuple(frame for frame in found if frame.keyframe in self.publisher.published)
+    def _settle_between(self, keyframes: list[int]) -> Settling:
+        """The frames before these keyframes are to be posed; those of the start are matched at once."""
+        if len(keyframes) > 1:
+            self.recovery.fill_in([record for record in self.records if record.index >= keyframes[0]])
+        frames = self.between.close()
+        last = partial(self.between.settle, frames, keyframes[-1], self.records, self.publisher.published)
+        return Settling(frames, self.both_sides.settle(keyframes), last, self.stats)
 
     def _settle(self) -> tuple[int, ...]:
         """Keyframes that were held back, with the focal length as far as it is known."""

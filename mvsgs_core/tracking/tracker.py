@@ -163,7 +163,21 @@ class Tracker:
         guessed: bool = False,
         exposure: float = 0.0,
     ) -> Update:
+        """The next frame, and all that becomes of it, see `follow`."""
+        return self.follow(index, timestamp, image, intrinsics, guessed, exposure).whole()
+
+    def follow(
+        self,
+        index: int,
+        timestamp: float,
+        image: np.ndarray,
+        intrinsics: np.ndarray,
+        guessed: bool = False,
+        exposure: float = 0.0,
+    ) -> Update:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow.
+
+        Its pose is known then; whether it becomes a keyframe is the update's `rest`, before the next frame.
 
         guessed: the focal length is to be estimated; keyframes are published when it is settled, see `focal_factor`.
         exposure: time times gain over the f-number squared, in a unit that the stream keeps; 0: not known.
@@ -188,7 +202,8 @@ class Tracker:
         session = self._session
         if session is None:
             return
-        yield from session.last_keyframes()
+        for update in session.last_keyframes():
+            yield update.whole()
         graph, stats = session.graph, self.stats
         if not self._frozen:
             with stats.time("global bundle adjustment"):

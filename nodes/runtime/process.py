@@ -105,7 +105,7 @@ class _Process:
         self._seed()
         config = build(node_type.Config, self._spec.config, self._spec.name)
         runner = self._runner = Runner(self._spec.name, node_type(config))
-        runner.node.rest = self._rest
+        runner.node.rest, runner.node.waiting = self._rest, self._waiting
         read = {given.type for given in self._spec.outputs}
         runner.node.unread = frozenset(sent for sent in outputs(node_type) if sent.__name__ not in read)
         inbox = self._open()
@@ -132,6 +132,9 @@ class _Process:
         """In the midst of a hook's long work."""
         self._signals.check()
         self._step.next("working")
+
+    def _waiting(self, kind: type) -> int:
+        return sum(reader.waiting for reader in self._readers if reader.type_name == kind.__name__)
 
     def abort(self, state: str, error: str, **details: Any) -> None:
         """Tells the launcher, then lets the node save what it has."""
@@ -188,7 +191,7 @@ class _Process:
                 idle = True
                 yield from runner.handle(received[1])
                 freed.give_back()
-            elif idle:
+            else:
                 produced = runner.idle()
                 idle = produced is not None
                 yield from produced or ()

@@ -4,7 +4,7 @@
      "inputs": [{"type": "Keyframe", "slot": "tracker", "address": "ipc:///tmp/x/tracker.Keyframe",
                  "best_effort": false}],
      "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1, "observers": []}],
-     "observer": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "keys": null, "token": "",
+     "observer": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "nice": 0, "keys": null, "token": "",
      "status_fd": null}
 
 `readers` counts those of both kinds without observers, which are named; `buffer` is in messages; `keys` is a folder,
@@ -56,6 +56,7 @@ class Spec:
     seed: int = 0
     threads: int | None = None
     cpu: tuple[int, ...] | None = None  # cores; None: all
+    nice: int = 0  # by how much it gives way to other processes
     keys: str | None = None
     token: str = ""
     status_fd: int | None = None

@@ -26,6 +26,17 @@ def test_what_nodes_counted_is_taken_over() -> None:
     }
 
 
+def test_latencies_and_what_was_overtaken_are_shown() -> None:
+    figures = {"median": 0.02, "p99": 0.08, "count": 7}
+    tracker = {"values": {"latency": {"frame to pose": figures}}, "best_effort_skipped": {"dataset.Frame": 3, "x.Y": 0}}
+    found = collected({"tracker": tracker, "mvs": {"values": {}}})
+    assert found["latency"] == {"tracker": {"frame to pose": figures}}
+    assert found["skipped"] == {"tracker": {"overtaken by a newer dataset.Frame": 3}}
+    for odd in (None, 7, "text", ["a"]):
+        assert "latency" not in collected({"tracker": {"values": {"latency": odd}}})
+    assert collected({"tracker": {"values": {"latency": {"x": 7}}}})["latency"] == {"tracker": {"x": {}}}
+
+
 def test_a_string_of_warnings_is_one_warning() -> None:
     assert collected({"mapper": {"warnings": "(5000 entries left out)"}})["warnings"] == {
         "mapper": ["(5000 entries left out)"]

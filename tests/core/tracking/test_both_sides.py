@@ -39,7 +39,7 @@ def shift(record: FrameRecord, graph: KeyframeGraph) -> float:
 def settled(graph: KeyframeGraph, frame: TrackingImage) -> tuple[FrameRecord, int]:
     sides, record = BothSides(graph, matcher(), 1), followed(graph, frame)
     sides.add(frame, record)
-    return record, sides.settle([BEFORE, AFTER])
+    return record, sum(job() for job in sides.settle([BEFORE, AFTER]))
 
 
 def test_depths_of_one_keyframe_that_are_off_hurt_less_with_both() -> None:
@@ -90,10 +90,10 @@ def test_frames_after_the_last_keyframe_and_forgotten_ones_keep_their_pose() -> 
     sides, late = BothSides(graph, matcher(), 1), image(FRAME, AFTER + 1)
     record = followed(graph, late)
     sides.add(late, record)
-    assert sides.settle([BEFORE, AFTER]) == 0
+    assert sides.settle([BEFORE, AFTER]) == []
     sides.add(image(FRAME), followed(graph, image(FRAME)))
     sides.forget()
-    assert sides.settle([BEFORE, AFTER]) == 0
+    assert sides.settle([BEFORE, AFTER]) == []
     assert record.after is None
 
 

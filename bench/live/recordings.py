@@ -1,0 +1,43 @@
+"""Sequences as recordings of small raw frames: to play them costs next to nothing, as a camera does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from bench.runs import DATA
+from nodes.reader import Reader
+from nodes.recorder import Recorder
+
+SIZE = [240, 320]
+SCENES: dict[str, dict[str, Any]] = {  # what the reader is given; the pace is the sequence's own
+    "tum_fr1_xyz": {"name": "tum", "path": DATA / "tum_fr1_xyz", "size": SIZE},
+    "redkitchen": {"name": "seven_scenes", "path": DATA / "seven_scenes_redkitchen", "size": SIZE},
+    "hololens_000": {"name": "tum", "path": DATA / "hololens_000", "size": 240 * 320},  # at its own aspect
+    "room": {"name": "synthetic", "size": SIZE, "options": {"scene": "room"}},
+    "loop": {"name": "synthetic", "size": SIZE, "options": {"scene": "room", "loop": True, "frames": 240}},
+}
+
+
+def available() -> list[str]:
+    """The scenes whose data are here."""
+    return [name for name, given in SCENES.items() if "path" not in given or Path(str(given["path"])).exists()]
+
+
+def recording(scene: str, folder: Path, stop: int | None = None) -> Path:
+    """The file of a scene, up to frame `stop`, made where it is not there yet."""
+    path = folder / f"{scene}{'' if stop is None else f'_{stop}'}.mcap"
+    if path.exists():
+        return path
+    aside = path.with_suffix(".part")
+    aside.unlink(missing_ok=True)
+    reader = Reader(Reader.Config(**SCENES[scene], stop=stop))
+    recorder = Recorder(Recorder.Config(path=str(aside), foxglove=False))
+    for message in reader.run():
+        recorder.on_message(message)
+    list(recorder.on_end())
+    aside.rename(path)
+    return path
+
+
+__all__ = ["SCENES", "available", "recording"]

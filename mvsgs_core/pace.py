@@ -1,0 +1,105 @@
+"""How much effort the next keyframe gets, so that a stage never falls behind the camera for long.
+
+A stage that keeps a live camera's pace has a few ways to do its work, from the best to the quickest, which it prices
+by what the work has cost here so far. Of these it takes the best by which what waits is done within `HORIZON`, beside
+all that comes meanwhile. So it saves where much is to be done, on a slow or busy machine too, and gives back where
+little is. It knows what waits for it and nothing of other stages: no message tells it what to do, and none can be lost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvsgs_core.stats import Stats
+
+HORIZON = 1.0  # s in which a stage works off what waits
+GAPS = 8  # keyframes over which their rate is taken
+MEMORY = 0.3  # weight of the newest cost
+FORGETTING = 0.95  # of the cost, at a keyframe that says nothing of it: the machine may be free again
+
+
+@dataclass(frozen=True)
+class Effort:
+    """A way to do the work."""
+
+    name: str
+    cost: float  # of the first and best one, about
+    telling: bool = True  # the time it takes says what the others would
+
+
+class Pace:
+    """Feeds on keyframes as they come (`came`), and on what they cost (`spend`)."""
+
+    def __init__(
+        self, efforts: Sequence[Effort], share: float, log: Stats | None = None, only: Sequence[int] | None = None
+    ) -> None:
+        """efforts: best first. share: of the time, that the stage may work: the rest of a core is others'.
+
+        only: positions of the efforts that may be made; None: all. Raises ValueError for none, or others.
+        """
+        self.efforts, self.share = tuple(efforts), share
+        self._open = sorted(range(len(self.efforts)) if only is None else set(only))
+        if not self._open or not 0 <= self._open[0] <= self._open[-1] < len(self.efforts):
+            names = ", ".join(f"{k}: {effort.name}" for k, effort in enumerate(self.efforts))
+            raise ValueError(f"efforts={list(only or ())}: some of {names}")
+        if not 0.0 < share <= 1.0:
+            raise ValueError(f"share={share}: of a core's time, above 0 and at most 1")
+        self.log = Stats() if log is None else log
+        self.waiting: Callable[[], int] = lambda: 0  # keyframes that came and were not taken up
+        self._gaps: deque[float] = deque(maxlen=GAPS)  # seconds of the stream between two keyframes
+        self._newest: float | None = None  # timestamp
+        self._cost: float | None = None  # seconds of the best effort; None: not known yet
+
+    @property
+    def interval(self) -> float:
+        """Seconds of the stream from one keyframe to the next, lately. A pause of the camera is none of them."""
+        return float(np.median(self._gaps)) if self._gaps else HORIZON
+
+    @property
+    def allowed(self) -> float:
+        """Seconds that a keyframe may cost now."""
+        coming = HORIZON / (self.share * max(self.interval, 1e-6))
+        return HORIZON / (self.waiting() + coming)
+
+    def came(self, timestamp: float) -> None:
+        """A keyframe of this time in the stream, seconds, is to be worked on."""
+        if not math.isfinite(timestamp):
+            return
+        if self._newest is not None and timestamp > self._newest:
+            self._gaps.append(timestamp - self._newest)
+        self._newest = timestamp
+
+    def choose(self) -> int:
+        """The effort for the next keyframe: a position in `efforts`."""
+        if self._cost is None:  # the second best that tells it is good, and no disaster where it takes long
+            telling = [k for k in self._open if self.efforts[k].telling]
+            return telling[:2][-1] if telling else self._open[-1]
+        allowed, cost = self.allowed, self._cost
+        return next((k for k in self._open if self.efforts[k].cost * cost <= allowed), self._open[-1])
+
+    @contextmanager
+    def spend(self) -> Iterator[int]:
+        """The effort to work with in this context, whose time is what it costs."""
+        chosen, start = self.choose(), self.log.clock()
+        yield chosen
+        self.spent(chosen, self.log.clock() - start)
+
+    def spent(self, chosen: int, seconds: float) -> None:
+        """So long that effort took."""
+        effort = self.efforts[chosen]
+        if effort.telling:
+            found = seconds / effort.cost
+            self._cost = found if self._cost is None else (1.0 - MEMORY) * self._cost + MEMORY * found
+        elif self._cost is not None:
+            self._cost *= FORGETTING
+        if chosen:
+            self.log.skip(f"effort on keyframes: {effort.name}")
+
+
+__all__ = ["HORIZON", "Effort", "Pace"]

@@ -1,0 +1,96 @@
+"""The benchmark of real time: its comparisons, its recordings, its slow stages."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bench.live.__main__ import FIXED, SLOW, WITHOUT, Result, below, efforts, rows_of_pace
+from bench.live.recordings import SCENES, recording
+from bench.live.slow import SlowFusion, SlowMapper, SlowStereo, slowed
+from launch.compose import compose
+from msgs import Frame
+from nodes.player import Player
+
+
+def report(psnr: dict[int, float], **parts: Any) -> Result:
+    frames = [{"index": i, "psnr": value, "held_out": i % 5 == 0} for i, value in psnr.items()]
+    return Result({"rendering": {"frames": frames}, "rendering_before_refinement": {"frames": frames}, **parts})
+
+
+def test_maps_are_compared_on_the_held_out_frames_that_both_know() -> None:
+    live, unhurried = report({0: 20.0, 1: 1.0, 10: 24.0}), report({0: 21.0, 1: 30.0, 5: 50.0, 10: 26.0})
+    assert below(live, unhurried, refined=True) == pytest.approx(1.5)
+    assert below(report({1: 20.0}), unhurried, refined=False) == float("inf")
+    assert below(Result(None), unhurried, refined=False) == float("inf")
+
+
+def test_a_run_that_failed_meets_no_goal() -> None:
+    rows = rows_of_pace("x", Result(None))
+    assert [row.met for row in rows if row.goal] == [False] * 4
+
+
+def test_goals_are_those_of_pose_and_map() -> None:
+    latency = {
+        "tracker": {"frame to pose": {"median": 0.02, "p99": 0.09}},
+        "mapper": {"keyframe to map": {"median": 1.2, "p99": 3.5}},
+    }
+    counts = {"dataset": {"frames": 100}, "tracker": {"frames": 90, "keyframes": 12}, "mapper": {"views": 12}}
+    skipped = {"mvs": {"effort on keyframes: half": 7, "hypotheses outside the range": 1e6}}
+    found = report({0: 20.0}, latency=latency, counts=counts, skipped=skipped)
+    rows = {row.name.removeprefix("x: "): row for row in rows_of_pace("x", found)}
+    assert rows["frame to pose, 99 %, ms"].met is True
+    assert rows["keyframes in the map"].met is True
+    assert rows["keyframe to map, median, s"].met is True
+    assert rows["keyframe to map, 99 %, s"].met is False
+    assert rows["frames that a newer one overtook"].value == "10 of 100"
+    assert efforts(found) == "half 7"
+
+
+def test_every_way_is_one_that_the_launcher_takes() -> None:
+    for way in (*FIXED, *WITHOUT):
+        graph = compose(list(way.overrides))
+        assert graph.slots["mvs"].parameters.efforts is not None
+    for slot, (target, override) in zip(SLOW, zip((SlowStereo, SlowFusion, SlowMapper), SLOW.values()), strict=True):
+        assert compose([override]).slots[slot].node is target
+
+
+def test_a_recording_is_made_once_and_played_at_its_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = {"name": "synthetic", "size": [24, 32], "options": {"frames": 3}}
+    monkeypatch.setitem(SCENES, "tiny", given)
+    path = recording("tiny", tmp_path)
+    assert recording("tiny", tmp_path).stat().st_mtime_ns == path.stat().st_mtime_ns
+    began = time.monotonic()
+    played = [m for m in Player(Player.Config(path=str(path), realtime=True)).run() if isinstance(m, Frame)]
+    assert time.monotonic() - began >= played[-1].timestamp - played[0].timestamp > 0.0
+    due = [frame.captured - frame.timestamp for frame in played]
+    assert max(due) - min(due) < 0.01
+    assert abs(played[0].captured - time.time()) < 60.0
+    assert all(m.captured == 0.0 for m in Player(Player.Config(path=str(path))).run())
+
+
+def test_a_slow_stage_takes_that_many_times_as_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("bench.live.slow.time.sleep", slept.append)
+
+    def work(answer: int) -> int:
+        until = time.perf_counter() + 0.02
+        while time.perf_counter() < until:
+            pass
+        return answer
+
+    assert slowed(work, 10.0)(7) == 7
+    assert slept[0] >= 9 * 0.02
+
+
+def test_the_slow_stages_slow_what_they_are_paced_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the governor would not see it."""
+    monkeypatch.setattr("bench.live.slow.time.sleep", lambda seconds: None)
+    stereo = SlowStereo(SlowStereo.Config(realtime=True, threads=1))
+    fusion = SlowFusion(SlowFusion.Config(realtime=True, threads=1))
+    mapper = SlowMapper(SlowMapper.Config(realtime=True, threads=1, device="cpu"))
+    for slow in (stereo._core._estimate, fusion._core._fuse, mapper._add, mapper.atlas.step):
+        assert hasattr(slow, "__wrapped__")
