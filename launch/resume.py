@@ -45,6 +45,11 @@ def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) ->
     if not all(node.replayable for node in _classes(config).values() if nodes.is_source(node)):
         _without_stream(config, folder, conf)
     for slot, node in _classes(config).items():
+        if not node.in_stream_order:
+            raise GraphError(
+                f"{WORD}{folder}: its {slot} sends keyframes in an order of its own, so that what the map lacks cannot "
+                "be told from what it has; run it again from the start"
+            )
         known = parameter_names(node.Config)
         if "resume" in known:
             config[slot].resume = str(folder)

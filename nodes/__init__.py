@@ -52,6 +52,7 @@ class Node:
 
     replayable: ClassVar[bool] = False  # sources: the same command gives the same stream once more
     live: ClassVar[bool] = False  # sources: a camera that waits for nobody
+    in_stream_order: ClassVar[bool] = True  # keyframes leave in the order of their indices, which resuming relies on
 
     config: Any
 

@@ -27,6 +27,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "mvsgs_core/fusion": ("mvsgs_core/networks",),
     "mvsgs_core/tracking": ("mvsgs_core/networks",),
     "mvsgs_core/droid": ("mvsgs_core/networks", "mvsgs_core/tracking"),
+    "mvsgs_core/photographs": ("mvsgs_core/tracking",),
     "mvsgs_core/mapping": ("mvsgs_core/rasterizer", "mvsgs_core/export"),
     "mvsgs_core/maps": ("mvsgs_core/tracking", "mvsgs_core/mapping"),
     "mvsgs_core/evaluation": (

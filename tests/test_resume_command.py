@@ -119,6 +119,12 @@ def test_a_run_of_an_older_version_is_refused_with_the_new_names(tmp_path: Path)
         resumed_config(tmp_path, ())
 
 
+def test_keyframes_in_an_order_of_their_own_are_not_resumed(tmp_path: Path) -> None:
+    """What the map has is told by how far the stream has come."""
+    with pytest.raises(GraphError, match="its tracker sends keyframes in an order of its own"):
+        resumed(interrupted(tmp_path, "tracker=photographs"))
+
+
 def test_a_refused_resume_touches_nothing(tmp_path: Path) -> None:
     folder = interrupted(tmp_path, report=json.dumps({"finished": True}))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}

@@ -1,9 +1,11 @@
-"""Poses and sparse points by COLMAP (Schoenberger and Frahm 2016): SIFT, sequential matching, incremental mapping.
+"""Poses and sparse points by COLMAP (Schoenberger and Frahm 2016): SIFT, matching, incremental mapping.
 
-    python -m bench.baselines.colmap_poses FOLDER [--threads N]
+    python -m bench.baselines.colmap_poses FOLDER [--threads N] [--photographs]
 
 A process of its own: pycolmap brings libraries of its own, and a failed check inside it ends the process. FOLDER holds
 images/NUMBER.png and camera.json (`size`, `intrinsics`); poses and points go to model.npz, times to seconds.json.
+Frames of a video are matched with those around them, and their calibration is known; of photographs all pairs are
+matched, and focal length and distortion, which they share, are estimated from the intrinsics as a guess.
 """
 
 from __future__ import annotations
@@ -33,10 +35,11 @@ class Model:
     colors: np.ndarray  # (M, 3) uint8 RGB
     seconds: dict[str, float]  # by stage
     processor_seconds: float  # of all threads, from start to end
+    focal: float  # pixels, as it was estimated or given
 
 
 def reconstruct(
-    frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: Path, threads: int
+    frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: Path, threads: int, photographs: bool = False
 ) -> tuple[Model | None, str]:
     """COLMAP's model of RGB images (H, W, 3) uint8 by frame index, and if there is none, why."""
     images = folder / "images"
@@ -49,6 +52,7 @@ def reconstruct(
         cv2.imwrite(str(images / f"{index:06d}.png"), image[..., ::-1])
     (folder / "camera.json").write_text(json.dumps({"size": size, "intrinsics": intrinsics.tolist()}))
     command = [sys.executable, "-m", "bench.baselines.colmap_poses", str(folder), "--threads", str(threads)]
+    command += ["--photographs"] if photographs else []
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     (folder / "colmap.log").write_text(done.stdout + done.stderr)
     file = folder / "model.npz"
@@ -63,24 +67,26 @@ def load(folder: Path) -> Model:
     with np.load(folder / "model.npz") as arrays:
         index, poses, points, colors = (arrays[name] for name in ("index", "world_from_cam", "points", "colors"))
     times = json.loads((folder / "seconds.json").read_text())
-    return Model(index, poses, points, colors, times["wall"], times["processor"])
+    return Model(index, poses, points, colors, times["wall"], times["processor"], times["focal"])
 
 
-def run(folder: Path, threads: int) -> None:
+def run(folder: Path, threads: int, photographs: bool) -> None:
     """Everything from images to model.npz. Raises RuntimeError where no two images could be put together."""
     import pycolmap
 
     camera = json.loads((folder / "camera.json").read_text())
     fx, fy, cx, cy = camera["intrinsics"]
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
-    reader.camera_params = f"{fx},{fy},{cx + 0.5},{cy + 0.5}"  # COLMAP's first pixel is centered at 0.5
+    # COLMAP's first pixel is centered at 0.5
+    pinhole, radial = f"{fx},{fy},{cx + 0.5},{cy + 0.5}", f"{fx},{cx + 0.5},{cy + 0.5},0,0"
+    reader.camera_model, reader.camera_params = ("RADIAL", radial) if photographs else ("PINHOLE", pinhole)
     extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
     mapping = pycolmap.IncrementalPipelineOptions()
     for options in (extraction, matching, mapping):
         options.num_threads = threads
-    for name in ("ba_refine_focal_length", "ba_refine_principal_point", "ba_refine_extra_params"):
-        setattr(mapping, name, False)  # the calibration is known, to us as well
+    for name in ("ba_refine_focal_length", "ba_refine_extra_params"):
+        setattr(mapping, name, photographs)  # of a video the calibration is known, to us as well
+    mapping.ba_refine_principal_point = False
     mapping.random_seed = 0
     database, images, seconds = folder / "database.db", folder / "images", {}
     start = time.perf_counter()
@@ -90,7 +96,8 @@ def run(folder: Path, threads: int) -> None:
     )  # fmt: skip
     seconds["features"] = time.perf_counter() - start
     start = time.perf_counter()
-    pycolmap.match_sequential(database, matching_options=matching, device=pycolmap.Device.cpu)
+    match_all = pycolmap.match_exhaustive if photographs else pycolmap.match_sequential
+    match_all(database, matching_options=matching, device=pycolmap.Device.cpu)
     seconds["matching"] = time.perf_counter() - start
     start = time.perf_counter()
     sparse = folder / "sparse"
@@ -106,7 +113,8 @@ def run(folder: Path, threads: int) -> None:
     for pose, image in zip(poses, registered):
         pose[:3] = image.cam_from_world().inverse().matrix()
     points = list(best.points3D.values())
-    times = {"wall": seconds, "processor": time.process_time()}
+    focal = next(iter(best.cameras.values())).mean_focal_length()
+    times = {"wall": seconds, "processor": time.process_time(), "focal": focal}
     (folder / "seconds.json").write_text(json.dumps(times))
     np.savez(
         folder / "model.npz",
@@ -121,5 +129,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--photographs", action="store_true", help="in any order, of an unknown lens")
     given = parser.parse_args()
-    run(given.folder, given.threads)
+    run(given.folder, given.threads, given.photographs)

@@ -86,7 +86,8 @@ class Diagnosis:
             return (
                 f"steps too wide: {self.lost.frames} of {frames} frames could not be followed from the one before "
                 f"(median displacement {jump}{found}; {100 * self.lost.median:.0f} % of the matches survive, "
-                f"{100 * self.lost_fraction:.0f} % are needed): more frames a second, or smaller steps, help"
+                f"{100 * self.lost_fraction:.0f} % are needed): more frames a second, or smaller steps, "
+                "help; photographs with wide steps, in any order, are for tracker=photographs"
             )
         if self.attempts:
             kind = max(self.attempts, key=lambda k: self.attempts[k][0])

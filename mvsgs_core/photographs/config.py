@@ -1,0 +1,24 @@
+"""What can be set of the tracker of photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PhotographsConfig:
+    """Raises ValueError for numbers of which nothing can come."""
+
+    features: int = 3000  # of a photograph, at most
+    neighbors: int = 20  # photographs that each is matched with, the most alike; of 30 or fewer all are
+    refine_lens: bool = True  # focal length and radial distortion, shared by all, are estimated from what is given
+    area: int = 320 * 240  # pixels of the grid of 8x8 cells that the points are sent on, as of the other trackers
+
+    def __post_init__(self) -> None:
+        if self.features < 100:
+            raise ValueError(f"tracker.features={self.features}: of fewer than 100 no photograph gets a pose")
+        if self.neighbors < 2:
+            raise ValueError(f"tracker.neighbors={self.neighbors}: a photograph needs two others or more")
+
+
+__all__ = ["PhotographsConfig"]

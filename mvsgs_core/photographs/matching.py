@@ -1,0 +1,65 @@
+"""Matches of two photographs, and which pairs of many are worth matching."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core.photographs.features import Features
+
+RATIO = 0.8  # of the distances to the best and the second best (Lowe 2004)
+FIRST = 200  # features of a photograph, of the largest scale, that propose its pairs
+EXHAUSTIVE = 30  # photographs: of so many all pairs are matched
+
+
+def match(a: Features, b: Features) -> np.ndarray:
+    """Pairs (N, 2) int64 of features that are each other's best match and pass the ratio test in `a`."""
+    if min(len(a.points), len(b.points)) < 2:
+        return np.zeros((0, 2), np.int64)
+    similarity = a.descriptors @ b.descriptors.T
+    best, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    mutual = np.flatnonzero(back[best] == np.arange(len(best)))
+    rows = similarity[mutual]
+    at = np.arange(len(mutual))
+    first = rows[at, best[mutual]]
+    rows[at, best[mutual]] = -1.0
+    second = rows.max(axis=1)
+    distinct = np.maximum(1.0 - first, 0.0) < RATIO**2 * (1.0 - second)  # squared distances over two
+    return np.stack([mutual, best[mutual]], axis=1)[distinct]
+
+
+def propose_pairs(features: list[Features], neighbors: int) -> list[tuple[int, int]]:
+    """Pairs (i < j) that share enough features of a large scale (preemptive matching, Wu 2013), those most alike first.
+
+    Each photograph brings its `neighbors` most alike; of few photographs all pairs are proposed.
+    """
+    count = len(features)
+    alike = likeness(features)
+    upper = [(i, j) for i in range(count) for j in range(i + 1, count)]
+    if count > EXHAUSTIVE:
+        nearest = np.argsort(-alike, axis=1, kind="stable")[:, :neighbors]
+        chosen = {(min(i, int(j)), max(i, int(j))) for i in range(count) for j in nearest[i] if alike[i, j] > 0}
+        upper = [pair for pair in upper if pair in chosen]
+    return sorted(upper, key=lambda pair: (-alike[pair], pair))
+
+
+def likeness(features: list[Features]) -> np.ndarray:
+    """(N, N) number of matches among the `FIRST` features of each; 0 with itself."""
+    count = len(features)
+    first = np.zeros((count, FIRST, 128), np.float32)  # an empty place is like nothing
+    for n, found in enumerate(features):
+        part = found.descriptors[:FIRST]
+        first[n, : len(part)] = part
+    alike = np.zeros((count, count))
+    for n in range(count - 1):
+        others = first[n + 1 :]
+        similarity = (others.reshape(-1, 128) @ first[n].T).reshape(len(others), FIRST, FIRST)
+        best, back = similarity.argmax(axis=2), similarity.argmax(axis=1)
+        value = np.take_along_axis(similarity, best[..., None], axis=2)
+        np.put_along_axis(similarity, best[..., None], -1.0, axis=2)
+        mutual = np.take_along_axis(back, best, axis=1) == np.arange(FIRST)
+        distinct = 1.0 - value[..., 0] < RATIO**2 * (1.0 - similarity.max(axis=2))
+        alike[n, n + 1 :] = alike[n + 1 :, n] = (mutual & distinct & (value[..., 0] > 0.0)).sum(axis=1)
+    return alike
+
+
+__all__ = ["likeness", "match", "propose_pairs"]

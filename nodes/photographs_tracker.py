@@ -1,0 +1,76 @@
+"""Frame -> Keyframe, TrackerPhase, Trajectory: photographs in any order, with wide steps (mvsgs_core.photographs)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from msgs import Frame, Keyframe
+from mvsgs_core.datasets.lens import Lens, Undistortion
+from mvsgs_core.photographs.config import PhotographsConfig
+from mvsgs_core.photographs.tracker import PhotographTracker
+from mvsgs_core.tracking.publish import Update
+from nodes.tracking import TrackerNode
+
+VISIBLE = 1.0  # pixels by which a distortion must bend the corner of an image to be taken out of it
+
+
+class PhotographsTracker(TrackerNode):
+    """Structure from motion of a set of photographs; everything leaves when the last one has come."""
+
+    in_stream_order: ClassVar[bool] = False
+
+    @dataclass(frozen=True)
+    class Config(PhotographsConfig):
+        pass
+
+    config: Config
+    core: PhotographTracker
+
+    def __init__(self, config: Config | None = None) -> None:
+        super().__init__(config)
+        self.core = PhotographTracker(self.config)
+        self._lenses: dict[tuple[float, float, float, float, tuple[int, int]], Undistortion] = {}
+
+    def _add(self, frame: Frame) -> Update:
+        return self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics, frame.intrinsics_guessed)
+
+    @property
+    def _focal_factor(self) -> float:
+        return self.core.focal_factor
+
+    def _keyframe(self, index: int) -> Keyframe:
+        frame = self._frames[index]
+        lens = self._undistortion(frame)
+        with self.stats.time("undistortion"):
+            image = lens.image(frame.image)
+        found = self.core.keyframe(index, lens.intrinsics, frame.image.shape[:2])
+        return Keyframe(
+            index=index,
+            timestamp=frame.timestamp,
+            image=image,
+            intrinsics=lens.intrinsics,
+            world_from_cam=found.world_from_cam,
+            scale=1.0,
+            inverse_depth=found.inverse_depth,
+            inverse_depth_weight=found.weight,
+            segment=found.segment,
+        )
+
+    def _undistortion(self, frame: Frame) -> Undistortion:
+        """Of the lens that was estimated, for images such as this; none where nobody would see it."""
+        k1, k2 = self.core.distortion
+        fx, fy, cx, cy = (float(v) for v in frame.intrinsics * [self._focal_factor, self._focal_factor, 1.0, 1.0])
+        size = (frame.image.shape[0], frame.image.shape[1])
+        key = (fx, fy, cx, cy, size)
+        if key not in self._lenses:
+            r2 = (max(cx, size[1] - cx) / fx) ** 2 + (max(cy, size[0] - cy) / fy) ** 2
+            bent = abs(r2 * (k1 + r2 * k2)) * r2**0.5 * fx
+            self._lenses[key] = Undistortion(Lens(key[:4], size, (k1, k2, 0.0, 0.0) if bent > VISIBLE else ()))
+            if bent > VISIBLE:
+                self.stats.warn(
+                    f"the photographs are distorted, by up to {bent:.0f} pixels; keyframes are undistorted, but "
+                    f"renders are scored against photographs as they came. dataset.intrinsics=[{fx:.2f},{fy:.2f},"
+                    f"{cx:.2f},{cy:.2f}] dataset.distortion=[{k1:.5f},{k2:.5f},0,0] undistorts all of them"
+                )
+        return self._lenses[key]

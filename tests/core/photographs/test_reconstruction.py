@@ -1,0 +1,108 @@
+"""Whole reconstructions of points that are known: any order, wrong matches, planes, an unknown lens, two parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvsgs_core.photographs.ordering import chain, covisibility
+from mvsgs_core.photographs.reconstruction import Model, all_models
+from mvsgs_core.photographs.registration import MIN_SEEN, register
+from mvsgs_core.photographs.tracks import link
+from mvsgs_core.photographs.two_views import TwoViews
+from tests.support.photograph_ring import SIZE, Ring, position_error, ring
+
+
+def models_of(of: Ring, pairs: dict[tuple[int, int], TwoViews], factor: float = 1.0, free: bool = True) -> list[Model]:
+    tracks = link(of.features, {pair: views.matches for pair, views in pairs.items()})
+    count = len(of.pixels)
+    lens = replace(of.lens, factor=factor, k1=0.0, k2=0.0)
+    everything = np.ones(count, bool)
+    return list(all_models(pairs, of.features, tracks, lens, np.tile(SIZE, (count, 1)), everything, free))
+
+
+def in_order(of: Ring, order: np.ndarray) -> Ring:
+    return replace(of, cam_from_world=of.cam_from_world[order], pixels=of.pixels[order])
+
+
+@pytest.mark.parametrize("order", [np.arange(8), np.random.default_rng(0).permutation(8)], ids=["sorted", "shuffled"])
+def test_photographs_in_any_order_with_wrong_matches(order: np.ndarray) -> None:
+    of = in_order(ring(8, k1=-0.05, k2=0.02), order)
+    (model,) = models_of(of, of.pairs(wrong=0.2), factor=1.15)
+    assert model.registered.all()
+    assert sorted(model.order) == list(range(8))
+    assert position_error(model.cam_from_world, of.cam_from_world) < 0.002
+    assert abs(model.lens.factor - 1.0) < 0.02
+    assert abs(model.lens.k1 + 0.05) < 0.03
+    assert np.median(model.residual) < 0.6
+
+
+def test_a_plane_is_no_obstacle() -> None:
+    of = ring(6, flat=True, depths=0.05)
+    (model,) = models_of(of, of.pairs(), free=False)
+    assert model.registered.all()
+    assert position_error(model.cam_from_world, of.cam_from_world) < 0.01
+
+
+def test_a_lens_that_is_known_stays() -> None:
+    of = ring(5)
+    (model,) = models_of(of, of.pairs(), free=False)
+    assert model.lens == of.lens
+
+
+def test_photographs_that_share_nothing_are_two_parts() -> None:
+    one, other = ring(4), ring(4, seed=5)
+    pixels = np.full((8, 800, 2), np.nan)
+    pixels[:4, :400], pixels[4:, 400:] = one.pixels, other.pixels
+    intrinsics = np.concatenate([one.lens.intrinsics, other.lens.intrinsics])
+    both = Ring(
+        np.concatenate([one.cam_from_world, other.cam_from_world]),
+        np.concatenate([one.world, other.world]),
+        pixels,
+        replace(one.lens, intrinsics=intrinsics),
+    )
+    models = models_of(both, both.pairs())
+    assert sorted(tuple(np.flatnonzero(model.registered)) for model in models) == [(0, 1, 2, 3), (4, 5, 6, 7)]
+
+
+def test_a_photograph_of_something_else_gets_no_pose() -> None:
+    of = ring(6)
+    pixels = of.pixels.copy()
+    pixels[3] = np.random.default_rng(1).permutation(pixels[3])
+    strange = replace(of, pixels=pixels)
+    (model,) = models_of(strange, strange.pairs())
+    assert np.flatnonzero(~model.registered).tolist() == [3]
+
+
+def test_two_photographs_alone_are_no_model() -> None:
+    of = ring(2)
+    assert models_of(of, of.pairs()) == []
+    assert models_of(ring(4), {}) == []
+
+
+def test_a_photograph_finds_its_pose_among_wrong_points() -> None:
+    of = ring(3, k1=-0.05)
+    seen = np.flatnonzero(np.isfinite(of.pixels[1, :, 0]))
+    pixels = of.pixels[1, seen].copy()
+    pixels[::3] = np.random.default_rng(0).uniform(0, 480, pixels[::3].shape)
+    pose = register(1, of.world[seen], pixels, of.lens)
+    assert pose is not None
+    np.testing.assert_allclose(pose, of.cam_from_world[1], atol=0.01)
+    assert register(1, of.world[seen[: MIN_SEEN - 1]], pixels[: MIN_SEEN - 1], of.lens) is None
+    nonsense = np.random.default_rng(1).uniform(0, 480, pixels.shape)
+    assert register(1, of.world[seen], nonsense, of.lens) is None
+
+
+def test_neighbors_leave_after_each_other() -> None:
+    order = np.random.default_rng(3).permutation(9)
+    place = np.random.default_rng(0).uniform(0, 1, 900)  # each point is seen by photographs near its place alone
+    sees = np.abs(np.arange(9)[:, None] / 8 - place) < 0.15
+    photograph, point = np.nonzero(sees[order])
+    shared = covisibility(photograph, point, 9)
+    assert shared[0, 1] == np.sum(sees[order[0]] & sees[order[1]])
+    assert np.all(np.diag(shared) == 0)
+    left = [int(order[n]) for n in chain(shared, list(range(9)))]
+    assert left in (list(range(9)), list(range(9))[::-1])
+    assert chain(shared, []) == []
