@@ -35,7 +35,7 @@ class Model:
     colors: np.ndarray  # (M, 3) uint8 RGB
     seconds: dict[str, float]  # by stage
     processor_seconds: float  # of all threads, from start to end
-    focal: float  # pixels, as it was estimated or given
+    focal: float = float("nan")  # pixels, of photographs, where it is estimated
 
 
 def reconstruct(
@@ -67,7 +67,7 @@ def load(folder: Path) -> Model:
     with np.load(folder / "model.npz") as arrays:
         index, poses, points, colors = (arrays[name] for name in ("index", "world_from_cam", "points", "colors"))
     times = json.loads((folder / "seconds.json").read_text())
-    return Model(index, poses, points, colors, times["wall"], times["processor"], times["focal"])
+    return Model(index, poses, points, colors, times["wall"], times["processor"], times.get("focal", float("nan")))
 
 
 def run(folder: Path, threads: int, photographs: bool) -> None:
@@ -114,7 +114,7 @@ def run(folder: Path, threads: int, photographs: bool) -> None:
         pose[:3] = image.cam_from_world().inverse().matrix()
     points = list(best.points3D.values())
     focal = next(iter(best.cameras.values())).mean_focal_length()
-    times = {"wall": seconds, "processor": time.process_time(), "focal": focal}
+    times = {"wall": seconds, "processor": time.process_time()} | ({"focal": focal} if photographs else {})
     (folder / "seconds.json").write_text(json.dumps(times))
     np.savez(
         folder / "model.npz",

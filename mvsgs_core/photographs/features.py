@@ -30,7 +30,7 @@ def find_features(image: np.ndarray, count: int) -> Features:
     height, width = image.shape[:2]
     size = fit_size(height, width, AREA, 1)
     gray = cv2.cvtColor(resize_image(image, size), cv2.COLOR_RGB2GRAY)
-    sift = cv2.SIFT_create(count, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(count, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))

@@ -17,11 +17,12 @@ from mvsgs_core.photographs.lens import SharedLens
 from mvsgs_core.photographs.registration import MAX_ERROR, MIN_SEEN, ROBUST, register
 from mvsgs_core.photographs.tracks import Tracks
 from mvsgs_core.photographs.triangulation import triangulate
-from mvsgs_core.photographs.two_views import TwoViews, relative_pose
+from mvsgs_core.photographs.two_views import TwoViews, relative_poses
 
 MIN_ANGLE = np.radians(1.5)  # between the rays of a point
 FIRST_ANGLE = np.radians(5.0)  # of the first two views, median
 FIRST_PAIRS, FIRST_TRIES = 12, 3  # pairs that are looked at, and that may begin a map
+PLANE = 0.8  # of the matches: where one homography explains so many, they may lie on a plane
 MIN_PHOTOGRAPHS = 3  # of a model
 AGAIN = 1.2  # times as many points of the map must a photograph see to be tried again
 GROWTH = 1.2  # of the number of photographs, between two adjustments of everything
@@ -76,13 +77,17 @@ class Reconstruction:
 
         Two alone are no model: any two that agree with one geometry seem right. points: (N, 2) features of each.
         """
-        for pair, pose in self._starts(pairs, points, left):
-            if self._begin(pair, pose):
-                self._grow(left)
-                self._triangulate(None)
-                self._adjust_all(last=True)
-                if len(self.order) >= MIN_PHOTOGRAPHS:
-                    return self._model()
+        for pair, poses in self._starts(pairs, points, left):
+            grown = []
+            for pose in poses:
+                if self._begin(pair, pose):
+                    self._grow(left)
+                    self._triangulate(None)
+                    self._adjust_all(last=True)
+                    grown.append(self._model())
+            best = max(grown, key=lambda model: (len(model.order), len(model.residual)), default=None)
+            if best is not None and len(best.order) >= MIN_PHOTOGRAPHS:
+                return best
         return None
 
     def _grow(self, left: np.ndarray) -> None:
@@ -108,7 +113,7 @@ class Reconstruction:
 
     def _starts(
         self, pairs: dict[tuple[int, int], TwoViews], points: list[np.ndarray], left: np.ndarray
-    ) -> list[tuple[tuple[int, int], np.ndarray]]:
+    ) -> list[tuple[tuple[int, int], list[np.ndarray]]]:
         """Pairs with their relative poses (4, 4): those first with most points at angles wide enough.
 
         Looked at are those with most matches that no homography explains.
@@ -117,21 +122,23 @@ class Reconstruction:
             ((len(v.matches) * (1.05 - v.by_homography), pair) for pair, v in pairs.items() if left[list(pair)].all()),
             reverse=True,
         )
-        found = []
+        found: list[tuple[float, tuple[int, int], list[np.ndarray]]] = []
         for _, (i, j) in rated[:FIRST_PAIRS]:
             matches = pairs[i, j].matches
             here = self.lens.unproject(np.full(len(matches), i), points[i][matches[:, 0]])
             there = self.lens.unproject(np.full(len(matches), j), points[j][matches[:, 1]])
-            pose = relative_pose(here, there, 0.5 * (self.lens.focal(i) + self.lens.focal(j)))
-            if pose is None:
-                continue
-            wide = np.isfinite(pose.points).all(axis=1) & (pose.angle > MIN_ANGLE)
-            if wide.sum() < MIN_SEEN:
-                continue
-            score = float(wide.sum()) * min(1.0, float(np.median(pose.angle[wide])) / FIRST_ANGLE)
-            found.append((score, (i, j), pose.second_from_first))
+            focal = 0.5 * (self.lens.focal(i) + self.lens.focal(j))
+            score, poses = 0.0, []
+            for pose in relative_poses(here, there, focal, pairs[i, j].by_homography > PLANE):
+                wide = np.isfinite(pose.points).all(axis=1) & (pose.angle > MIN_ANGLE)
+                if wide.sum() >= MIN_SEEN:
+                    angle = float(np.median(pose.angle[wide]))
+                    score = max(score, float(wide.sum()) * min(1.0, angle / FIRST_ANGLE))
+                    poses.append(pose.second_from_first)
+            if poses:
+                found.append((score, (i, j), poses))
         found.sort(key=lambda start: -start[0])
-        return [(pair, pose) for _, pair, pose in found[:FIRST_TRIES]]
+        return [(pair, poses) for _, pair, poses in found[:FIRST_TRIES]]
 
     def _begin(self, pair: tuple[int, int], second_from_first: np.ndarray) -> bool:
         """A map of two views alone, in the place of whatever there was."""

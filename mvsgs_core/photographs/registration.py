@@ -22,21 +22,26 @@ def register(photograph: int, points: np.ndarray, pixels: np.ndarray, lens: Shar
     focal = lens.focal(photograph)
     flat = lens.unproject(np.full(len(points), photograph), pixels) * focal
     cv2.setRNGSeed(0)
+    camera = np.diag([focal, focal, 1.0])
     try:
-        found, turn, shift, inliers = cv2.solvePnPRansac(
-            points, flat, np.diag([focal, focal, 1.0]), None,
+        found, _, _, inliers = cv2.solvePnPRansac(
+            points, flat, camera, None,
             iterationsCount=TRIALS, reprojectionError=MAX_ERROR, confidence=0.9999, flags=cv2.SOLVEPNP_P3P,
         )  # fmt: skip
+        if not found or inliers is None or len(inliers) < max(MIN_SEEN, MIN_AGREE * len(points)):
+            return None
+        # RANSAC ends with EPnP, which of points on a plane may find the wrong one of two minima: SQPnP does not
+        agree = inliers.ravel()
+        found, turn, shift = cv2.solvePnP(points[agree], flat[agree], camera, None, flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:  # OpenCV throws where the points are no configuration for it
         return None
-    if not found or inliers is None or len(inliers) < max(MIN_SEEN, MIN_AGREE * len(points)):
+    if not found:
         return None
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     if not np.isfinite(pose).all():
         return None
-    seen = inliers.ravel()
-    seen = seen[((points[seen] @ pose[:3, :3].T + pose[:3, 3])[:, 2]) > 0.0]
+    seen = agree[((points[agree] @ pose[:3, :3].T + pose[:3, 3])[:, 2]) > 0.0]
     if len(seen) < MIN_SEEN:
         return None
     one = SharedLens(lens.intrinsics[photograph][None], lens.factor, lens.k1, lens.k2)

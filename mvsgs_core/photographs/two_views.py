@@ -14,6 +14,8 @@ import numpy as np
 MIN_MATCHES = 20  # that agree: of fewer, two photographs of different things have as many
 PIXELS = 2.0  # from the epipolar line
 TRIALS = 5000
+IN_FRONT = 0.9  # of the most points that a pose has in front of both cameras: with fewer it is none
+MIN_STEP = 1e-3  # of the distance of a plane: a camera that moved less only turned
 
 
 @dataclass(frozen=True)
@@ -54,28 +56,44 @@ def verify(here: np.ndarray, there: np.ndarray, matches: np.ndarray) -> TwoViews
     return TwoViews(matches[agree], fundamental, float((planar & agree).sum() / agree.sum()))
 
 
-def relative_pose(here: np.ndarray, there: np.ndarray, focal: float) -> RelativePose | None:
-    """Five-point pose (Nister 2004) of matches (N, 2) on the planes at distance 1; None where there is none.
+def relative_poses(here: np.ndarray, there: np.ndarray, focal: float, planar: bool) -> list[RelativePose]:
+    """Of the second camera, by matches (N, 2) on the planes at distance 1: none where they do not tell, else one.
 
-    focal: pixels, for the threshold. With a known focal length a plane is no degenerate case for it.
+    That is the five-point pose (Nister 2004). Of a plane it is one of two that explain the matches as well, if all of
+    the plane is nearer to one camera (Longuet-Higgins 1986): where `planar`, those of the homography (Malis and Vargas
+    2007) are given instead, for a third photograph to decide. focal: pixels, for the threshold.
     """
     cv2.setRNGSeed(0)
     try:
-        essential, mask = cv2.findEssentialMat(
-            here * focal, there * focal, np.diag([focal, focal, 1.0]), cv2.USAC_MAGSAC, 0.9999, PIXELS
-        )
-        if essential is None or essential.shape != (3, 3):
-            return None
-        count, rotation, translation, _ = cv2.recoverPose(essential, here, there, np.eye(3), mask=mask.copy())
-    except cv2.error:
-        return None
-    if count < MIN_MATCHES:
-        return None
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation.ravel() / np.linalg.norm(translation)
-    points, angle = midpoints(here, there, pose)
-    points[mask.ravel() == 0] = np.nan
-    return RelativePose(pose, points, angle)
+        candidates = _of_plane(here, there, focal) if planar else _five_point(here, there, focal)
+    except cv2.error:  # OpenCV throws where it finds no model at all
+        return []
+    found = []
+    for rotation, translation in candidates:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, translation.ravel() / np.linalg.norm(translation)
+        points, angle = midpoints(here, there, pose)
+        found.append(RelativePose(pose, points, angle))
+    front = [int(np.isfinite(pose.points[:, 0]).sum()) for pose in found]
+    return [pose for pose, n in zip(found, front) if n >= max(MIN_MATCHES, IN_FRONT * max(front))]
+
+
+def _five_point(here: np.ndarray, there: np.ndarray, focal: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    essential, mask = cv2.findEssentialMat(
+        here * focal, there * focal, np.diag([focal, focal, 1.0]), cv2.USAC_MAGSAC, 0.9999, PIXELS
+    )
+    if essential is None or essential.shape != (3, 3):
+        return []
+    count, rotation, translation, _ = cv2.recoverPose(essential, here, there, np.eye(3), mask=mask)
+    return [(np.asarray(rotation), np.asarray(translation))] if count >= MIN_MATCHES else []
+
+
+def _of_plane(here: np.ndarray, there: np.ndarray, focal: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    homography, _ = cv2.findHomography(here * focal, there * focal, cv2.USAC_MAGSAC, PIXELS)
+    if homography is None:
+        return []
+    _, rotations, translations, _ = cv2.decomposeHomographyMat(homography, np.diag([focal, focal, 1.0]))
+    return [(np.asarray(r), np.asarray(t)) for r, t in zip(rotations, translations) if np.linalg.norm(t) > MIN_STEP]
 
 
 def midpoints(here: np.ndarray, there: np.ndarray, second_from_first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -97,4 +115,4 @@ def midpoints(here: np.ndarray, there: np.ndarray, second_from_first: np.ndarray
     return points, np.arccos(np.clip(ab / np.sqrt(aa * bb), -1.0, 1.0))
 
 
-__all__ = ["MIN_MATCHES", "RelativePose", "TwoViews", "midpoints", "relative_pose", "verify"]
+__all__ = ["MIN_MATCHES", "RelativePose", "TwoViews", "midpoints", "relative_poses", "verify"]
