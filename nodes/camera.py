@@ -16,6 +16,7 @@ from msgs import Frame
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource
 from nodes.stream_frames import StreamFrames
 from nodes.stream_presence import Presence, pauses
@@ -83,6 +84,7 @@ class Camera(LiveSource):
         if self._lens is None:
             native = picture.shape[0], picture.shape[1]
             self._lens, notes = lens_from_option(self.config.intrinsics, self.config.distortion, native)
+            self.stats.values[LENS] = lens_values(self._lens)
             for note in notes:
                 self.stats.warn(note)
         return self._lens

@@ -14,6 +14,7 @@ from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap, TrackedFrame
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.export.source_camera import source_camera
 from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.between import FrameBetween
@@ -171,7 +172,7 @@ class Mapper(Node):
         self._report()
         self._check()
         if self._checkpoints is not None and len(self.atlas.current.state):
-            self.stats.values["map_bytes"] = self._checkpoints.finish(self.atlas)
+            self.stats.values["map_bytes"] = self._checkpoints.finish(self.atlas, source_camera(self.upstream))
         yield from self._preview(due=True)  # who watches is left with the map as it is now
         yield self._map(refined=True)
         if self._checkpoints is not None:

@@ -10,6 +10,7 @@ from msgs import Frame, GroundTruth
 from mvsgs_core import datasets
 from mvsgs_core.datasets import Item, check, open_dataset, options_of
 from mvsgs_core.datasets.options import FileOptions
+from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes import Node
 from nodes.parameters import Parameter, parameter_names, parameters
 from nodes.playback import Playback
@@ -41,6 +42,7 @@ class Reader(Node):
     def run(self) -> Iterator[Frame | GroundTruth]:
         sequence = open_dataset(self.config.name, **_options(self.config))
         self.stats.values["frames_expected"] = len(sequence)
+        self.stats.values[LENS] = lens_values(sequence.lens)
         self._pass_warnings_on(sequence)  # those that opening gave; the others are counted until the end
         playback = Playback()
         frames = iter(sequence)

@@ -11,6 +11,8 @@ from msgs import End, Frame
 from msgs.codec import CodecError
 from mvsgs_core.camera import resize_image, scale_intrinsics
 from mvsgs_core.datasets.framing import target_size
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource
 from nodes.runtime.addresses import TransportError, check_address, load_keys
 from nodes.runtime.transport import LiveReader
@@ -102,5 +104,8 @@ class Robot(LiveSource):
         native = self._frames.native
         assert native is not None
         size = target_size(self.config.size, native)
+        if LENS not in self.stats.values:
+            fx, fy, cx, cy = frame.intrinsics.tolist()
+            self.stats.values[LENS] = lens_values(Lens((fx, fy, cx, cy), native, guessed=frame.intrinsics_guessed))
         intrinsics = scale_intrinsics(frame.intrinsics, native, size)
         return replace(frame, image=resize_image(frame.image, size), intrinsics=intrinsics)

@@ -15,6 +15,7 @@ from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.ros import COMPRESSED, calibrated, camera_info_topic, lens_of, rectified, rgb_of
 from mvsgs_core.datasets.sequence import same_shape
+from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource
 from nodes.ros2.cdr import CdrError
 from nodes.ros2.connection import LOOPBACK, SENSOR_DATA, Connection, check_installed
@@ -158,6 +159,8 @@ class Ros2Camera(LiveSource):
             self._lens = self._given_lens(native) or self._calibrated_lens() or self._guessed_lens(native)
         if self._lens is None:
             self.stats.count("before_calibration")
+        else:
+            self.stats.values[LENS] = lens_values(self._lens)
         return self._lens
 
     def _given_lens(self, native: tuple[int, int], otherwise: str | None = None) -> Lens | None:

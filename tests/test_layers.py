@@ -22,7 +22,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "mvsgs_core/networks": (),
     "mvsgs_core/scene": (),
     "mvsgs_core/datasets": ("mvsgs_core/scene",),
-    "mvsgs_core/export": ("mvsgs_core/rasterizer",),
+    "mvsgs_core/export": ("mvsgs_core/rasterizer", "mvsgs_core/datasets"),
     "mvsgs_core/mvs": ("mvsgs_core/networks",),
     "mvsgs_core/fusion": ("mvsgs_core/networks",),
     "mvsgs_core/tracking": ("mvsgs_core/networks",),

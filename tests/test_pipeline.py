@@ -16,6 +16,7 @@ import pytest
 from launch.compose import compose
 from launch.inline import run_inline
 from msgs import Trajectory
+from mvsgs_core.export.cameras import read_source_camera
 from tests.support.shared_data import shared
 
 pytestmark = pytest.mark.slow
@@ -66,6 +67,13 @@ def test_the_room_is_mapped(room: tuple[Path, str]) -> None:
     # At 160x120 over a short path the ratio of depth to motion is weak: a part of each can look like the other.
     assert scores["depth"]["abs_rel"] < 0.3
     assert scores["depth"]["completeness"] > 0.2
+
+
+def test_the_camera_is_in_the_output(room: tuple[Path, str]) -> None:
+    camera = read_source_camera(room[0] / "out" / "cameras.json")
+    assert camera is not None
+    assert (camera.origin, camera.lens.size, camera.doubt) == ("given", (120, 160), "")
+    assert camera.readout_time is not None
 
 
 def test_the_same_command_gives_the_same_map(room: tuple[Path, str], tmp_path: Path) -> None:

@@ -40,7 +40,8 @@ def test_reader_sends_each_frame_and_then_its_truth(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.image, truth.image)
         assert truth.world_from_cam is not None
     assert reader.stats.counts == {"frames": 4}
-    assert reader.stats.values == {"frames_expected": 5}
+    assert reader.stats.values["frames_expected"] == 5
+    assert reader.stats.values["lens"]["size"] == [480, 640]  # of the published calibration
     assert any("could not be read: 1 (first: 1.png" in w for w in reader.stats.warnings)
 
 

@@ -17,6 +17,8 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from mvsgs_core.datasets.lens import Lens
+
 R = TypeVar("R")
 
 
@@ -38,6 +40,9 @@ class Sequence(Protocol):
     """What every reader gives. `warnings` grows while iterating: unreadable images, missing depth, ..."""
 
     warnings: list[str]
+
+    @property
+    def lens(self) -> Lens: ...  # of the first frame, at the size that its calibration is for
 
     def __len__(self) -> int: ...
 

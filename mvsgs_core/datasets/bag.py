@@ -68,6 +68,11 @@ class Bag(FileReader):
             raise ValueError(f"no frame left: {self._topic} has {self._count}, wanted from {self.start}")
         self._opening_warnings = len(self.warnings)
 
+    @property
+    def lens(self) -> Lens:
+        """Of the image as it is in the file."""
+        return self._lens
+
     def __len__(self) -> int:
         """Frames selected; those that turn out unreadable are not delivered."""
         return len(range(self._count)[self.wanted])

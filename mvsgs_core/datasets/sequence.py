@@ -105,6 +105,11 @@ class ImageSequence(FileReader, ABC):
         self._depth_format, self._turn_upright = found.depth_format, found.turn_upright
         self._opening_warnings = len(self.warnings)
 
+    @property
+    def lens(self) -> Lens:
+        """The first frame's, at the size that its calibration is for."""
+        return self.records[0].lens
+
     @abstractmethod
     def _find(self) -> Found:
         """What there is; warnings go to `self.warnings`."""

@@ -12,6 +12,7 @@ from ..scene.difficulties import Difficulties, DifficultPath, Sensor
 from ..scene.renderer import Rendering
 from ..scene.stage import SCENES, stage
 from . import Item, dataset
+from .lens import Lens
 
 FPS = 20.0
 FOCAL = 0.8  # of the image's width: a field of view of 64 degrees
@@ -72,6 +73,11 @@ class Synthetic:
         self.sensor = Sensor(d, seed)
         lost = np.random.default_rng([seed, 5]).random(frames) < d.drop
         self.numbers = [n for n in range(frames)[film.start : film.stop : film.stride] if not lost[n]]
+
+    @property
+    def lens(self) -> Lens:
+        fx, fy, cx, cy = self.intrinsics.tolist()
+        return Lens((fx, fy, cx, cy), self.size)
 
     def __len__(self) -> int:
         return len(self.numbers)

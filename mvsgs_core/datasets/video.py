@@ -14,6 +14,7 @@ from mvsgs_core.bad_file import BadFileError, brief, reading
 from mvsgs_core.datasets import Item, dataset
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.files import Layout
+from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import FileReader, same_shape
 
 LAYOUT = Layout(
@@ -72,6 +73,11 @@ class Video(FileReader):
         if self._rate != rate:
             self.warnings.append(f"{self._path.name} gives no frame rate: {_DEFAULT_RATE:.0f} per second assumed")
         self._opening_warnings = len(self.warnings)
+
+    @property
+    def lens(self) -> Lens:
+        """Of the image as it is in the file."""
+        return self._lens
 
     def __len__(self) -> int:
         """Frames selected, as far as the container knows its own length; 0 where it does not and `stop` is null."""

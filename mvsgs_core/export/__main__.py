@@ -1,8 +1,8 @@
 """Turns a map.ply into other formats: `python -m mvsgs_core.export MAP.ply OUT`.
 
 OUT decides: gaussians.ply (--fold, for viewers without shapes), .splat, .spz, a mesh (.glb, .obj, or --mesh with .ply),
-or a folder for a COLMAP model, with --images and --observations where they are wanted. Mesh and COLMAP model are made
-from the keyframes in the cameras.json beside the map, or from a --trajectory.
+a folder for a COLMAP model, with --images and --observations where they are wanted, or transforms.json for nerfstudio.
+Mesh, model and transforms are made from the keyframes in the cameras.json beside the map, or from a --trajectory.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.splat import write_splat, write_spz
+from mvsgs_core.export.transforms import write_transforms
 
 BESIDE = Path()  # --images without a folder: those beside the map
 
@@ -46,9 +47,18 @@ def colmap(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     return f"{written.images} images, {written.points} points, {written.observations} observations"
 
 
+def transforms(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
+    given = options.images is not None and options.images is not BESIDE
+    images = options.images if given else options.map.with_name(keyframe_images.FOLDER)
+    cameras = cameras_of_map(options)
+    there = write_transforms(out, cameras, images)
+    missing = "" if there == len(cameras) else f", of which {there} have their image in {images}"
+    return f"{len(cameras)} cameras{missing}"
+
+
 FORMATS = {  # by the suffix of OUT, of which a folder has none: writes the map, returns what is in the file
     ".ply": splats, ".splat": splats, ".spz": splats, ".glb": mesh, ".obj": mesh, ".stl": mesh, ".off": mesh,
-    "": colmap,
+    ".json": transforms, "": colmap,
 }  # fmt: skip
 
 
@@ -67,7 +77,9 @@ def export(options: argparse.Namespace) -> str:
 def main(arguments: list[str] | None = None, prog: str = "python -m mvsgs_core.export") -> int:
     parser = argparse.ArgumentParser(prog=prog, description=__doc__)
     input_arguments(parser)
-    parser.add_argument("out", type=Path, help="file.ply, .splat, .spz, .glb, .obj, or a folder for a COLMAP model")
+    parser.add_argument(
+        "out", type=Path, help="file.ply, .splat, .spz, .glb, .obj, .json, or a folder for a COLMAP model"
+    )
     parser.add_argument("--fold", action="store_true", help="fold the shape into the scales (.ply)")
     parser.add_argument("--mesh", action="store_true", help="OUT.ply is a mesh, not splats")
     parser.add_argument(

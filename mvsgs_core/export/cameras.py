@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core.atomic_file import replace_text
+from mvsgs_core.export.source_camera import SourceCamera, camera_of, camera_values
 
 FORMAT, VERSION = "mvsgs cameras", 1
 
@@ -29,8 +30,11 @@ class Cameras:
         return len(self.keyframes)
 
 
-def write_cameras(path: Path, cameras: Cameras) -> None:
-    """Replaces `path` atomically: what stood there stays until the new file is whole. Raises OSError."""
+def write_cameras(path: Path, cameras: Cameras, source: SourceCamera | None = None) -> None:
+    """Replaces `path` atomically: what stood there stays until the new file is whole. Raises OSError.
+
+    source: the camera that took the images, before they were undistorted and resized; None: not known.
+    """
     keyframes = [
         {
             "index": int(cameras.keyframes[k]),
@@ -42,21 +46,15 @@ def write_cameras(path: Path, cameras: Cameras) -> None:
         }
         for k in range(len(cameras))
     ]
-    text = json.dumps({"format": FORMAT, "version": VERSION, "keyframes": keyframes}, allow_nan=False)
+    camera = None if source is None else camera_values(source)
+    content = {"format": FORMAT, "version": VERSION, "camera": camera, "keyframes": keyframes}
+    text = json.dumps(content, allow_nan=False)
     replace_text(path, text.replace(' {"index"', '\n{"index"') + "\n")  # a keyframe a line
 
 
 def read_cameras(path: Path) -> Cameras:
     """The cameras that `write_cameras` wrote. Raises ValueError, saying what is wrong with the file, and OSError."""
-    try:
-        content = json.loads(path.read_text(encoding="ascii"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no cameras.json: {error}") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"{path} is no cameras.json of this program")
-    if content.get("version") != VERSION:
-        raise ValueError(f"{path} has version {content.get('version')!r}: this program reads {VERSION}")
-    keyframes = content.get("keyframes")
+    keyframes = _content(path).get("keyframes")
     if not isinstance(keyframes, list) or not all(isinstance(entry, dict) for entry in keyframes):
         raise ValueError(f"{path}: `keyframes` must be a list of objects")
     result = Cameras(
@@ -70,6 +68,31 @@ def read_cameras(path: Path) -> Cameras:
     if (result.sizes < 1).any() or (result.intrinsics[:, :2] <= 0).any():
         raise ValueError(f"{path}: sizes and focal lengths must be positive")
     return result
+
+
+def read_source_camera(path: Path) -> SourceCamera | None:
+    """The camera that took the images; None where the file does not say it. Raises ValueError and OSError."""
+    values = _content(path).get("camera")
+    if values is None:
+        return None
+    try:
+        if not isinstance(values, dict):
+            raise ValueError("it is no object")
+        return camera_of(values)
+    except ValueError as error:
+        raise ValueError(f"{path}: `camera`: {error}") from error
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="ascii"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no cameras.json: {error}") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{path} is no cameras.json of this program")
+    if content.get("version") != VERSION:
+        raise ValueError(f"{path} has version {content.get('version')!r}: this program reads {VERSION}")
+    return content
 
 
 def _numbers(

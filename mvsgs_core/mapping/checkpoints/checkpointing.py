@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from mvsgs_core.export.source_camera import SourceCamera
 from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.results import write_results
@@ -72,11 +73,14 @@ class Checkpointing:
             log.refuse("checkpoints", 1, f"no last checkpoint: {error}")
         self._pass_problems_on(log)
 
-    def finish(self, atlas: Atlas) -> int:
-        """The finished map: its files are whole and on the disk then; the bytes of map.ply. Raises OSError."""
+    def finish(self, atlas: Atlas, source: SourceCamera | None = None) -> int:
+        """The finished map: its files are whole and on the disk then; the bytes of map.ply. Raises OSError.
+
+        source: the camera that took the stream.
+        """
         self._writer.wait()
         self._pass_problems_on(atlas.current.log)
-        return write_results(self._output, atlas.current)
+        return write_results(self._output, atlas.current, source=source)
 
     def close(self, atlas: Atlas, *, keep: bool) -> None:
         """After the map is finished. keep: its checkpoint is made too, and stays alone; else the last one stays, for a

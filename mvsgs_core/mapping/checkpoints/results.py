@@ -7,20 +7,24 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core.atomic_file import replacing
+from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import Cameras, write_cameras
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.export.source_camera import SourceCamera
+from mvsgs_core.export.transforms import write_transforms
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.trajectory_file import write_trajectory
 
 
-def write_results(output: Path, mapper: OnlineMapper, *, sync: bool = True) -> int:
+def write_results(output: Path, mapper: OnlineMapper, *, source: SourceCamera | None = None, sync: bool = True) -> int:
     """Replaces them by what the mapper has now; the bytes of map.ply. Raises OSError.
 
     trajectory.txt: the stream's keyframes' poses as the mapper has them, TUM format; those without a timestamp are left
     out.
-    The map comes last: where there is one, there are the others.
+    transforms.json, where the keyframes' images are kept: for nerfstudio. source: see `write_cameras`. The map comes
+    last: where there is one, there are the others.
     """
     output.mkdir(parents=True, exist_ok=True)
     final = mapper.snapshot()
@@ -28,7 +32,10 @@ def write_results(output: Path, mapper: OnlineMapper, *, sync: bool = True) -> i
     known = np.isfinite(seconds) & (final.keyframes >= 0)
     with replacing(output / "trajectory.txt", sync=sync) as aside:
         write_trajectory(aside, seconds[known], final.world_from_cam[known])
-    write_cameras(output / "cameras.json", cameras_of(final, mapper.views))
+    cameras = cameras_of(final, mapper.views)
+    write_cameras(output / "cameras.json", cameras, source)
+    if (output / keyframe_images.FOLDER).is_dir():
+        write_transforms(output / "transforms.json", cameras, output / keyframe_images.FOLDER)
     with replacing(output / "map.ply", sync=sync) as aside:
         write_ply(aside, final)
         return aside.stat().st_size

@@ -29,6 +29,8 @@ class Calibration:
 
     def __post_init__(self) -> None:
         self.graph.readout_time = self.readout_time or 0.0
+        if self.readout_time is not None:
+            self.stats.values["readout_time"] = self.readout_time
         self.given = self.graph.intrinsics  # (4,) that came with the frames, at the tracker's size
         self.guessed = not self.settled
 
@@ -65,6 +67,7 @@ class Calibration:
         self.graph.intrinsics = self.given.copy()
         self.graph.optimize(members, set(members[1:]), set(members), Solver(steps=15, threads=self.threads))
         self._report([])
+        self.stats.values["focal_doubt"] = "it can't be told from these images, and the guess is kept"
         self.stats.warn(
             "the focal length can't be told from these images (a camera that hardly turns, or a flat scene): the guess "
             f"is kept, {self.pixels:.0f} px, and the map may be stretched in depth; calibrate and set "
@@ -85,6 +88,7 @@ class Calibration:
         self.stats.values["focal_checked_px"] = factor * used
         self.stats.values["focal length, whole stream"] = f"{factor * used:.1f} px, give or take {100 * sigma:.1f} %"
         if abs(np.log(factor)) > max(self.config.drift, sigma):
+            self.stats.values["focal_doubt"] = f"all keyframes together want {factor:.4f} times as much"
             self.stats.warn(
                 f"all keyframes together want a focal length of {factor * used:.0f} px, give or take {100 * sigma:.1f} "
                 f"%, and {used:.0f} px was used: run again with dataset.intrinsics=[fx,fy,cx,cy] set to it"
@@ -96,6 +100,7 @@ class Calibration:
             return
         with self.stats.time("rolling shutter"):
             self.graph.readout_time = estimate_readout_time(self.graph, members, self.threads)
+        self.stats.values["readout_time"] = self.graph.readout_time
         self.stats.values["rolling shutter"] = f"{1e3 * self.graph.readout_time:.1f} ms"
 
     def _sensible(self) -> bool:
@@ -113,6 +118,7 @@ class Calibration:
         self.stats.values["focal length"] += f", give or take {100 * sigma:.1f} %"
         self.stats.values["focal_sigma_percent"] = 100 * sigma
         if sigma > self.config.doubt:
+            self.stats.values["focal_doubt"] = "the camera hardly turned while it was estimated"
             self.stats.warn(
                 f"the focal length of {used:.0f} px is uncertain by {100 * sigma:.1f} %: the camera hardly turned "
                 "while it was estimated, and the map may be stretched in depth by as much; calibrate and set "

@@ -1,0 +1,49 @@
+"""transforms.json: read back by our reader, and by nerfstudio's rules written out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvsgs_core.datasets import open_dataset
+from mvsgs_core.export import __main__ as export
+from mvsgs_core.export.keyframe_images import write_image
+from tests.support.tiny_map import SIZE, cameras_around, write_tiny_run
+
+
+def test_our_reader_finds_the_same_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, cameras = write_tiny_run(tmp_path / "run"), cameras_around([0.0, 0.5, 1.0])
+    for index in cameras.keyframes.tolist():
+        write_image(run / "keyframes", index, np.full((*SIZE, 3), index, np.uint8))
+    assert export.main([str(run), str(run / "transforms.json")]) == 0
+    assert capsys.readouterr().out == f"{run / 'transforms.json'}: 3 cameras\n"
+    items = list(open_dataset("images", path=run / "keyframes"))
+    assert [int(item.image[0, 0, 0]) for item in items] == cameras.keyframes.tolist()
+    for k, item in enumerate(items):
+        np.testing.assert_allclose(item.world_from_cam, cameras.world_from_cam[k], atol=1e-12)
+        np.testing.assert_allclose(item.intrinsics, cameras.intrinsics[k], atol=1e-9)
+        assert not item.intrinsics_guessed
+
+
+def test_axes_and_pixels_are_nerfstudios(tmp_path: Path) -> None:
+    run, cameras = write_tiny_run(tmp_path / "run"), cameras_around([0.0, 0.5, 1.0])
+    assert export.main([str(run), str(tmp_path / "elsewhere.json")]) == 0
+    content = json.loads((tmp_path / "elsewhere.json").read_text())
+    frame, pose = content["frames"][1], cameras.world_from_cam[1]
+    assert content["camera_model"] == "OPENCV"
+    assert (frame["w"], frame["h"]) == (SIZE[1], SIZE[0])
+    assert frame["file_path"] == "run/keyframes/000007.png"
+    matrix = np.array(frame["transform_matrix"])
+    np.testing.assert_allclose(matrix[:3, 3], pose[:3, 3])
+    np.testing.assert_allclose(-matrix[:3, 2], pose[:3, 2])  # OpenGL looks along -z,
+    np.testing.assert_allclose(-matrix[:3, 1], pose[:3, 1])  # y is up
+    assert frame["cx"] == cameras.intrinsics[1, 2] + 0.5  # pixel (0, 0) is a corner there
+
+
+def test_missing_images_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    assert export.main([str(run), str(run / "transforms.json")]) == 0
+    assert f"3 cameras, of which 0 have their image in {run / 'keyframes'}" in capsys.readouterr().out
