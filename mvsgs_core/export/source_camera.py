@@ -75,13 +75,14 @@ def source_camera(statistics: Mapping[str, Any]) -> SourceCamera | None:
         lens = _lens(values[LENS])
         sigma, readout = values.get("focal_sigma_percent"), values.get("readout_time")
         found = lens.guessed and sigma is not None
+        error = float(sigma) / 100.0 if found and sigma is not None else None
         factor = float(values[FACTOR]) if found else 1.0
         fx, fy, cx, cy = lens.intrinsics
         doubt = str(values.get("focal_doubt") or ("" if found or not lens.guessed else UNTESTED))
         camera = SourceCamera(
             replace(lens, intrinsics=(factor * fx, factor * fy, cx, cy), guessed=lens.guessed and not found),
             ESTIMATED if found else GUESSED if lens.guessed else GIVEN,
-            float(sigma) / 100.0 if found else None, doubt, None if readout is None else float(readout),
+            error, doubt, None if readout is None else float(readout),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
