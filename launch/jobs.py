@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import sys
 from collections.abc import Sequence
@@ -40,6 +41,13 @@ class Job:
     number: int | None  # in a sweep
     resumed: bool = False  # goes on with what is in its output directory
 
+    @property
+    def command(self) -> str:
+        """What a user types for the same."""
+        words = [text.lstrip("+") for text in self.overrides]
+        resume = [f"resume={self.config.output}"] if self.resumed else []
+        return shlex.join(["mvsgs", *resume, *words])
+
     @staticmethod
     def of(config: DictConfig, hydra: Any) -> Job:
         sweep = hydra.mode == RunMode.MULTIRUN
@@ -69,7 +77,7 @@ def _run(job: Job) -> int:
     except GraphError as error:
         return refused(error)
     try:
-        output.begin(graph.resolved, resumed=job.resumed)
+        output.begin(graph.resolved, job.command, resumed=job.resumed)
         screen = make_screen(graph.settings.screen)
         said: list[Outcome] = []
 
@@ -95,8 +103,8 @@ def _run(job: Job) -> int:
 
 
 def refused(error: GraphError) -> int:
-    """Says why nothing runs; the exit code."""
-    print(f"error: {error}", file=sys.stderr)
+    """Says why nothing runs, in one line; the exit code."""
+    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
     return REFUSED
 
 

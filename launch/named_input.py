@@ -129,7 +129,9 @@ def _overrides(choice: str, word: str) -> list[str]:
 
 
 def _quoted(text: str) -> str:
-    """Any text as a quoted value of Hydra's grammar, in which nothing is an interpolation."""
+    """Any text as a value of Hydra's grammar, in which nothing is an interpolation; in quotes unless it is plain."""
+    if re.fullmatch(r"[A-Za-z_./][\w./-]*[./][\w./-]*", text, re.ASCII):
+        return text
     text = re.sub(r"(\\*)'", r"\1\1\\'", text)
     text = re.sub(r"(\\+)$", r"\1\1", text)
     return "'" + text.replace("${", "\\${") + "'"

@@ -27,7 +27,9 @@ from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 
 LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
 MAP = ("map.ply", "trajectory.txt", FOLDER)  # what is worth keeping of an earlier run
-BESIDE = ("report.html", REPORT, "comparison.png", "cameras.json", "keyframes", "config.yaml")  # and what belongs to it
+BESIDE = (  # and what belongs to it
+    "report.html", REPORT, "comparison.png", "cameras.json", "transforms.json", "keyframes", "config.yaml",
+)  # fmt: skip
 RUN_ALL = Path(__file__).resolve().parent / "run_all.py"
 
 
@@ -38,6 +40,8 @@ class Output:
         """Raises GraphError where it cannot be made, or where another run is writing to it."""
         self.path = path
         self.resume: str | None = None  # the command that goes on with the run, once it has ended early
+        if path.exists() and not path.is_dir():
+            raise GraphError(f"output={path}: is a file; the output is a folder")
         try:
             path.mkdir(parents=True, exist_ok=True)
             self._lock = _lock(path / LOCK)
@@ -48,8 +52,9 @@ class Output:
         except OSError as error:
             raise GraphError(f"output={path}: {error.strerror}") from error
 
-    def begin(self, config: Mapping[str, Any], *, resumed: bool) -> None:
-        """Moves an earlier run's results aside (a resumed one's stay), and writes this run's configuration.
+    def begin(self, config: Mapping[str, Any], command: str, *, resumed: bool) -> None:
+        """Moves an earlier run's results aside (a resumed one's stay), and writes this run's configuration, under the
+        command that composed it.
 
         Raises GraphError where that cannot be written.
         """
@@ -57,7 +62,8 @@ class Output:
             if not resumed:
                 self._move_previous()
             self.write_report({"finished": False, "reason": "still running, or killed with its launcher"})
-            replace_text(self.path / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+            settings = OmegaConf.to_yaml(OmegaConf.create(dict(config)))
+            replace_text(self.path / "config.yaml", f"# {' '.join(command.split())}\n{settings}")
         except OSError as error:
             raise GraphError(f"output={self.path}: {error.strerror or error}") from error
 

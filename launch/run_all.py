@@ -29,6 +29,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from launch.children import python_environment
+from launch.comparison import comparison_text, has_figures
 from launch.compose import CONF, choices_of, graph_of, prepare
 from launch.graph_text import graph_text
 from launch.help_text import help_text
@@ -53,14 +54,27 @@ def main(arguments: Sequence[str]) -> int:
         return refused(error)
     os.environ |= python_environment()  # Hydra's launchers start workers that need the workspace too
     codes: list[int] = []
+    swept: list[Path] = []
 
     @hydra.main(version_base="1.3", config_path="conf", config_name="config")
     def job(config: DictConfig) -> None:
         one = Job.of(config, HydraConfig.get())
+        if one.number is not None and shown is None:
+            swept.append(Path(one.config.output))
         codes.append(run(one) if shown is None else show(one, shown))
 
-    job()
+    try:
+        job()
+    finally:  # also where a job of a sweep has failed: Hydra exits then
+        side_by_side(swept)
     return codes[-1] if codes else 0
+
+
+def side_by_side(outputs: Sequence[Path]) -> None:
+    """At the end of a sweep: those of its runs that have figures."""
+    scored = [output for output in outputs if has_figures(output)]
+    if len(scored) > 1:
+        print(f"\n{comparison_text(scored)}", flush=True)
 
 
 def show(job: Job, shown: str) -> int:

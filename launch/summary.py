@@ -9,7 +9,8 @@ from typing import Any
 
 from mvsgs_core.evaluation import metrics
 
-FILES = ("report.html", "report.json", "map.ply", "cameras.json", "keyframes", "trajectory.txt", "config.yaml", "logs")
+FILES = ("report.html", "report.json", "map.ply", "cameras.json", "transforms.json", "keyframes", "trajectory.txt",
+         "config.yaml", "logs")  # fmt: skip
 
 
 def summary(output: Path) -> str:

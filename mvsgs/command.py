@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]  # of the workspace: launch, nodes and msgs lie in it
-RUN_ALL = ROOT / "launch" / "run_all.py"
+from mvsgs import WORKSPACE
+
+RUN_ALL = WORKSPACE / "launch" / "run_all.py"
 REFUSED = 2
 
 USAGE = """\
@@ -37,6 +38,8 @@ COMMANDS = {
     "run": Command("INPUT ...", "the same as without this word"),
     "demo": Command("...", "maps the embedded room", words=("dataset=synthetic",)),
     "view": Command("MAP", "a saved map in the browser: keyframes, renders, depth", "mvsgs.view"),
+    "eval": Command("RUN", "the figures of a run again", "mvsgs.evaluate"),
+    "compare": Command("RUN RUN ...", "runs side by side, with --html also renders", "mvsgs.compare"),
     "info": Command("DIR", "what is in the map that a run kept, for map=DIR", "mvsgs_core.maps.info"),
     "export": Command("MAP OUT", "to .ply, .splat, .spz, .glb, .obj or a COLMAP folder", "mvsgs_core.export.__main__"),
     "render": Command("MAP PATH OUT.mp4", "a video along a trajectory", "mvsgs_core.export.render_path"),
@@ -92,5 +95,5 @@ def _refuse_misspelled(word: str) -> None:
 
 def _put_path_in_order() -> None:
     """The workspace first, and the current directory out: nothing among a user's data takes a module's place."""
-    here = {"", str(Path.cwd())} - {str(ROOT)}
-    sys.path[:] = [str(ROOT)] + [path for path in sys.path if path not in (*here, str(ROOT))]
+    here = {"", str(Path.cwd())} - {str(WORKSPACE)}
+    sys.path[:] = [str(WORKSPACE)] + [path for path in sys.path if path not in (*here, str(WORKSPACE))]

@@ -6,7 +6,6 @@ import argparse
 import importlib.metadata
 import importlib.util
 import json
-import os
 import platform
 import shutil
 import subprocess
@@ -19,9 +18,9 @@ from pathlib import Path
 import psutil
 import torch
 
-from mvsgs_core import native, weights
+from mvsgs import WORKSPACE
+from mvsgs_core import machine, native, weights
 
-ROOT = Path(__file__).resolve().parents[1]
 KERNELS = ("rasterizer", "mapping", "tracking", "mvs", "fusion", "scene")
 NEEDED = ("torch", "numpy", "pyzmq", "opencv-contrib-python-headless", "open3d", "viser", "av")
 OPTIONAL = {  # module: what it is for, how it is had
@@ -36,11 +35,10 @@ TOO_LONG = 300.0  # s
 def checks() -> Iterator[tuple[str, str, bool]]:
     """What is looked at, what was found, and whether runs work with it."""
     memory = psutil.virtual_memory()
-    yield "version", f"{_version('mvsgs') or 'not installed'}, {ROOT}", True
+    yield "version", f"{machine.version() or 'not installed'}, {WORKSPACE}", True
     yield "python", f"{platform.python_version()}, {sys.executable}", sys.version_info >= (3, 11)
     yield "system", f"{platform.system()} {platform.release()} {platform.machine()}", True
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield "processor", f"{_processor()}, {cores} cores, {', '.join(native.instruction_sets())}", True
+    yield "processor", machine.processor(), True
     yield "memory", f"{memory.available / 1e9:.1f} of {memory.total / 1e9:.1f} GB free", memory.available > 2e9
     free = shutil.disk_usage(tempfile.gettempdir()).free
     yield "disk", f"{free / 1e9:.1f} GB free in {tempfile.gettempdir()}", free > 1e9
@@ -64,7 +62,7 @@ def self_test(folder: Path) -> tuple[str, bool]:
     """Maps 30 small frames of the embedded room, in processes as any run; what was reached, whether that is right."""
     output, began = folder / "out", time.monotonic()
     command = [
-        sys.executable, str(ROOT / "launch/run_all.py"), "dataset=synthetic", "dataset.stop=30",
+        sys.executable, str(WORKSPACE / "launch/run_all.py"), "dataset=synthetic", "dataset.stop=30",
         "dataset.size=[96,128]", "mapper.iterations=20", "mapper.refinement=40", "evaluator.lpips=off", "device=auto",
         f"output={output}", "screen=off",
     ]  # fmt: skip
@@ -98,20 +96,11 @@ def _kernels() -> Iterator[tuple[str, str, bool]]:
 
 
 def _gpu() -> tuple[str, bool]:
-    if not torch.cuda.is_available():
+    names = machine.gpus()
+    if not names:
         built = "PyTorch sees none" if torch.version.cuda else "this PyTorch is built for processors alone"
         return f"none: {built}; runs use the processor", True
-    names = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
     return f"{', '.join(names)}, CUDA {torch.version.cuda}; device=cpu leaves it alone", True
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return named[0] if named else platform.processor() or "unknown"
 
 
 def _version(package: str) -> str | None:
@@ -128,9 +117,9 @@ def main(arguments: list[str] | None = None, prog: str = "mvsgs doctor") -> int:
     wrong = []
     for name, found, right in checks():
         wrong += [] if right else [name]
-        print(f"{'' if right else '! '}{name:{22 if right else 20}} {found}", flush=True)
+        print(f"{'' if right else '! '}{name:{30 if right else 28}} {found}", flush=True)
     if not options.no_test:
-        print(f"{'self-test':22} ", end="", flush=True)
+        print(f"{'self-test':30} ", end="", flush=True)
         with tempfile.TemporaryDirectory() as folder:
             reached, right = self_test(Path(folder))
         wrong += [] if right else ["self-test"]

@@ -20,13 +20,11 @@ from mvsgs_core.evaluation.scoring import colorize_depth
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.command_line import input_arguments, known_cameras, read_map, run
+from mvsgs_core.export.keyframe_render import rendered_keyframe
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.preview import as_bytes, covariances
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes.map_page import MapPage, thumbnail
-
-NEAR = 1e-3  # of the page's unit
-
 
 class SavedMapView:
     """The page of one saved map. `closed` is set by its button."""
@@ -48,29 +46,12 @@ class SavedMapView:
         )  # fmt: skip
         said = f"**{name}**: {len(splats)} splats, {len(self._poses)} keyframes"
         gui.add_markdown(said + (f"; {left_out} splats that are not finite are not shown" if left_out else ""))
-        self._toggles()
+        page.add_toggles()
         if cameras is None:
             gui.add_markdown("There is no cameras.json beside this map, so that its keyframes are not known.")
         else:
             self._show_keyframes(cameras)
         gui.add_button("Close").on_click(lambda _: self.closed.set())
-
-    def _toggles(self) -> None:
-        """What is shown, each by a box."""
-        shown = {
-            "splats": lambda: [self.page.splats],
-            "keyframes": lambda: list(self.page.frustums.values()),
-            "path": lambda: [self.page.path],
-        }
-        for name, handles in shown.items():
-            box = self.page.server.gui.add_checkbox(name, True)
-
-            def switched(event: Any, handles: Any = handles) -> None:
-                for handle in handles():
-                    if handle is not None:
-                        handle.visible = event.target.value
-
-            box.on_update(switched)
 
     def _show_keyframes(self, cameras: Cameras) -> None:
         for k, index in enumerate(cameras.keyframes.tolist()):
@@ -102,21 +83,18 @@ class SavedMapView:
         assert self._cameras is not None
         assert self.page.unit is not None
         self._shown = k
-        index, size = int(self._cameras.keyframes[k]), self._cameras.sizes[k].tolist()
+        index, (height, width) = int(self._cameras.keyframes[k]), self._cameras.sizes[k].tolist()
         self.page.mark(index)
         photograph = self._photograph(index)
         self._pictures["photograph"].visible = photograph is not None
         if photograph is not None:
             self._pictures["photograph"].image = thumbnail(photograph)
-        render = self._final.render(
-            self._cameras.world_from_cam[k], self._cameras.intrinsics[k], (size[0], size[1]), near=NEAR * self.page.unit
-        )
-        affine = torch.from_numpy(self._cameras.exposures[k]).to(render.color)
-        self._pictures["render"].image = thumbnail(as_bytes(render.color @ affine[:, :3].T + affine[:, 3]))
+        color, render = rendered_keyframe(self._final, self._cameras, k)
+        self._pictures["render"].image = thumbnail(as_bytes(color))
         self._pictures["depth"].image = thumbnail(colorize_depth(render.depth.numpy()))
         known = render.depth[render.opacity > 0.5]
         depths = f"; depth {_span(known.numpy())}" if len(known) else ""
-        self._caption.content = f"keyframe **{index}**, {size[1]}x{size[0]}{depths}"
+        self._caption.content = f"keyframe **{index}**, {width}x{height}{depths}"
 
     def _photograph(self, index: int) -> np.ndarray | None:
         file = self._photographs / keyframe_images.image_name(index)

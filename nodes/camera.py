@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -25,7 +26,7 @@ ANSWER = 5.0  # s for a network camera to answer, before it is tried again
 POLL = 0.5  # s at most between two looks at whether the stream goes on
 
 
-class CameraError(RuntimeError):
+class CameraError(OSError):
     """A camera that cannot be opened or gives no picture; the message says what to check."""
 
 
@@ -51,6 +52,17 @@ class Camera(LiveSource):
         sender = f"camera {self.config.path}"
         self._frames = StreamFrames(self.stats, sender, stamped=False)
         self._presence = Presence(self.stats, sender, self.config.timeout)
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        lens_from_option(config.intrinsics, config.distortion, (480, 640))
+        device = Path(f"/dev/video{config.path}")
+        if Path(config.path).is_file():
+            raise CameraError(f"{config.path} is a file and no camera: use dataset=video dataset.path={config.path}")
+        if config.path.isdecimal() and sys.platform == "linux" and not device.exists():
+            there = sorted(str(path) for path in device.parent.glob("video*"))
+            found = f"there is {', '.join(there)}" if there else "no camera is connected"
+            raise CameraError(f"camera {config.path}: {device} does not exist; {found}")
 
     def _open(self) -> None:
         self._feed = _Feed(self.config, self._presence)

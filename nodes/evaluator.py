@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import math
 import resource
@@ -16,11 +15,12 @@ import numpy as np
 import torch
 
 from msgs import FusedKeyframe, GroundTruth, SplatMap, Trajectory
-from mvsgs_core import trajectory, weights
+from mvsgs_core import machine, trajectory, weights
 from mvsgs_core.atomic_file import replace_text, replacing
 from mvsgs_core.evaluation import html, pictures, statistics
 from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.lpips import Lpips
+from mvsgs_core.evaluation.origin import origin
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.held_out import HELD_OUT_EVERY
 from mvsgs_core.rasterizer.splats import Splats
@@ -117,8 +117,9 @@ class Evaluator(Node):
         self.report |= {
             "finished": True,
             "date": time.strftime("%Y-%m-%d %H:%M:%S %Z"),
-            "version": _version(),
+            "version": machine.version(),
             "input": self.config.input.strip(),
+            "run": origin(self.folder, self.evaluation.size, self.evaluation.trajectory, self.upstream),
         }
         self.report["protocol"] = (
             "Scored at native resolution; strict: nothing is fitted to a scored frame, exposure neither. "
@@ -192,11 +193,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _version() -> str | None:
-    """Of the installed package; None where a checkout runs without being installed."""
-    try:
-        return importlib.metadata.version("mvsgs")
-    except importlib.metadata.PackageNotFoundError:
-        return None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 import viser
@@ -27,6 +29,7 @@ class MapPage:
         self.splats: viser.GaussianSplatHandle | None = None
         self.path: viser.LineSegmentsHandle | None = None
         self.frustums: dict[int, viser.CameraFrustumHandle] = {}  # by keyframe
+        self._visible = dict.fromkeys(("splats", "keyframes", "path"), True)
 
     def begin(self, world_from_cam: np.ndarray, means: np.ndarray) -> None:
         """Unit, up direction and first view of the page, all from a camera (4, 4) and splats (N, 3)."""
@@ -38,6 +41,24 @@ class MapPage:
         behind = position - 0.6 * world_from_cam[:3, 2] - 0.25 * world_from_cam[:3, 1]
         self.server.initial_camera.position = tuple(behind)
         self.server.initial_camera.look_at = tuple(position + world_from_cam[:3, 2])
+
+    def add_toggles(self) -> None:
+        """A box for each kind of thing, by which it is shown or not."""
+        for name, visible in self._visible.items():
+            self.server.gui.add_checkbox(name, visible).on_update(partial(self._switched, name))
+
+    def _switched(self, name: str, event: Any) -> None:
+        self.set_visible(name, event.target.value)
+
+    def set_visible(self, name: str, visible: bool) -> None:
+        """Of splats, keyframes or path: those that are there, and those that come."""
+        self._visible[name] = visible
+        handles: dict[str, list[Any]] = {
+            "splats": [self.splats], "keyframes": list(self.frustums.values()), "path": [self.path]
+        }  # fmt: skip
+        for handle in handles[name]:
+            if handle is not None:
+                handle.visible = visible
 
     def show_splats(self, means: np.ndarray, covariances: np.ndarray, colors: np.ndarray, opacities: np.ndarray) -> int:
         """(N, 3), (N, 3, 3), (N, 3) uint8 and (N,) in place of those before. Returns how many were left out, as a value
@@ -52,7 +73,9 @@ class MapPage:
                 "opacities": opacities[known, None],
             }
             if self.splats is None:
-                self.splats = self.server.scene.add_gaussian_splats("/splats", **arrays)
+                self.splats = self.server.scene.add_gaussian_splats(
+                    "/splats", **arrays, visible=self._visible["splats"]
+                )
             else:
                 self.splats.set_gaussians(**arrays)
         return int((~known).sum())
@@ -60,7 +83,7 @@ class MapPage:
     def add_keyframe(
         self, index: int, world_from_cam: np.ndarray, intrinsics: np.ndarray, size: Sequence[int]
     ) -> viser.CameraFrustumHandle:
-        """A frustum for the keyframe of a camera (4, 4) with intrinsics (4,) at `size` (height, width), marked."""
+        """A frustum for the keyframe of a camera (4, 4) with intrinsics (4,) at `size` (height, width)."""
         assert self.unit is not None
         height, width = size
         self.frustums[index] = self.server.scene.add_camera_frustum(
@@ -68,12 +91,13 @@ class MapPage:
             fov=2.0 * float(np.arctan(0.5 * height / intrinsics[1])),
             aspect=width / height,
             scale=0.04,
+            color=_PLAIN_COLOR,
             thickness=1.5,
             thickness_units="screen",
             wxyz=quaternion_from_rotation(world_from_cam[:3, :3]),
             position=world_from_cam[:3, 3] / self.unit,
+            visible=self._visible["keyframes"],
         )
-        self.mark(index)
         return self.frustums[index]
 
     def mark(self, index: int) -> None:
@@ -102,8 +126,9 @@ class MapPage:
             return
         lines = np.stack([places[:-1], places[1:]], axis=1)
         self.path = self.server.scene.add_line_segments(
-            "/path", lines, np.array(_PATH_COLOR, np.uint8), thickness=2.0, thickness_units="screen"
-        )
+            "/path", lines, np.array(_PATH_COLOR, np.uint8), thickness=2.0, thickness_units="screen",
+            visible=self._visible["path"],
+        )  # fmt: skip
 
 
 def thumbnail(image: np.ndarray) -> np.ndarray:

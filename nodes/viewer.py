@@ -50,6 +50,7 @@ class Viewer(Node):
         blank = np.zeros((2, 2, 3), np.uint8)
         self._photo = self.server.gui.add_image(blank, label="photo", format="jpeg")
         self._render = self.server.gui.add_image(blank, label="render", format="jpeg")
+        self.page.add_toggles()
         if c.keep_open:
             self.server.gui.add_button("Close").on_click(lambda _: self.closed.set())
 
@@ -61,6 +62,7 @@ class Viewer(Node):
                 self.stats.warn("splats that are not finite were left out of the view")
             self._move_keyframes(preview)
             self.page.add_keyframe(preview.index, preview.world_from_cam, preview.intrinsics, preview.image.shape[:2])
+            self.page.mark(preview.index)
             while len(self.page.frustums) > self.config.max_frustums:
                 self.page.remove_keyframe(next(iter(self.page.frustums)))
             self.page.show_path()

@@ -28,7 +28,7 @@ def test_kernels_that_are_not_built_are_said(
     monkeypatch.setattr(native, "load", missing)
     assert doctor.main(["--no-test"]) == 1
     said = capsys.readouterr().out
-    assert "! kernels              `_rasterizer` are not built" in said
+    assert "! kernels                      `_rasterizer` are not built" in said
     assert said.endswith("to be looked at: kernels\n")
 
 

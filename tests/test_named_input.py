@@ -63,7 +63,7 @@ def test_files_and_folders_are_known_by_name_and_layout(
     write: Callable[[Path], Path], choice: str, tmp_path: Path
 ) -> None:
     path = write(tmp_path / "data")
-    assert meant(str(path)) == [f"dataset={choice}", f"dataset.path='{path}'"]
+    assert meant(str(path)) == [f"dataset={choice}", f"dataset.path={path}"]
     assert meant(str(path), "mapper.iterations=3")[2:] == ["mapper.iterations=3"]
 
 
@@ -75,7 +75,9 @@ def test_files_and_folders_are_known_by_name_and_layout(
     ],
 )  # fmt: skip
 def test_addresses_and_numbers_are_cameras_and_robots(word: str, choice: str) -> None:
-    assert meant(word) == [f"dataset={choice}", f"dataset.path='{word}'"]
+    chosen, path = meant(word)
+    assert chosen == f"dataset={choice}"
+    assert compose([chosen, path]).slots["dataset"].config["path"] == word
 
 
 def test_a_choice_is_meant_by_its_name_and_overrides_stay() -> None:
@@ -86,7 +88,7 @@ def test_a_choice_is_meant_by_its_name_and_overrides_stay() -> None:
 
 def test_a_choice_that_is_given_holds(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "data")
-    assert meant(str(folder), "dataset=images") == [f"dataset.path='{folder}'", "dataset=images"]
+    assert meant(str(folder), "dataset=images") == [f"dataset.path={folder}", "dataset=images"]
 
 
 @pytest.mark.parametrize("name", ["my walk (1), a=b.mp4", "it's.mp4", "a$b${c}.mp4", "back\\slash.mp4", "'\\'.mp4"])

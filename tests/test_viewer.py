@@ -162,6 +162,21 @@ def test_frustums_follow_corrections(viewer: Viewer) -> None:
     assert viewer.server.scene.get_handle_by_name("/keyframes/0") is not None
 
 
+def test_what_is_switched_off_stays_off_for_what_comes(viewer: Viewer) -> None:
+    show(viewer, preview(1))
+    for name in ("keyframes", "path"):
+        viewer.page.set_visible(name, False)
+    show(viewer, preview(2))
+    show(viewer, preview(3))
+    scene = viewer.server.scene
+    assert [scene.get_handle_by_name(f"/keyframes/{index}").visible for index in (1, 2, 3)] == [False] * 3  # type: ignore[union-attr]
+    assert not scene.get_handle_by_name("/path").visible  # type: ignore[union-attr]
+    assert scene.get_handle_by_name("/splats").visible  # type: ignore[union-attr]
+    viewer.page.set_visible("keyframes", True)
+    assert scene.get_handle_by_name("/keyframes/1").visible  # type: ignore[union-attr]
+    assert "keyframes" in received(viewer)
+
+
 def test_splats_that_are_not_finite_are_left_out_and_said(viewer: Viewer) -> None:
     bad = preview(1)
     bad.means[7] = np.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,18 @@ from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import image_size, lens_from_option
 from mvsgs_core.datasets.colmap import find_colmap, read_colmap
 from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens
-from mvsgs_core.datasets.files import IMAGE_SUFFIXES, Layout, images_in, natural_order
+from mvsgs_core.datasets.files import (
+    IMAGE_SUFFIXES,
+    Layout,
+    UnreadableImageError,
+    images_in,
+    natural_order,
+    opened_image,
+    upright_size,
+)
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model
-from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
+from mvsgs_core.datasets.sequence import Found, ImageSequence, Record, same_shape
 from mvsgs_core.datasets.strecha import find_strecha, read_strecha
 from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transforms
 
@@ -56,6 +65,7 @@ class Images(ImageSequence):
         model = None if self.intrinsics is not None else _find_model(folder, images, self.model)
         if model is not None:
             return Found(_from_model(model, folder, images, self.rate, self.warnings), turn_upright=False)
+        _check_shapes(images)
         lenses = self._lenses(images)
         return Found([Record(i / self.rate, image, lens) for i, (image, lens) in enumerate(zip(images, lenses))])
 
@@ -100,6 +110,26 @@ def _find_images(folder: Path) -> list[Path]:
         )
         raise LAYOUT.missing(f"{folder} has no image{hint}")
     return sorted(below, key=lambda p: natural_order(p.relative_to(folder).as_posix()))
+
+
+def _check_shapes(images: list[Path]) -> None:
+    """Raises ValueError where most images would be left out, as they have another shape than the first. Looks at a
+    hundred of them at most; those that cannot be read are no matter of shape."""
+    shapes: dict[Path, tuple[int, int]] = {}
+    for path in images[:: -(-len(images) // 100)]:
+        with suppress(UnreadableImageError), opened_image(path, path.name) as opened:
+            shapes[path] = upright_size(opened)
+    if not shapes:
+        return
+    first, shape = next(iter(shapes.items()))
+    others = [path for path, other in shapes.items() if not same_shape(other, shape)]
+    if 2 * len(others) > len(shapes):
+        height, width = shapes[others[0]]
+        raise ValueError(
+            f"{len(others)} of {len(shapes)} images have another shape than the first, {first.name} of "
+            f"{shape[1]}x{shape[0]}: {others[0].name} is {width}x{height}; one camera's images of one shape make a map: "
+            "put the others into a folder of their own, or turn them"
+        )
 
 
 def _find_model(folder: Path, images: list[Path], given: str | Path | None) -> Model | None:

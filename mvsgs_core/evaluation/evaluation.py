@@ -42,6 +42,7 @@ class Evaluation:
     def __post_init__(self) -> None:
         self._frames = Frames(self.folder, self.max_frames, self.max_bytes)
         self._received = 0
+        self.size: tuple[int, int] | None = None  # height, width of the first frame
         self._truth: dict[int, np.ndarray] = {}
 
     def add_frame(
@@ -55,6 +56,7 @@ class Evaluation:
         if self.started is None:
             self.started = time.perf_counter()
         self._received += 1
+        self.size = self.size or (image.shape[0], image.shape[1])
         self._frames.add(index, image, intrinsics, depth)
         if world_from_cam is not None and np.isfinite(world_from_cam).all():
             self._truth[index] = world_from_cam

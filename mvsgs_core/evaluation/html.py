@@ -11,18 +11,23 @@ import cv2
 import numpy as np
 
 from mvsgs_core.evaluation import metrics, svg
+from mvsgs_core.evaluation.origin import in_words
 
+_FIRST, _WATCHING = ("tracker", "dataset"), ("viewer", "recorder", "publisher", "evaluator")  # slots, by their warnings
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8882; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; margin-bottom: 0; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
-table { border-collapse: collapse; } td, th { padding: .25rem .8rem; border-bottom: 1px solid var(--line); }
+table { border-collapse: collapse; display: block; overflow-x: auto; } td, th { padding: .25rem .8rem; border-bottom: 1px solid var(--line); }
 th { text-align: left; } td { text-align: right; font-variant-numeric: tabular-nums; }
 td:first-child { text-align: left; }
 .pictures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px; margin: 2px 0 14px; }
-.pictures img { width: 100%; display: block; } figure { margin: 0; }
+.pictures img { width: 100%; display: block; cursor: zoom-in; } figure { margin: 0; }
+.pictures .large { grid-column: 1 / -1; } .large img { cursor: zoom-out; image-rendering: pixelated; }
+.run td { text-align: left; overflow-wrap: anywhere; } pre { overflow-x: auto; background: var(--soft); padding: .6rem; }
+@media (max-width: 700px) { .pictures { grid-template-columns: repeat(2, 1fr); } td, th { padding: .2rem .4rem; } }
 figcaption { font-size: .8rem; opacity: .75; }
-.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(420px, 1fr)); gap: 16px; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 16px; }
 .plot { width: 100%; font-size: 11px; fill: currentColor; background: var(--soft); border-radius: 6px; }
 .plot .grid { stroke: var(--line); stroke-width: .6; }
 .warning { border-left: 4px solid #dd6b20; padding: .1rem .8rem; background: var(--soft); margin: .3rem 0; }
@@ -37,7 +42,9 @@ def image_tag(picture: np.ndarray, caption: str) -> str:
         raise RuntimeError(f"could not encode the picture {caption!r}")
     encoded = base64.b64encode(data.tobytes()).decode()
     text = escape(caption)
-    return f'<figure><img alt="{text}" src="data:image/jpeg;base64,{encoded}"><figcaption>{text}</figcaption></figure>'
+    enlarge = "this.parentNode.classList.toggle('large')"
+    image = f'<img alt="{text}" title="click: larger" onclick="{enlarge}" src="data:image/jpeg;base64,{encoded}">'
+    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
 
 
 def rendering_table(report: Mapping[str, Any]) -> str:
@@ -136,19 +143,17 @@ def page(
     skipped = {
         f"{node}: {what}": f"{n:,.10g}" for node, s in report.get("skipped", {}).items() for what, n in s.items()
     }
-    warnings = [f"{node}: {text}" for node, text in report.get("nothing", {}).items()]
-    warnings += [f"{node}: {text}" for node, texts in report.get("warnings", {}).items() for text in texts]
-    warnings += report.get("notes", [])
-    origin = [report.get("input"), report.get("date"), report.get("version") and f"MVS-GS {report['version']}"]
+    named = str(report.get("input") or "")
     body = [
-        f"<h1>{escape(title)}</h1>",
-        f"<p>{escape(' · '.join(str(part) for part in origin if part))}</p>",
-        f"<p>{escape(report.get('protocol', ''))}</p>",
-        "".join(f'<p class="warning">{escape(w)}</p>' for w in warnings),
+        f"<h1>{escape(f'{title}: {named}' if named else title)}</h1>",
+        f'<div class="run">{figures_table(in_words(report))}</div>',
+        _settings(report.get("run", {}).get("settings")),
+        "".join(f'<p class="warning">{escape(w)}</p>' for w in sorted_warnings(report)),
         "<h2>Rendering</h2>",
+        f"<p>{escape(report.get('protocol', ''))}</p>",
         rendering_table(report),
         figures_table(worst_figures(report["rendering"])),
-        *(_row(caption, pictures) for caption, pictures in comparisons),
+        *(row(caption, pictures) for caption, pictures in comparisons),
         "<h2>Figures</h2>",
         figures_table(figures),
         *latency_table(report.get("latency", {})),
@@ -156,18 +161,40 @@ def page(
         *(f"<div><b>{escape(name)}</b>{plot}</div>" for name, plot in plots.items()),
         "</div>",
         "<h2>Depth maps of keyframes, filtered</h2>",
-        *(_row(caption, pictures) for caption, pictures in depth_maps),
+        *(row(caption, pictures) for caption, pictures in depth_maps),
         "<h2>Skipped work</h2>",
         figures_table(skipped) if skipped else "<p>nothing</p>",
         "<h2>Peak memory</h2>",
         figures_table(memory),
     ]
-    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+    return document(f"{title} {named}".strip(), body)
+
+
+def document(title: str, body: Sequence[str]) -> str:
+    """A whole page of these parts."""
+    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     head = f"{meta}<title>{escape(title)}</title><style>{_STYLE}</style>"
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
 
 
-def _row(caption: str, pictures: Mapping[str, np.ndarray]) -> str:
+def sorted_warnings(report: Mapping[str, Any]) -> list[str]:
+    """What was warned of, by what it costs: no result at all, then the poses on which all else stands, then the stages
+    after them, then what only watches, of which the map does not depend."""
+    said = {str(node): list(texts) for node, texts in report.get("warnings", {}).items()}
+    last = [node for node in said if node in _WATCHING]
+    order = [node for node in _FIRST if node in said]
+    order += [node for node in said if node not in (*order, *last)]
+    warnings = [f"{node}: {text}" for node, text in report.get("nothing", {}).items()]
+    warnings += [f"{node}: {text}" for node in order for text in said[node]]
+    return warnings + list(report.get("notes", [])) + [f"{node}: {text}" for node in last for text in said[node]]
+
+
+def _settings(text: str | None) -> str:
+    return f"<details><summary>all settings</summary><pre>{escape(text)}</pre></details>" if text else ""
+
+
+def row(caption: str, pictures: Mapping[str, np.ndarray]) -> str:
+    """Pictures (H, W, 3) uint8 RGB beside each other, each with its name."""
     figures = "".join(image_tag(picture, name) for name, picture in pictures.items())
     return f'<b>{escape(caption)}</b><div class="pictures">{figures}</div>'
 

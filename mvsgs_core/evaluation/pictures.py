@@ -65,7 +65,8 @@ def depth_maps(evaluation: Evaluation, count: int = 3) -> list[Row]:
         depth = evaluation.filtered_depth(index)
         assert depth is not None
         size = (max(1, round(depth.shape[0] * 400 / depth.shape[1])), 400)
-        pictures = {"photograph": evaluation.photograph(index), "filtered depth": scoring.colorize_depth(depth)}
+        shown = f"filtered depth{scoring.depth_scale(depth)}"
+        pictures = {"photograph": evaluation.photograph(index), shown: scoring.colorize_depth(depth)}
         kept = 100 * float((depth > 0).mean())
         caption = f"keyframe {index}: {kept:.0f} % of the pixels kept"
         rows.append((caption, {n: resize_image(p, size) for n, p in pictures.items()}))
@@ -82,7 +83,10 @@ def plots(evaluation: Evaluation, stages: Mapping[str, Mapping[str, float]]) -> 
         axes = np.linalg.svd(everything, full_matrices=False)[2][:2] if len(everything) > 1 else np.eye(3)[:2]
         center = next(iter(paths.values())).mean(axis=0)
         series = [svg.Series(name, *((p - center) @ axes.T).T) for name, p in paths.items()]
-        result["Trajectory"] = svg.plot(series, "widest direction", "second", equal=True)
+        unit = "unit of the true poses" if "truth" in paths else "the map's unit, which is arbitrary"
+        result["Trajectory, in the plane of its two widest directions"] = svg.plot(
+            series, f"first direction, {unit}", "second direction", equal=True
+        )
     series, covered, first = [], [], metrics.IMAGE[0]
     for refined, name in ((False, "before refinement"), (True, "after")):
         scores = evaluation.scores.get(refined, [])

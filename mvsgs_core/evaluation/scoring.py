@@ -176,7 +176,7 @@ def comparison(splats: Splats, kernel: str, frame: ScoredFrame, width: int = 400
         "photograph": photograph,
         "render": (color * 255).round().astype(np.uint8),
         "error (x4)": colorize(np.clip(error * 4, 0, 1)),
-        "rendered depth": colorize_depth(depth),
+        f"rendered depth{depth_scale(depth)}": colorize_depth(depth),
     }
     return {name: resize_image(picture, size) for name, picture in pictures.items()}
 
@@ -189,11 +189,23 @@ def colorize(values: np.ndarray) -> np.ndarray:
 
 def colorize_depth(depth: np.ndarray) -> np.ndarray:
     """(H, W) depth, 0 unknown, to (H, W, 3) uint8 by inverse depth: near red, far blue, unknown dark gray."""
-    known = np.isfinite(depth) & (depth > 0)
-    inverse = np.zeros(depth.shape, np.float32)
-    inverse[known] = 1.0 / depth[known]
+    known, inverse, (low, high) = _inverse(depth)
     if known.any():
-        low, high = np.percentile(inverse[known], [1, 99])
         inverse = np.clip((inverse - low) / max(high - low, 1e-12), 0, 1)
     picture = cv2.applyColorMap((inverse * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
     return np.where(known[..., None], picture, np.uint8(40))
+
+
+def depth_scale(depth: np.ndarray) -> str:
+    """What the ends of `colorize_depth` mean for this depth map, in the map's unit; nothing where nothing is known."""
+    known, _, (low, high) = _inverse(depth)
+    return f", {1.0 / high:.3g} (red) to {1.0 / low:.3g} (blue)" if known.any() else ""
+
+
+def _inverse(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Where a depth map is known, its inverse (H, W) there, and the range of that without the outermost percent."""
+    known = np.isfinite(depth) & (depth > 0)
+    inverse = np.zeros(depth.shape, np.float32)
+    inverse[known] = 1.0 / depth[known]
+    low, high = np.percentile(inverse[known], [1, 99]) if known.any() else (0.0, 0.0)
+    return known, inverse, (float(low), float(high))

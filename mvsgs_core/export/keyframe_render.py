@@ -1,0 +1,22 @@
+"""A saved map as one of its keyframes saw it, in the exposure of that photograph."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from mvsgs_core.export.cameras import Cameras
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.rasterizer.rasterize import Render
+
+NEAR = 0.01  # of the splats' median distance: what is nearer to the camera is not drawn
+
+
+def rendered_keyframe(final: Snapshot, cameras: Cameras, k: int) -> tuple[torch.Tensor, Render]:
+    """Keyframe number k, from 0: color (H, W, 3), nominally 0 to 1, and the render in the map's own colors."""
+    pose, (height, width) = cameras.world_from_cam[k], cameras.sizes[k].tolist()
+    distances = np.linalg.norm(final.splats.means.numpy() - final.relative_pose(pose)[:3, 3], axis=1)
+    near = NEAR * float(np.median(distances)) if len(distances) else NEAR
+    render = final.render(pose, cameras.intrinsics[k], (height, width), near=near)
+    affine = torch.from_numpy(cameras.exposures[k]).to(render.color)
+    return render.color @ affine[:, :3].T + affine[:, 3], render

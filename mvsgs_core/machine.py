@@ -1,0 +1,79 @@
+"""What a result was computed on and by: the machine in words, and the version of this program."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+from pathlib import Path
+
+import psutil
+
+from mvsgs_core import native
+
+_ROOT = Path(__file__).resolve().parents[1]
+_GIT_SECONDS = 5.0  # for git to answer
+KERNELS = {"v4": "AVX-512", "v3": "AVX2", "generic": "generic kernels"}
+
+
+def processor() -> str:
+    """In one line: its name, the cores that this process may use, the instructions that the kernels use."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{_model()}, {cores} cores, {KERNELS[native.instruction_sets()[0]]}"
+
+
+def gpus() -> list[str]:
+    """Names of the CUDA devices that PyTorch sees."""
+    import torch  # takes a second to load, and most who ask have it
+
+    return [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+
+
+def described() -> dict[str, str]:
+    """The machine, by what there is to say of it."""
+    import torch
+
+    return {
+        "processor": processor(),
+        "memory": f"{psutil.virtual_memory().total / 1e9:.1f} GB",
+        "GPU": ", ".join(gpus()) or "none",
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "Python, PyTorch": f"{platform.python_version()}, {torch.__version__}",
+    }
+
+
+def version() -> str | None:
+    """Of the installed package, with the commit of a checkout; None where neither is known."""
+    try:
+        number = importlib.metadata.version("mvsgs")
+    except importlib.metadata.PackageNotFoundError:
+        number = ""
+    return " ".join(filter(None, (number, _commit()))) or None
+
+
+def _model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.processor() or "unknown CPU"
+
+
+def _commit() -> str:
+    """Of the checkout that runs, with a plus where its files differ from it; empty where it is none."""
+    if not (_ROOT / ".git").exists():
+        return ""
+    git = ["git", "-C", str(_ROOT)]
+    try:
+        name = subprocess.run(
+            [*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, timeout=_GIT_SECONDS
+        )
+        changed = subprocess.run([*git, "diff", "--quiet", "HEAD"], capture_output=True, timeout=_GIT_SECONDS)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return f"({name.stdout.strip()}{'+' if changed.returncode else ''})" if name.returncode == 0 else ""
+
+
+__all__ = ["KERNELS", "described", "gpus", "processor", "version"]

@@ -1,0 +1,104 @@
+"""What people get wrong is refused before a process starts, in one line that says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from launch.compose import choices_of, compose
+from launch.jobs import Job, refused, run
+from launch.named_input import with_named_input
+from launch.output import Output
+from launch.refusal import GraphError
+from tests.support.dataset_folders import write_image, write_photos, write_tum
+
+CHOICES = choices_of("dataset")
+
+
+@pytest.fixture
+def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What the launcher says of a command line, given in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def refusal(*words: str) -> str:
+        try:
+            graph = compose([*with_named_input(words, CHOICES)])
+            code = run(Job(OmegaConf.create(graph.resolved), [], {"dataset": "x"}, None))
+        except GraphError as error:
+            code = refused(error)
+        errors = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("[")]  # FFmpeg's own
+        assert code == 2
+        assert len(errors) == 1, errors
+        assert errors[0].startswith("error: ")
+        return errors[0]
+
+    return refusal
+
+
+def fill(folder: Path) -> None:
+    """What lies around where a user stands."""
+    (folder / "notes.mp4").write_text("no video")
+    (folder / "empty").mkdir()
+    (folder / "file").touch()
+    write_photos(folder / "photos", 3)
+    write_tum(folder / "walk", 3)
+    for i in range(5):
+        write_image(folder / "mixed" / f"{i}.png", 9, (48, 64) if i < 2 else (64, 48))
+    (folder / "broken").mkdir()
+    (folder / "broken" / "0.jpg").write_bytes(b"nothing")
+
+
+@pytest.mark.parametrize(
+    ("words", "answer"),
+    [
+        (["wolk.mp4"], "there is no such file or folder here"),
+        (["empty"], "empty: is an empty folder"),
+        (["notes.mp4"], "OpenCV cannot open notes.mp4: no video, cut off before its index was written"),
+        (["broken"], "no image could be read"),
+        (["photso"], "(did you mean photos?)"),
+        (["photos/photo1.png"], "one image makes no map; give the folder"),
+        (["walk"], "does not tell which camera took it: set dataset.options.camera to one of freiburg1"),
+        (["dataset=video", "dataset.path=notes.mp4", "dataset.intrinsics=null"], "set dataset.intrinsics=[fx,fy,cx,cy]"),
+        (["mixed"], "3 of 5 images have another shape than the first, 0.png of 64x48: 2.png is 48x64"),
+        (["photos", "output=file"], "output="),
+        (["photos", "mapper.iteration=3"], "has no parameter 'iteration' (did you mean iterations?)"),
+        (["photos", "maper=ges"], "no slot or key 'maper' (did you mean mapper?)"),
+        (["photos", "tracker=droit"], "tracker has no choice 'droit' (did you mean droid?)"),
+        (["photos", "dataset.options.fps=3"], "dataset.options.fps: there is no such key"),
+        (["photos", "dataset.stride=0"], "stride >= 1"),
+        (["photos", "dataset.start=7"], "no frame left: the sequence has 3"),
+        (["photos", "dataset.intrinsics=[1,2,3]"], "intrinsics is [fx, fy, cx, cy] in pixels of the original image"),
+        (["photos", "mapper.iterations=many"], "mapper.iterations=many: must be int"),
+        (["photos", "device=cuda:77"], "device=cuda:77: this machine has"),
+        (["photos", "evaluator=of"], "evaluator has no choice 'of' (did you mean off?)"),
+        (["photos", "video"], "photos and video: one input at a time"),
+        (["photos", "dataset.path=x"], "the input is given twice"),
+        (["77"], "camera 77: /dev/video77 does not exist"),
+        (["photos", "viewer"], "a parameter is written slot.parameter=value"),
+    ],
+)
+def test_it_is_said_in_one_line(words: list[str], answer: str, tmp_path: Path, said: Callable[..., str]) -> None:
+    fill(tmp_path)
+    assert answer in said(*words)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_an_output_in_use_is_refused(tmp_path: Path, said: Callable[..., str]) -> None:
+    fill(tmp_path)
+    held = Output(tmp_path / "out")
+    try:
+        assert "another run" in said("photos", f"output={tmp_path / 'out'}")
+    finally:
+        held.release()
+
+
+def test_a_few_images_of_another_shape_are_left_out_and_no_reason_to_refuse(tmp_path: Path) -> None:
+    from mvsgs_core.datasets import check
+
+    fill(tmp_path)
+    for i in range(5, 10):
+        write_image(tmp_path / "mixed" / f"{i}.png", 9, (48, 64))
+    check("images", path=tmp_path / "mixed")
