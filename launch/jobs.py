@@ -104,7 +104,7 @@ def _run(job: Job) -> int:
 
 def refused(error: GraphError) -> int:
     """Says why nothing runs, in one line; the exit code."""
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    print(f"error: {' '.join(line.strip() for line in str(error).splitlines())}", file=sys.stderr)
     return REFUSED
 
 

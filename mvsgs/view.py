@@ -26,6 +26,7 @@ from mvsgs_core.mapping.preview import as_bytes, covariances
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes.map_page import MapPage, thumbnail
 
+
 class SavedMapView:
     """The page of one saved map. `closed` is set by its button."""
 

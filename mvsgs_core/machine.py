@@ -27,7 +27,9 @@ def gpus() -> list[str]:
     """Names of the CUDA devices that PyTorch sees."""
     import torch  # takes a second to load, and most who ask have it
 
-    return [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+    return (
+        [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+    )
 
 
 def described() -> dict[str, str]:

@@ -61,7 +61,10 @@ def fill(folder: Path) -> None:
         (["photso"], "(did you mean photos?)"),
         (["photos/photo1.png"], "one image makes no map; give the folder"),
         (["walk"], "does not tell which camera took it: set dataset.options.camera to one of freiburg1"),
-        (["dataset=video", "dataset.path=notes.mp4", "dataset.intrinsics=null"], "set dataset.intrinsics=[fx,fy,cx,cy]"),
+        (
+            ["dataset=video", "dataset.path=notes.mp4", "dataset.intrinsics=null"],
+            "set dataset.intrinsics=[fx,fy,cx,cy]",
+        ),
         (["mixed"], "3 of 5 images have another shape than the first, 0.png of 64x48: 2.png is 48x64"),
         (["photos", "output=file"], "output="),
         (["photos", "mapper.iteration=3"], "has no parameter 'iteration' (did you mean iterations?)"),

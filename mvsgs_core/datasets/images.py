@@ -127,8 +127,8 @@ def _check_shapes(images: list[Path]) -> None:
         height, width = shapes[others[0]]
         raise ValueError(
             f"{len(others)} of {len(shapes)} images have another shape than the first, {first.name} of "
-            f"{shape[1]}x{shape[0]}: {others[0].name} is {width}x{height}; one camera's images of one shape make a map: "
-            "put the others into a folder of their own, or turn them"
+            f"{shape[1]}x{shape[0]}: {others[0].name} is {width}x{height}; one camera's images of one shape make "
+            "a map: put the others into a folder of their own, or turn them"
         )
 
 

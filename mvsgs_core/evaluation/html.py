@@ -18,13 +18,15 @@ _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8882; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; margin-bottom: 0; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
-table { border-collapse: collapse; display: block; overflow-x: auto; } td, th { padding: .25rem .8rem; border-bottom: 1px solid var(--line); }
+table { border-collapse: collapse; display: block; overflow-x: auto; }
+td, th { padding: .25rem .8rem; border-bottom: 1px solid var(--line); }
 th { text-align: left; } td { text-align: right; font-variant-numeric: tabular-nums; }
 td:first-child { text-align: left; }
 .pictures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px; margin: 2px 0 14px; }
 .pictures img { width: 100%; display: block; cursor: zoom-in; } figure { margin: 0; }
 .pictures .large { grid-column: 1 / -1; } .large img { cursor: zoom-out; image-rendering: pixelated; }
-.run td { text-align: left; overflow-wrap: anywhere; } pre { overflow-x: auto; background: var(--soft); padding: .6rem; }
+.run td { text-align: left; overflow-wrap: anywhere; }
+pre { overflow-x: auto; background: var(--soft); padding: .6rem; }
 @media (max-width: 700px) { .pictures { grid-template-columns: repeat(2, 1fr); } td, th { padding: .2rem .4rem; } }
 figcaption { font-size: .8rem; opacity: .75; }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 16px; }

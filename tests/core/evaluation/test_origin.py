@@ -24,7 +24,9 @@ def words(folder: Path | None, size: tuple[int, int] | None = None) -> dict[str,
 
 
 def test_command_settings_camera_and_machine_are_there(tmp_path: Path) -> None:
-    (tmp_path / SETTINGS).write_text("# mvsgs dataset=video dataset.path=walk.mp4\noutput: x\nmapper:\n  iterations: 3\n")
+    (tmp_path / SETTINGS).write_text(
+        "# mvsgs dataset=video dataset.path=walk.mp4\noutput: x\nmapper:\n  iterations: 3\n"
+    )
     found = words(tmp_path, (240, 320))
     assert found["command"] == "mvsgs dataset=video dataset.path=walk.mp4"
     assert found["stream"] == "30 frames, mapped at 320x240 pixels"
