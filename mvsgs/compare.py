@@ -43,8 +43,8 @@ def page(outputs: Sequence[Path]) -> str:
 def common_keyframes(cameras: Sequence[Cameras]) -> list[int]:
     """Some that all runs have, spread over the stream."""
     common = sorted(set.intersection(*(set(each.keyframes.tolist()) for each in cameras)))
-    places = np.unique(np.linspace(0, len(common) - 1, SHOWN).round().astype(int)) if common else []
-    return [common[place] for place in places]
+    places = np.linspace(0, len(common) - 1, min(SHOWN, len(common))).round().astype(int)
+    return [common[place] for place in places.tolist()]
 
 
 def render(final: Snapshot, cameras: Cameras, index: int) -> np.ndarray:

@@ -69,7 +69,7 @@ def test_a_model_of_several_cameras_with_equal_file_names(tmp_path: Path) -> Non
 
 
 def test_a_folder_without_images_says_so(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="has no image\n"):
+    with pytest.raises(FileNotFoundError, match="has no image; A folder of images expects: "):
         open_dataset("images", path=tmp_path)
     (tmp_path / "IMG_1.HEIC").touch()
     with pytest.raises(FileNotFoundError, match="only HEIC files: convert them"):
