@@ -80,3 +80,12 @@ def test_eval_shows_what_the_run_reached(runs: list[Path], capsys: pytest.Captur
     (runs[0] / "report.json").unlink()
     assert evaluate([str(runs[0])]) == 1
     assert "no report.json there" in capsys.readouterr().err
+
+
+def test_a_sweep_ends_with_its_runs_side_by_side(runs: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    from launch.run_all import side_by_side  # which puts the path in order
+
+    side_by_side([runs[0]])
+    assert capsys.readouterr().out == ""
+    side_by_side([runs[0], runs[0].parent / "failed", runs[1]])
+    assert "31.25 (+1.25)" in capsys.readouterr().out
