@@ -21,7 +21,7 @@ from mvsgs_core.export.ply import read_ply
 from nodes.map_page import MapPage
 from tests.support.shared_data import ROOT
 from tests.support.tiny_map import SIZE, write_tiny_run
-from tests.test_viewer import free_port, page
+from tests.support.viewer_page import free_port, page
 
 
 @pytest.fixture

@@ -15,24 +15,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import msgpack
 import numpy as np
 import pytest
-import viser
-import zstandard
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
 
 from msgs import Preview, TrackerPhase
 from nodes import handlers, outputs
 from nodes.viewer import Viewer
 from tests.support.shared_data import ROOT
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
+from tests.support.viewer_page import free_port, page
 
 
 @pytest.fixture
@@ -68,19 +58,6 @@ def received(viewer: Viewer) -> str:
     """What a browser gets on connecting, as text to search for names in."""
     viewer.server.flush()
     return page(viewer.url)
-
-
-def page(url: str) -> str:
-    address = url.replace("http", "ws")
-    got = ""
-    with connect(address, subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None) as browser:
-        while "ReplayDone" not in got:
-            frame = browser.recv(timeout=10.0)
-            assert isinstance(frame, bytes)
-            length = int.from_bytes(frame[8:16], "little")  # 8 bytes: size unpacked, 8: packed, then zstd of msgpack
-            metadata = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + length])
-            got += str(msgpack.unpackb(metadata, strict_map_key=False, raw=False))
-    return got
 
 
 def test_reads_previews_and_sends_nothing() -> None:
