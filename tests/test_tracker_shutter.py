@@ -14,7 +14,7 @@ from mvsgs_core.datasets.synthetic import FPS, Synthetic
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.trajectory import Trajectory as CameraTrajectory
 from nodes.posed_tracker import PosedTracker
-from nodes.tracker import Tracker
+from nodes.tracker import Tracker, in_milliseconds
 
 
 def of_type(sent: list[msgs.Message], kind: type) -> list:  # type: ignore[type-arg]
