@@ -49,7 +49,10 @@ def test_only_our_own_names_are_in_site_packages(site: Path) -> None:
 
 def test_the_command_runs_from_there(site: Path, tmp_path: Path) -> None:
     def run(*words: str) -> subprocess.CompletedProcess[str]:
-        start = f"import sys; sys.path.insert(0, {str(site)!r}); from mvsgs.command import main; sys.exit(main())"
+        start = (
+            "import sys; sys.meta_path = [f for f in sys.meta_path if 'editable' not in f.__module__]; "  # the checkout
+            f"sys.path.insert(0, {str(site)!r}); from mvsgs.command import main; sys.exit(main())"
+        )
         return subprocess.run(
             [sys.executable, "-I", "-c", start, *words],
             cwd=tmp_path, capture_output=True, text=True, timeout=200, env={**os.environ, "PYTHONPATH": str(site)},
