@@ -32,7 +32,7 @@ class FrameRecord:
     after: int | None = None  # keyframe after the frame that it was matched with, too
     points_after: bytes = b""
     same_as: int | None = None  # frame that this one did not move against
-    confidence: float = 0.0  # of the reference's points that the pose shows, the fraction that was found there
+    found_percent: int = 0  # of the reference's points that the pose shows, those that were found there
     light: bytes = b""  # what its gray levels say of its exposure, see photometer.py
 
     def follow(
@@ -47,7 +47,7 @@ class FrameRecord:
         self.light = observed(graph, reference, image, matches)
         self.reference, self.same_as = reference, None
         self.after, self.points_after = None, b""
-        self.confidence = confirmed(graph, reference, matches, cam_from_world)
+        self.found_percent = round(100 * confirmed(graph, reference, matches, cam_from_world))  # a small int is shared
         self._stand(graph, matches, cam_from_world)
 
     def follow_both(

@@ -128,7 +128,7 @@ class Tracker:
         record = session.records[newest]
         if record.same_as is not None:
             record = next(r for r in reversed(session.records) if r.index == record.same_as)
-        return NewestPose(*seen, before[0] if before is not None and same_part else None, record.confidence)
+        return NewestPose(*seen, before[0] if before is not None and same_part else None, record.found_percent / 100)
 
     def trajectory(self) -> Trajectory:
         """Every frame's pose and exposure, after `finish`."""

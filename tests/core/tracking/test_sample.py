@@ -92,4 +92,4 @@ def test_a_frame_needs_a_kilobyte() -> None:
         size, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert size / len(records) < 1440, "bytes, 185 of them for its light, 32 its confidence; all matches took 16,800"
+    assert size / len(records) < 1400, "bytes, 185 of them for its light; all matches took 16,800"
