@@ -89,6 +89,7 @@ def test_a_frame_needs_a_kilobyte() -> None:
             record = FrameRecord(n, n / 30.0, TrackingState.TRACKED)
             record.follow(graph, reference, matches, pose, image)
             records.append(record)
+        gc.collect()  # what is no record's
         size, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
