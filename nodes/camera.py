@@ -97,7 +97,7 @@ class Camera(LiveSource):
             native = picture.shape[0], picture.shape[1]
             self._lens, notes = lens_from_option(self.config.intrinsics, self.config.distortion, native)
             self.stats.values[LENS] = lens_values(self._lens)
-            for note in notes:
+            for note in notes + self._framing.notice(native):
                 self.stats.warn(note)
         return self._lens
 

@@ -10,7 +10,7 @@ from typing import Any
 from msgs import End, Frame
 from msgs.codec import CodecError
 from mvsgs_core.camera import resize_image, scale_intrinsics
-from mvsgs_core.datasets.framing import target_size
+from mvsgs_core.datasets.framing import Framing, target_size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource
@@ -107,5 +107,7 @@ class Robot(LiveSource):
         if LENS not in self.stats.values:
             fx, fy, cx, cy = frame.intrinsics.tolist()
             self.stats.values[LENS] = lens_values(Lens((fx, fy, cx, cy), native, guessed=frame.intrinsics_guessed))
+            for note in Framing(self.config.size).notice(native):
+                self.stats.warn(note)
         intrinsics = scale_intrinsics(frame.intrinsics, native, size)
         return replace(frame, image=resize_image(frame.image, size), intrinsics=intrinsics)

@@ -160,6 +160,9 @@ class Ros2Camera(LiveSource):
         if self._lens is None:
             self.stats.count("before_calibration")
         else:
+            if LENS not in self.stats.values:
+                for note in self._framing.notice(self._lens.size):
+                    self.stats.warn(note)
             self.stats.values[LENS] = lens_values(self._lens)
         return self._lens
 

@@ -64,6 +64,7 @@ class Bag(FileReader):
                 lens, notes = lens_from_option(given, self.distortion, _first_size(bag, self._topic))
                 self.warnings += notes
             self._lens = lens
+        self.warnings += self._framing.notice(lens.size)
         if self.start >= self._count:
             raise ValueError(f"no frame left: {self._topic} has {self._count}, wanted from {self.start}")
         self._opening_warnings = len(self.warnings)

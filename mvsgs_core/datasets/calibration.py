@@ -11,19 +11,23 @@ from mvsgs_core.datasets.exif import read_exif_lens
 from mvsgs_core.datasets.files import UnreadableImageError, opened_image, upright_size
 from mvsgs_core.datasets.lens import Lens, guess_lens
 
+FISHEYE = "fisheye"  # first of the distortion: what follows are the four coefficients of OpenCV's fisheye model
+
 
 def lens_from_option(
-    intrinsics: Sequence[float] | str, distortion: Sequence[float], size: tuple[int, int]
+    intrinsics: Sequence[float] | str, distortion: Sequence[float | str], size: tuple[int, int]
 ) -> tuple[Lens, list[str]]:
     """The lens of the option `intrinsics`: [fx, fy, cx, cy] in pixels of the original image (height, width), or "auto".
 
+    distortion: OpenCV's coefficients, "fisheye" before them where they are of that model.
     Returns the lens and warnings: "auto" is a guess and says so, also in `Lens.guessed`. Raises ValueError for anything
     else.
     """
+    coefficients, fisheye = _model(distortion)
     if isinstance(intrinsics, str):
         if intrinsics != "auto":
             raise ValueError(f"intrinsics is null, [fx, fy, cx, cy] or auto, got {intrinsics!r}")
-        lens = replace(guess_lens(size), distortion=tuple(float(v) for v in distortion))
+        lens = replace(guess_lens(size), distortion=coefficients, fisheye=fisheye)
         return lens, [
             f"intrinsics are a guess: {lens.intrinsics[0]:.0f} pixels focal length for {size[1]}x{size[0]} (65 degrees "
             f"across the longer side), {'the given' if lens.distorted else 'no'} distortion; tracker=dense estimates "
@@ -32,11 +36,23 @@ def lens_from_option(
     values = [float(v) for v in intrinsics]
     if len(values) != 4:
         raise ValueError(f"intrinsics is [fx, fy, cx, cy] in pixels of the original image, got {list(intrinsics)}")
-    return Lens((values[0], values[1], values[2], values[3]), size, tuple(float(v) for v in distortion)), []
+    return Lens((values[0], values[1], values[2], values[3]), size, coefficients, fisheye), []
+
+
+def _model(distortion: Sequence[float | str]) -> tuple[tuple[float, ...], bool]:
+    """The coefficients, and whether they are of the fisheye model."""
+    fisheye = bool(distortion) and distortion[0] == FISHEYE
+    numbers = distortion[1:] if fisheye else distortion
+    try:
+        return tuple(float(v) for v in numbers), fisheye
+    except ValueError as error:
+        raise ValueError(
+            f"distortion is [k1, k2, p1, p2(, k3, ...)] or [{FISHEYE}, k1, k2, k3, k4], got {list(distortion)}"
+        ) from error
 
 
 def lens_for_images(
-    intrinsics: Sequence[float] | str, distortion: Sequence[float], images: Iterable[Path]
+    intrinsics: Sequence[float] | str, distortion: Sequence[float | str], images: Iterable[Path]
 ) -> tuple[Lens, list[str]]:
     """`lens_from_option` for the size of the first of `images` whose header can be read.
 
@@ -47,7 +63,8 @@ def lens_for_images(
     lens = read_exif_lens(images[0]) if intrinsics == "auto" else None
     if lens is None or lens.size != size:
         return lens_from_option(intrinsics, distortion, size)
-    return replace(lens, distortion=tuple(float(v) for v in distortion)), [
+    coefficients, fisheye = _model(distortion)
+    return replace(lens, distortion=coefficients, fisheye=fisheye), [
         f"intrinsics are from EXIF: focal length {lens.intrinsics[0]:.0f} pixels for {size[1]}x{size[0]}, good to a "
         f"few percent, distortion {'as given' if len(distortion) else 'unknown'}"
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 from collections.abc import Iterator
@@ -15,9 +16,19 @@ from PIL import Image, ImageOps
 
 from mvsgs_core.bad_file import BadFileError, brief, reading
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".avif", ".heic", ".heif")
+_HEIF = (".heic", ".heif")  # as phones take them
 MAX_PIXELS = 2**27  # of one image: 134 million, more than cameras of 100 million have
-_FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM")  # of these suffixes: Pillow knows 40 more that nobody needs
+_FORMATS = (
+    "JPEG",
+    "PNG",
+    "BMP",
+    "TIFF",
+    "WEBP",
+    "PPM",
+    "AVIF",
+    "HEIF",
+)  # of these suffixes; Pillow knows 40 more
 _ORIENTATION = 0x0112  # EXIF tag
 
 Image.MAX_IMAGE_PIXELS = MAX_PIXELS  # Pillow's own bound, of what it decodes inside of other formats, is the same
@@ -70,6 +81,9 @@ def opened_image(source: Path | BinaryIO, name: str) -> Iterator[Image.Image]:
     try:
         if isinstance(source, Path) and source.exists() and not source.is_file():
             raise UnreadableImageError(f"{name}: is no file")  # a pipe would be waited for
+        if isinstance(source, Path) and source.suffix.lower() in _HEIF:
+            pi_heif = importlib.import_module("pi_heif")  # loads a library, which few need
+            pi_heif.register_heif_opener()
         with Image.open(source, formats=_FORMATS) as image:
             width, height = image.size
             if not 0 < width * height <= MAX_PIXELS:

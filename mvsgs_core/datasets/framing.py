@@ -11,16 +11,17 @@ from mvsgs_core.camera import fit_size, resize_image, scale_intrinsics
 from mvsgs_core.datasets.lens import Lens, Undistortion
 
 Size = tuple[int, int] | Sequence[int] | int | None
+# Pixels of a frame where no size was asked for: robots' cameras (1280x1024) stay as they are; 4K would take hours.
+LARGEST = 1_500_000
 _KEPT = 4  # undistortion maps in memory: most sequences have one camera, some a camera for each image
 
 
 def target_size(size: Size, native: tuple[int, int]) -> tuple[int, int]:
-    """(height, width) to deliver: `size` itself, about `size` pixels at the same aspect if it is one number, native.
-
-    Raises ValueError for a size that is none.
+    """(height, width) to deliver: `size` itself, or at most `size` pixels at the same aspect if it is one number, by
+    default LARGEST. Raises ValueError for a size that is none.
     """
     if size is None:
-        return native
+        return native if native[0] * native[1] <= LARGEST else fit_size(*native, area=LARGEST)
     if isinstance(size, int):
         if size < 64:
             raise ValueError(f"size as one number is a count of pixels, at least 64; got {size}")
@@ -40,7 +41,7 @@ def resize_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 class Framing:
     """Brings every frame of a sequence to one size; the intrinsics follow.
 
-    size: [height, width], a number of pixels at the same aspect, null for as it is.
+    size: [height, width], or a number of pixels at the same aspect; null: as it is, up to LARGEST pixels.
     crop: null zooms in until undistortion leaves no empty pixel; a number keeps the focal length, resizes to `size`
     plus that many pixels on each side and cuts them off. Raises ValueError for a size or crop that is none.
     """
@@ -58,6 +59,16 @@ class Framing:
         if self._size is None and self._crop:  # nothing to resize to, so cropping makes the image smaller
             return native[0] - 2 * self._crop, native[1] - 2 * self._crop
         return target_size(self._size, native)
+
+    def notice(self, native: tuple[int, int]) -> list[str]:
+        """What to say where images of size `native` are made smaller though nobody asked for that."""
+        size = self.size_of(native)
+        if self._size is not None or self._crop or size == native:
+            return []
+        return [
+            f"frames of {native[1]}x{native[0]} are processed at {size[1]}x{size[0]}; another size: dataset.size="
+            f"[height,width], or a number of pixels ({native[0] * native[1]} for as they are)"
+        ]
 
     def image(self, image: np.ndarray, lens: Lens, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, 3) uint8 of a lens's own size -> image at `size`, which has intrinsics (4,)."""

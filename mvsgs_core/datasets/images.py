@@ -22,6 +22,7 @@ from mvsgs_core.datasets.files import (
 )
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model
+from mvsgs_core.datasets.phone_scans import find_record3d, polycam_folders, read_polycam, read_record3d
 from mvsgs_core.datasets.sequence import Found, ImageSequence, Record, same_shape
 from mvsgs_core.datasets.strecha import find_strecha, read_strecha
 from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transforms
@@ -29,10 +30,10 @@ from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transfor
 LAYOUT = Layout(
     "A folder of images",
     "photographs or frames (" + ", ".join(IMAGE_SUFFIXES) + ") in the order of their names, in the folder or in its "
-    "subfolder images/; beside them, if there is one, a COLMAP model (sparse/0), a transforms.json or .camera files",
+    "subfolder images/; beside them, if there is one, a COLMAP model (sparse/0), a transforms.json, .camera files, "
+    "or what Polycam (raw data) or Record3D exported",
     "your own camera; frames of a video: ffmpeg -i video.mp4 -qscale:v 2 images/%05d.jpg (or dataset=video directly)",
 )
-_NOT_READ = (".heic", ".heif")  # images all the same
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
 
 
@@ -42,8 +43,9 @@ class Images(ImageSequence):
     """Images in natural order, undistorted where the distortion is known.
 
     intrinsics: [fx, fy, cx, cy] in pixels of the images, "auto" for EXIF or a guess, null for what is found: a COLMAP
-    model, a transforms.json, Strecha's .camera files, whose poses then are the ground truth, or EXIF headers, in this
-    order; where there is none of them it is the guess of "auto", for the tracker to estimate.
+    model, a transforms.json, Strecha's .camera files, an export of Polycam's or Record3D's, whose poses then are the
+    ground truth, or EXIF headers, in this order; where there is none of them it is the guess of "auto", for the tracker
+    to estimate.
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
@@ -53,7 +55,7 @@ class Images(ImageSequence):
     @staticmethod
     def recognizes(path: Path) -> bool:
         places = [place for place in _places(path) if place.is_dir()]
-        return any(file.suffix.lower() in (*IMAGE_SUFFIXES, *_NOT_READ) for place in places for file in place.iterdir())
+        return any(file.suffix.lower() in IMAGE_SUFFIXES for place in places for file in place.iterdir())
 
     def _find(self) -> Found:
         if self.rate <= 0:
@@ -94,7 +96,8 @@ class Images(ImageSequence):
 
 def _places(folder: Path) -> list[Path]:
     """Where the images may be."""
-    return [folder, *(folder / name for name in _SUBFOLDERS)]
+    polycam = polycam_folders(folder)
+    return [folder, *([polycam[0]] if polycam else []), *(folder / name for name in _SUBFOLDERS)]
 
 
 def _find_images(folder: Path) -> list[Path]:
@@ -104,11 +107,7 @@ def _find_images(folder: Path) -> list[Path]:
             return images
     below = [p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
     if not below:
-        heic = any(p.suffix.lower() in _NOT_READ for p in folder.rglob("*"))
-        hint = (
-            ", only HEIC files: convert them (heif-convert, or the phone's setting `most compatible`)" if heic else ""
-        )
-        raise LAYOUT.missing(f"{folder} has no image{hint}")
+        raise LAYOUT.missing(f"{folder} has no image")
     return sorted(below, key=lambda p: natural_order(p.relative_to(folder).as_posix()))
 
 
@@ -146,6 +145,12 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None) -> M
         strecha = find_strecha(base)
         if strecha is not None:
             return read_strecha(strecha)
+        polycam = polycam_folders(base)
+        if polycam is not None:
+            return read_polycam(polycam[1])
+        record3d = find_record3d(base)
+        if record3d is not None:
+            return read_record3d(record3d)
     if given is not None:
         raise ValueError(f"model {place} is neither a COLMAP model, nor a {NAMES[0]}, nor a folder of .camera files")
     return None

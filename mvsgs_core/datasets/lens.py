@@ -19,7 +19,7 @@ _GUESSED_FIELD_OF_VIEW = math.radians(65.0)  # across the longer side: phones 60
 class Lens:
     """A calibrated camera. Raises ValueError for numbers that no camera has.
 
-    `distortion` is OpenCV's: (k1, k2, p1, p2[, k3[, k4, k5, k6]]), fisheye (k1, k2, k3, k4).
+    `distortion` is OpenCV's: (k1, k2, p1, p2[, k3[, k4, k5, k6[, s1 .. s4[, tx, ty]]]]), fisheye (k1, k2, k3, k4).
     """
 
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels at `size`, (0, 0) is a pixel's center
@@ -32,7 +32,7 @@ class Lens:
         check_intrinsics(np.array(self.intrinsics), self.size)
         if not all(math.isfinite(v) and abs(v) < _LARGEST_COEFFICIENT for v in self.distortion):
             raise ValueError(f"distortion must be finite and of sensible size, got {self.distortion}")
-        allowed = (0, 4) if self.fisheye else (0, 4, 5, 8)
+        allowed = (0, 4) if self.fisheye else (0, 4, 5, 8, 12, 14)
         if len(self.distortion) not in allowed:
             raise ValueError(f"distortion must have {allowed} coefficients, got {len(self.distortion)}")
 

@@ -36,7 +36,8 @@ class Selection:
 class SizedSelection(Selection):
     """Which frames, and how large. Raises ValueError for a size that is none."""
 
-    size: list[int] | int | None = None  # [height, width], or a number of pixels at the same aspect; null: as it is
+    # [height, width], or a number of pixels at the same aspect; null: as it is, up to 1.5 million pixels
+    size: list[int] | int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,4 +51,5 @@ class FileOptions(SizedSelection):
     path: str | Path | None = None  # folder or file
     # [fx, fy, cx, cy] in pixels of the original image; auto: the tracker estimates them; null: the data set's own
     intrinsics: Sequence[float] | str | None = None
-    distortion: Sequence[float] = field(default_factory=list)  # with intrinsics: [k1, k2, p1, p2(, k3)] as in OpenCV
+    # with intrinsics, as in OpenCV: [k1, k2, p1, p2(, k3, ...)], or [fisheye, k1, k2, k3, k4]
+    distortion: Sequence[float | str] = field(default_factory=list)

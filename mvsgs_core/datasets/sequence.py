@@ -157,6 +157,8 @@ class ImageSequence(FileReader, ABC):
                 self._notices.tally("images left out because they have another aspect ratio than the first", example)
                 return None
             self._notices.tally("images scaled to the size of the first", example)
+        if first is None:
+            self.warnings += self._framing.notice(native)
         size = self._framing.size_of(first or native)
         lens = record.lens.at(native)
         try:

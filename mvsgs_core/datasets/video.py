@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 
@@ -33,6 +34,16 @@ _MAX_COUNT = 2**40  # frames: more is no count
 _GAP_FRAMES, _GAP_SHARE = 2, 0.01
 
 
+_WIDE_RANGES = {16: "PQ", 18: "HLG"}  # transfer functions of HDR video, ITU-T H.273
+
+
+@dataclass(frozen=True)
+class _Picture:
+    seconds: float
+    rgb: np.ndarray  # (H, W, 3) uint8, as in the file
+    sharpness: float
+
+
 @dataset
 @dataclass(kw_only=True, eq=False)
 class Video(FileReader):
@@ -40,9 +51,14 @@ class Video(FileReader):
 
     intrinsics: [fx, fy, cx, cy] in pixels of the video's frames, or "auto": 65 degrees across the longer side, for the
     tracker to estimate. A video says nothing of its camera, so null is refused.
-    Frames of another shape than the first are left out and counted, those of another size scaled to it.
+    Frames of another shape than the first are left out and counted, those of another size scaled to it. Video turned by
+    its metadata is upright, and HDR is brought to the range of a photograph, what is brighter than white clipped (both
+    by FFmpeg in OpenCV).
     Raises FileNotFoundError and ValueError, which say what was expected, BadFileError for a file that has no frame.
     """
+
+    # of each `stride` frames the sharpest, not the first: for long hand-held videos; all frames are decoded for it
+    sharpest: bool = False
 
     @staticmethod
     def recognizes(path: Path) -> bool:
@@ -67,7 +83,7 @@ class Video(FileReader):
         self._native = frame.shape[0], frame.shape[1]
         self._count = int(count) if 0 < count < _MAX_COUNT else 0
         self._rate = rate if math.isfinite(rate) and 0 < rate < 1000 else _DEFAULT_RATE
-        self.warnings += notes
+        self.warnings += notes + self._framing.notice(self._native) + _range_notice(self._path)
         if self._count and self.start >= self._count:
             raise ValueError(f"no frame left: {self._path.name} has {self._count}, wanted from {self.start}")
         if self._rate != rate:
@@ -88,6 +104,7 @@ class Video(FileReader):
         self._notices.truncate(self._opening_warnings)  # those of an earlier pass
         capture = self._open()
         number = index = 0
+        group: _Picture | None = None  # the best since the last one that was wanted
         first, last = math.inf, -math.inf  # seconds
         try:
             while self.wanted.stop is None or number < self.wanted.stop:
@@ -99,18 +116,27 @@ class Video(FileReader):
                     seconds = last + 1.0 / self._rate if math.isfinite(last) else number / self._rate
                 first, last = min(first, seconds), seconds
                 offset = number - self.wanted.start
-                if offset >= 0 and offset % self.wanted.step == 0:
-                    item = self._item(index, number, seconds, capture)
-                    if item is not None:
-                        index += 1
-                        yield item
+                if offset >= 0 and offset % self.wanted.step == 0 and group:
+                    yield self._item(index, group)
+                    index, group = index + 1, None
+                if offset >= 0 and (self.sharpest or offset % self.wanted.step == 0):
+                    group = self._better(group, self._picture(number, seconds, capture))
                 number += 1
+            if group:
+                yield self._item(index, group)
+                index += 1
         finally:
             capture.release()
         if index == 0:
             raise BadFileError(f"no frame of {self._path} could be read: " + "; ".join(self.warnings))
 
-    def _item(self, index: int, number: int, seconds: float, capture: cv2.VideoCapture) -> Item | None:
+    def _better(self, best: _Picture | None, other: _Picture | None) -> _Picture | None:
+        if best is None or other is None:
+            return best or other
+        return other if other.sharpness > best.sharpness else best
+
+    def _picture(self, number: int, seconds: float, capture: cv2.VideoCapture) -> _Picture | None:
+        """The frame that was grabbed; None, and counted, where it cannot be used."""
         try:
             decoded, frame = capture.retrieve()
             if not decoded:
@@ -118,13 +144,17 @@ class Video(FileReader):
             native = frame.shape[0], frame.shape[1]
             if not same_shape(native, self._native):
                 raise ValueError(f"{native[1]}x{native[0]} after {self._native[1]}x{self._native[0]}")
-            rgb = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
+            sharpness = _sharpness(frame) if self.sharpest else 0.0
+            return _Picture(seconds, np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)), sharpness)
         except (ValueError, cv2.error) as error:
             what = f"frames of {self._path.name} left out because they could not be decoded"
             self._notices.tally(what, f"frame {number}: {brief(error)}")
             return None
-        image, intrinsics = self._framing.image(rgb, self._lens.at(native), self._framing.size_of(self._native))
-        return Item(index, seconds, image, intrinsics, intrinsics_guessed=self._lens.guessed)
+
+    def _item(self, index: int, picture: _Picture) -> Item:
+        lens = self._lens.at((picture.rgb.shape[0], picture.rgb.shape[1]))
+        image, intrinsics = self._framing.image(picture.rgb, lens, self._framing.size_of(self._native))
+        return Item(index, picture.seconds, image, intrinsics, intrinsics_guessed=self._lens.guessed)
 
     def _judge_end(self, frames: int, seconds: float) -> None:
         """Warns where the file ends after `frames`, the last `seconds` after the first, and promised more than that."""
@@ -149,3 +179,21 @@ class Video(FileReader):
                 "repair it with untrunc), or a codec that OpenCV was built without (ffmpeg -i FILE out.mp4 converts it)"
             )
         return capture
+
+
+def _sharpness(frame: np.ndarray) -> float:
+    """Mean square of the Laplacian, at half the size where it is the motion's blur and not the noise that counts."""
+    gray = cv2.cvtColor(cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY)
+    return float(np.mean(np.square(cv2.Laplacian(gray, cv2.CV_32F))))
+
+
+def _range_notice(path: Path) -> list[str]:
+    """What to say of a video whose range is wider than a photograph's. OpenCV judges one that does not open."""
+    try:
+        with av.open(str(path)) as container:
+            transfer = int(container.streams.video[0].codec_context.color_trc)
+    except (av.FFmpegError, IndexError, OSError, ValueError):
+        return []
+    if transfer not in _WIDE_RANGES:
+        return []
+    return [f"{path.name} is HDR video ({_WIDE_RANGES[transfer]}), mapped to a photograph's range, highlights clipped"]

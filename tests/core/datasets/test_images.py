@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from mvsgs_core.datasets.colmap import lens_of, read_colmap
 from mvsgs_core.geometry import inverse, quaternion_from_rotation, so3_exp
 from tests.support.dataset_folders import POSES, colmap_text, truncate, write_image, write_photos
 
+PHOTO = Path(__file__).parents[2] / "support" / "photo.heic"
 for i in range(4):
     pose = np.eye(4)
     pose[:3, :3] = so3_exp(np.array([0.1 * i, -0.2, 0.3]))
@@ -70,9 +72,6 @@ def test_a_model_of_several_cameras_with_equal_file_names(tmp_path: Path) -> Non
 
 def test_a_folder_without_images_says_so(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="has no image; A folder of images expects: "):
-        open_dataset("images", path=tmp_path)
-    (tmp_path / "IMG_1.HEIC").touch()
-    with pytest.raises(FileNotFoundError, match="only HEIC files: convert them"):
         open_dataset("images", path=tmp_path)
 
 
@@ -281,3 +280,31 @@ def test_truncated_photos(tmp_path: Path) -> None:
     assert any(
         w.startswith("images left out because they could not be read: 2 (first: a.jpg") for w in sequence.warnings
     )
+
+
+def test_photographs_of_phones(tmp_path: Path) -> None:
+    """HEIC, turned by its header: red above blue became red to the right; 26 mm of focal length."""
+    for name in ("IMG_1.HEIC", "IMG_2.heic"):
+        shutil.copy(PHOTO, tmp_path / name)
+    items = list(open_dataset("images", path=tmp_path))
+    assert len(items) == 2
+    image = items[1].image
+    assert image.shape == (64, 48, 3)
+    assert image[:, 30:, 0].min() > 150 > 100 > image[:, 30:, 2].max()
+    assert image[:, :18, 2].min() > 150 > 100 > image[:, :18, 0].max()
+    np.testing.assert_allclose(items[1].intrinsics[0], 26 * np.hypot(64, 48) / np.hypot(36, 24), rtol=1e-6)
+
+
+def test_avif(tmp_path: Path) -> None:
+    Image.fromarray(np.full((48, 64, 3), 90, np.uint8)).save(tmp_path / "a.avif")
+    np.testing.assert_allclose(next(iter(open_dataset("images", path=tmp_path))).image, 90, atol=3)
+
+
+def test_a_fisheye_lens_is_given_in_words(tmp_path: Path) -> None:
+    write_photos(tmp_path, 1)
+    options = {"path": tmp_path, "intrinsics": [30, 30, 31.5, 23.5], "crop": 0}
+    fisheye = open_dataset("images", distortion=["fisheye", 0.1, 0, 0, 0], **options)
+    assert fisheye.lens.fisheye
+    assert fisheye.lens.distortion == (0.1, 0, 0, 0)
+    with pytest.raises(ValueError, match=r"distortion is \[k1, k2, p1, p2\(, k3, \.\.\.\)\] or \[fisheye"):
+        open_dataset("images", distortion=["wide", 0.1, 0, 0, 0], **options)

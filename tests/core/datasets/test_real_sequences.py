@@ -98,7 +98,7 @@ def test_the_color_camera_of_seven_scenes_is_not_the_published_one() -> None:
     [("fox", 25, (1920, 1080)), ("strecha/fountain-P11", 11, (800, 1200)), ("strecha/Herz-Jesus-P8", 8, (800, 1200))],
 )
 def test_photo_sets_with_poses(folder: str, frames: int, shape: tuple[int, int]) -> None:
-    sequence = open_dataset("images", path=shared(f"data/{folder}"), start=0, stop=None)
+    sequence = open_dataset("images", path=shared(f"data/{folder}"), size=list(shape))
     assert len(sequence) == frames
     item = next(iter(sequence))
     assert item.image.shape == (*shape, 3)

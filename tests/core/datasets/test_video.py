@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -150,3 +151,70 @@ def test_a_video_without_its_index_says_what_to_do(tmp_path: Path) -> None:
     truncate(path, 0.5)
     with pytest.raises(BadFileError, match=r"walk\.mp4.*cut off before its index was written"):
         check("video", path=path, intrinsics="auto")
+
+
+def test_hdr_is_mapped_and_said(tmp_path: Path) -> None:
+    """White paper is 75 % of HLG's signal (ITU-R BT.2408), mid gray 38 %; as a photograph's they are 191 and 97."""
+    path = tmp_path / "phone.mov"
+    with av.open(path, "w") as container:
+        stream = container.add_stream("libx265", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p10le"
+        stream.options = {"x265-params": "log-level=none:colorprim=9:transfer=18:colormatrix=9"}
+        gray = np.full((64, 128, 3), int(0.38 * 65535), np.uint16)
+        gray[:, 64:] = int(0.75 * 65535)
+        for _ in range(3):
+            frame = av.VideoFrame.from_ndarray(gray, format="rgb48le")
+            frame = frame.reformat(format="yuv420p10le", dst_colorspace=9)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    sequence = open_dataset("video", path=path, intrinsics=[100, 100, 63.5, 31.5])
+    assert any("HDR video (HLG)" in warning for warning in sequence.warnings)
+    image = next(iter(sequence)).image
+    assert image[:, 80:].min() > 230, "white paper is white"
+    assert 97 < image[:, :48].mean() < 135
+
+
+def test_a_video_turned_by_its_metadata_is_upright(tmp_path: Path) -> None:
+    path = tmp_path / "phone.mp4"
+    with av.open(path, "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        stream.set_display_rotation(90)  # counterclockwise, as players show it
+        picture = np.zeros((64, 96, 3), np.uint8)
+        picture[:, :48, 0] = 255
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+    image = next(iter(open_dataset("video", path=path, intrinsics=[80, 80, 31.5, 47.5]))).image
+    assert image.shape == (96, 64, 3)
+    assert image[60:, :, 0].min() > 200 > 60 > image[:36, :, 0].max(), "what was left is below"
+
+
+def test_the_sharpest_of_each_group(tmp_path: Path) -> None:
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), RATE, (160, 120))
+    sharp = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8).repeat(4, 0).repeat(4, 1)
+    for i in range(11):
+        writer.write(sharp if i in (2, 5, 7, 10) else cv2.GaussianBlur(sharp, None, 3.0))
+    writer.release()
+    sequence = open_dataset("video", path=path, intrinsics="auto", stride=4, sharpest=True)
+    items = list(sequence)
+    assert len(items) == len(sequence) == 3
+    np.testing.assert_allclose([item.timestamp * RATE for item in items], [2, 5, 10], atol=1e-3)
+    assert [item.index for item in items] == [0, 1, 2]
+
+
+def test_4k_is_processed_at_a_size_that_fits(tmp_path: Path) -> None:
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), RATE, (3840, 2160))
+    writer.write(np.zeros((2160, 3840, 3), np.uint8))
+    writer.release()
+    sequence = open_dataset("video", path=path, intrinsics=[3000, 3000, 1919.5, 1079.5])
+    item = next(iter(sequence))
+    height, width = item.image.shape[:2]
+    assert 1.3e6 < height * width <= 1.55e6
+    np.testing.assert_allclose(item.intrinsics[:2], [3000 * width / 3840, 3000 * height / 2160])
+    assert [w for w in sequence.warnings if "3840x2160" in w and "dataset.size=" in w]
+    asked = open_dataset("video", path=path, intrinsics=[3000, 3000, 1919.5, 1079.5], size=3840 * 2160)
+    assert next(iter(asked)).image.shape == (2160, 3840, 3)
+    assert not [w for w in asked.warnings if "3840x2160" in w]
