@@ -1,4 +1,5 @@
-# make demo · make test · make test-quick · make bench · make lint: each sets up what it needs. make setup only installs.
+# make demo · make test · make test-quick · make bench · make lint · make docs: each sets up what it needs; make setup only
+# installs.
 # Everything lands in .venv and build/; once installed, nothing here needs the network.
 
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
@@ -11,11 +12,12 @@ DEMO_OUTPUT ?= runs/demo
 BIN := .venv/bin
 PACKAGES := .venv/.packages
 STAMP := .venv/.installed
+DOCS := build/site/venv
 KERNELS := $(shell find mvsgs_core/csrc -type f 2>/dev/null)
 
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(JOBS)
 
-.PHONY: setup wheel demo test test-quick lint bench bench-quick clean check-system
+.PHONY: setup wheel demo test test-quick suite lint style types bench bench-quick docs clean check-system
 
 setup: $(STAMP)
 
@@ -31,7 +33,7 @@ check-system:
 # PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" spares gigabytes of CUDA packages.
 $(PACKAGES): constraints.txt | check-system
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	@echo "installing packages into .venv (2.6 GB, some minutes)"
+	@echo "installing packages into .venv (4.2 GB, some minutes)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -r constraints.txt
 	@touch $@
 
@@ -56,16 +58,35 @@ demo: setup
 	$(BIN)/python launch/run_all.py dataset=synthetic output=$(DEMO_OUTPUT)
 	@echo "report: file://$(abspath $(DEMO_OUTPUT))/report.html"
 
-test: lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+# Types are checked beside the tests. Three of these at once keep two cores busy, as many wait for processes; one thread
+# each, or they wait for each other.
+test: style
+	@$(MAKE) --no-print-directory -j2 types suite
 
-test-quick: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+suite test-quick: setup
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile $(if $(filter test-quick,$@),-m "not slow")
 
-lint: setup
+lint: style types
+
+style: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: setup
 	$(BIN)/mypy
+
+# A site of the documents and docstrings, by tools of an environment of its own; nothing of it asks for a network.
+docs: $(DOCS)/.installed
+	@$(DOCS)/bin/python docs/site/stage.py
+	@NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build --strict --quiet
+	@echo "site: file://$(CURDIR)/build/site/html/index.html"
+	@echo "with its search: $(DOCS)/bin/python -m http.server --bind 127.0.0.1 --directory build/site/html"
+
+$(DOCS)/.installed: docs/site/constraints.txt
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is missing"; exit 1; }
+	@test -x $(DOCS)/bin/python || $(PYTHON) -m venv $(DOCS)
+	@$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check -r docs/site/constraints.txt
+	@touch $@
 
 # Every module of bench/ that ends with main(measure, ...) is a benchmark. `make bench` takes hours: it runs them all, keeps
 # the rows in bench/recorded/ and writes docs/benchmarks/. `make bench-quick` takes minutes and says what got

@@ -21,6 +21,7 @@ from mvsgs_core import image_metrics
 from mvsgs_core.evaluation import scoring
 from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.fitted_camera import fit_camera
+from mvsgs_core.evaluation.straight import undistortion
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.export.snapshot import Snapshot
@@ -61,8 +62,11 @@ class FinishedRun:
         return sorted(self.psnr, key=lambda index: self.psnr[index])
 
     def photograph(self, index: int) -> np.ndarray:
-        """(H, W, 3) uint8 of a held-out frame."""
-        return self._frames[index].image
+        """(H, W, 3) uint8 of a held-out frame, without the distortion that the tracker found."""
+        frame = self._frames[index]
+        size = frame.image.shape[0], frame.image.shape[1]
+        lens = undistortion(self.trajectory, frame.intrinsics, size)
+        return frame.image if lens is None else lens.image(frame.image)
 
     def render(self, index: int) -> scoring.Rendered:
         """A held-out frame as it was scored."""

@@ -3,35 +3,40 @@
 The tracker: how soon the camera is found, how far its poses and the first half's are from the truth, together, against
 those of one run over both halves; the same with a frozen map, whose frame of reference is the first half's alone. Other
 ways back and other light. Frames of other scenes, each on its own, must be found in no map. Whole runs: held-out frames
-of the second half, rendered from the extended map and from the map of one run over both.
+of the second half, rendered from the extended map and from the map of one run over both, forward, and backward in other
+light. `--resume` takes what an earlier, interrupted call has finished from the output's folder.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import tempfile
+import shutil
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from bench.runs import DATA
+from bench.runs import folder, folder_name
 from bench.table import Row, all_of, at_least, at_most, main
 from bench.tracking.cases import CASES, Case
 from launch.compose import compose
 from launch.inline import run_inline
+from msgs import Frame, GroundTruth
 from mvsgs_core import geometry
 from mvsgs_core.datasets import Item
 from mvsgs_core.kept_map import STREAM, tracker_file
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.known_map import KnownMap, load
 from mvsgs_core.tracking.tracker import Tracker
+from nodes.recorder import Recorder
 
+SMALL = [240, 320]  # height, width of the whole runs' frames
 LOOP = {"frames": 300, "loop": True, "threads": 1}
 DARKER = 0.6  # of the gray levels
 
@@ -69,24 +74,43 @@ def backward(way: Return) -> Return:
     return Return(way.first, numbered(way.second[::-1], way.step))
 
 
-def in_light(way: Return, second: Sequence[Item]) -> Return:
-    return Return(way.first, numbered(second, way.step))
+def darker(way: Return) -> Return:
+    """The second half is dark."""
+    return Return(way.first, [replace(i, image=(DARKER * i.image).astype(np.uint8)) for i in way.second])
 
 
-def returns(quick: bool) -> dict[str, Return]:
-    """By name; those whose data are here."""
-    if quick:
-        return {"room": backward(halves(Case("synthetic", {"frames": 80, "threads": 1}).items()))}
-    found: dict[str, Return] = {}
-    for name, case in {"redkitchen": "redkitchen, color camera 525", "tum_fr1_xyz": "tum_fr1_xyz"}.items():
-        if CASES[case].there:
-            way = halves(CASES[case].items())
-            darker = [replace(i, image=(DARKER * i.image).astype(np.uint8)) for i in way.second]
-            found |= {name: way, f"{name}, backward, darker": backward(in_light(way, darker))}
-    loop = halves(Case("synthetic", LOOP).items())
-    varying = halves(Case("synthetic", {**LOOP, "exposure": 1.0}).items())
-    other = in_light(loop, varying.second)
-    return found | {"room, loop": loop, "room, loop, backward, varying exposure": backward(other)}
+@dataclass(frozen=True)
+class Scene:
+    """The same place twice: the second half as it was, and seen backward in other light."""
+
+    light: str  # what the other light is
+    plain: Case
+    other: Case | None = None  # the frames in other light; None: they are made darker
+
+    def returns(self, name: str, size: Sequence[int] | None = None) -> dict[str, Return]:
+        """By name. size: (height, width) of the frames; None: their own."""
+        way = halves(_of_size(self.plain, size).items())
+        other = (
+            darker(way) if self.other is None else Return(way.first, halves(_of_size(self.other, size).items()).second)
+        )
+        return {name: way, f"{name}, backward, {self.light}": backward(other)}
+
+
+def _of_size(case: Case, size: Sequence[int] | None) -> Case:
+    return case if size is None else replace(case, options={**case.options, "size": list(size)})
+
+
+SCENES = {
+    "redkitchen": Scene("darker", CASES["redkitchen, color camera 525"]),
+    "tum_fr1_xyz": Scene("darker", CASES["tum_fr1_xyz"]),
+    "room, loop": Scene("varying exposure", Case("synthetic", LOOP), Case("synthetic", {**LOOP, "exposure": 1.0})),
+}
+QUICK = {"room": Scene("darker", Case("synthetic", {"frames": 80, "threads": 1}))}
+
+
+def scenes(options: argparse.Namespace) -> dict[str, Scene]:
+    """Those whose data are here."""
+    return QUICK if options.quick else {name: scene for name, scene in SCENES.items() if scene.plain.there}
 
 
 def tracked(items: Sequence[Item], known: KnownMap | None = None, frozen: bool = False) -> tuple[Tracker, int | None]:
@@ -120,10 +144,9 @@ def errors(estimates: np.ndarray, truths: np.ndarray, aligned_by: slice) -> np.n
     return np.asarray(np.linalg.norm(s * estimates @ r.T + t - truths, axis=1))
 
 
-def rows_of_tracking(name: str, way: Return, folder: Path) -> tuple[list[Row], KnownMap]:
-    file, everything = folder / "tracker.npz", slice(None)
-    tracked(way.first)[0].keep_map(file)
-    known = load(file)
+def rows_of_tracking(name: str, way: Return, file: Path) -> list[Row]:
+    """file: the first half's map."""
+    everything, known = slice(None), load(file)
     tracker, found = tracked(way.second, known.renumbered(STREAM))
     estimates, truths, old = positions(tracker, way.second, way.first)
     together = 100.0 * float(np.median(errors(estimates, truths, everything)[old:]))
@@ -148,7 +171,7 @@ def rows_of_tracking(name: str, way: Return, folder: Path) -> tuple[list[Row], K
         Row(f"{name}: frozen: error in the first half's frame, median", float(np.median(off)), "cm"),
         Row(f"{name}: the tracker's half, {len(known.keyframes)} keyframes", 1e-6 * file.stat().st_size, "MB"),
         Row(f"{name}: taking it up", cost, "ms CPU"),
-    ], known
+    ]
 
 
 def false_finds(known: KnownMap, own: Item, strangers: Sequence[Item]) -> int:
@@ -162,94 +185,119 @@ def false_finds(known: KnownMap, own: Item, strangers: Sequence[Item]) -> int:
     return found
 
 
-def rows_of_strangers(known: dict[str, KnownMap], ways: dict[str, Return], wanted: int | None) -> list[Row]:
-    """Every map against the frames of every other scene."""
+def rows_of_strangers(known: dict[str, KnownMap], ways: dict[str, Return]) -> list[Row]:
+    """The map of every scene against the frames of every other one."""
     tried = found = 0
     for name, one in known.items():
-        scene = name.partition(",")[0]
-        others = {n.partition(",")[0]: way for n, way in ways.items() if n.partition(",")[0] != scene}
-        strangers = [item for way in others.values() for item in (*way.first, *way.second)]
-        if not others:
-            strangers = Case("synthetic", {"scene": "aerial", "frames": wanted or 120, "threads": 1}).items()
+        strangers = [item for n, way in ways.items() if n != name for item in (*way.first, *way.second)]
+        if not strangers:
+            strangers = Case("synthetic", {"scene": "aerial", "frames": 60, "threads": 1}).items()
         tried += len(strangers)
         found += false_finds(one, ways[name].first[0], strangers)
     return [at_most(f"{tried:,} frames of other scenes: found in a map all the same", float(found), "", 0.0)]
 
 
-@dataclass(frozen=True)
-class Scene:
-    """For whole runs."""
-
-    words: tuple[str, ...]  # overrides
-    half: int  # frames
-    on_return: tuple[str, ...] = ()  # overrides of the second half's
-    folder: str = ""  # below ../shared/data
-
-    @property
-    def there(self) -> bool:
-        return not self.folder or (DATA / self.folder).is_dir()
+EACH = (
+    "dataset=player", "device=cpu", "evaluator.fitted=false", "evaluator.max_frames=1000", "mapper.checkpoint=0",
+    "screen=off",
+)  # fmt: skip
+QUICKLY = ("mapper.iterations=8",)
 
 
-KITCHEN, TUM = "seven_scenes_redkitchen", "tum_fr1_xyz"
-SCENES = {
-    "redkitchen": Scene(("dataset=seven_scenes", f"dataset.path={DATA / KITCHEN}"), 150, folder=KITCHEN),
-    "tum_fr1_xyz": Scene(("dataset=tum", f"dataset.path={DATA / TUM}"), 80, folder=TUM),
-    "room, loop": Scene(("dataset.options.frames=300", "dataset.options.loop=true"), 150),
-    "room, loop, varying exposure": Scene(
-        ("dataset.options.frames=300", "dataset.options.loop=true"), 150, ("dataset.options.exposure=1.0",)
-    ),
-}
-QUICK = {"room": Scene(("dataset.options.frames=80", "dataset.size=[120,160]", "mapper.iterations=8"), 40)}
-EACH = ("device=cpu", "evaluator.fitted=false", "evaluator.max_frames=1000", "mapper.checkpoint=0", "screen=off")
+def recorded(items: Sequence[Item], file: Path) -> Path:
+    """A stream of them for whole runs, where it is not there yet."""
+    if file.exists():
+        return file
+    aside = file.with_suffix(".part")
+    aside.unlink(missing_ok=True)
+    recorder = Recorder(Recorder.Config(path=str(aside), foxglove=False))
+    for i in items:
+        recorder.on_message(Frame(i.index, i.timestamp, i.image, i.intrinsics, i.intrinsics_guessed, i.exposure))
+        recorder.on_message(GroundTruth(i.index, i.timestamp, i.image, i.intrinsics, i.world_from_cam, i.depth))
+    list(recorder.on_end())
+    return aside.rename(file)
 
 
-def held_out(words: Sequence[str], output: Path, first: int) -> dict[int, float]:
-    """PSNR of a run's held-out frames, by their index from that frame on."""
-    run_inline(compose([*EACH, *words, f"output={output}"]))
-    report: dict[str, Any] = json.loads((output / "report.json").read_text())
+def held_out(words: Sequence[str], output: Path, first: int, resume: bool) -> dict[int, float]:
+    """PSNR of a run's held-out frames, by their index from that frame on; of a run that is there with resume."""
+    file = output / "report.json"
+    if not (resume and file.exists() and json.loads(file.read_text()).get("finished", True)):
+        shutil.rmtree(output, ignore_errors=True)
+        run_inline(compose([*EACH, *words, f"output={output}"]))
+    report: dict[str, Any] = json.loads(file.read_text())
     frames = report["rendering"]["frames"]
     return {frame["index"] - first: frame["psnr"] for frame in frames if frame["held_out"] and frame["index"] >= first}
 
 
-def rows_of_map(name: str, scene: Scene, folder: Path) -> list[Row]:
-    small = ("dataset.size=[240,320]",) if scene.folder else ()
-    words, start, stop = [*scene.words, *small], f"dataset.start={scene.half}", f"dataset.stop={scene.half}"
-    held_out([*words, stop, "keep_map=true"], folder / "first", 0)
-    extended = held_out([*words, start, *scene.on_return, f"map={folder / 'first'}"], folder / "second", 0)
-    rows = []
-    if not scene.on_return:
-        one = held_out(words, folder / "both", scene.half)
-        same = sorted(extended.keys() & one.keys())
-        gain = float(np.mean([extended[k] - one[k] for k in same]))
-        rows = [at_least(f"{name}: held-out PSNR of the second half over that of one run over both", gain, "dB", -0.3)]
+def rows_of_map(name: str, way: Return, first: Path, place: Path, options: argparse.Namespace) -> list[Row]:
+    """first: of the run over the first half, which ways back share; place: of the others."""
+    words = QUICKLY if options.quick else ()
+
+    def of(items: Sequence[Item], output: Path, start: int, *more: str) -> dict[int, float]:
+        stream = recorded(items, output.with_suffix(".mcap"))
+        return held_out([*words, f"dataset.path={stream}", *more], output, start, options.resume)
+
+    of(way.first, first, 0, "keep_map=true")
+    extended = of(way.second, place / "second", 0, f"map={first}")
+    one = of(way.both, place / "both", len(way.first))
+    same = sorted(extended.keys() & one.keys())
+    gain = float(np.mean([extended[k] - one[k] for k in same]))
     mean = float(np.mean(list(extended.values())))
-    size = sum(f.stat().st_size for f in tracker_file(folder / "second").parent.rglob("*") if f.is_file())
+    size = sum(f.stat().st_size for f in tracker_file(place / "second").parent.rglob("*") if f.is_file())
     return [
         Row(f"{name}: held-out PSNR of the second half, extended map", mean, "dB"),
-        *rows,
+        at_least(f"{name}: held-out PSNR of the second half over that of one run over both", gain, "dB", -0.3),
         Row(f"{name}: the extended map as it is kept", 1e-6 * size, "MB"),
     ]
 
 
+def kept(file: Path, resume: bool, made: Callable[[], list[Row]]) -> list[Row]:
+    """Rows that an earlier call left in a file, or that are measured now and left there."""
+    if resume and file.exists():
+        return [Row(**row) for row in json.loads(file.read_text())]
+    rows = made()
+    file.write_text(json.dumps([asdict(row) for row in rows]))
+    return rows
+
+
+def mapped(options: argparse.Namespace) -> dict[str, Scene]:
+    """Those of which there are whole runs."""
+    there = scenes(options)
+    wanted = list(there) if options.maps is None else options.maps.split(";")
+    if unknown := sorted(set(wanted) - there.keys()):
+        raise SystemExit(f"no scene {'; '.join(unknown)} here; there are: {'; '.join(there)}")
+    return {name: there[name] for name in wanted} if options.part != "tracker" else {}
+
+
+def parts(options: argparse.Namespace, place: Path) -> Iterator[list[Row]]:
+    known: dict[str, KnownMap] = {}
+    plain: dict[str, Return] = {}
+    for scene, given in scenes(options).items():
+        ways, file = given.returns(scene), place / f"{folder_name(scene)}.npz"
+        if not (options.resume and file.exists()):
+            tracked(ways[scene].first)[0].keep_map(file)
+        for name, way in ways.items():
+            measured = partial(rows_of_tracking, name, way, file)
+            yield kept(place / f"{folder_name(name)}.json", options.resume, measured)
+        known[scene], plain[scene] = load(file), ways[scene]
+    yield kept(place / "strangers.json", options.resume, partial(rows_of_strangers, known, plain))
+    for scene, given in mapped(options).items():
+        for name, way in given.returns(scene, [120, 160] if options.quick else SMALL).items():
+            runs = place / folder_name(name)
+            runs.mkdir(exist_ok=True)
+            yield rows_of_map(name, way, place / f"{folder_name(scene)}-first", runs, options)
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
-    rows: list[Row] = []
-    ways, known = returns(options.quick), {}
-    for name, way in ways.items():
-        with tempfile.TemporaryDirectory() as folder:
-            found, known[name] = rows_of_tracking(name, way, Path(folder))
-            rows += found
-    rows += rows_of_strangers(known, ways, 60 if options.quick else None)
-    if options.part != "tracker":
-        for name, scene in (QUICK if options.quick else SCENES).items():
-            if scene.there:
-                with tempfile.TemporaryDirectory() as folder:
-                    rows += rows_of_map(name, scene, Path(folder))
-    return rows
+    return [row for rows in parts(options, folder(options, "known_map")) for row in rows]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--part", choices=("all", "tracker"), default="all", help="tracker: no whole runs")
+    parser.add_argument("--maps", help="scenes of which there are whole runs, separated by semicolons; default: all")
+    parser.add_argument("--resume", action="store_true", help="what is in the folder already is not measured again")
+    parser.add_argument("--output", type=Path, help="folder of the runs; default: runs/bench/known_map")
 
 
 if __name__ == "__main__":

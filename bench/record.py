@@ -1,4 +1,4 @@
-"""Records a benchmark's rows, and writes what is read of them: docs/benchmarks/ and the figures of BENCHMARKS.md.
+"""Records a benchmark's rows, and writes what is read of them: docs/benchmarks/, BENCHMARKS.md's figures, README's.
 
     python -m bench.record NAME FILE.json [FILE.json ...] [--from FOLDER] [--command TEXT] [--note TEXT]
     python -m bench.record                    only writes the documents anew from what is recorded
@@ -30,6 +30,7 @@ from bench.runs import ROOT, commit, machine
 RECORDED = ROOT / "bench" / "recorded"
 PAGES = ROOT / "docs" / "benchmarks"
 DOCUMENT = ROOT / "BENCHMARKS.md"
+README = ROOT / "README.md"
 _UNSET = {"unit": "", "goal": "", "met": None, "spread": None}  # of a row; not written
 _BLOCK = re.compile(r"(<!-- bench:([\w/.-]+) -->\n).*?(<!-- /bench:\2 -->)", re.DOTALL)
 
@@ -107,8 +108,8 @@ def render(text: str, folder: Path = RECORDED) -> str:
 
     def block(match: re.Match[str]) -> str:
         name = match[2]
-        if name == "figures":
-            body = figures.markdown(lambda of: Record.load(of, folder).rows)
+        if name in ("figures", "first"):
+            body = figures.markdown(lambda of: Record.load(of, folder).rows, first=name == "first")
         elif (folder / f"{name}.json").exists():
             body = Record.load(name, folder).markdown()
         else:
@@ -119,7 +120,7 @@ def render(text: str, folder: Path = RECORDED) -> str:
 
 
 def documents() -> list[Path]:
-    return [DOCUMENT, *sorted(PAGES.glob("*.md"))]
+    return [README, DOCUMENT, *sorted(PAGES.glob("*.md"))]
 
 
 def read_rows(files: Iterable[Path]) -> list[list[dict[str, Any]]]:

@@ -4,15 +4,20 @@ Both know nothing of the lens but a focal length of 65 degrees across the longer
 two coefficients of distortion; both run on one thread. All photographs are used, none is held out. COLMAP matches all
 pairs. Position error: root mean square of the distance to COLMAP's positions after alignment by a similarity, over
 photographs that both have, in percent of the path from photograph to photograph in the order of their names.
+
+What was measured of a scene is kept in runs/bench/wide: with --resume the same command measures only the scenes that
+are missing there, and --minutes ends it early, so that all can be measured at several times. Ours and COLMAP's are
+always of the same time.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
@@ -20,9 +25,10 @@ import numpy as np
 
 from bench.baselines.colmap_poses import Model as ColmapModel
 from bench.baselines.colmap_poses import reconstruct
-from bench.runs import DATA
+from bench.runs import DATA, commit, folder
 from bench.table import Row, at_most, main
 from mvsgs_core import geometry
+from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.photographs.reconstruction import Model
 from mvsgs_core.photographs.structure import Photographs
@@ -127,26 +133,58 @@ def beside(name: str, items: Sequence[Item], ours: Solved, theirs: ColmapModel |
     return rows
 
 
+def scene(name: str) -> list[Row]:
+    """Ours in the order of the names and shuffled, and COLMAP's."""
+    items = photographs(name)
+    ours = solve(items)
+    order = np.random.default_rng(0).permutation(len(items))
+    rows = rows_of(name, items, ours, solve([items[n] for n in order]), order)
+    with tempfile.TemporaryDirectory() as place:
+        frames = {n: item.image for n, item in enumerate(items)}
+        theirs, why = reconstruct(frames, items[0].intrinsics, Path(place), 1, photographs=True)
+    return rows + beside(name, items, ours, theirs, why)
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
     scenes = options.scenes.split(",") if options.scenes else list(QUICK if options.quick else NAMES)
     unknown = set(scenes) - set(NAMES)
     if unknown:
         raise SystemExit(f"--scenes {','.join(sorted(unknown))}: there are {','.join(NAMES)}")
-    rows: list[Row] = []
+    return in_pieces(scenes, folder(options, "wide"), options.resume, options.minutes, scene)
+
+
+def in_pieces(
+    scenes: Sequence[str], output: Path, resume: bool, minutes: float | None, measured: Callable[[str], list[Row]]
+) -> list[Row]:
+    """The rows of all scenes, of which those of another time are read where `resume`; each is kept as it ends.
+
+    minutes: no scene is begun after; None: all are.
+    """
+    start, rows, commits, missing = time.monotonic(), [], set(), []
     for name in scenes:
-        items = photographs(name)
-        ours = solve(items)
-        order = np.random.default_rng(0).permutation(len(items))
-        rows += rows_of(name, items, ours, solve([items[n] for n in order]), order)
-        with tempfile.TemporaryDirectory() as folder:
-            frames = {n: item.image for n, item in enumerate(items)}
-            theirs, why = reconstruct(frames, items[0].intrinsics, Path(folder), 1, photographs=True)
-        rows += beside(name, items, ours, theirs, why)
+        file = output / f"{name}.json"
+        if not (resume and file.exists()):
+            if minutes is not None and time.monotonic() - start > 60.0 * minutes:
+                missing.append(name)
+                continue
+            found = {"commit": commit(), "rows": [asdict(row) for row in measured(name)]}
+            output.mkdir(parents=True, exist_ok=True)
+            replace_text(file, json.dumps(found, indent=1))
+        kept = json.loads(file.read_text())
+        commits.add(kept["commit"])
+        rows += [Row(**row) for row in kept["rows"]]
+    if len(commits) > 1:
+        rows.append(Row("scenes of the commits", ", ".join(sorted(commits))))
+    if missing:
+        rows.append(Row("not measured yet (--resume goes on with them)", ", ".join(missing)))
     return rows
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", help="those to measure, by commas; all, or the two smallest with --quick")
+    parser.add_argument("--output", type=Path, help="folder of what was measured; default: in runs")
+    parser.add_argument("--resume", action="store_true", help="keep the scenes that an earlier call measured")
+    parser.add_argument("--minutes", type=float, help="begin no scene after; --resume goes on")
 
 
 if __name__ == "__main__":

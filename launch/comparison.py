@@ -9,7 +9,7 @@ from typing import Any
 
 from launch.output import REPORT, read_report
 from mvsgs_core.evaluation import metrics
-from mvsgs_core.evaluation.metrics import Metric
+from mvsgs_core.evaluation.metrics import Figure
 
 PARTS = {  # where it is in the report -> how it is called
     **{f"rendering.held_out.{m.key}": f"held-out {m.label}" for m in metrics.IMAGE},
@@ -35,17 +35,31 @@ def names(outputs: Sequence[Path]) -> list[str]:
     return [path.relative_to(common).as_posix() if path != common else path.name for path in paths]
 
 
-def compared(outputs: Sequence[Path]) -> list[list[str]]:
-    """A table, its first row the heading: what is compared, then each run's figure, after the first with what it has
-    more; figures that no run has are left out. Raises ValueError for a folder without a finished report."""
-    reports = [finished_report(output) for output in outputs]
-    rows = [["", *names(outputs)]]
+def figures(reports: Sequence[Mapping[str, Any]]) -> list[Figure]:
+    """Those that any of the runs has."""
+    found = []
     for place, name in PARTS.items():
         values = [_number(report, place) for report in reports]
         if any(value is not None for value in values):
             metric = metrics.at(place)
-            rows.append([f"{name}, {metric.unit}".removesuffix(", "), *_cells(metric, values)])
-    return rows
+            found.append(Figure(f"{name}, {metric.unit}".removesuffix(", "), metric, values))
+    return found
+
+
+def compared(outputs: Sequence[Path]) -> list[list[str]]:
+    """A table, its first row the heading: what is compared, then each run's figure, after the first with what it has
+    more; figures that no run has are left out. Raises ValueError for a folder without a finished report."""
+    rows = [[figure.name, *figure.cells()] for figure in figures([finished_report(output) for output in outputs])]
+    return [["", *names(outputs)], *rows]
+
+
+def comparison_page(outputs: Sequence[Path]) -> str:
+    """The same as HTML, with renders of the same keyframes. Raises ValueError and OSError."""
+    from mvsgs_core.evaluation.side_by_side import Run, page  # it renders, which the launcher else does not
+
+    reports = [finished_report(output) for output in outputs]
+    runs = [Run(name, output, report) for name, output, report in zip(names(outputs), outputs, reports)]
+    return page(runs, figures(reports))
 
 
 def comparison_text(outputs: Sequence[Path]) -> str:
@@ -75,15 +89,6 @@ def finished_report(output: Path) -> dict[str, Any]:
     if not report.get("finished", True) or "rendering" not in report:
         raise ValueError(f"{output}: that run has no figures: {report.get('reason') or 'no evaluator scored it'}")
     return report
-
-
-def _cells(metric: Metric, values: Sequence[float | None]) -> list[str]:
-    first = values[0]
-    cells = [metric.text(first, unit=False)]
-    for value in values[1:]:
-        more = "" if value is None or first is None else f" ({metric.factor * (value - first):+,.{metric.digits}f})"
-        cells.append(metric.text(value, unit=False) + more)
-    return cells
 
 
 def _number(report: Mapping[str, Any], place: str) -> float | None:

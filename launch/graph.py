@@ -16,6 +16,8 @@ import msgs
 import nodes
 from launch.refusal import GraphError
 from launch.renamed_parameters import refuse_old_names
+from launch.requests import MESSAGES as REQUESTS
+from launch.requests import asker
 from launch.settings import BUFFER, FROM_SETTINGS, LIVE_BUFFER, Settings
 from mvsgs_core.named_modules import import_named
 from nodes.parameters import ParameterError, build, did_you_mean, parameter_names, plain_values
@@ -123,8 +125,17 @@ def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) ->
     for name, section in sections.items():
         if section.get("_target_") is not None:
             slots[name] = _build_slot(name, section, replaced.get(name), settings, device)
+    asking, unanswered = asker(
+        {name: slot.reads for name, slot in slots.items()},
+        {name: _outputs(name, slot.node) for name, slot in slots.items()},
+    )
+    if asking is None:
+        slots = {name: _without_requests(slot) for name, slot in slots.items()}
     edges, warnings = connect(slots, list(sections))
     names = order(slots, edges)
+    warnings += unanswered
+    if asking is not None:  # against the stream: nobody waits for a request
+        edges += [Edge(msgs.Request, asking, name, False) for name in names if nodes.is_source(slots[name].node)]
     resolved: dict[str, Any] = plain_values(settings)
     resolved |= {name: _section(slots[name]) if name in slots else {"_target_": None} for name in sections}
     graph = Graph({name: slots[name] for name in names}, edges, settings, resolved, warnings)
@@ -258,7 +269,8 @@ def connect(slots: Mapping[str, Slot], known: Collection[str]) -> tuple[list[Edg
                     f"{name}.reads.{message.__name__}: {slot.target} does not take a {message.__name__}; "
                     f"it takes: {_names(inputs)}"
                 )
-        for message in [m for m in inputs if m in slot.reads or m not in nodes.free_inputs(slot.node)]:
+        free = nodes.free_inputs(slot.node) | REQUESTS
+        for message in [m for m in inputs if m in slot.reads or m not in free]:
             senders = ", ".join(other for other, types in sends.items() if message in types)
             hint = f"set {name}.reads.{message.__name__} to one that does: {senders}" if senders else "no slot does"
             refusal = f"{name}: nobody sends {slot.target} a {message.__name__}"
@@ -310,7 +322,7 @@ def order(slots: Collection[str], edges: Collection[Edge]) -> list[str]:
 def _check_observers(graph: Graph) -> None:
     """Nothing that makes the map may depend on an observer."""
     for edge in graph.edges:
-        if edge.sender in graph.observers and edge.reader not in graph.observers:
+        if edge.sender in graph.observers and edge.reader not in (*graph.observers, *graph.sources):
             raise GraphError(
                 f"{edge.reader} reads {edge.message.__name__} from {edge.sender}, which may fail alone: set "
                 f"{edge.sender}.observer=false, or {edge.reader}.observer=true"
@@ -336,9 +348,15 @@ def _handlers(name: str, node: type[nodes.Node]) -> dict[type, str]:
         raise GraphError(f"{name}: {error}") from error
 
 
+def _without_requests(slot: Slot) -> Slot:
+    """Where nobody asks anything."""
+    return replace(slot, reads={message: sender for message, sender in slot.reads.items() if message not in REQUESTS})
+
+
 def _outputs(name: str, node: type[nodes.Node]) -> tuple[type, ...]:
+    """What it yields; a source's process sends requests on as well."""
     try:
-        return nodes.outputs(node)
+        return (*nodes.outputs(node), msgs.Request) if nodes.is_source(node) else nodes.outputs(node)
     except TypeError as error:
         raise GraphError(f"{name}: {error}") from error
 

@@ -1,10 +1,14 @@
-"""The same nodes in one process: depth first, so deterministic; no process, no socket. For debuggers and tests."""
+"""The same nodes in one process: depth first, so deterministic; no process, no socket.
+
+For debuggers, for tests, and for programs that map by themselves (mvsgs/mapping.py).
+"""
 
 from __future__ import annotations
 
 import random
 import resource
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -13,8 +17,10 @@ import numpy as np
 import nodes
 from launch.graph import Graph
 from msgs import End, Message
+from nodes.runtime.requests import Pause
 from nodes.runtime.runner import Runner, end_of
 
+POLL = 0.05  # s between two looks at what is asked, while the stream waits
 Observer = Callable[[str, nodes.Node, Any], None]
 
 
@@ -26,46 +32,76 @@ def run_inline(graph: Graph, observe: Observer | None = None) -> dict[str, nodes
     every node's `on_abort`.
     """
     _seed(graph.settings.seed)
-    run = _Inline(graph, observe or (lambda slot, node, message: None))
+    run = InlineGraph(graph, observe)
     try:
-        return run.run()
+        run.run_sources()
+        run.end()
     except BaseException as error:
         run.abort(f"{type(error).__name__}: {error}")
         raise
+    return run.nodes
 
 
-class _Inline:
-    def __init__(self, graph: Graph, observe: Observer) -> None:
+class InlineGraph:
+    """A graph whose nodes were made, and wait: `run_sources` as often as a source has something new, then `end`."""
+
+    def __init__(self, graph: Graph, observe: Observer | None = None) -> None:
+        """observe(slot, node, message) sees every message sent."""
         self._graph = graph
-        self._observe = observe
+        self._observe = observe or (lambda slot, node, message: None)
         self._runners = {name: Runner(name, slot.node(slot.parameters)) for name, slot in graph.slots.items()}
+        self._pauses = {name: Pause(self._runners[name].node) for name in graph.sources}
+        self._asked: dict[str, list[Any]] = {}  # of each source, on its way there
 
-    def run(self) -> dict[str, nodes.Node]:
+    @property
+    def nodes(self) -> dict[str, nodes.Node]:
+        """By slot."""
+        return {name: runner.node for name, runner in self._runners.items()}
+
+    def run_sources(self) -> None:
+        """Takes what the sources have and does all that comes of it."""
         sources: dict[str, Iterator[Message]] = {name: self._runners[name].source() for name in self._graph.sources}
         while sources:  # two sources take turns, as two processes would
             for name, messages in list(sources.items()):
+                pause = self._pauses[name]
+                self._ask(name, pause)
+                if pause.waits:
+                    time.sleep(POLL)
+                    continue
                 message = next(messages, None)
                 if message is None:
                     del sources[name]
-                else:
+                elif not pause.leaves_out(message):
                     self._send(name, [message])
+
+    def end(self) -> None:
+        """The stream is over: every node finishes its work."""
         for name, runner in self._runners.items():  # senders come before their readers
             self._send(name, runner.end())
             end = self._end(name, runner)
-            for reader in dict.fromkeys(edge.reader for edge in self._graph.out_of(name)):
+            for reader in dict.fromkeys(e.reader for e in self._graph.out_of(name) if e.reader not in self._pauses):
                 list(self._runners[reader].handle(end))
-        return {name: runner.node for name, runner in self._runners.items()}
 
     def abort(self, reason: str) -> None:
         """Lets every node save what it has."""
         for runner in self._runners.values():
             runner.node.on_abort(reason)
 
+    def _ask(self, source: str, pause: Pause) -> None:
+        """What came for a source since its last message goes out, and who asks may ask for more."""
+        for asking in {edge.sender for edge in self._graph.into(source)}:
+            self._send(asking, self._runners[asking].idle() or ())
+        for request in self._asked.pop(source, []):
+            pause.note(request)
+            self._send(source, [request])
+
     def _send(self, sender: str, messages: Iterable[Message]) -> None:
         for message in messages:
             self._observe(sender, self._runners[sender].node, message)
             for edge in self._graph.out_of(sender):
-                if edge.message is type(message):
+                if edge.message is type(message) and edge.reader in self._pauses:  # in its place among the frames
+                    self._asked.setdefault(edge.reader, []).append(message)
+                elif edge.message is type(message):
                     self._receive(edge.reader, message)
 
     def _receive(self, name: str, message: Message) -> None:

@@ -43,7 +43,7 @@ def with_named_input(words: Sequence[str], choices: Sequence[str]) -> list[str]:
     if f"{SLOT}.path" in keys:
         raise GraphError(f"{word}: the input is given twice, by {SLOT}.path, too")
     if SLOT in keys:
-        meant = [f"{SLOT}.path={_quoted(word)}"]
+        meant = [f"{SLOT}.path={quoted(word)}"]
     else:
         meant = _meaning(word, choices)
     return [*words[:place], *meant, *words[place + 1 :]]
@@ -125,10 +125,10 @@ def _any(path: Path) -> bool:
 
 
 def _overrides(choice: str, word: str) -> list[str]:
-    return [f"{SLOT}={choice}", f"{SLOT}.path={_quoted(word)}"]
+    return [f"{SLOT}={choice}", f"{SLOT}.path={quoted(word)}"]
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
     """Any text as a value of Hydra's grammar, in which nothing is an interpolation; in quotes unless it is plain."""
     if re.fullmatch(r"[A-Za-z_./][\w./-]*[./][\w./-]*", text, re.ASCII):
         return text

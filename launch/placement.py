@@ -17,7 +17,9 @@ LAST = ("evaluator",)
 # The heaviest slot takes most of a whole run's CPU time (the mapper 76 to 94 % of it, measured on the synthetic room
 # and on TUM's freiburg1_xyz): the others often wait for it, and it goes on when they have finished.
 HEAVIEST_SHARE = 0.75
-BEHIND_THE_POSE, WATCHING = 5, 10  # niceness in real time, of what comes after the tracker and of who only looks
+# Niceness in real time, for each stage that stands between a node and the frames, and of who only looks: a level is a
+# tenth of the time of a core that two share, so that stereo is hardly slowed by a mapper that fills what is left.
+STEP, WATCHING = 4, 15
 
 
 def available_cores() -> int:
@@ -53,11 +55,17 @@ def niceness(graph: Graph, name: str) -> int:
     """By how much a node gives way to others. In real time whoever stands nearer to the camera goes first."""
     if not graph.settings.realtime:
         return 0
-    newest_only = all(edge.best_effort for edge in graph.into(name))
-    if name in graph.observers:
-        return WATCHING if newest_only else BEHIND_THE_POSE  # what reads every message must not fall far behind
-    near = {*graph.sources, *(edge.reader for edge in graph.edges if edge.message is msgs.Frame)}
-    return 0 if name in near else BEHIND_THE_POSE
+    if any(edge.message is msgs.CameraPose for edge in graph.into(name)):
+        return STEP  # a robot waits for what it sends
+    if name in graph.observers and all(edge.best_effort for edge in graph.into(name)):
+        return WATCHING
+    away: dict[str, int] = {}
+    for slot in graph.slots:  # senders come first
+        frames = any(edge.message is msgs.Frame for edge in graph.into(slot))
+        senders = [away[edge.sender] + 1 for edge in graph.into(slot) if edge.sender in away]
+        away[slot] = 0 if frames or not senders else max(senders)
+    # who reads every message and only looks must not fall far behind: no further than the last stage
+    return STEP * min(away[name], max(n for slot, n in away.items() if slot not in graph.observers))
 
 
 def thread_environment(threads: int) -> dict[str, str]:

@@ -28,8 +28,9 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from launch.advice import advised
 from launch.children import python_environment
-from launch.comparison import comparison_text, has_figures
+from launch.comparison import comparison_page, comparison_text, has_figures
 from launch.compose import CONF, choices_of, graph_of, prepare
 from launch.graph_text import graph_text
 from launch.help_text import help_text
@@ -38,7 +39,10 @@ from launch.named_input import SLOT, with_named_input
 from launch.refusal import GraphError
 from launch.resume import WORD as RESUME
 from launch.resume import leave_out_refused, resumed_config
+from launch.sweep import swept
+from mvsgs_core.atomic_file import replace_text
 
+COMPARISON = "comparison.html"  # of a sweep
 GRAPH = "--graph"
 SHOWN = (GRAPH, "--help", "-h")  # --cfg, --info and --hydra-help are Hydra's own
 
@@ -54,27 +58,34 @@ def main(arguments: Sequence[str]) -> int:
         return refused(error)
     os.environ |= python_environment()  # Hydra's launchers start workers that need the workspace too
     codes: list[int] = []
-    swept: list[Path] = []
 
     @hydra.main(version_base="1.3", config_path="conf", config_name="config")
     def job(config: DictConfig) -> None:
         one = Job.of(config, HydraConfig.get())
-        if one.number is not None and shown is None:
-            swept.append(Path(one.config.output))
+        one, notes = advised(one)
+        for note in notes:
+            print(f"note: {note}", flush=True)
         codes.append(run(one) if shown is None else show(one, shown))
 
     try:
         job()
     finally:  # also where a job of a sweep has failed: Hydra exits then
-        side_by_side(swept)
+        side_by_side(swept() if shown is None else [])
     return codes[-1] if codes else 0
 
 
 def side_by_side(outputs: Sequence[Path]) -> None:
-    """At the end of a sweep: those of its runs that have figures."""
+    """At the end of a sweep: those of its runs that have figures, here and as a page in the folder of the sweep."""
     scored = [output for output in outputs if has_figures(output)]
-    if len(scored) > 1:
-        print(f"\n{comparison_text(scored)}", flush=True)
+    if len(scored) < 2:
+        return
+    print(f"\n{comparison_text(scored)}", flush=True)
+    file = Path(os.path.commonpath([output.absolute() for output in scored])) / COMPARISON
+    try:
+        replace_text(file, comparison_page(scored))
+        print(f"{file}: the same with pictures", flush=True)
+    except (ValueError, OSError) as error:
+        print(f"{file} could not be written: {error}", flush=True)
 
 
 def show(job: Job, shown: str) -> int:

@@ -13,7 +13,9 @@ class Supervise:
     """What the launcher does about a node that it no longer hears of."""
 
     silent: float = 10.0  # seconds until it is named
-    dead: float = 60.0  # seconds until the run ends without it, or goes on without it where it only observes
+    # seconds until the run ends without it, or goes on without it where it only observes; so long a stage that was
+    # started by hand, on another host, is waited for once it is lost
+    dead: float = 60.0
 
 
 @dataclass(frozen=True)

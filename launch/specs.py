@@ -60,14 +60,17 @@ def spec(
     """The JSON that `python -m nodes` runs a node from."""
     slot = graph.slots[name]
     settings = graph.settings
+    away = settings.supervise.dead
     own_threads = {"threads": threads} if "threads" in slot.config else {}  # a node's kernels keep to its share too
     outputs: dict[str, dict[str, Any]] = {}
     for edge in graph.out_of(name):
         kind = edge.message.__name__
         output = outputs.setdefault(
-            kind, {"type": kind, "address": address[topic_of(edge)], "readers": 0, "observers": []}
+            kind, {"type": kind, "address": address[topic_of(edge)], "readers": 0, "observers": [], "away": 0.0}
         )
-        if edge.reader in graph.observers:
+        if returns(graph, edge.reader) and not edge.best_effort:
+            output["away"] = away
+        if edge.reader in graph.observers or edge.reader in graph.sources:  # a source that has ended is not missed
             output["observers"].append(edge.reader)
         else:
             output["readers"] += 1
@@ -76,12 +79,14 @@ def spec(
         "target": slot.target,
         "config": slot.config | own_threads,
         "observer": name in graph.observers,
+        "returns": returns(graph, name),
         "inputs": [
             {
                 "type": edge.message.__name__,
                 "slot": edge.sender,
                 "address": address[topic_of(edge)],
                 "best_effort": edge.best_effort,
+                "away": away if returns(graph, edge.sender) else 0.0,
             }
             for edge in graph.into(name)
         ],
@@ -95,6 +100,12 @@ def spec(
         "token": token,
         "status_fd": status_fd,
     }
+
+
+def returns(graph: Graph, name: str) -> bool:
+    """Whether the run waits for a node that is lost: who started it, by hand or on another host, starts it again."""
+    slot = graph.slots[name]
+    return slot.placement.external and slot.node.restartable and name not in graph.observers
 
 
 def write_spec(content: dict[str, Any], path: Path) -> Path:

@@ -10,7 +10,7 @@ from typing import Any
 from mvsgs_core.evaluation import metrics
 
 FILES = ("report.html", "report.json", "map.ply", "cameras.json", "transforms.json", "keyframes", "trajectory.txt",
-         "config.yaml", "logs")  # fmt: skip
+         "georeference.json", "config.yaml", "logs")  # fmt: skip
 
 
 def summary(output: Path) -> str:
@@ -42,6 +42,12 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"trajectory  {trajectory.get('frames_tracked')} of {trajectory.get('frames')} frames, "
             f"{trajectory.get('keyframes')} keyframes" + (f", {ate} {behind}" if ate else "")
+        )
+    if place := _get(report, "georeference"):
+        sure = f"unit {100 * place['scale_deviation']:.2g} %, orientation {place['angle_deviation']:.2g} degrees"
+        lines.append(
+            f"GPS         {place['residual']:.2f} m from {place['positions']} positions (median), {place['outliers']} "
+            f"outliers; sure to {sure}; metres: mvsgs export RUN OUT --frame enu"
         )
     depth = _get(report, "depth") or {}
     if errors := metrics.listed(metrics.DEPTH, depth):

@@ -7,7 +7,7 @@ Conventions (ARCHITECTURE.md): camera axes x right, y down, z forward; depth is 
 first pixel; `world_from_cam` maps camera to world coordinates; images are RGB; intrinsics are (fx, fy, cx, cy) in
 pixels of the image they come with. Maps smaller than the image (`h w` against `H W`) cover the same field of view:
 scale the intrinsics with `mvsgs_core.camera.scale_intrinsics`. 0 in a depth or inverse-depth map means "unknown".
-A number with a default is left out of the wire where it has that value, so that older programs still fit.
+A number or text with a default is left out of the wire where it has that value, so that older programs still fit.
 
 Exposure: `exposure` is the color affine [A | b] (3, 4) from the map's colors, those of the mean camera, to the image's,
 0 to 1; `vignetting` (v1, v2, v3) the sensor's brightness factor V(r) = 1 + v1 r² + v2 r⁴ + v3 r⁶, r the distance from
@@ -20,11 +20,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Annotated, Any, get_args
 
 import numpy as np
 
 from mvsgs_core.trajectory import TrackingState as TrackingState
+
+
+class Asked(StrEnum):
+    """What a Request can ask."""
+
+    PAUSE = "pause"  # the source's frames are not taken
+    SAVE_MAP = "save_map"  # the map as it is, for another run to begin on; the run goes on
+    LOAD_MAP = "load_map"  # goes on in a map that was saved; that of the run is saved before
+    LOCALIZE = "localize"  # frames are only found in the map, which stays as it is
+    RESET = "reset"  # a new map; that of the run is saved before
 
 
 @dataclass(frozen=True)
@@ -37,6 +48,8 @@ class _Image:
     intrinsics: Annotated[np.ndarray, "float64 4"]
     # when it came from the camera, seconds since 1970 by the host's clock; 0: it is of no live stream
     captured: float = field(default=0.0, kw_only=True)
+    # of the image, and of its photograph: False where a pixel is not of the scene, as a person's; None: all are
+    mask: Annotated[np.ndarray, "bool H W"] | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,8 @@ class Frame(_Image):
 
     intrinsics_guessed: bool = False  # the focal length is a guess, to be estimated by the tracker if it can
     exposure: float = 0.0  # exposure time times gain over f-number², in a unit that the stream keeps; 0: not known
+    # by GPS: latitude, longitude (degrees, WGS84), altitude (m)
+    place: Annotated[np.ndarray, "float64 3"] | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -191,6 +206,9 @@ class Trajectory:
     exposure: Annotated[np.ndarray, "float32 N 3 4"] | None = None  # of every frame, NaN where it is not known
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None
     velocity: Annotated[np.ndarray, "float64 N 6"] | None = None  # as of keyframes; None: that between the poses
+    places: Annotated[np.ndarray, "float64 N 3"] | None = None  # Frame.place, NaN where there is none; None: nowhere
+    # k1, k2 as OpenCV's of the frames, by the focal lengths as found; keyframes are without; None: frames have none
+    distortion: Annotated[np.ndarray, "float64 2"] | None = None
 
 
 @dataclass(frozen=True)
@@ -237,6 +255,36 @@ class Preview:
     latency: Annotated[np.ndarray, "float64 2 2"] | None = None
     effort: int = 0  # that stereo made for the newest keyframe, see Depth
     fusion_effort: int = 0  # that fusion made
+    # of the render, 0 where the map covers a pixel by less than half; None: not said
+    depth: Annotated[np.ndarray, "float32 h w"] | None = None
+    splats: Annotated[np.ndarray, "int64 K"] | None = None  # of the whole map, that came from each of the keyframes
+    memory: int = 0  # bytes that the mapper holds
+    coarse: int = 0  # keyframes of a live stream that get the rest of their splats when there is time
+
+
+@dataclass(frozen=True)
+class Request:
+    """What somebody outside asks of the run, as `Asked` names it: a source sends it on in its place among the frames.
+
+    Each stage does its part between the frames before and those after, and passes it on; the last one replies. A stage
+    that cannot do its part says so in `problem`, and the stages behind it leave theirs.
+    """
+
+    number: int  # of who asks, which its Reply has too
+    asked: str  # Asked
+    on: bool = True  # of pause and localize; false: not any more
+    folder: str = ""  # of save_map and load_map: where the map is to be, or is
+    kept: str = ""  # of load_map and reset: where the run's map is to be kept
+    problem: str = ""  # one line that says what to do; empty as long as there is none
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What became of a Request, once it is done or cannot be."""
+
+    number: int  # of the Request
+    success: bool
+    message: str  # one line
 
 
 @dataclass(frozen=True)
@@ -259,6 +307,8 @@ Message = (
     | Trajectory
     | SplatMap
     | Preview
+    | Request
+    | Reply
     | End
 )
 TYPES: dict[str, type] = {t.__name__: t for t in get_args(Message)}

@@ -26,6 +26,7 @@ from mvsgs_core.printable import printable
 VERSION = 2
 RELIABLE = b"R"  # first byte of a frame, which readers subscribe to: every message ...
 NEWEST = b"N"  # ... or only the newest
+AGAIN = b"A"  # a message of the first kind once more, to a reader that was started again
 SMALL_BYTES = 4096  # an array up to this is copied: who keeps a pose does not keep its frame's images
 ALIGNMENT = 64  # bytes, of each array from the frame's start
 MAX_MESSAGE_BYTES = 256 * 2**20
@@ -222,7 +223,7 @@ def _split(view: memoryview) -> tuple[str, memoryview]:
     if view.nbytes < _PREFIX.size:
         raise CodecError(f"a frame of {view.nbytes} bytes is too short")
     delivery, magic, version, name_length, zero, header_length = _PREFIX.unpack_from(view)
-    if magic != _MAGIC or delivery not in (RELIABLE, NEWEST):
+    if magic != _MAGIC or delivery not in (RELIABLE, NEWEST, AGAIN):
         raise CodecError(f"no message: it starts with {bytes(view[:4])!r}, not b'RMVS' or b'NMVS'")
     if version != VERSION:
         raise VersionError(f"a frame of wire version {version}; this program writes and reads version {VERSION}")

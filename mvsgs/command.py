@@ -38,7 +38,7 @@ COMMANDS = {
     "run": Command("INPUT ...", "the same as without this word"),
     "demo": Command("...", "maps the embedded room", words=("dataset=synthetic",)),
     "view": Command("MAP", "a saved map in the browser: keyframes, renders, depth", "mvsgs.view"),
-    "eval": Command("RUN", "the figures of a run again", "mvsgs.evaluate"),
+    "eval": Command("RUN [INPUT ...]", "a run's figures again; its map's on other images", "mvsgs.evaluate"),
     "compare": Command("RUN RUN ...", "runs side by side, with --html also renders", "mvsgs.compare"),
     "info": Command("DIR", "what is in the map that a run kept, for map=DIR", "mvsgs_core.maps.info"),
     "export": Command("MAP OUT", "to .ply, .splat, .spz, .glb, .obj or a COLMAP folder", "mvsgs_core.export.__main__"),

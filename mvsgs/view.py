@@ -1,4 +1,4 @@
-"""`mvsgs view MAP`: a saved map in a web browser, with a slider through its keyframes: photograph, render and depth."""
+"""`mvsgs view MAP`: a saved map in a web browser, with its keyframes, to measure, crop, fly through and export it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ import numpy as np
 import torch
 import viser
 
-from mvsgs_core.datasets.files import UnreadableImageError, read_image
-from mvsgs_core.evaluation.scoring import colorize_depth
+from mvsgs.view_tools import Cropping, Exporting, Flight, Measuring
+from mvsgs_core.camera import resize_image, scale_intrinsics
+from mvsgs_core.evaluation.ground_plane import ground_axes, up_direction
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.command_line import input_arguments, known_cameras, read_map, run
@@ -24,7 +25,13 @@ from mvsgs_core.export.keyframe_render import rendered_keyframe
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.preview import as_bytes, covariances
 from mvsgs_core.rasterizer.spherical_harmonics import C0
-from nodes.map_page import MapPage, thumbnail
+from nodes.keyframe_pictures import KeyframePictures, depth_points, difference, pictures
+from nodes.map_page import MapPage
+from nodes.seen_keyframes import goodness
+
+FIGURES = ("coverage", "error")  # that can color keyframes
+_POINTS = 20000  # of the depth of the keyframe that is shown
+_UNKNOWN = np.array([900.0, 900.0, 639.5, 359.5]), (720, 1280)  # camera of a flight where the map's is not known
 
 
 class SavedMapView:
@@ -35,16 +42,14 @@ class SavedMapView:
         self.page, self.closed = page, threading.Event()
         self._showing = threading.Lock()
         self._final, self._cameras, self._photographs = final, cameras, photographs
+        self._left = final  # of the map, where it is cropped
         gui, splats = page.server.gui, final.splats
-        means, colors = splats.means.numpy(), as_bytes(0.5 + C0 * splats.sh[:, 0])
+        means = splats.means.numpy()
         self._poses = (
             np.zeros((0, 4, 4)) if cameras is None else np.stack([*map(final.relative_pose, cameras.world_from_cam)])
         )
         page.begin(self._poses[0] if len(self._poses) else _outside(means), means)
-        left_out = page.show_splats(
-            means, covariances(splats.quaternions, splats.log_scales, 1.0).numpy(), colors,
-            torch.sigmoid(splats.opacity_logits).numpy(),
-        )  # fmt: skip
+        left_out = self._show_splats(final)
         said = f"**{name}**: {len(splats)} splats, {len(self._poses)} keyframes"
         gui.add_markdown(said + (f"; {left_out} splats that are not finite are not shown" if left_out else ""))
         page.add_toggles()
@@ -52,7 +57,33 @@ class SavedMapView:
             gui.add_markdown("There is no cameras.json beside this map, so that its keyframes are not known.")
         else:
             self._show_keyframes(cameras)
+        self._add_tools()
         gui.add_button("Close").on_click(lambda _: self.closed.set())
+        if cameras is not None:
+            self.pictures = KeyframePictures(gui)
+            self.show(0)
+
+    def _show_splats(self, final: Snapshot) -> int:
+        splats = final.splats
+        return self.page.show_splats(
+            splats.means.numpy(), covariances(splats.quaternions, splats.log_scales, 1.0).numpy(),
+            as_bytes(0.5 + C0 * splats.sh[:, 0]), torch.sigmoid(splats.opacity_logits).numpy(),
+        )  # fmt: skip
+
+    def _add_tools(self) -> None:
+        rotations = self._poses[:, :3, :3] if len(self._poses) else np.eye(3)[None]
+        axes = np.concatenate([ground_axes(rotations), up_direction(rotations)[None]])
+        self.cropping = Cropping(self.page, self._final, axes, self._cropped)
+        self.measuring = Measuring(self.page, lambda: self._left)
+        intrinsics, size = _UNKNOWN if self._cameras is None else _lens(self._cameras)
+        self.flight = Flight(self.page, lambda: self._left, intrinsics, size, self._poses)
+        self.exporting = Exporting(self.page, lambda: self._left, lambda: self.measuring.ruler.factor, self._cameras)
+
+    def _cropped(self, left: Snapshot) -> None:
+        self._left = left
+        self._show_splats(left)
+        if self._cameras is not None:
+            self.show(self._shown)
 
     def _show_keyframes(self, cameras: Cameras) -> None:
         for k, index in enumerate(cameras.keyframes.tolist()):
@@ -60,14 +91,13 @@ class SavedMapView:
             frustum.on_click(partial(self._choose, k))
         self.page.show_path()
         gui, last = self.page.server.gui, len(cameras) - 1
+        self._figure = gui.add_dropdown("color keyframes by", ("nothing", *FIGURES), initial_value="nothing")
+        self._figure.on_update(lambda _: self.tint(str(self._figure.value)))
         if last > 0:
             self._slider: viser.GuiInputHandle[int] = gui.add_slider("keyframe", 0, last, 1, 0)
             self._slider.on_update(lambda _: self.show(int(self._slider.value)))
         self._caption = gui.add_markdown("")
         gui.add_button("Look from here").on_click(self._look)
-        blank = np.zeros((2, 2, 3), np.uint8)
-        self._pictures = {name: gui.add_image(blank, label=name) for name in ("photograph", "render", "depth")}
-        self.show(0)
 
     def _choose(self, k: int, _: Any) -> None:
         if len(self._poses) > 1:
@@ -82,34 +112,55 @@ class SavedMapView:
 
     def _show(self, k: int) -> None:
         assert self._cameras is not None
-        assert self.page.unit is not None
         self._shown = k
         index, (height, width) = int(self._cameras.keyframes[k]), self._cameras.sizes[k].tolist()
         self.page.mark(index)
-        photograph = self._photograph(index)
-        self._pictures["photograph"].visible = photograph is not None
-        if photograph is not None:
-            self._pictures["photograph"].image = thumbnail(photograph)
-        color, render = rendered_keyframe(self._final, self._cameras, k)
-        self._pictures["render"].image = thumbnail(as_bytes(color))
-        self._pictures["depth"].image = thumbnail(colorize_depth(render.depth.numpy()))
-        known = render.depth[render.opacity > 0.5]
-        depths = f"; depth {_span(known.numpy())}" if len(known) else ""
+        photograph = keyframe_images.known_image(self._photographs, index)
+        render, depth = self._rendered(self._cameras, k)
+        self.pictures.show(pictures(photograph, render, depth))
+        self.page.show_points(index, *depth_points(depth, self._cameras.intrinsics[k], render, _POINTS), alone=True)
+        known = depth[depth > 0]
+        depths = f"; depth {_span(known)}, {100 * (depth > 0).mean():.0f} % covered" if len(known) else ""
         self._caption.content = f"keyframe **{index}**, {width}x{height}{depths}"
 
-    def _photograph(self, index: int) -> np.ndarray | None:
-        file = self._photographs / keyframe_images.image_name(index)
-        try:
-            return read_image(file) if file.is_file() else None
-        except UnreadableImageError:
-            return None
+    def _rendered(self, cameras: Cameras, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W, 3) uint8 and the depth (H, W), 0 where the map covers less than half of a pixel."""
+        color, render = rendered_keyframe(self._left, cameras, k)
+        return as_bytes(color), torch.where(render.opacity > 0.5, render.depth, 0.0).numpy()
+
+    def tint(self, figure: str) -> None:
+        """Colors all keyframes by "coverage", or by the "error" of those with a photograph; or by "nothing"."""
+        assert self._cameras is not None
+        found = {}
+        with self._showing:
+            for k in range(len(self._cameras)) if figure in FIGURES else ():
+                index, small = int(self._cameras.keyframes[k]), _small(self._cameras, k)
+                render, depth = self._rendered(small, 0)
+                if figure == "coverage":
+                    found[index] = float((depth > 0).mean())
+                elif (photograph := keyframe_images.known_image(self._photographs, index)) is not None:
+                    size = (int(small.sizes[0, 0]), int(small.sizes[0, 1]))
+                    found[index] = goodness(float(difference(render, resize_image(photograph, size)).mean()))
+            self.page.tint(found)
 
     def _look(self, event: Any) -> None:
         client: viser.ClientHandle | None = event.client
         if client is not None:
-            frustum = self.page.frustums[list(self.page.frustums)[self._shown]]
-            with client.atomic():
-                client.camera.wxyz, client.camera.position = frustum.wxyz, frustum.position
+            self.page.look(client, list(self.page.frustums)[self._shown])
+
+
+def _small(cameras: Cameras, k: int, width: int = 160) -> Cameras:
+    """Keyframe number k alone, with a picture that is `width` pixels wide at most."""
+    one = {name: value[k : k + 1].copy() for name, value in vars(cameras).items()}
+    height, full = (int(side) for side in cameras.sizes[k])
+    size = (max(1, round(height * min(width, full) / full)), min(width, full))
+    one["intrinsics"][0], one["sizes"][0] = scale_intrinsics(cameras.intrinsics[k], (height, full), size), size
+    return Cameras(**one)
+
+
+def _lens(cameras: Cameras) -> tuple[np.ndarray, tuple[int, int]]:
+    """Intrinsics (4,) and size (height, width) of the newest keyframe."""
+    return cameras.intrinsics[-1], (int(cameras.sizes[-1, 0]), int(cameras.sizes[-1, 1]))
 
 
 def _span(depths: np.ndarray) -> str:

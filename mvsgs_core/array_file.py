@@ -66,6 +66,9 @@ class Arrays:
     def of(self, prefix: str) -> Arrays:
         return Arrays(self._arrays, f"{self._prefix}{prefix}/")
 
+    def __contains__(self, name: str) -> bool:
+        return self._prefix + name in self._arrays
+
     def take(self, name: str, dtype: type, shape: tuple[int | None, ...], *, nan: bool = False) -> np.ndarray:
         """An array of this dtype and shape (None: any size), finite unless NaN is allowed."""
         full = self._prefix + name

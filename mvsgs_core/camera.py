@@ -73,6 +73,19 @@ def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.asarray(resized)
 
 
+def mask_at(mask: np.ndarray | None, size: tuple[int, ...]) -> np.ndarray | None:
+    """A mask (H, W) bool at (height, width): True where all that a pixel covers counts; None: all pixels do."""
+    if mask is None or mask.shape == size:
+        return mask
+    return np.asarray(resize_image(mask.astype(np.float32), (size[0], size[1])) > 0.999)
+
+
+def shrunk(mask: np.ndarray, radius: int) -> np.ndarray:
+    """The mask (H, W) bool without what is within `radius` pixels of its border; the image's own border takes none."""
+    side = 2 * radius + 1
+    return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
 def fit_size(height: int, width: int, area: int, multiple: int = 8) -> tuple[int, int]:
     """(height, width) of about `area` pixels, same aspect, both multiples of `multiple`; never enlarges."""
     factor = min(1.0, (area / (height * width)) ** 0.5)

@@ -14,11 +14,27 @@ from pathlib import Path
 FOLDER = "checkpoint"
 TRACKER = "tracker.npz"
 STREAM = 1_000_000_000  # frames, a multiple of HELD_OUT_EVERY
+NOTHING_MAPPED = "nothing is mapped yet: move the camera sideways until keyframes are mapped, and ask again"
 
 
 def tracker_file(output: Path | str) -> Path:
     """Of the map in a run's output directory."""
     return Path(output) / FOLDER / TRACKER
+
+
+def check_no_map(output: Path | str) -> None:
+    """Raises ValueError, saying what to do, for a directory that has a map already: none is written over."""
+    if (Path(output) / FOLDER).exists():
+        raise ValueError(f"{output}: there is a map already; give another folder")
+
+
+def drop_tracker_half(output: Path | str) -> None:
+    """Of a map whose other half was not written. Raises OSError."""
+    file = tracker_file(output)
+    file.unlink(missing_ok=True)
+    for folder in (file.parent, Path(output)):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def check_kept_map(output: Path | str) -> None:
@@ -32,4 +48,7 @@ def check_kept_map(output: Path | str) -> None:
         )
 
 
-__all__ = ["FOLDER", "STREAM", "TRACKER", "check_kept_map", "tracker_file"]
+__all__ = [
+    "FOLDER", "NOTHING_MAPPED", "STREAM", "TRACKER", "check_kept_map", "check_no_map", "drop_tracker_half",
+    "tracker_file",
+]  # fmt: skip

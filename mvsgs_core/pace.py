@@ -3,7 +3,8 @@
 A stage that keeps a live camera's pace has a few ways to do its work, from the best to the quickest, which it prices
 by what the work has cost here so far. Of these it takes the best by which what waits is done within `HORIZON`, beside
 all that comes meanwhile. So it saves where much is to be done, on a slow or busy machine too, and gives back where
-little is. It knows what waits for it and nothing of other stages: no message tells it what to do, and none can be lost.
+little is. Where it has time for none of them on any keyframe, it makes the quickest on as many as there is time for.
+It knows what waits for it and nothing of other stages: no message tells it what to do, and none can be lost.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ class Pace:
         self.waiting: Callable[[], int] = lambda: 0  # keyframes that came and were not taken up
         self._gaps: deque[float] = deque(maxlen=GAPS)  # seconds of the stream between two keyframes
         self._newest: float | None = None  # timestamp
+        self._saved = 0.0  # seconds that keyframes could have cost, since the last on which there was work
         self._cost: float | None = None  # seconds of the best effort; None: not known yet
 
     @property
@@ -66,6 +68,11 @@ class Pace:
         """Seconds that a keyframe may cost now."""
         coming = HORIZON / (self.share * max(self.interval, 1e-6))
         return HORIZON / (self.waiting() + coming)
+
+    @property
+    def fits(self) -> bool:
+        """Whether the best effort is done, about, before the next keyframe comes."""
+        return self._cost is not None and self._cost * self.efforts[0].cost <= self.interval
 
     def came(self, timestamp: float) -> None:
         """A keyframe of this time in the stream, seconds, is to be worked on."""
@@ -81,7 +88,13 @@ class Pace:
             telling = [k for k in self._open if self.efforts[k].telling]
             return telling[:2][-1] if telling else self._open[-1]
         allowed, cost = self.allowed, self._cost
-        return next((k for k in self._open if self.efforts[k].cost * cost <= allowed), self._open[-1])
+        chosen = next((k for k in self._open if self.efforts[k].cost * cost <= allowed), self._open[-1])
+        if (
+            not self.efforts[chosen].telling and not self.waiting()
+        ):  # no work at all: what that saved may do for the quickest that is some
+            quickest = [k for k in self._open if self.efforts[k].telling][-1:]
+            chosen = next((k for k in quickest if self.efforts[k].cost * cost <= allowed + self._saved), chosen)
+        return chosen
 
     @contextmanager
     def spend(self) -> Iterator[int]:
@@ -93,6 +106,7 @@ class Pace:
     def spent(self, chosen: int, seconds: float) -> None:
         """So long that effort took."""
         effort = self.efforts[chosen]
+        self._saved = 0.0 if effort.telling else self._saved + max(0.0, self.allowed - seconds)
         if effort.telling:
             found = seconds / effort.cost
             self._cost = found if self._cost is None else (1.0 - MEMORY) * self._cost + MEMORY * found

@@ -36,6 +36,8 @@ class Trajectory:
     exposure: np.ndarray | None = None  # (N, 3, 4) float32 color affine of each, see `msgs`, NaN where it is not known
     vignetting: np.ndarray | None = None  # (3,) float32 of the sensor
     velocity: np.ndarray | None = None  # (N, 6) of the camera, see `velocities`; None: that between the poses
+    places: np.ndarray | None = None  # (N, 3) latitude, longitude, altitude by GPS, NaN where not known; None: nowhere
+    distortion: np.ndarray | None = None  # (2,) k1, k2 of the frames that the keyframes are without; None: none
 
     @classmethod
     def empty(cls) -> Trajectory:

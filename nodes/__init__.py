@@ -23,6 +23,8 @@ The parameter's type declares the input, the yielded type the output. Hooks:
 - `check(cls, config)`: before any process starts, on the launcher's machine: raises OSError or ValueError, saying what
   to do, where it is plain that the node cannot run (its file is missing, or cannot be read). A source opens its input
   and reads one frame of it, no more: quick, and nothing is written or sent.
+- `advise(cls, config)`: before that, and as quick: the choices of other slots that its input asks for, taken where
+  nobody chose.
 
 Arrays of a message that came from another process are read-only, and those over 4 kB are views that keep its whole
 frame in memory: copy what you change, and what you keep of it.
@@ -35,12 +37,22 @@ from __future__ import annotations
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import msgs
 from mvsgs_core.stats import Stats
 from nodes.parameters import Parameter
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A choice of another slot."""
+
+    choice: str
+    why: str  # what was measured, and how to choose otherwise
+    parameters: Mapping[str, Any] = field(default_factory=dict)  # of that choice
 
 
 class Node:
@@ -52,6 +64,9 @@ class Node:
 
     replayable: ClassVar[bool] = False  # sources: the same command gives the same stream once more
     live: ClassVar[bool] = False  # sources: a camera that waits for nobody
+    # a process of it that is started again in the midst of a run goes on: it needs the newest messages, and what the
+    # one before left in `kept_in`
+    restartable: ClassVar[bool] = False
     in_stream_order: ClassVar[bool] = True  # keyframes leave in the order of their indices, which resuming relies on
 
     config: Any
@@ -62,11 +77,17 @@ class Node:
         self.upstream: dict[str, Any] = {}  # what each node upstream counted, by name: complete when on_end runs
         self.unread: frozenset[type] = frozenset()  # messages that nobody reads here: work for them alone can be spared
         self.rest: Callable[[], object] = _go_on  # to be called in long work where nothing is half changed, see above
+        self.kept_in: Path | None = None  # folder for what a process started in this one's place needs; None: none is
         self.waiting: Callable[[type], int] = _none  # messages of a type that came and were not taken up, about
 
     @classmethod
     def check(cls, config: Any) -> None:
         """Nothing to check."""
+
+    @classmethod
+    def advise(cls, config: Any) -> Mapping[str, Advice]:
+        """By slot: nothing. Raises OSError or ValueError where the input cannot be read, as `check` will."""
+        return {}
 
     @classmethod
     def keys_of(cls, config: Any) -> Mapping[str, Sequence[Parameter]]:

@@ -18,7 +18,7 @@ from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.export.source_camera import LENS, lens_values
-from nodes.live import LiveSource
+from nodes.live import LiveSource, camera_mask
 from nodes.stream_frames import StreamFrames
 from nodes.stream_presence import Presence, pauses
 
@@ -56,6 +56,7 @@ class Camera(LiveSource):
     @classmethod
     def check(cls, config: Config) -> None:
         lens_from_option(config.intrinsics, config.distortion, (480, 640))
+        camera_mask(config.mask)
         device = Path(f"/dev/video{config.path}")
         if Path(config.path).is_file():
             raise CameraError(f"{config.path} is a file and no camera: use dataset=video dataset.path={config.path}")
@@ -104,8 +105,10 @@ class Camera(LiveSource):
     def _framed(self, frame: Frame) -> Frame:
         assert self._lens is not None
         rgb = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2RGB))
-        image, intrinsics = self._framing.image(rgb, self._lens, self._framing.size_of(self._lens.size))
-        return replace(frame, image=image, intrinsics=intrinsics)
+        size = self._framing.size_of(self._lens.size)
+        image, intrinsics = self._framing.image(rgb, self._lens, size)
+        mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, self._lens, size)
+        return replace(frame, image=image, intrinsics=intrinsics, mask=mask)
 
 
 class _Feed:

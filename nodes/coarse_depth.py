@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from msgs import Depth, Keyframe, Poses, TrackedFrame
+import numpy as np
+
+from msgs import Depth, Keyframe, Poses, Request, TrackedFrame
 from mvsgs_core import camera
 from mvsgs_core.inverse_depth import enlarge_inverse_depth
 from nodes import Node
@@ -25,6 +27,9 @@ class CoarseDepth(Node):
         size = camera.fit_size(keyframe.image.shape[0], keyframe.image.shape[1], self.config.area)
         with self.stats.time("enlarge"):
             depth, confidence = enlarge_inverse_depth(keyframe.inverse_depth, keyframe.inverse_depth_weight, size)
+        seen = camera.mask_at(keyframe.mask, size)
+        if seen is not None:
+            depth, confidence = (np.where(seen, values, np.float32(0)) for values in (depth, confidence))
         self.stats.count("keyframes")
         yield depth_message(keyframe, depth, confidence)
 
@@ -35,3 +40,7 @@ class CoarseDepth(Node):
     def on_poses(self, poses: Poses) -> Iterator[Poses]:
         """Passed on, so that they reach the next stage between the same keyframes."""
         yield poses
+
+    def on_request(self, request: Request) -> Iterator[Request]:
+        """Passed on, in its place: nothing waits here."""
+        yield request

@@ -23,6 +23,8 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
         self._depths: dict[int, Depth] = {}  # not sent yet
 
     def on_depth(self, depth: Depth) -> Iterator[FusedKeyframe]:
+        if not self._once.keyframe(depth):
+            return
         self._take(depth.index, depth.timestamp)
         self._depths[depth.index] = depth
         view = KeyframeDepth(
@@ -33,6 +35,7 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             world_from_cam=depth.world_from_cam,
             scale=depth.scale,
             segment=depth.segment,
+            mask=camera.mask_at(depth.mask, depth.depth.shape),
         )
         yield from self._messages(self._core.add(self._corrected(view)))
 
@@ -85,6 +88,7 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             exposure=message.exposure,
             vignetting=message.vignetting,
             captured=message.captured,
+            mask=message.mask,
             effort=message.effort,
             fusion_effort=found.effort,
         )

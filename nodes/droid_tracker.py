@@ -29,6 +29,8 @@ class DroidTracker(TrackerNode):
 
     def _add(self, frame: Frame) -> Update:
         warn_of_guessed_focal(self.stats, frame)
+        if frame.mask is not None:
+            self.stats.warn("DROID-SLAM tracks on whole images: masks are left out of the map alone")
         return self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics)
 
     def _keyframe(self, index: int) -> Keyframe:
@@ -44,4 +46,5 @@ class DroidTracker(TrackerNode):
             inverse_depth_weight=coarse.weight,
             segment=0,
             captured=frame.captured,
+            mask=frame.mask,
         )

@@ -22,6 +22,8 @@ from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.origin import origin
 from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.georeference import FILE as GEOREFERENCE
+from mvsgs_core.georeference import Georeference, NoReferenceError, georeference, values_of, write_georeference
 from mvsgs_core.held_out import HELD_OUT_EVERY
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.trajectory_file import write_trajectory
@@ -39,6 +41,8 @@ class Evaluator(Node):
         max_frames: int = 200  # frames scored at most, keyframes, held-out and others evenly; 0: no scoring
         max_bytes: float = 2e9  # of images and depth maps that wait on disk to be scored
         lpips: Literal["auto", "on", "off"] = "auto"  # auto: if its weights are found; on: an error if they are not
+        # GPS of a path along a line does not tell the rotation about it: take it from cameras that were held upright
+        camera_up: bool = False
         fitted: bool = True  # score held-out frames also with pose and exposure fitted to them at test time
 
     config: Config
@@ -66,11 +70,13 @@ class Evaluator(Node):
             raise ValueError(f"max_bytes={config.max_bytes}: bytes on disk, more than 0; max_frames=0 keeps no frame")
 
     def on_ground_truth(self, truth: GroundTruth) -> Iterator[None]:
-        self.evaluation.add_frame(truth.index, truth.image, truth.intrinsics, truth.world_from_cam, truth.depth)
+        self.evaluation.add_frame(
+            truth.index, truth.image, truth.intrinsics, truth.world_from_cam, truth.depth, truth.mask
+        )
         yield from ()
 
     def on_fused_keyframe(self, view: FusedKeyframe) -> Iterator[None]:
-        self.evaluation.add_keyframe(view.index, view.image, view.intrinsics, view.depth, view.scale)
+        self.evaluation.add_keyframe(view.index, view.image, view.intrinsics, view.depth, view.scale, view.mask)
         yield from ()
 
     def on_trajectory(self, message: Trajectory) -> Iterator[None]:
@@ -86,13 +92,36 @@ class Evaluator(Node):
             self.report = self.evaluation.report()
         self.stats.seconds["fitting at test time"] = self.evaluation.fitting
         self.stats.seconds["scoring"] -= self.evaluation.fitting
+        found = self._georeference()
         self._add_statistics()
         for note in self.report["notes"]:
             self.stats.warn(note)
         if self.folder:
             self._write(self.folder)
+            if found is not None:
+                write_georeference(self.folder / GEOREFERENCE, found)
         self.evaluation.close()
         yield from ()
+
+    def _georeference(self) -> Georeference | None:
+        """Where the map's main part lies, where frames have a place; None, and said why, where they do not tell."""
+        track = self.evaluation.final_trajectory
+        if track is None or track.places is None:
+            return None
+        placed = track.main() & np.isfinite(track.places).all(axis=1)
+        try:
+            found = georeference(track.world_from_cam[placed], track.places[placed], self.config.camera_up)
+        except NoReferenceError as error:
+            self.stats.warn(f"GPS does not tell where the map lies: {error}")
+            self.report["georeference"] = None
+            return None
+        self.report["georeference"] = values_of(found)
+        if found.outliers:
+            self.stats.warn(
+                f"GPS places that do not fit the trajectory, left out: {found.outliers} of {found.positions}, off by "
+                f"up to {found.farthest:.0f} m; where they follow each other, GPS drifted or the trajectory is bent"
+            )
+        return found
 
     def _load_lpips(self) -> Lpips | None:
         if self.config.lpips == "off":
@@ -128,6 +157,7 @@ class Evaluator(Node):
             "pixels at which the render is more than half opaque. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self._lpips else 'not computed'}. "
             f"{_shutter(self.evaluation.trajectory)}{_exposure(self.report['exposure'])}"
+            f"{_masked(self.evaluation.masked)}"
             "ATE: RMSE of keyframe positions after Sim(3) alignment."
         )
 
@@ -182,6 +212,14 @@ def _exposure(found: dict[str, Any] | None) -> str:
         return ""
     vignetting = "" if found["vignetting"] is None else " and its vignetting"
     return f"Renders have each frame's exposure{vignetting} as the tracker estimated it from matches to keyframes. "
+
+
+def _masked(parts: list[float]) -> str:
+    if not parts:
+        return ""
+    return (
+        f"Of {len(parts)} frames, masks leave out {100 * np.mean(parts):.1f} % of the pixels: figures are of the rest. "
+    )
 
 
 def _plain(value: Any) -> Any:

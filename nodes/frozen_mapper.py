@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs import CameraPose, Frame, Preview, SplatMap
+from msgs import Asked, CameraPose, Frame, Preview, Reply, Request, SplatMap
 from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.mapping.preview import as_bytes, preview_arrays
+from mvsgs_core.mapping.preview import preview_arrays, seen
 from mvsgs_core.stats import Stats
 from nodes import Node
 from nodes.mapper import splat_map
@@ -72,6 +72,18 @@ class FrozenMapper(Node):
             self._last_preview = now
             yield self._preview(pose, frame)
 
+    def on_request(self, request: Request) -> Iterator[Reply]:
+        said, problem = "it localizes", request.problem
+        if request.asked == Asked.PAUSE:
+            said = "paused" if request.on else "the stream goes on"
+        elif request.asked == Asked.LOAD_MAP and not problem:
+            try:
+                self.atlas = begin_on(Path(request.folder), self.config, Stats())
+                said = f"the camera is looked for in {request.folder}"
+            except ValueError as error:
+                problem = f"the camera is looked for in {request.folder}, whose splats cannot be taken up: {error}"
+        yield Reply(request.number, not problem, problem or said)
+
     def on_end(self) -> Iterator[SplatMap | Preview]:
         yield splat_map(self._mapper.snapshot(), refined=True)
 
@@ -100,10 +112,9 @@ class FrozenMapper(Node):
             | {
                 "index": frame.index,
                 "world_from_cam": camera,
-                "intrinsics": view.intrinsics,
-                "image": view.image.cpu().numpy(),
-                "render": as_bytes(mapper.render(view).color),
+                **seen(mapper, view),
                 "keyframes": np.append(shown["keyframes"], frame.index),
+                "splats": np.append(shown["splats"], 0),
                 "keyframe_poses": np.concatenate([shown["keyframe_poses"], camera[None]]),
             }
         )

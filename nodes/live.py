@@ -6,11 +6,18 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 from msgs import Frame, GroundTruth
+from mvsgs_core.datasets.masks import CameraMask
 from mvsgs_core.datasets.options import SizedSelection
 from nodes import Node
+
+
+def camera_mask(file: str | Path | None) -> CameraMask | None:
+    """The mask of all frames; raises FileNotFoundError and ValueError for a file that is none."""
+    return None if file is None else CameraMask(file)
 
 
 class LiveSource(Node, ABC):
@@ -23,6 +30,12 @@ class LiveSource(Node, ABC):
         pass
 
     config: Config
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        self._camera_mask = camera_mask(self.config.mask)
+        for note in [] if self._camera_mask is None else self._camera_mask.notices:
+            self.stats.warn(note)
 
     def run(self) -> Iterator[Frame | GroundTruth]:
         """Ends where the stream does, and when nothing comes any more, so that a session still finishes its map."""
@@ -38,7 +51,9 @@ class LiveSource(Node, ABC):
                     shown = replace(self._framed(frame), index=index, captured=came)
                     self.stats.count("frames")
                     yield shown
-                    yield GroundTruth(index, shown.timestamp, shown.image, shown.intrinsics, None, None)
+                    yield GroundTruth(
+                        index, shown.timestamp, shown.image, shown.intrinsics, None, None, mask=shown.mask
+                    )
                     index += 1
                 taken += 1
         finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,9 +11,11 @@ import viser
 
 from mvsgs_core.geometry import quaternion_from_rotation
 
-PICTURE_WIDTH = 320  # pixels of the pictures beside the scene: enough to compare, quick to send
 _PATH_COLOR = (230, 90, 40)
 _PLAIN_COLOR, _MARKED_COLOR = (90, 110, 140), (230, 90, 40)
+_WORST, _BEST = (215, 48, 39), (69, 117, 180)  # of a figure that colors keyframes
+_POINT = 0.004  # size of a depth point, page units
+_BEHIND = 0.6, 0.25  # of the page's unit: as far the view stands behind a camera and above it
 
 
 class MapPage:
@@ -29,7 +31,10 @@ class MapPage:
         self.splats: viser.GaussianSplatHandle | None = None
         self.path: viser.LineSegmentsHandle | None = None
         self.frustums: dict[int, viser.CameraFrustumHandle] = {}  # by keyframe
-        self._visible = dict.fromkeys(("splats", "keyframes", "path"), True)
+        self.points: dict[int, viser.PointCloudHandle] = {}  # by keyframe
+        self._marked: int | None = None
+        self._tints: dict[int, tuple[int, int, int]] = {}  # of keyframes, instead of the plain color
+        self._visible = {"splats": True, "depth points": False, "keyframes": True, "path": True}
 
     def begin(self, world_from_cam: np.ndarray, means: np.ndarray) -> None:
         """Unit, up direction and first view of the page, all from a camera (4, 4) and splats (N, 3)."""
@@ -38,9 +43,31 @@ class MapPage:
         self.unit = median if np.isfinite(median) and median > 0 else 1.0
         position = world_from_cam[:3, 3] / self.unit
         self.server.scene.set_up_direction(tuple(-world_from_cam[:3, 1]))
-        behind = position - 0.6 * world_from_cam[:3, 2] - 0.25 * world_from_cam[:3, 1]
-        self.server.initial_camera.position = tuple(behind)
+        self.server.initial_camera.position = tuple(self._behind(world_from_cam))
         self.server.initial_camera.look_at = tuple(position + world_from_cam[:3, 2])
+
+    def _behind(self, world_from_cam: np.ndarray) -> np.ndarray:
+        assert self.unit is not None
+        back, above = _BEHIND
+        axes = world_from_cam[:3, :3]
+        return np.asarray(world_from_cam[:3, 3] / self.unit - back * axes[:, 2] - above * axes[:, 1])
+
+    def follow(self, world_from_cam: np.ndarray) -> None:
+        """All who look at the page look over the shoulder of a camera (4, 4)."""
+        assert self.unit is not None
+        ahead = world_from_cam[:3, 3] / self.unit + world_from_cam[:3, 2]
+        for client in self.server.get_clients().values():
+            with client.atomic():
+                client.camera.up_direction = -world_from_cam[:3, 1]
+                client.camera.position = self._behind(world_from_cam)
+                client.camera.look_at = ahead
+
+    def look(self, client: viser.ClientHandle, index: int) -> None:
+        """One who looks at the page sees what a keyframe sees, as high."""
+        frustum = self.frustums[index]
+        with client.atomic():
+            client.camera.wxyz, client.camera.position = frustum.wxyz, frustum.position
+            client.camera.fov = frustum.fov
 
     def add_toggles(self) -> None:
         """A box for each kind of thing, by which it is shown or not."""
@@ -51,10 +78,11 @@ class MapPage:
         self.set_visible(name, event.target.value)
 
     def set_visible(self, name: str, visible: bool) -> None:
-        """Of splats, keyframes or path: those that are there, and those that come."""
+        """Of splats, depth points, keyframes or path: those that are there, and those that come."""
         self._visible[name] = visible
         handles: dict[str, list[Any]] = {
-            "splats": [self.splats], "keyframes": list(self.frustums.values()), "path": [self.path]
+            "splats": [self.splats], "depth points": list(self.points.values()),
+            "keyframes": list(self.frustums.values()), "path": [self.path],
         }  # fmt: skip
         for handle in handles[name]:
             if handle is not None:
@@ -100,24 +128,50 @@ class MapPage:
         )
         return self.frustums[index]
 
-    def mark(self, index: int) -> None:
+    def show_points(self, index: int, points: np.ndarray, colors: np.ndarray, alone: bool = False) -> None:
+        """Of a keyframe that is there, (N, 3) in its camera's axes, map units, and (N, 3) uint8: they move with it.
+
+        alone: those of other keyframes go.
+        """
+        assert self.unit is not None
+        for other in list(self.points) if alone else [index] if index in self.points else []:
+            self.points.pop(other).remove()
+        frustum = self.frustums[index]
+        self.points[index] = self.server.scene.add_point_cloud(
+            f"/points/{index}", (points / self.unit).astype(np.float32), colors, point_size=_POINT,
+            precision="float32", wxyz=frustum.wxyz, position=frustum.position, visible=self._visible["depth points"],
+        )  # fmt: skip
+
+    def mark(self, index: int | None) -> None:
         """Shows one keyframe in another color than all others."""
+        self._marked = index
         for other, frustum in self.frustums.items():
-            color = _MARKED_COLOR if other == index else _PLAIN_COLOR
+            color = _MARKED_COLOR if other == index else self._tints.get(other, _PLAIN_COLOR)
             if frustum.color != color:
                 frustum.color = color
 
+    def tint(self, goodness: Mapping[int, float]) -> None:
+        """Colors keyframes from red, 0, to blue, 1; those that are not given are plain."""
+        worst, best = np.array(_WORST), np.array(_BEST)
+        self._tints = {}
+        for index, part in goodness.items():
+            r, g, b = (worst + np.clip(part, 0.0, 1.0) * (best - worst)).round().astype(int).tolist()
+            self._tints[index] = (r, g, b)
+        self.mark(self._marked)
+
     def move_keyframe(self, index: int, world_from_cam: np.ndarray) -> None:
         assert self.unit is not None
-        frustum = self.frustums[index]
         position, rotation = world_from_cam[:3, 3] / self.unit, quaternion_from_rotation(world_from_cam[:3, :3])
-        if not np.allclose(frustum.position, position, rtol=0.0, atol=1e-5):
-            frustum.position = position
-        if not np.allclose(frustum.wxyz, rotation, rtol=0.0, atol=1e-5):
-            frustum.wxyz = rotation
+        for moved in (self.frustums[index], self.points.get(index)):
+            if moved is not None and not np.allclose(moved.position, position, rtol=0.0, atol=1e-5):
+                moved.position = position
+            if moved is not None and not np.allclose(moved.wxyz, rotation, rtol=0.0, atol=1e-5):
+                moved.wxyz = rotation
 
     def remove_keyframe(self, index: int) -> None:
         self.frustums.pop(index).remove()
+        if index in self.points:
+            self.points.pop(index).remove()
 
     def show_path(self) -> None:
         """Lines between the keyframes drawn, in the order of the stream."""
@@ -129,9 +183,3 @@ class MapPage:
             "/path", lines, np.array(_PATH_COLOR, np.uint8), thickness=2.0, thickness_units="screen",
             visible=self._visible["path"],
         )  # fmt: skip
-
-
-def thumbnail(image: np.ndarray) -> np.ndarray:
-    """An image (H, W, 3) as small as it is shown beside the scene."""
-    step = max(1, image.shape[1] // PICTURE_WIDTH)
-    return np.ascontiguousarray(image[::step, ::step])

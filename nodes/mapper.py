@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap, TrackedFrame
+from msgs import Asked, FusedKeyframe, Keyframe, Poses, Preview, Reply, Request, SplatMap, TrackedFrame
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.export.snapshot import Snapshot
@@ -23,18 +24,28 @@ from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.replay import Replay
+from mvsgs_core.mapping.checkpoints.saved_map import SavedMap
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
+from mvsgs_core.mapping.losses import loss_function
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
 from mvsgs_core.mapping.self_check import why_nothing
 from mvsgs_core.pace import Effort, Pace
 from nodes import Node
+from nodes.once import Once
+from nodes.runtime.freed_memory import return_large_blocks
+from nodes.runtime.status import rss
 
 _SLICE = 0.05  # seconds of optimization in one on_idle
 PREVIEWS = 0.1  # of the time that previews may take in real time
-EFFORTS = (Effort("full", 1.0), Effort("new splats as of half the image's size", 0.35))
+EFFORTS = (  # one by the number of halvings of the image
+    Effort("full", 1.0),
+    Effort("new splats as of half the image's size", 0.35),
+    Effort("new splats as of a quarter of the image's size", 0.2),
+    Effort("no new splats for now", 0.02, telling=False),
+)
 LAST_SECONDS = 2.0  # after the last keyframe of a live stream the map is handed out, before its refinement
 
 
@@ -66,8 +77,10 @@ class Mapper(Node):
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
+        return_large_blocks()
         self._pace = Pace(EFFORTS, self.config.share, self.stats, None if self.config.realtime else (0,))
         self._pace.waiting = lambda: self.waiting(FusedKeyframe)
+        self._once = Once(self.stats)
         self._last_captured = 0.0  # of the keyframes that came
         self._efforts = 0, 0  # that stereo and fusion made for the newest keyframe
         self._shown = -1  # newest keyframe that a preview showed
@@ -82,11 +95,15 @@ class Mapper(Node):
         self._checkpoints: Checkpointing | None = None
         if self.config.output is not None:
             self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.atlas, resumed)
+        self._frozen = False  # frames are only found in the map
+        self._saving: deque[tuple[SavedMap, Reply]] = deque()  # that are being written, and what is replied then
         self._last_preview = self._preview_seconds = 0.0
         self._provisional = Provisional(self.config.preview_splats)
 
     @classmethod
     def check(cls, config: Config) -> None:
+        if config.training.loss_function is not None:
+            loss_function(config.training.loss_function)
         if config.resume is not None:
             checkpoint_info(config.resume)
         elif config.map is not None:
@@ -94,6 +111,8 @@ class Mapper(Node):
             checkpoint_info(config.map)
 
     def on_fused_keyframe(self, fused: FusedKeyframe) -> Iterator[Preview]:
+        if not self._once.keyframe(fused):
+            return
         self._provisional.came(fused.index)
         if self._replay and not self._replay.view(fused.index, fused.world_from_cam, fused.scale):
             self._pass_over(
@@ -103,7 +122,7 @@ class Mapper(Node):
         self._settle()
         self._pace.came(fused.timestamp)
         with self._pace.spend() as effort:
-            added = self._add(fused, small=effort > 0)
+            added = self._add(fused, effort)
         self.stats.arrived("keyframe to map", fused.captured)
         self._efforts = fused.effort, fused.fusion_effort
         self._came(fused)
@@ -115,12 +134,12 @@ class Mapper(Node):
         yield from self._preview()
 
     def on_tracked_frame(self, frame: TrackedFrame) -> Iterator[Preview]:
-        if not self._replay or not self._replay.problem:
+        if self._once.frame(frame) and (not self._replay or not self._replay.problem):
             self.atlas.add_between(
                 FrameBetween(
                     index=frame.index, timestamp=frame.timestamp, image=frame.image, intrinsics=frame.intrinsics,
                     keyframe=frame.keyframe, keyframe_from_cam=frame.keyframe_from_cam, scale=frame.scale,
-                    exposure=frame.exposure, velocity=frame.velocity, readout_time=frame.readout_time,
+                    exposure=frame.exposure, velocity=frame.velocity, readout_time=frame.readout_time, mask=frame.mask,
                 )
             )  # fmt: skip
         yield from ()
@@ -139,6 +158,8 @@ class Mapper(Node):
         yield from self._preview()
 
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
+        if not self._once.poses(poses):
+            return
         self._provisional.correct(poses.index, poses.world_from_cam, poses.scale, poses.segment)
         if self._replay and not self._replay.poses(poses.revision, poses.index, poses.world_from_cam, poses.scale):
             self._pass_over()
@@ -151,24 +172,49 @@ class Mapper(Node):
         )  # fmt: skip
         yield from ()
 
-    def on_idle(self) -> list[Preview] | None:
+    def on_request(self, request: Request) -> Iterator[Reply]:
+        """In its place among the keyframes; the reply to what is written to a disk comes when it is there."""
+        if not self._once.request(request):
+            return
+        reply = None if request.problem else Reply(request.number, True, "")
+        if reply is None:
+            reply = Reply(request.number, False, request.problem)
+        elif request.asked == Asked.PAUSE:
+            reply = replace(reply, message="paused" if request.on else "the stream goes on")
+        else:
+            self._settle_last() if request.asked == Asked.LOCALIZE else self._settle()
+            reply = self._meet(request, reply)
+        if reply is not None:
+            yield reply
+
+    def on_idle(self) -> list[Preview | Reply] | None:
+        replies: list[Preview | Reply] = list(self._replies())
         deadline = time.perf_counter() + _SLICE
-        if not self.atlas.step():
-            return None
-        while time.perf_counter() < deadline and self.atlas.step():
+        if self._frozen or not self._piece(self._pace.fits):
+            return replies or None
+        while time.perf_counter() < deadline and self._piece(self._pace.fits):
             pass
         self._keep()
         self._report()
-        return list(self._preview())
+        return [*replies, *self._preview()]
 
-    def on_end(self) -> Iterator[SplatMap | Preview]:
+    def _piece(self, splats: bool) -> bool:
+        """An iteration; of a live stream, where none is pending, a piece of what there was no time for."""
+        return self.atlas.step() or (self.config.realtime and self._last_captured > 0.0 and self.atlas.make_up(splats))
+
+    def on_end(self) -> Iterator[SplatMap | Preview | Reply]:
+        yield from self._replies(wait=True)
+        if self._replay is None:
+            self._once.report_missing()
         self._settle_last()
         self.atlas.finish()
         self._settle_last()
         self.stats.arrived("last keyframe to the map before its refinement", self._last_captured)
         yield self._map(refined=False)
-        while self.atlas.refine():
+        while not self._frozen and self._finishing():
             self._keep()
+            if self.config.realtime:
+                yield from self._preview()
         self._report()
         self._check()
         if self._checkpoints is not None and len(self.atlas.current.state):
@@ -179,22 +225,78 @@ class Mapper(Node):
             self._checkpoints.close(self.atlas, keep=self.config.keep_map)
             self._checkpoints = None
 
+    def _finishing(self) -> bool:
+        """One piece of work after the stream; False when all are done."""
+        return (self.config.realtime and self.atlas.make_up()) or self.atlas.refine()
+
     def on_abort(self, reason: str) -> None:
         if self._checkpoints is not None:
             self._checkpoints.last(self.atlas)
 
-    def _add(self, fused: FusedKeyframe, small: bool) -> TrainingView | None:
+    def _add(self, fused: FusedKeyframe, halvings: int) -> TrainingView | None:
         return self.atlas.add(
             RGBDKeyframe(
                 index=fused.index, image=fused.image, intrinsics=fused.intrinsics, world_from_cam=fused.world_from_cam,
                 depth=fused.depth, scale=fused.scale, confidence=fused.confidence, normals=fused.normals,
                 unfiltered=fused.unfiltered, timestamp=fused.timestamp, exposure=fused.exposure,
                 vignetting=fused.vignetting, photograph=fused.photograph, velocity=fused.velocity,
-                readout_time=fused.readout_time,
+                readout_time=fused.readout_time, mask=fused.mask,
             ),
             fused.segment,
-            small,
+            halvings,
         )  # fmt: skip
+
+    def _meet(self, request: Request, reply: Reply) -> Reply | None:
+        """Does the mapper's part. None: the reply comes later, with what is written to a disk."""
+        if request.asked == Asked.LOCALIZE:
+            self._frozen = request.on
+            what = "frames are only found in the map, which stays as it is" if request.on else "the map grows again"
+            return replace(reply, message=what)
+        try:
+            saved = SavedMap(self.atlas, self.config, Path(request.kept or request.folder))
+        except (OSError, ValueError) as error:
+            if request.asked == Asked.SAVE_MAP or len(self.atlas.largest.state):
+                return replace(reply, success=False, message=str(error))
+            saved = None
+        before = (
+            "there was nothing to keep of the one before" if saved is None else f"the one before is in {saved.what}"
+        )
+        if request.asked == Asked.RESET:
+            self._go_on_with(Atlas(OnlineMapper(self.config, self.stats)))
+            self._frozen = False  # a new map has to grow
+            reply = replace(reply, message=f"a new map begins; {before}")
+        elif request.asked == Asked.LOAD_MAP:
+            reply = self._load(request.folder, before, reply)
+        elif saved is not None:
+            reply = replace(reply, message=saved.what)
+        if saved is None:
+            return reply
+        self._saving.append((saved, reply))
+        return None
+
+    def _load(self, folder: str, before: str, reply: Reply) -> Reply:
+        """Goes on in a map in which the tracker looks for the camera already."""
+        try:
+            self._go_on_with(begin_on(Path(folder), self.config, self.stats))
+        except ValueError as error:
+            self._go_on_with(Atlas(OnlineMapper(self.config, self.stats)))
+            what = f"the camera is looked for in {folder}, but its splats cannot be taken up ({error}); {before}"
+            return replace(reply, success=False, message=what)
+        return replace(reply, message=f"the camera is looked for in {folder}; {before}")
+
+    def _replies(self, wait: bool = False) -> Iterator[Reply]:
+        """Of the maps that are written by now, in the order in which they were asked for."""
+        while self._saving and (wait or self._saving[0][0].done):
+            saved, reply = self._saving.popleft()
+            saved.wait()
+            problem = saved.problem
+            yield replace(reply, success=False, message=f"{reply.message}: {problem}") if problem else reply
+
+    def _go_on_with(self, atlas: Atlas) -> None:
+        """Another map; what is counted goes on."""
+        self.atlas, self._replay = atlas, None
+        self._provisional = Provisional(self.config.preview_splats)
+        self._unseen.clear()
 
     def _pass_over(self, counted: str = "") -> None:
         """A message that is not taken in, as the checkpoint has it or the stream does not fit, which is said."""
@@ -212,7 +314,7 @@ class Mapper(Node):
     def _settle_last(self) -> None:
         """The stream has ended: the pending iterations; of a live one as many as its last frame may wait for."""
         until = self._last_captured + LAST_SECONDS if self._last_captured else math.inf
-        while time.time() < until and self.atlas.step():
+        while not self._frozen and time.time() < until and self._piece(splats=False):
             self._keep()
 
     def _came(self, keyframe: FusedKeyframe | Keyframe) -> None:
@@ -277,6 +379,8 @@ class Mapper(Node):
             latency=None if live is None else np.array(live),
             effort=self._efforts[0],
             fusion_effort=self._efforts[1],
+            memory=rss(),
+            coarse=len(mapper.coarse),
         )
         shown = {view.index for view in mapper.views} | self._provisional.shown
         for index in self._unseen.keys() & shown:

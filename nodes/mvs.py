@@ -23,6 +23,8 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
         self._keyframes: dict[int, Keyframe] = {}  # without depth yet
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
+        if not self._once.keyframe(keyframe):
+            return
         self._take(keyframe.index, keyframe.timestamp)
         passed_over = self.config.resume_after is not None and keyframe.index <= self.config.resume_after
         if passed_over:
@@ -39,6 +41,7 @@ class StereoNode(WindowedNode[OnlineStereo, CascadeDepth, Depth]):
                 weight=keyframe.inverse_depth_weight,
                 scale=keyframe.scale,
                 segment=keyframe.segment,
+                mask=keyframe.mask,
             )
         yield from self._messages(self._core.add(self._corrected(view), wanted=not passed_over))
 
@@ -88,6 +91,7 @@ def depth_message(keyframe: Keyframe, depth: np.ndarray, confidence: np.ndarray)
         velocity=keyframe.velocity,
         readout_time=keyframe.readout_time,
         captured=keyframe.captured,
+        mask=keyframe.mask,
     )
 
 

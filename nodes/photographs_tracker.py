@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
 from msgs import Frame, Keyframe
 from mvsgs_core.datasets.lens import Lens, Undistortion
 from mvsgs_core.photographs.config import PhotographsConfig
@@ -30,14 +32,22 @@ class PhotographsTracker(TrackerNode):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         self.core = PhotographTracker(self.config)
+        self._bent = False
         self._lenses: dict[tuple[float, float, float, float, tuple[int, int]], Undistortion] = {}
 
     def _add(self, frame: Frame) -> Update:
-        return self.core.add(frame.index, frame.timestamp, frame.image, frame.intrinsics, frame.intrinsics_guessed)
+        guessed, place = frame.intrinsics_guessed, self._places.get(frame.index)
+        return self.core.add(
+            frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed, frame.exposure, place, frame.mask
+        )
 
     @property
     def _focal_factor(self) -> float:
         return self.core.focal_factor
+
+    @property
+    def _distortion(self) -> np.ndarray | None:
+        return np.array(self.core.distortion) if self._bent else None
 
     def _keyframe(self, index: int) -> Keyframe:
         frame = self._frames[index]
@@ -55,6 +65,9 @@ class PhotographsTracker(TrackerNode):
             inverse_depth=found.inverse_depth,
             inverse_depth_weight=found.weight,
             segment=found.segment,
+            exposure=self.core.exposure(index),
+            vignetting=self.core.light.vignetting,
+            mask=None if frame.mask is None else lens.mask(frame.mask),
         )
 
     def _undistortion(self, frame: Frame) -> Undistortion:
@@ -68,9 +81,10 @@ class PhotographsTracker(TrackerNode):
             bent = abs(r2 * (k1 + r2 * k2)) * r2**0.5 * fx
             self._lenses[key] = Undistortion(Lens(key[:4], size, (k1, k2, 0.0, 0.0) if bent > VISIBLE else ()))
             if bent > VISIBLE:
+                self._bent = True
                 self.stats.warn(
-                    f"the photographs are distorted, by up to {bent:.0f} pixels; keyframes are undistorted, but "
-                    f"renders are scored against photographs as they came. dataset.intrinsics=[{fx:.2f},{fy:.2f},"
-                    f"{cx:.2f},{cy:.2f}] dataset.distortion=[{k1:.5f},{k2:.5f},0,0] undistorts all of them"
+                    f"the photographs are distorted, by up to {bent:.0f} pixels, which is taken out: "
+                    f"dataset.intrinsics=[{fx:.2f},{fy:.2f},{cx:.2f},{cy:.2f}] "
+                    f"dataset.distortion=[{k1:.5f},{k2:.5f},0,0] does it before"
                 )
         return self._lenses[key]

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msgs import Frame, GroundTruth, Keyframe, Poses, TrackingState, Trajectory
+from msgs import Frame, GroundTruth, Keyframe, Poses, Request, TrackingState, Trajectory
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import PosedConfig
-from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified
+from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified, rectified_mask
 from mvsgs_core.tracking.posed import PosedTracker as CoreTracker
 from mvsgs_core.tracking.publish import affine_of, changed_vignetting, differ
 from nodes import Node
-from nodes.tracking import warn_of_guessed_focal
+from nodes.tracking import keep_place, places_of, refused, warn_of_guessed_focal
 
 
 class PosedTracker(Node):
@@ -37,10 +37,12 @@ class PosedTracker(Node):
         self._joined: dict[int, tuple[float, np.ndarray]] = {}  # timestamp and pose (4, 4), NaN where there is none
         self._keyframes: dict[int, np.ndarray | None] = {}  # with the exposure (3, 4) that was sent
         self._vignetting: np.ndarray | None = None  # (3,) that was sent
+        self._places: dict[int, np.ndarray] = {}  # by GPS
         self._revision = 0
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
         self._frames[frame.index] = frame
+        keep_place(self._places, frame)
         warn_of_guessed_focal(self.stats, frame)
         if frame.index in self._truths:
             yield from self._join(frame.index)
@@ -49,6 +51,9 @@ class PosedTracker(Node):
         self._truths[truth.index] = truth
         if truth.index in self._frames:
             yield from self._join(truth.index)
+
+    def on_request(self, request: Request) -> Iterator[Request]:
+        yield refused(request, type(self))
 
     def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
         if self._core is not None:
@@ -83,6 +88,7 @@ class PosedTracker(Node):
             readout_time=self.config.readout_time,
             exposure=np.stack([exposures.get(i, unknown) for i in order]) if exposures else None,
             vignetting=None if self._core is None else self._core.photometer.vignetting,
+            places=places_of(np.array(order, np.int64), self._places),
         )
 
     def _join(self, index: int) -> Iterator[Keyframe | Poses]:
@@ -95,7 +101,7 @@ class PosedTracker(Node):
             return
         if self._core is None:
             self._core = CoreTracker(self.config, frame.image.shape[:2], frame.intrinsics)
-        for done in self._core.add(index, frame.timestamp, frame.image, pose, frame.exposure):
+        for done in self._core.add(index, frame.timestamp, frame.image, pose, frame.exposure, frame.mask):
             yield self._keyframe(self._core, done)
             yield from self._exposed(self._core)
         for old in (self._frames.keys() & self._joined.keys()) - self._core.pending:
@@ -125,6 +131,7 @@ class PosedTracker(Node):
             velocity=velocity,
             readout_time=0.0 if velocity is None else readout_time,
             captured=frame.captured,
+            mask=rectified_mask(frame.mask, keyframe.image, readout_time),
         )
 
     def _exposed(self, core: CoreTracker) -> Iterator[Poses]:

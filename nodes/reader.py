@@ -10,8 +10,9 @@ from msgs import Frame, GroundTruth
 from mvsgs_core import datasets
 from mvsgs_core.datasets import Item, check, open_dataset, options_of
 from mvsgs_core.datasets.options import FileOptions
+from mvsgs_core.datasets.sequence import ImageSequence
 from mvsgs_core.export.source_camera import LENS, lens_values
-from nodes import Node
+from nodes import Advice, Node
 from nodes.parameters import Parameter, parameter_names, parameters
 from nodes.playback import Playback
 
@@ -32,6 +33,24 @@ class Reader(Node):
     @classmethod
     def check(cls, config: Config) -> None:
         check(config.name, **_options(config))
+
+    @classmethod
+    def advise(cls, config: Config) -> Mapping[str, Advice]:
+        """Of a folder of images: the tracker of photographs where they step wide."""
+        if config.name != datasets.PLAIN or config.realtime:
+            return {}
+        from mvsgs_core.photographs import steps as measured  # loads what only the tracker needs
+
+        sequence = open_dataset(config.name, **_options(config))
+        assert isinstance(sequence, ImageSequence)
+        steps = measured.measure_steps(sequence.successive(measured.chosen_pairs(len(sequence)), measured.ENOUGH))
+        if not steps.wide:
+            return {}
+        if len(sequence) > measured.MOST:
+            why = f"{steps}, but {len(sequence)} are too many for tracker=photographs, which waits for all"
+            return {"tracker": Advice("dense", why)}
+        why = f"{steps}, so they are taken for photographs; tracker=dense takes them for a video"
+        return {"tracker": Advice("photographs", why, {"because": why})}
 
     @classmethod
     def keys_of(cls, config: Config) -> Mapping[str, Sequence[Parameter]]:
@@ -56,8 +75,9 @@ class Reader(Node):
                 self.stats.count("frames")
                 guessed, exposure = item.intrinsics_guessed, item.exposure
                 yield Frame(
-                    item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure, captured=captured
-                )
+                    item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure, captured=captured,
+                    place=item.place, mask=item.mask,
+                )  # fmt: skip
                 yield _ground_truth(item)
         finally:  # also when the run is interrupted
             self._pass_warnings_on(sequence)
@@ -73,4 +93,6 @@ def _options(c: Reader.Config) -> dict[str, Any]:
 
 
 def _ground_truth(item: Item) -> GroundTruth:
-    return GroundTruth(item.index, item.timestamp, item.image, item.intrinsics, item.world_from_cam, item.depth)
+    return GroundTruth(
+        item.index, item.timestamp, item.image, item.intrinsics, item.world_from_cam, item.depth, mask=item.mask
+    )

@@ -39,12 +39,12 @@ class Resumed(Node):
         self.stats.values["frames_expected"] = len(keyframes)
         for keyframe in keyframes:
             with self.stats.time("read"):
-                image = keyframe.image()
+                image, mask = keyframe.image(), keyframe.mask()
             if image is None:
                 self.stats.skip("keyframes whose image was let go (mapper.max_keyframes)")
                 continue
             self.stats.count("frames")
-            yield GroundTruth(keyframe.index, keyframe.timestamp, image, keyframe.intrinsics, None, None)
+            yield GroundTruth(keyframe.index, keyframe.timestamp, image, keyframe.intrinsics, None, None, mask=mask)
         yield Trajectory(
             index=np.array([keyframe.index for keyframe in keyframes], dtype=np.int64),
             timestamp=np.array([keyframe.timestamp for keyframe in keyframes], dtype=np.float64),

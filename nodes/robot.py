@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from msgs import End, Frame
 from msgs.codec import CodecError
 from mvsgs_core.camera import resize_image, scale_intrinsics
 from mvsgs_core.datasets.framing import Framing, target_size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.export.source_camera import LENS, lens_values
-from nodes.live import LiveSource
+from nodes.live import LiveSource, camera_mask
 from nodes.runtime.addresses import TransportError, check_address, load_keys
 from nodes.runtime.transport import LiveReader
 from nodes.stream_frames import StreamFrames
@@ -49,6 +51,7 @@ class Robot(LiveSource):
             check_address(config.path)
             if config.keys is not None:
                 load_keys(Path(config.keys))
+            camera_mask(config.mask)
         except TransportError as error:
             raise ValueError(str(error)) from error
 
@@ -110,4 +113,15 @@ class Robot(LiveSource):
             for note in Framing(self.config.size).notice(native):
                 self.stats.warn(note)
         intrinsics = scale_intrinsics(frame.intrinsics, native, size)
-        return replace(frame, image=resize_image(frame.image, size), intrinsics=intrinsics)
+        return replace(
+            frame, image=resize_image(frame.image, size), intrinsics=intrinsics, mask=self._mask(frame, size)
+        )
+
+    def _mask(self, frame: Frame, size: tuple[int, int]) -> np.ndarray | None:
+        """(h, w) bool: what the robot's own mask and that of all frames leave alike; None: every pixel counts."""
+        native = frame.image.shape[0], frame.image.shape[1]
+        fx, fy, cx, cy = frame.intrinsics.tolist()
+        lens, framing = Lens((fx, fy, cx, cy), native), Framing(self.config.size)
+        common = None if self._camera_mask is None else self._camera_mask.framed(framing, lens, size)
+        own = None if frame.mask is None else framing.mask(frame.mask, lens, size)
+        return common if own is None else own if common is None else own & common

@@ -11,12 +11,11 @@ import numpy as np
 from msgs import Frame
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets.calibration import lens_from_option
-from mvsgs_core.datasets.framing import Framing
+from mvsgs_core.datasets.framing import Framing, same_shape
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.ros import COMPRESSED, calibrated, camera_info_topic, lens_of, rectified, rgb_of
-from mvsgs_core.datasets.sequence import same_shape
 from mvsgs_core.export.source_camera import LENS, lens_values
-from nodes.live import LiveSource
+from nodes.live import LiveSource, camera_mask
 from nodes.ros2.cdr import CdrError
 from nodes.ros2.connection import LOOPBACK, SENSOR_DATA, Connection, check_installed
 from nodes.ros2.messages import CameraInfo, CompressedImage, Image
@@ -75,6 +74,7 @@ class Ros2Camera(LiveSource):
     @classmethod
     def check(cls, config: Config) -> None:
         check_installed()
+        camera_mask(config.mask)
         if config.intrinsics is not None:
             lens_from_option(config.intrinsics, config.distortion, (480, 640))
 
@@ -199,5 +199,7 @@ class Ros2Camera(LiveSource):
         assert self._lens is not None
         native = frame.image.shape[0], frame.image.shape[1]
         size = self._framing.size_of(self._lens.size)
-        image, intrinsics = self._framing.image(frame.image, self._lens.at(native), size)
-        return replace(frame, image=image, intrinsics=intrinsics)
+        lens = self._lens.at(native)
+        image, intrinsics = self._framing.image(frame.image, lens, size)
+        mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, lens, size)
+        return replace(frame, image=image, intrinsics=intrinsics, mask=mask)

@@ -1,15 +1,16 @@
-"""CameraPose, Keyframe, Poses, FusedKeyframe, Preview -> ROS 2: poses, path, transforms, depth, the map as points."""
+"""CameraPose, Keyframe, Poses, FusedKeyframe, Preview, Reply -> Request, ROS 2: poses, depth, the map; services."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from msgs import CameraPose, FusedKeyframe, Keyframe, Poses, Preview
+from msgs import Asked, CameraPose, FusedKeyframe, Keyframe, Poses, Preview, Reply, Request
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.datasets.ros import camera_info_topic
 from nodes import Node
@@ -17,6 +18,7 @@ from nodes.odometry import Odometry
 from nodes.ros2 import forms
 from nodes.ros2.connection import DEFAULT, LATCHED, TF, Connection, Quality, check_installed
 from nodes.ros2.messages import CameraInfo, Image, Message, Path, PointCloud2, PoseStamped, TFMessage
+from nodes.ros2_services import Names, Services
 
 if TYPE_CHECKING:
     from nodes.ros2.dds import Writer
@@ -70,6 +72,10 @@ class Ros2Publisher(Node):
     class Config(Connection):
         frames: Frames = field(default_factory=Frames)
         topics: Topics = field(default_factory=Topics)
+        services: Names = field(default_factory=Names)
+        output: str | None = None  # of the run
+        maps: str | None = None  # folder in which save_map, load_map and reset leave maps; null: OUTPUT/maps
+        load: str | None = None  # the map of load_map, output of a run that kept it; null: the newest in `maps`
         unit: float = 1.0  # meters in one unit of the map, where you know it
         reliable: bool = True  # pose, path and depth; false: best effort, which readers that ask for more do not get
         queue: int = DEFAULT.depth  # messages of a topic that a slow reader may be behind
@@ -83,7 +89,7 @@ class Ros2Publisher(Node):
             names = list(vars(self.frames).values())
             if not all(names) or len(set(names)) < len(names):
                 raise ValueError(f"frames must have four different names, got {names}")
-            for name in filter(None, vars(self.topics).values()):
+            for name in filter(None, (*vars(self.topics).values(), *vars(self.services).values())):
                 self.topic(name)
 
     config: Config
@@ -102,20 +108,60 @@ class Ros2Publisher(Node):
         self._info = self._writer(camera_info_topic(topics.depth) if topics.depth else "", CameraInfo, live)
         self._tf = self._writer(topics.tf, TFMessage, TF)
         self._tf_static = self._writer(topics.tf_static, TFMessage, LATCHED)
-        self._odometry = Odometry()
-        self._keyframes: dict[int, _Placed] = {}
-        self._sent: dict[int, None] = {}  # frames with their transforms, the newest last
+        self._maps = FilePath(c.maps or FilePath(c.output or ".") / "maps").expanduser().absolute()
+        self._services: Services | None = None  # once it is known whether anybody hears
+        self._begin()
         self._newest = float("-inf")  # timestamp of a pose
         self._by_frame = False  # the tracker sends CameraPose
-        self._shown: tuple[int, int] | None = None  # keyframe and iterations of the map that is published
         self._write(self._tf_static, self._static_transform())
         where = f"domain {c.number} on interface={c.interface}"
         self.stats.values["ros2"] = where
         logging.info("publishing to ROS 2: %s", where)
 
+    def _begin(self) -> None:
+        """A map."""
+        self._odometry = Odometry()
+        self._keyframes: dict[int, _Placed] = {}
+        self._sent: dict[int, None] = {}  # frames with their transforms, the newest last
+        self._shown: tuple[int, int] | None = None  # keyframe and iterations of the map that is published
+
     @classmethod
     def check(cls, config: Config) -> None:
         check_installed()
+
+    @classmethod
+    def unused_inputs(cls, config: Config) -> frozenset[type]:
+        return frozenset() if any(vars(config.services).values()) else frozenset({Request, Reply})
+
+    def on_idle(self) -> list[Request] | None:
+        """What was asked since."""
+        if Request in self.unread:
+            return None
+        if self._services is None:
+            self._services = Services(self._participant, self.config, self.config.services, self.stats)
+        return self._services.new(self._maps, self.config.load) or None
+
+    def on_reply(self, reply: Reply) -> Iterator[None]:
+        if self._services is not None:
+            self._services.reply(reply)
+        yield from ()
+
+    def on_request(self, request: Request) -> Iterator[None]:
+        """From the tracker, in its place among the poses: those that follow are of another map."""
+        if not request.problem and request.asked in (Asked.RESET, Asked.LOAD_MAP):
+            self._begin()
+        yield from ()
+
+    def on_end(self) -> Iterator[None]:
+        self._answer("the run has ended; its map is in its output")
+        yield from ()
+
+    def on_abort(self, reason: str) -> None:
+        self._answer(f"the run was stopped: {reason}")
+
+    def _answer(self, why: str) -> None:
+        if self._services is not None:
+            self._services.close(why)
 
     def on_camera_pose(self, message: CameraPose) -> Iterator[None]:
         self._by_frame = True

@@ -8,17 +8,22 @@ from typing import ClassVar
 
 import numpy as np
 
-from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame, Trajectory
+from msgs import Asked, CameraPose, Frame, Keyframe, Poses, Request, TrackedFrame, TrackerPhase, Trajectory
 from mvsgs_core import geometry
-from mvsgs_core.kept_map import STREAM, check_kept_map, tracker_file
+from mvsgs_core.kept_map import NOTHING_MAPPED, STREAM, check_kept_map, check_no_map, tracker_file
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.tracking import known_map
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import TrackerConfig
-from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified
+from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified, rectified_mask
 from mvsgs_core.tracking.publish import Correction, Update
 from mvsgs_core.tracking.tracker import Tracker as CoreTracker
+from nodes.localization_file import LocalizationFile
+from nodes.returning import Returning
 from nodes.tracking import TrackerNode
+
+ONLY_LOCALIZES = "this run only localizes: begin one with map=DIR and without mapper=frozen, and switch by localize"
 
 
 class Tracker(TrackerNode):
@@ -33,12 +38,16 @@ class Tracker(TrackerNode):
 
     config: Config
     core: CoreTracker
-    frozen: ClassVar[bool] = False  # frames are only found in the map
+    restartable: ClassVar[bool] = True
+    only_localizes: ClassVar[bool] = False  # from the start to the end, frames are only found in the map
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
-        known = None if self.config.map is None else known_map.load(tracker_file(self.config.map)).renumbered(STREAM)
-        self.core = CoreTracker(self.config, known=known, frozen=self.frozen)
+        known = None if self.config.map is None else _known(self.config.map)
+        self.core = CoreTracker(self.config, known=known, frozen=self.only_localizes)
+        self._localized = LocalizationFile(self.config.output, self.stats)
+        self._newest: Frame | None = None
+        self._returning: Returning | None = None
         self._readout_times: list[float] = []  # seconds, what was taken out of each keyframe's image
         self._without_shutter: set[int] = set()  # keyframes that were sent before the readout time was known
 
@@ -48,9 +57,57 @@ class Tracker(TrackerNode):
             check_kept_map(config.map)
             known_map.load(tracker_file(config.map))
 
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase]:
+        self._begin()
+        if self._returning is not None and frame.index <= self._returning.newest:
+            self.stats.skip("frames that came again")
+            return
+        self._newest = frame
+        yield from super().on_frame(frame)
+        if self.core.frozen:
+            self._localized.add(frame, self.core.newest_pose())
+        self._save_to_return()
+
+    def on_idle(self) -> list[Keyframe | Poses | TrackedFrame] | None:
+        found = super().on_idle()
+        if not found:  # what is saved was sent
+            self._save_to_return()
+        return found
+
+    def _save_to_return(self) -> None:
+        """Where the map is no further than what was sent of it."""
+        if self._returning is not None and self._work is None:
+            self._returning.save(self.core)
+
+    def _begin(self) -> None:
+        """With the first message: this process may be one that was started in another's place."""
+        if self.kept_in is None or self._returning is not None:
+            return
+        returning = self._returning = Returning(self.kept_in, self.stats)
+        if (known := returning.known()) is not None:
+            self._revision = returning.revision
+            self.core = CoreTracker(self.config, known=known, frozen=returning.frozen)
+
+    def on_request(self, request: Request) -> Iterator[Keyframe | Poses | TrackedFrame | Request]:
+        """Between two frames: what is saved is the map as it is there, and what is begun begins there."""
+        self._begin()
+        if self._returning is not None and request.number in self._returning.met:
+            self.stats.skip("requests that came again")
+            return
+        yield from self._settled()
+        if not request.problem and request.asked != Asked.PAUSE:
+            try:
+                self._meet(request)
+            except (OSError, ValueError) as error:
+                request = replace(request, problem=str(error))
+        if self._returning is not None:
+            self._returning.note(request)
+        yield request
+
     def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
         yield from super().on_end()
-        if self.config.keep_map and not self.frozen and self.config.output is not None:
+        self._localized.close()
+        if self.config.keep_map and not self.only_localizes and self.config.output is not None:
             self._keep_map(self.config.output)
 
     def _keep_map(self, output: str) -> None:
@@ -60,13 +117,71 @@ class Tracker(TrackerNode):
         except (OSError, ValueError) as error:
             self.stats.warn(f"no other run can begin on this map: {error}")
 
+    def _meet(self, request: Request) -> None:
+        """Raises OSError and ValueError, saying what to do, where it cannot be done; then nothing has changed."""
+        if self.only_localizes and (request.asked in (Asked.SAVE_MAP, Asked.RESET) or _grows(request)):
+            raise ValueError(ONLY_LOCALIZES)
+        match request.asked:
+            case Asked.SAVE_MAP:
+                self._save(request.folder)
+            case Asked.RESET:
+                self._go_on_with(CoreTracker(self.config, stats=self.core.stats), request.kept)
+            case Asked.LOAD_MAP:
+                self._go_on_with(self._on(request.folder), request.kept)
+            case Asked.LOCALIZE if request.on:
+                self.core.freeze()
+                self._note_mode()
+            case Asked.LOCALIZE:
+                self.core.thaw()
+                self._note_mode()
+            case _:
+                raise ValueError(f"{request.asked}: no tracker does that")
+
+    def _note_mode(self) -> None:
+        if self._returning is not None:
+            self._returning.note_mode(self.core.frozen)
+
+    def _on(self, folder: str) -> CoreTracker:
+        """A tracker that looks for the camera in a map. Raises ValueError, saying what to do."""
+        check_kept_map(folder)
+        checkpoint_info(folder)
+        if self._newest is None:
+            raise ValueError("no frame has come yet: ask again when one has, or begin the run with map=DIR")
+        core = CoreTracker(self.config, known=_known(folder), frozen=self.core.frozen, stats=self.core.stats)
+        frame = self._newest
+        core.begin((frame.image.shape[0], frame.image.shape[1]), frame.intrinsics, frame.intrinsics_guessed)
+        return core
+
+    def _save(self, folder: str) -> None:
+        if not self.core.mapped:
+            raise ValueError(NOTHING_MAPPED)
+        check_no_map(folder)
+        self.core.keep_map(tracker_file(folder))
+
+    def _go_on_with(self, core: CoreTracker, kept: str) -> None:
+        """Another map; what is there of the one before is kept in that folder, and goes out no more."""
+        if self.core.mapped and not self.only_localizes:
+            self._save(kept)
+        self.stats.warn("another map was begun on request: what is reported is the last one")
+        self.core = core
+        if self._returning is not None:
+            self._returning.forget()
+            self._returning.save(core)
+        self._frames.clear()
+        self._readout_times.clear()
+        self._without_shutter.clear()
+
     def _add(self, frame: Frame) -> Update:
-        guessed = frame.intrinsics_guessed
-        return self.core.follow(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed, frame.exposure)
+        guessed, exposure, mask = frame.intrinsics_guessed, frame.exposure, frame.mask
+        return self.core.follow(frame.index, frame.timestamp, frame.image, frame.intrinsics, guessed, exposure, mask)
 
     @property
     def _live(self) -> bool:
         return self.config.realtime
+
+    @property
+    def _late(self) -> bool:
+        return self.core.late
 
     @property
     def _focal_factor(self) -> float:
@@ -79,7 +194,10 @@ class Tracker(TrackerNode):
     def _send(self, update: Update) -> Iterator[Keyframe | Poses | TrackedFrame]:
         if update.correction is not None:
             update = replace(update, correction=self._with_shutter(update.correction))
-        yield from super()._send(update)
+        for message in super()._send(update):
+            if self._returning is not None:
+                self._returning.note(message)
+            yield message
 
     def _with_shutter(self, correction: Correction) -> Correction:
         """Corrected keyframes that were sent before the readout time was known get it, and their velocities."""
@@ -129,6 +247,7 @@ class Tracker(TrackerNode):
             velocity=velocity,
             readout_time=0.0 if velocity is None else self._readout_time,
             captured=frame.captured,
+            mask=rectified_mask(frame.mask, keyframe.image, self._readout_time),
         )
 
     def _camera_pose(self, frame: Frame) -> CameraPose | None:
@@ -148,10 +267,20 @@ class Tracker(TrackerNode):
             exposure=found.exposure,
             velocity=velocity,
             readout_time=0.0 if velocity is None else self._readout_time,
+            mask=frame.mask,
         )
 
     def _intrinsics(self, frame: Frame) -> np.ndarray:
         return frame.intrinsics * [self.core.focal_factor, self.core.focal_factor, 1.0, 1.0]
+
+
+def _grows(request: Request) -> bool:
+    return request.asked == Asked.LOCALIZE and not request.on
+
+
+def _known(folder: str) -> known_map.KnownMap:
+    """The tracker's half of a map, as a new stream goes on in it. Raises ValueError."""
+    return known_map.load(tracker_file(folder)).renumbered(STREAM)
 
 
 def in_milliseconds(readout_times: list[float]) -> str:

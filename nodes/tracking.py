@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 
-from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame, TrackerPhase, Trajectory
+from msgs import Asked, CameraPose, Frame, Keyframe, Poses, Request, TrackedFrame, TrackerPhase, Trajectory
+from mvsgs_core.geodesy import is_place
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
 from mvsgs_core.tracking.settling import Settling
+from mvsgs_core.tracking.steps import Steps
 from mvsgs_core.trajectory import TrackingState
 from mvsgs_core.trajectory import Trajectory as CameraTrajectory
 from nodes import Node
 
 POSE = "frame to pose"  # the latency
 PERIOD = 1.0  # s between two TrackerPhase of a live stream
+SLICE = 0.005  # s of a keyframe's work, about, between two looks for a frame: looking costs a tenth of that
 
 
 class CoreTracker(Protocol):
@@ -46,6 +50,25 @@ def warn_of_guessed_focal(stats: Stats, frame: Frame) -> None:
         stats.warn("the focal length is a guess, which this tracker takes for true: tracker=dense estimates it")
 
 
+def keep_place(places: dict[int, np.ndarray], frame: Frame) -> None:
+    """What can be no place, as a receiver without a fix sends it, is none."""
+    if frame.place is not None and is_place(frame.place):
+        places[frame.index] = frame.place.copy()  # a view would keep the whole frame
+
+
+def places_of(index: np.ndarray, places: dict[int, np.ndarray]) -> np.ndarray | None:
+    """(N, 3) of frames `index` (N,), as `Trajectory` has them."""
+    unknown = np.full(3, np.nan)
+    return np.stack([places.get(int(i), unknown) for i in index]) if places and len(index) else None
+
+
+def refused(request: Request, tracker: type[Node]) -> Request:
+    """Passed on by a tracker that can only be paused."""
+    if request.problem or request.asked == Asked.PAUSE:
+        return request
+    return replace(request, problem=f"{tracker.__name__} cannot: start the run with tracker=dense")
+
+
 class TrackerNode(Node, ABC):
     """A subclass makes the tracker of the core, gives it frames and describes a keyframe."""
 
@@ -54,10 +77,14 @@ class TrackerNode(Node, ABC):
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
         self._frames: dict[int, Frame] = {}  # those that may still be sent
+        self._places: dict[int, np.ndarray] = {}  # by GPS, of the frames that have one
         self._revision = 0
         self._phase = Phase.INITIALIZING  # that was sent last
         self._told = 0.0  # when, by time.monotonic
-        self._later: Settling | None = None  # what is done as there is time, in a live stream
+        # what is done as there is time, in a live stream:
+        self._work: Steps[Update] | None = None  # what a keyframe takes
+        self._worked = False  # some of it was done since the last frame
+        self._later: Settling | None = None  # the frames before the keyframe whose work is done
 
     @abstractmethod
     def _add(self, frame: Frame) -> Update: ...
@@ -71,30 +98,42 @@ class TrackerNode(Node, ABC):
         return 1.0
 
     @property
+    def _distortion(self) -> np.ndarray | None:
+        """k1, k2 of the frames, which were taken out of the keyframes' images."""
+        return None
+
+    @property
     def _readout_time(self) -> float:
         """Seconds of the rolling shutter that was taken out of the keyframes' images."""
         return 0.0
 
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase]:
         self._frames[frame.index] = frame
+        keep_place(self._places, frame)
         update = self._add(frame)
         if CameraPose not in self.unread and (pose := self._camera_pose(frame)) is not None:
             yield pose  # first: who waits for it steers by it
         if update.state in (TrackingState.TRACKED, TrackingState.DEGENERATE):
             self.stats.arrived(POSE, frame.captured)
-        yield from self._send((yield from self._begun(update)) if self._live else update.whole())
+        yield from self._send_live(update) if self._live else self._send(update.whole())
         due = frame.captured > 0.0 and time.monotonic() - self._told >= PERIOD
         if self.core.phase != self._phase or due:
             self._phase, self._told = self.core.phase, time.monotonic()
             latency = np.array(self.stats.latency(POSE)[0]) if frame.captured > 0.0 else None
             yield TrackerPhase(frame.index, frame.timestamp, self._phase.value, latency)
 
-    def on_idle(self) -> list[TrackedFrame] | None:
+    def on_request(self, request: Request) -> Iterator[Keyframe | Poses | TrackedFrame | Request]:
+        yield refused(request, type(self))
+
+    def on_idle(self) -> list[Keyframe | Poses | TrackedFrame] | None:
+        if self._work is not None:
+            return list(self._work_for(SLICE))
         if self._later is None:
             return None
         return [] if self._later.step() else list(self._settled())
 
     def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
+        yield from self._work_for(np.inf)
         while self._later is not None and self._later.step():
             pass
         yield from self._settled()
@@ -103,26 +142,50 @@ class TrackerNode(Node, ABC):
         self._report()
         if self.core.nothing:
             self.stats.nothing(self.core.nothing)
+        trajectory = self.core.trajectory()
         found = {"focal_factor": self._focal_factor, "readout_time": self._readout_time}
-        yield Trajectory(**vars(self.core.trajectory()) | found)
+        known = {"places": places_of(trajectory.index, self._places), "distortion": self._distortion}
+        yield Trajectory(**vars(trajectory) | found | known)
 
     @property
     def _live(self) -> bool:
         """Whether the next frame is not to wait for what can be done later."""
         return False
 
-    def _begun(self, update: Update) -> Generator[TrackedFrame, None, Update]:
-        """With what is to be done before the next frame; what is left of the keyframe before is settled first."""
+    @property
+    def _late(self) -> bool:
+        """Whether the camera may be lost before there is time for the work on a keyframe."""
+        return False
+
+    def _send_live(self, update: Update) -> Iterator[Keyframe | Poses | TrackedFrame]:
+        """What is left to do is done as there is time, but some of it with every frame that comes meanwhile."""
+        yield from self._send(update)
         if update.rest is not None:
             yield from self._settled()
-        update = update.begun()
-        if update.later is not None:
-            yield from self._settled()
-            self._later = update.later
-        return update
+            self._work = update.rest
+        elif not self._worked:
+            yield from self._work_for(SLICE)
+        self._worked = False
+        while self._late and self._work is not None:
+            yield from self._work_for(SLICE)
 
-    def _settled(self) -> Iterator[TrackedFrame]:
-        """The frames between keyframes, with the poses that they have by now."""
+    def _work_for(self, seconds: float) -> Iterator[Keyframe | Poses | TrackedFrame]:
+        """The work on a keyframe goes on for about so long; what comes of it is sent when it is done."""
+        until = time.monotonic() + seconds
+        while self._work is not None:
+            self._worked = True
+            try:
+                next(self._work)
+            except StopIteration as done:
+                update: Update = done.value
+                self._work, self._later = None, update.later
+                yield from self._send(update)
+            if time.monotonic() >= until:
+                return
+
+    def _settled(self) -> Iterator[Keyframe | Poses | TrackedFrame]:
+        """The last keyframe, with all the work on it, and the frames before it with the poses that they have by now."""
+        yield from self._work_for(np.inf)
         later, self._later = self._later, None
         yield from self._frames_between(() if later is None else later.finish())
 

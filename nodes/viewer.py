@@ -1,4 +1,4 @@
-"""Preview, TrackerPhase -> nothing: the map as it grows in a web browser, by viser."""
+"""Preview, TrackerPhase, SplatMap -> nothing: the map as it grows in a web browser, by viser."""
 
 from __future__ import annotations
 
@@ -6,19 +6,31 @@ import logging
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import torch
+import viser
 
-from msgs import Preview, TrackerPhase
+from msgs import Preview, SplatMap, TrackerPhase
+from mvsgs_core.mapping.preview import as_bytes, covariances
+from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.splats import Splats
 from nodes import Node
-from nodes.map_page import MapPage, thumbnail
+from nodes.keyframe_pictures import KeyframePictures, depth_points, pictures
+from nodes.map_page import MapPage
+from nodes.seen_keyframes import SeenKeyframe, SeenKeyframes
+
+_FIGURES = ("nothing", "coverage", "error")  # that can color keyframes
 
 
 class Viewer(Node):
-    """A page with the splats, a frustum for each keyframe seen, the path, and the newest photo beside its render.
+    """A page with the splats, a frustum for each keyframe seen, the path, and pictures of the newest keyframe or one
+    that is chosen.
 
     Lengths are divided by the first preview's median distance, so that any map fits the browser's near and far planes.
-    Keyframes stand where the newest preview has them: later corrections move their frustums with the splats.
+    Keyframes stand where the newest preview has them: later corrections move their frustums with the splats. The
+    refined map is shown whole, and its keyframes as they are rendered from it.
     """
 
     @dataclass
@@ -27,6 +39,7 @@ class Viewer(Node):
         port: int = 8080  # of the page; the next free one if it is taken
         keep_open: bool = False  # after the end of the run, until the page's button or Ctrl-C closes it
         max_frustums: int = 200  # keyframes drawn; beyond, the oldest go
+        max_splats: int = 1000000  # of the refined map that are shown, spread over it
 
     config: Config
 
@@ -40,43 +53,90 @@ class Viewer(Node):
             self.stats.warn(f"port {c.port} is taken: the viewer is at {self.url}")
         logging.info("viewer at %s", self.url)
         self.closed = threading.Event()
+        self.seen = SeenKeyframes()
+        self._showing = threading.RLock()  # the page calls from threads
         self._iterations = 0  # of the map that is shown
         self._phase = "initializing"  # what the tracker does
         self._pose_latency = ""  # of a live stream, and its other latencies
         self._map_latency = ""
         self._shown = "waiting for the first keyframe"
-        self._status = self.server.gui.add_markdown("")
+        self._memory = ""
+        gui = self.server.gui
+        self._status = gui.add_markdown("")
         self._show_status()
-        blank = np.zeros((2, 2, 3), np.uint8)
-        self._photo = self.server.gui.add_image(blank, label="photo", format="jpeg")
-        self._render = self.server.gui.add_image(blank, label="render", format="jpeg")
+        self._follow = gui.add_checkbox("follow the camera", False)
         self.page.add_toggles()
+        self._figure = gui.add_dropdown("color keyframes by", _FIGURES, initial_value="nothing")
+        self._figure.on_update(lambda _: self._tint())
+        self._newest = gui.add_checkbox("newest keyframe", True)
+        self._newest.on_update(lambda _: self._show_chosen())
+        self._slider: viser.GuiInputHandle[int] = gui.add_slider("keyframe", 0, 1, 1, 0, disabled=True)
+        self._slider.on_update(lambda event: self._chosen() if event.client is not None else None)
+        self._caption = gui.add_markdown("")
+        self.pictures = KeyframePictures(gui)
         if c.keep_open:
-            self.server.gui.add_button("Close").on_click(lambda _: self.closed.set())
+            gui.add_button("Close").on_click(lambda _: self.closed.set())
 
     def on_preview(self, preview: Preview) -> Iterator[None]:
-        with self.stats.time("show"), self.server.atomic():
+        with self.stats.time("show"), self._showing, self.server.atomic():
             if self.page.unit is None:
                 self.page.begin(preview.world_from_cam, preview.means)
-            if self.page.show_splats(preview.means, preview.covariances, preview.colors, preview.opacities):
-                self.stats.warn("splats that are not finite were left out of the view")
+            if self.seen.final is None:
+                self._show_splats(preview.means, preview.covariances, preview.colors, preview.opacities)
+                self._iterations = preview.iterations
+                self._say_shown(preview.index, len(preview.means))
             self._move_keyframes(preview)
             self.page.add_keyframe(preview.index, preview.world_from_cam, preview.intrinsics, preview.image.shape[:2])
-            self.page.mark(preview.index)
+            self.seen.add(
+                SeenKeyframe.of(
+                    preview.index, preview.world_from_cam, preview.intrinsics, preview.image, preview.render,
+                    preview.depth,
+                )
+            )  # fmt: skip
+            if preview.depth is not None:
+                self.page.show_points(preview.index, *depth_points(preview.depth, preview.intrinsics, preview.image))
+            if preview.keyframes is not None and preview.splats is not None:
+                self.seen.splats = dict(zip(preview.keyframes.tolist(), preview.splats.tolist()))
             while len(self.page.frustums) > self.config.max_frustums:
-                self.page.remove_keyframe(next(iter(self.page.frustums)))
+                self._remove(next(iter(self.page.frustums)))
             self.page.show_path()
-            self._photo.image, self._render.image = thumbnail(preview.image), thumbnail(preview.render)
-            self._iterations = preview.iterations
-            self._shown = f"keyframe **{preview.index}**, {len(preview.means)} splats, {preview.iterations} iterations"
+            self._fit_slider()
+            self._tint()
+            self._show_chosen()
+            if self._follow.value:
+                self.page.follow(preview.world_from_cam)
+            if preview.memory:
+                self._memory = f"; the mapper holds {preview.memory / 1e6:.0f} MB"
             if preview.latency is not None:
                 to_map, to_preview = map(_milliseconds, preview.latency)
                 self._map_latency = (
                     f"; capture to map {to_map}, to preview {to_preview}; effort of stereo and fusion, 0 the most: "
                     f"{preview.effort}, {preview.fusion_effort}"
                 )
+                if preview.coarse:
+                    self._map_latency += f"; {preview.coarse} keyframes wait for the rest of their splats"
             self._show_status()
         self.stats.count("previews")
+        yield from ()
+
+    def on_splat_map(self, message: SplatMap) -> Iterator[None]:
+        """The refined map in place of previews, whole."""
+        if message.refined and len(message.means):
+            with self.stats.time("show"), self._showing, self.server.atomic():
+                final = self.seen.finish(message)
+                if self.page.unit is None:
+                    self.page.begin(final.relative_pose(message.world_from_cam[-1]), message.means)
+                stride = -(-len(message.means) // self.config.max_splats)
+                shown = Splats(**{name: value[::stride] for name, value in final.splats.tensors().items()})
+                self._move(dict(zip(final.keyframes.tolist(), map(final.relative_pose, final.world_from_cam))))
+                self._show_splats(
+                    shown.means.numpy(), covariances(shown.quaternions, shown.log_scales, 1.0).numpy(),
+                    as_bytes(0.5 + C0 * shown.sh[:, 0]), torch.sigmoid(shown.opacity_logits).numpy(),
+                )  # fmt: skip
+                self._iterations = message.iterations
+                self._shown = f"the **refined** map, {len(shown)} splats, {message.iterations} iterations"
+                self._show_chosen()
+                self._show_status()
         yield from ()
 
     def on_tracker_phase(self, message: TrackerPhase) -> Iterator[None]:
@@ -95,8 +155,52 @@ class Viewer(Node):
         self.server.stop()
         yield from ()
 
+    def choose(self, place: int) -> None:
+        """Shows the keyframe at this place of the slider, from 0, instead of the newest."""
+        with self._showing:
+            _set(self._newest, False)
+            _set(self._slider, place)
+            self._show_chosen()
+
+    def _chosen(self) -> None:
+        """The slider was moved."""
+        with self._showing:
+            _set(self._newest, False)
+            self._show_chosen()
+
+    def _show_chosen(self) -> None:
+        with self._showing:
+            keyframe = self.seen.at(None if self._newest.value else int(self._slider.value))
+            if keyframe is None:
+                return
+            self.page.mark(keyframe.index)
+            shown = self.seen.shown(keyframe)
+            self.pictures.show(pictures(*shown))
+            self._caption.content = self.seen.caption(keyframe, *shown)
+
+    def _fit_slider(self) -> None:
+        self._slider.disabled = len(self.seen) < 2
+        self._slider.max = max(1, len(self.seen) - 1)  # type: ignore[attr-defined]  # of sliders alone
+        if self._newest.value:
+            _set(self._slider, max(0, len(self.seen) - 1))
+
+    def _tint(self) -> None:
+        figure = str(self._figure.value)
+        self.page.tint({} if figure == "nothing" else self.seen.goodness(figure))
+
+    def _show_splats(
+        self, means: np.ndarray, covariances: np.ndarray, colors: np.ndarray, opacities: np.ndarray
+    ) -> None:
+        if self.page.show_splats(means, covariances, colors, opacities):
+            self.stats.warn("splats that are not finite were left out of the view")
+
+    def _say_shown(self, index: int, splats: int) -> None:
+        self._shown = f"keyframe **{index}**, {splats} splats, {self._iterations} iterations"
+
     def _show_status(self) -> None:
-        self._status.content = f"tracker: **{self._phase}**{self._pose_latency}; {self._shown}{self._map_latency}"
+        self._status.content = (
+            f"tracker: **{self._phase}**{self._pose_latency}; {self._shown}{self._map_latency}{self._memory}"
+        )
 
     def _ending(self) -> str:
         """What is shown once nothing more comes: the map as the mapper left it, or an earlier state of it."""
@@ -110,12 +214,23 @@ class Viewer(Node):
         """Earlier frustums to where corrections have put them since; those that the map no longer has go."""
         if preview.keyframes is None or preview.keyframe_poses is None:
             return
-        poses = dict(zip(preview.keyframes.tolist(), preview.keyframe_poses))
+        self._move(dict(zip(preview.keyframes.tolist(), preview.keyframe_poses)))
+
+    def _move(self, poses: dict[int, np.ndarray]) -> None:
         for index in list(self.page.frustums):
             if index in poses:
                 self.page.move_keyframe(index, poses[index])
+                self.seen.move(index, poses[index])
             else:
-                self.page.remove_keyframe(index)
+                self._remove(index)
+
+    def _remove(self, index: int) -> None:
+        self.page.remove_keyframe(index)
+        self.seen.remove(index)
+
+
+def _set(handle: viser.GuiInputHandle[Any], value: Any) -> None:
+    handle.value = value  # type: ignore[misc]  # viser's setter
 
 
 def _milliseconds(latency: np.ndarray) -> str:

@@ -10,11 +10,13 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from msgs import Depth, FusedKeyframe, Keyframe, Poses, TrackedFrame
+from msgs import Asked, Depth, FusedKeyframe, Keyframe, Poses, Request, TrackedFrame
 from mvsgs_core.keyframe_window import WindowedKeyframe
 from mvsgs_core.pace import Pace
 from nodes import Node
+from nodes.once import Once
 
+CLOSING = (Asked.RESET, Asked.LOAD_MAP, Asked.LOCALIZE)  # requests after which the map gets none of the next keyframes
 PATIENCE = 0.5  # s that a live keyframe waits for later ones
 
 
@@ -29,6 +31,10 @@ class WindowedCore(Protocol):
 
     def release(self) -> Iterator[Any]: ...
 
+    def flush(self) -> Iterator[Any]: ...
+
+    def forget(self) -> None: ...
+
 
 Core = TypeVar("Core", bound=WindowedCore)
 Found = TypeVar("Found")  # what the core finds of a keyframe
@@ -41,10 +47,12 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
     """A subclass makes the core from its Config, feeds it, and makes messages of what it finds."""
 
     step: ClassVar[str]  # name of the core's work in the times of the report
+    restartable: ClassVar[bool] = True
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
         self._core = self._make_core()
+        self._once = Once(self.stats)
         self._core.pace.log = self.stats
         self._core.pace.waiting = self._queue
         self._came: dict[int, float] = {}  # when keyframes came that wait for later ones, by a clock of its own
@@ -78,6 +86,8 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
 
     def on_poses(self, poses: Poses) -> Iterator[Poses]:
         """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
+        if not self._once.poses(poses):
+            return
         for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
             self._poses[int(i)] = (pose, float(scale))
         if poses.exposure is not None:
@@ -93,7 +103,21 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
 
     def on_tracked_frame(self, frame: TrackedFrame) -> Iterator[TrackedFrame]:
         """Passed on, in its place among the corrections: it needs no depth."""
-        yield frame
+        if self._once.frame(frame):
+            yield frame
+
+    def on_request(self, request: Request) -> Iterator[Sent | Request]:
+        """Passed on, in its place: before a map is closed, the keyframes that wait for later ones go without them."""
+        if not self._once.request(request):
+            return
+        if not request.problem and request.asked in CLOSING:
+            yield from self._messages(self._core.flush())
+        if not request.problem and request.asked in (Asked.RESET, Asked.LOAD_MAP):
+            self._core.forget()
+            for known in (self._poses, self._exposures, self._velocities):
+                known.clear()
+            self._vignetting = None
+        yield request
 
     def _exposed(self, message: Lit) -> Lit:
         """With exposure and vignetting as they are now: corrections may have overtaken the keyframe."""

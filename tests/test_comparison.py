@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from launch.comparison import compared, comparison_text, names
-from mvsgs.compare import common_keyframes
 from mvsgs.compare import main as compare
 from mvsgs.evaluate import main as evaluate
-from mvsgs_core.export.cameras import read_cameras
-from tests.support.tiny_map import write_tiny_run
+from mvsgs_core.evaluation import metrics
+from mvsgs_core.evaluation.metrics import Figure
+from mvsgs_core.evaluation.side_by_side import chosen
+from mvsgs_core.export.keyframe_images import write_image
+from tests.support.chromium import browser
+from tests.support.tiny_map import SIZE, write_tiny_run
 
 
 def scored(folder: Path, psnr: float, splats: int, **more: Any) -> Path:
@@ -54,11 +60,48 @@ def test_the_page_has_the_same_keyframes_of_all_runs(
     assert compare([*map(str, runs), "--html", str(tmp_path / "page.html")]) == 0
     assert "31.25 (+1.25)" in capsys.readouterr().out
     page = (tmp_path / "page.html").read_text()
-    assert page.count("data:image/jpeg;base64,") == 6  # three keyframes of two runs
-    assert "<b>keyframe 7</b>" in page
-    assert "http" not in page
-    cameras = read_cameras(runs[0] / "cameras.json")
-    assert common_keyframes([cameras, cameras]) == [0, 7, 14]
+    assert page.count("data:image/jpeg;base64,") == 9  # of three keyframes, two runs and their difference
+    assert ">keyframe 7</p>" in page
+    assert '<td class="better">31.25 (+1.25)</td>' in page
+    assert "http:" not in page
+    assert "https:" not in page
+
+
+def test_the_keyframe_in_which_runs_differ_most_is_among_those_shown() -> None:
+    common = list(range(0, 100, 10))
+    scores = [dict.fromkeys(common, 30.0), {**dict.fromkeys(common, 30.5), 70: 20.0}]
+    assert chosen(common, scores) == [0, 40, 70, 90]
+    assert chosen(common, [{}, {}]) == [0, 40, 90]
+    assert chosen([], [{}, {}]) == []
+
+
+def test_better_is_what_the_metric_says() -> None:
+    lower, higher = metrics.at("depth.abs_rel"), metrics.at("rendering.held_out.psnr")
+    assert Figure("", lower, [0.02, 0.01, 0.03, 0.02000001, None]).better() == [None, True, False, None, None]
+    assert Figure("", higher, [30.0, 31.0, 29.0]).better() == [None, True, False]
+    assert Figure("", metrics.at("map.splats"), [1, 2]).better() == [None, None]
+
+
+@pytest.mark.slow
+def test_in_a_browser_all_is_within_the_screen_and_errors_stand_below_their_renders(
+    runs: list[Path], tmp_path: Path
+) -> None:
+    for run in runs:
+        write_image(run / "keyframes", 7, np.full((*SIZE, 3), 200, np.uint8))
+    assert compare([*map(str, runs), "--html", str(tmp_path / "page.html")]) == 0
+    left = "[...document.querySelectorAll('img')].filter(i => {}).map(i => Math.round(i.getBoundingClientRect().x))"
+    with browser() as page:
+        for width in (390, 1400):
+            page.size(width, 900)
+            page.open((tmp_path / "page.html").as_uri())
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            renders, errors = (
+                page.evaluate(left.format("i.alt == 'b'")),
+                page.evaluate(left.format("/b, err/.test(i.alt)")),
+            )
+            assert len(renders) == 3
+            assert errors == renders[1:2]  # of the keyframe whose photograph was kept
+        assert page.evaluate("getComputedStyle(document.querySelector('.better')).color") == "rgb(47, 133, 90)"
 
 
 def test_what_has_no_figures_is_said(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -82,10 +125,35 @@ def test_eval_shows_what_the_run_reached(runs: list[Path], capsys: pytest.Captur
     assert "no report.json there" in capsys.readouterr().err
 
 
+def test_the_runs_of_a_sweep_are_found_in_its_folder(tmp_path: Path) -> None:
+    from launch.sweep import SweepFolder, swept
+
+    for name in ("0", "2", "10", "11", ".submitit"):
+        (tmp_path / name).mkdir()
+    os.utime(tmp_path / "11", (0, 0))  # of an earlier sweep
+    SweepFolder().on_multirun_start(OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}}))
+    assert [folder.name for folder in swept() if folder.parent == tmp_path] == ["0", "2", "10"]
+
+
 def test_a_sweep_ends_with_its_runs_side_by_side(runs: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     from launch.run_all import side_by_side  # which puts the path in order
 
     side_by_side([runs[0]])
     assert capsys.readouterr().out == ""
     side_by_side([runs[0], runs[0].parent / "failed", runs[1]])
+    assert "31.25 (+1.25)" in (runs[0].parent / "comparison.html").read_text()
     assert "31.25 (+1.25)" in capsys.readouterr().out
+
+
+def test_eval_of_other_images_asks_how_well_the_map_explains_them(
+    runs: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    typed: list[str] = []
+
+    def run_all(words: list[str]) -> int:
+        typed.extend(words)
+        return 0
+
+    monkeypatch.setattr("mvsgs.evaluate.run_all", run_all)
+    assert evaluate([str(runs[0] / "map.ply"), "walk.mp4", "dataset.stride=2"]) == 0
+    assert typed == [f"map={runs[0]}", "mapper=frozen", "walk.mp4", "dataset.stride=2"]

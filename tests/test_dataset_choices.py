@@ -52,7 +52,7 @@ def test_every_choice_has_all_options_of_its_format() -> None:
     def options(choice: str) -> set[str]:
         return set(compose([f"dataset={choice}"]).slots["dataset"].config["options"])
 
-    own = {"path", "start", "stop", "stride", "size", "intrinsics", "distortion"}
+    own = {"path", "start", "stop", "stride", "size", "intrinsics", "distortion", "mask", "gps", "gps_start"}
     for name, reader in {"tum": Tum, "seven_scenes": SevenScenes, "images": Images, "video": Video, "bag": Bag}.items():
         assert options(name) == set(inspect.signature(reader).parameters) - own
     film = {field.name for kind in (Film, Difficulties) for field in dataclasses.fields(kind)}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from msgs import Depth, FusedKeyframe, Keyframe, Poses, TrackedFrame
+from msgs import Depth, FusedKeyframe, Keyframe, Poses, Request, TrackedFrame
 from nodes import handlers, outputs
 from nodes.coarse_depth import CoarseDepth
 from nodes.depth_fusion import DepthFusion
@@ -26,11 +26,11 @@ def fusion(**changes: object) -> DepthFusion:
 
 
 def test_contract() -> None:
-    assert set(handlers(Mvs)) == {Keyframe, TrackedFrame, Poses}
-    assert set(outputs(Mvs)) == {Depth, TrackedFrame, Poses}
-    assert set(handlers(DepthFusion)) == {Depth, TrackedFrame, Poses}
-    assert set(outputs(DepthFusion)) == {FusedKeyframe, TrackedFrame, Poses}
-    assert set(outputs(CoarseDepth)) == {Depth, TrackedFrame, Poses}
+    assert set(handlers(Mvs)) == {Keyframe, TrackedFrame, Poses, Request}
+    assert set(outputs(Mvs)) == {Depth, TrackedFrame, Poses, Request}
+    assert set(handlers(DepthFusion)) == {Depth, TrackedFrame, Poses, Request}
+    assert set(outputs(DepthFusion)) == {FusedKeyframe, TrackedFrame, Poses, Request}
+    assert set(outputs(CoarseDepth)) == {Depth, TrackedFrame, Poses, Request}
 
 
 def test_frames_between_keyframes_pass_at_once() -> None:
@@ -59,6 +59,26 @@ def test_every_keyframe_becomes_one_view_in_order_and_is_right() -> None:
     np.testing.assert_allclose(np.linalg.norm(view.normals[kept], axis=-1), 1.0, atol=1e-5)
     assert mvs.stats.counts["keyframes"] == 7
     assert mvs.stats.skipped["hypotheses outside the range"] > 0
+
+
+def test_before_a_map_is_closed_no_keyframe_waits_and_the_next_are_matched_with_none_of_it() -> None:
+    mvs, depth_fusion = stereo(), fusion()
+    for asked, closes in (("save_map", False), ("reset", True)):
+        sent = [d for i in range(4) for d in mvs.on_keyframe(keyframe(i))]
+        (*late, request) = mvs.on_request(Request(1, asked))
+        assert [d.index for d in (*sent, *late)] == ([0, 1, 2, 3] if closes else [0, 1])
+        fused = [v for d in (*sent, *late) for v in depth_fusion.on_depth(d)]
+        (*late, passed) = depth_fusion.on_request(request)
+        assert [v.index for v in (*fused, *late)] == ([0, 1, 2, 3] if closes else [])
+        assert passed == Request(1, asked)
+        mvs, depth_fusion = (mvs, depth_fusion) if closes else (stereo(), fusion())
+    before = mvs.stats.counts["neighbors"]
+    list(mvs.on_keyframe(keyframe(5)))
+    list(mvs.on_end())
+    assert mvs.stats.counts["neighbors"] == before, "one alone has no neighbor"
+    stopped = Request(2, "reset", problem="the disk is full")
+    list(mvs.on_keyframe(keyframe(6)))
+    assert list(mvs.on_request(stopped)) == [stopped]
 
 
 def test_corrected_poses_move_what_is_stored() -> None:

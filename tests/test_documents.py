@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.util import find_spec
@@ -12,8 +13,9 @@ from typing import Any
 import pytest
 
 from bench import figures, plots, record
-from launch.compose import compose
+from launch.compose import choices_of, compose
 from launch.refusal import GraphError
+from mvsgs.command import COMMANDS
 from tests.support.benchmarks import BENCHMARKS
 from tests.support.shared_data import ROOT
 
@@ -21,6 +23,7 @@ DOCUMENTS = [
     *(ROOT / name for name in ("README.md", "ARCHITECTURE.md", "BENCHMARKS.md", "CHANGELOG.md")),
     *sorted((ROOT / "docs").rglob("*.md")), ROOT / "examples" / "README.md", ROOT / "msgs" / "WIRE.md",
 ]  # fmt: skip
+FOR_PEOPLE = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs" / "guides").glob("*.md"))]
 WIDEST, MAX_COLUMNS, LONGEST_PAGE = 120, 8, 150
 FOLDERS = ("bench", "docs", "examples", "launch", "msgs", "mvsgs", "mvsgs_core", "nodes", "tests")
 GENERATED = re.compile(r"<!-- bench:([\w/.-]+) -->.*?<!-- /bench:\1 -->", re.DOTALL)
@@ -84,6 +87,37 @@ def test_commands_compose(document: Path) -> None:
             pytest.fail(f"{document.name}: {line}: {error}")
 
 
+def source_of(words: list[str]) -> str | None:
+    """What reads the options of a command line that a document shows; None for one that maps what it names."""
+    if words[0] == "mvsgs":
+        known = COMMANDS.get(words[1])
+        if known is None:  # an input, or a choice; a setting
+            assert re.search(r"[=/.]", words[1]) or words[1] in (*choices_of("dataset"), "rgbd_dataset_freiburg1_xyz")
+        if known is None or not known.module:
+            return None
+        module = known.module
+    elif words[1] == "-m":
+        module = words[2]
+    elif words[1].endswith(".py"):
+        return (ROOT / words[1].removeprefix("PATH/TO/REPOSITORY/")).read_text()
+    else:
+        return None
+    found = find_spec(module)
+    assert found is not None
+    assert found.origin is not None
+    file = Path(found.origin)
+    return "".join(path.read_text() for path in (file, file.with_name("command_line.py")) if path.exists())
+
+
+@pytest.mark.parametrize("document", FOR_PEOPLE, ids=lambda document: document.stem)
+def test_commands_and_their_options_exist(document: Path) -> None:
+    for line in re.findall(r"^ *((?:mvsgs|python) .+)$", by_hand(document).replace("\\\n", " "), re.MULTILINE):
+        words = shlex.split(line, comments=True)
+        source = source_of(words)
+        for option in [word.partition("=")[0] for word in words if word.startswith("--")]:
+            assert source is not None and f'"{option}"' in source, f"{document.name}: {line}: {option}"  # noqa: PT018
+
+
 def flat(config: Mapping[str, Any], prefix: str) -> Iterator[str]:
     for key, value in config.items():
         yield f"{prefix}.{key}"
@@ -120,9 +154,10 @@ def test_every_benchmark_has_its_page_and_every_page_what_is_recorded() -> None:
     for document in record.documents():
         text = document.read_text()
         names = set(re.findall(r"<!-- bench:(\S+) -->", text))
-        assert names == {"figures" if document == record.DOCUMENT else document.stem}
+        own = {record.DOCUMENT: "figures", record.README: "first"}.get(document)
+        assert names == {own or document.stem}
         assert record.render(text) == text, f"{document.name} differs from what is recorded: python -m bench.record"
-        if document != record.DOCUMENT:
+        if own is None:
             assert f"python -m bench.{document.stem}" in by_hand(document)
 
 

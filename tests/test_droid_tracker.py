@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 
 import msgs
-from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame, TrackerPhase, TrackingState, Trajectory
+from msgs import (
+    CameraPose,
+    Frame,
+    Keyframe,
+    Poses,
+    Request,
+    TrackedFrame,
+    TrackerPhase,
+    TrackingState,
+    Trajectory,
+)
 from nodes import handlers, outputs
 from nodes.droid_tracker import DroidTracker
 from tests.support.sequences import synthetic
@@ -25,8 +35,10 @@ def run(config: DroidTracker.Config, count: int = COUNT) -> tuple[DroidTracker, 
 
 
 def test_contract() -> None:
-    assert handlers(DroidTracker).keys() == {Frame}
-    assert set(outputs(DroidTracker)) == {Keyframe, Poses, TrackedFrame, CameraPose, TrackerPhase, Trajectory}
+    assert handlers(DroidTracker).keys() == {Frame, Request}
+    assert set(outputs(DroidTracker)) == {
+        Keyframe, Poses, TrackedFrame, CameraPose, TrackerPhase, Trajectory, Request,
+    }  # fmt: skip
 
 
 @pytest.mark.slow

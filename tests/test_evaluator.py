@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 from msgs import GroundTruth, Trajectory
+from mvsgs_core.datasets.lens import Lens, Undistortion
+from mvsgs_core.georeference import read_georeference
 from nodes.evaluator import Evaluator
 from nodes.parameters import build
 from tests.support.evaluated_wall import (
@@ -72,6 +75,47 @@ def test_files(evaluator: Evaluator) -> None:
     assert "http://" not in html  # nothing is fetched
     assert "https://" not in html
     assert len((evaluator.folder / "trajectory.txt").read_text().splitlines()) == N + 1
+
+
+def test_with_gps_the_report_and_a_file_say_where_the_map_lies(evaluator: Evaluator) -> None:
+    """The unit of the poses is 50 m here, x goes east, y down, z north."""
+    x, y, z = 50.0 * poses_along()[:, :3, 3].T + 0.1 * np.random.default_rng(0).standard_normal((3, N))
+    degree = np.radians(1.0) * 6378137.0  # at the equator; its meridians are bent by a percent more
+    places = np.stack([z / degree + 1e-7, x / degree, -y], axis=1)
+    places[3] += [0.01, 0.0, 30.0]
+    places[7] = np.nan
+    report = feed(evaluator, places=places)["georeference"]
+    assert (report["positions"], report["outliers"]) == (N - 1, 1)
+    assert report["residual"] < 0.5
+    assert report["scale"] == pytest.approx(50.0, rel=0.01)
+    assert evaluator.folder is not None
+    found = read_georeference(evaluator.folder / "georeference.json")
+    np.testing.assert_allclose(found.rotation, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=0.1)
+    assert "GPS: how sure" in (evaluator.folder / "report.html").read_text()
+    assert any("left out: 1 of 11" in warning for warning in evaluator.stats.warnings)
+
+
+def test_renders_are_compared_with_photographs_without_the_distortion_that_was_found(evaluator: Evaluator) -> None:
+    """The same as the tracker's keyframes are, which have none."""
+    photograph = np.random.default_rng(0).integers(0, 256, (H, W, 3), dtype=np.uint8)
+    list(evaluator.on_ground_truth(GroundTruth(5, 0.2, photograph, INTRINSICS, None, None)))
+    index, poses = np.arange(N), poses_along()
+    track = Trajectory(index, index / 30, poses, index % 3 == 0, np.zeros(N, np.uint8), np.zeros(N, np.int32), 1.2)
+    list(evaluator.on_trajectory(replace(track, distortion=np.array([0.1, 0.02]))))
+    list(evaluator.on_splat_map(splat_map_of(True)))
+    lens = Undistortion(Lens((36.0, 36.0, 15.5, 11.5), (H, W), (0.1, 0.02, 0.0, 0.0)))
+    (scored,) = [frame for frame in evaluator.evaluation.scored_frames() if frame.index == 5]
+    np.testing.assert_array_equal(scored.photograph(), lens.image(photograph))
+    np.testing.assert_array_equal(evaluator.evaluation.photograph(5), lens.image(photograph))
+    np.testing.assert_allclose(scored.intrinsics, lens.intrinsics)
+    assert lens.intrinsics[0] > 36.0  # zoomed in, so that no pixel is without a source
+    evaluator.evaluation.close()
+
+
+def test_gps_that_does_not_tell_is_said(evaluator: Evaluator) -> None:
+    report = feed(evaluator, places=np.random.default_rng(0).uniform(0.0, 0.001, (N, 3)))
+    assert report["georeference"] is None
+    assert any("GPS does not tell where the map lies: " in warning for warning in report["warnings"]["evaluator"])
 
 
 def test_lost_frames_have_no_pose_and_are_not_scored(evaluator: Evaluator) -> None:

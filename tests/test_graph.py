@@ -89,8 +89,9 @@ def test_real_time_is_one_switch_and_the_default_of_live_sources() -> None:
     assert paced.slots["dataset"].config["realtime"] is True
     (frames,) = [edge for edge in paced.edges if edge.message is Frame]
     assert frames.best_effort  # as a camera's
-    assert [niceness(paced, name) for name in ("dataset", "tracker", "mapper", "evaluator")] == [0, 0, 5, 5]
-    assert niceness(compose(["realtime=true", "viewer=viser"]), "viewer") == 10
+    assert [niceness(paced, name) for name in paced.slots] == [0, 0, 4, 8, 12, 12]  # in their order
+    assert niceness(compose(["realtime=true", "viewer=viser"]), "viewer") == 15
+    assert niceness(compose(["realtime=true", "publisher=ros2"]), "publisher") == 4  # poses, for which a robot waits
     assert {niceness(plain, name) for name in plain.slots} == {0}
 
 

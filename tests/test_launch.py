@@ -214,6 +214,14 @@ def test_a_sweep_gives_each_job_its_own_output(launch: type[Launch]) -> None:
     assert sink(run.output / "1")["keyframes"] == [0, 2]
 
 
+def test_a_sweep_on_a_cluster_does_the_same(launch: type[Launch]) -> None:
+    run = launch("-m", "hydra/launcher=submitit_local", "relay.stride=1,2", "source.count=4")  # Slurm's, on one machine
+    code, out, err = run.finish(120)
+    assert code == 0, out + err
+    assert sink(run.output / "0")["keyframes"] == [0, 1, 2, 3]
+    assert sink(run.output / "1")["keyframes"] == [0, 2]
+
+
 def test_a_sweep_goes_on_after_a_failure_and_says_so_at_the_end(launch: type[Launch]) -> None:
     run = launch("-m", "relay.fail_at=1,null", "source.count=4")
     assert run.finish()[0] == 1

@@ -14,6 +14,7 @@ from tests.support.shared_data import ROOT
 GROUND = "mvsgs_core"  # the files right in it: what several rooms need, and all may import
 PARAMETERS = "nodes/parameters.py"  # what a parameter is, which the contract speaks of
 CONTRACT = "nodes/__init__.py"  # what a node is
+DOOR = "mvsgs_core/__init__.py"  # by which a program finds the interface for programs, above all rooms of the core
 
 # From the ground up: each room, its folders included, with those below it that it may import besides the ground.
 ROOMS: dict[str, tuple[str, ...]] = {
@@ -33,6 +34,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "mvsgs_core/evaluation": (
         "mvsgs_core/rasterizer",
         "mvsgs_core/networks",
+        "mvsgs_core/datasets",  # lenses
         "mvsgs_core/export",
         "mvsgs_core/mapping",
     ),
@@ -52,7 +54,18 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "mvsgs_core/evaluation",
     ),
     "mvsgs": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes", "launch", "mvsgs_core/*"),
-    "examples": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "nodes", "mvsgs_core/datasets"),
+    DOOR: ("mvsgs",),
+    "examples": (
+        "msgs",
+        CONTRACT,
+        PARAMETERS,
+        "nodes/runtime",
+        "nodes/ros2",
+        "nodes",
+        "mvsgs_core/datasets",
+        "mvsgs_core/mapping",  # what a loss is given
+        "mvsgs",
+    ),
     "bench": ("msgs", CONTRACT, PARAMETERS, "nodes/runtime", "nodes/ros2", "nodes", "launch", "mvsgs_core/*"),
 }
 

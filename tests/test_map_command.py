@@ -18,7 +18,8 @@ from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.maps.info import main
 from nodes import Node
 from nodes.frozen_mapper import FrozenMapper
-from nodes.localizer import HEADER, Localizer
+from nodes.localization_file import HEADER
+from nodes.localizer import Localizer
 from nodes.mapper import Mapper
 from nodes.tracker import Tracker
 from tests.support.small_atlas import PLAIN, begun, view

@@ -13,11 +13,14 @@ import pytest
 import torch
 
 import nodes
-from msgs import FusedKeyframe, Keyframe, Poses, Preview, SplatMap, TrackedFrame
+from msgs import FusedKeyframe, Keyframe, Poses, Preview, Reply, Request, SplatMap, TrackedFrame
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.image_metrics import psnr
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+from mvsgs_core.mapping.coarse import LATER
 from mvsgs_core.mapping.map_state import PARAMETERS
+from mvsgs_core.mapping.preview import splats_by_keyframe
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from nodes.mapper import LAST_SECONDS, Mapper
@@ -33,8 +36,9 @@ def test_inputs_and_outputs_are_declared() -> None:
         TrackedFrame: "on_tracked_frame",
         Poses: "on_poses",
         Keyframe: "on_keyframe",
+        Request: "on_request",
     }
-    assert set(nodes.outputs(Mapper)) == {SplatMap, Preview}
+    assert set(nodes.outputs(Mapper)) == {SplatMap, Preview, Reply}
 
 
 def test_two_maps_leave_the_mapper_before_and_after_the_refinement(tmp_path: Path) -> None:
@@ -53,6 +57,56 @@ def test_two_maps_leave_the_mapper_before_and_after_the_refinement(tmp_path: Pat
     np.testing.assert_allclose(written.splats.means.numpy(), after.means + after.origin, atol=1e-5)
     assert node.stats.values["splats"] == len(after.means)
     assert node.stats.seconds["refinement"] > 0
+
+
+def test_a_map_is_saved_while_it_grows_and_a_new_one_begins_where_it_is_asked(tmp_path: Path) -> None:
+    def asked(node: Mapper, request: Request) -> Reply:
+        replies: list[Any] = list(node.on_request(request))
+        while not replies:
+            replies = [m for m in node.on_idle() or () if isinstance(m, Reply)]
+        (reply,) = replies
+        assert reply.number == request.number
+        return reply
+
+    node = Mapper(settings())
+    reset = asked(node, Request(1, "reset", kept=str(tmp_path / "none")))
+    assert (reset.success, reset.message) == (
+        True,
+        "a new map begins; there was nothing to keep of the one before",
+    )
+    assert not (tmp_path / "none").exists()
+    assert not asked(node, Request(2, "save_map", folder=str(tmp_path / "none"))).success
+    for k in range(2):
+        list(node.on_fused_keyframe(view_message(7 * k, k / 2)))
+    saved = asked(node, Request(3, "save_map", folder=str(tmp_path / "saved")))
+    assert saved.success, saved.message
+    splats = len(node.atlas.current.state)
+    assert saved.message == f"{tmp_path / 'saved'}: {splats} splats, 2 keyframes"
+    assert checkpoint_info(tmp_path / "saved").keyframes.tolist() == [0, 7]
+    refused = asked(node, Request(4, "reset", kept=str(tmp_path / "kept"), problem="the disk is full"))
+    assert refused == Reply(4, False, "the disk is full")
+    assert len(node.atlas.current.state) == splats
+    assert asked(node, Request(5, "localize")).success
+    assert asked(node, Request(6, "reset", kept=str(tmp_path / "kept"))).success
+    assert checkpoint_info(tmp_path / "kept").keyframes.tolist() == [0, 7]
+    list(node.on_fused_keyframe(view_message(21, 1.0)))
+    while node.on_idle() is not None:
+        pass
+    before, after = (m for m in node.on_end() if isinstance(m, SplatMap))
+    assert after.keyframes.tolist() == [21]
+    assert after.iterations > before.iterations, "a new map grows, whatever was asked of the one before"
+
+
+def test_a_map_in_which_frames_are_only_found_stays_as_it_is() -> None:
+    node = Mapper(settings())
+    for k in range(2):
+        list(node.on_fused_keyframe(view_message(7 * k, k / 2)))
+    (reply,) = node.on_request(Request(1, "localize"))
+    assert reply.success
+    iterations = node.atlas.current.trainer.iterations
+    assert node.on_idle() is None
+    before, after = (m for m in node.on_end() if isinstance(m, SplatMap))
+    assert iterations == before.iterations == after.iterations
 
 
 def test_the_cameras_and_on_request_the_images_are_beside_the_map(tmp_path: Path) -> None:
@@ -91,13 +145,14 @@ def test_without_refinement_both_maps_are_the_same() -> None:
 
 
 def test_a_live_map_is_handed_out_soon_after_the_last_frame() -> None:
-    """However many iterations are left: after that it is refined."""
+    """However many iterations are left: as many of them as the refinement has are made up before it."""
 
     def maps(age: float) -> tuple[Mapper, SplatMap, SplatMap]:
         node = Mapper(replace(settings(iterations=100_000, refinement=2), realtime=True))
         list(node.on_fused_keyframe(replace(view_message(0, 0.5), captured=time.time() - age)))
         before, after = (message for message in node.on_end() if isinstance(message, SplatMap))
-        assert after.iterations == before.iterations + 2
+        assert after.iterations == before.iterations + 2 + 2
+        assert node.stats.counts["iterations made up"] == 2
         return node, before, after
 
     began = time.monotonic()
@@ -120,7 +175,11 @@ def test_where_keyframes_wait_new_splats_get_larger_and_none_is_left_out() -> No
     list(plain.on_fused_keyframe(view_message(0, 0.0)))
     first = int((hurried.state.anchors == 0).sum())
     assert 0.1 * len(plain.atlas.current.state) < first < 0.6 * len(plain.atlas.current.state)
-    assert node.stats.skipped["effort on keyframes: new splats as of half the image's size"] == 3
+    assert node.stats.skipped["effort on keyframes: new splats as of half the image's size"] == 1
+    assert node.stats.skipped["effort on keyframes: no new splats for now"] == 2
+    list(node.on_end())
+    assert not len(hurried.coarse)
+    assert node.stats.counts[LATER] == 3
 
 
 def test_the_preview_of_a_live_stream_says_how_late_it_is() -> None:
@@ -232,6 +291,16 @@ def test_a_preview_is_capped_and_relative_to_the_origin() -> None:
     np.testing.assert_array_equal(preview.keyframe_poses[0], preview.world_from_cam)
     np.testing.assert_array_equal(preview.origin, view_message(0, 0.5).world_from_cam[:3, 3])
     assert (np.linalg.eigvalsh(preview.covariances) > -1e-9).all()
+    assert preview.splats.tolist() == [len(node.atlas.current.state)]
+    true = view_message(0, 0.5).depth
+    assert np.median(preview.depth[preview.depth > 0]) == pytest.approx(np.median(true[true > 0]), rel=0.1)
+    assert preview.memory > 1e7
+
+
+def test_splats_are_counted_by_the_keyframe_that_they_came_from() -> None:
+    anchors = np.array([3, 3, -2, 7, 7, 7])
+    assert splats_by_keyframe(anchors, np.array([-5, -2, 3, 7, 9])).tolist() == [0, 1, 2, 3, 0]
+    assert splats_by_keyframe(anchors[:0], np.array([1, 2])).tolist() == [0, 0]
 
 
 def test_an_empty_stream_still_ends_with_two_empty_maps() -> None:

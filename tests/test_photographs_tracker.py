@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 import msgs
-from msgs import CameraPose, Frame, Keyframe, Poses, TrackedFrame, TrackerPhase, TrackingState, Trajectory
+from msgs import (
+    CameraPose,
+    Frame,
+    Keyframe,
+    Poses,
+    Request,
+    TrackedFrame,
+    TrackerPhase,
+    TrackingState,
+    Trajectory,
+)
 from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.datasets import Item, open_dataset
@@ -50,8 +60,10 @@ def cam_from_world(items: Sequence[Item]) -> np.ndarray:
 
 
 def test_contract() -> None:
-    assert handlers(PhotographsTracker).keys() == {Frame}
-    assert set(outputs(PhotographsTracker)) == {Keyframe, Poses, TrackedFrame, CameraPose, TrackerPhase, Trajectory}
+    assert handlers(PhotographsTracker).keys() == {Frame, Request}
+    assert set(outputs(PhotographsTracker)) == {
+        Keyframe, Poses, TrackedFrame, CameraPose, TrackerPhase, Trajectory, Request,
+    }  # fmt: skip
     assert not PhotographsTracker.in_stream_order
 
 
@@ -72,6 +84,11 @@ def test_all_photographs_have_poses_and_those_held_out_are_no_keyframes() -> Non
     for m in keyframes:
         assert isinstance(m, Keyframe)
         np.testing.assert_array_equal(m.world_from_cam, trajectory.world_from_cam[m.index])
+        assert m.exposure is not None
+        assert trajectory.exposure is not None
+        np.testing.assert_array_equal(m.exposure, trajectory.exposure[m.index])
+    assert trajectory.exposure is not None
+    assert np.isfinite(trajectory.exposure).all()  # of those held out, too
 
 
 @pytest.mark.slow

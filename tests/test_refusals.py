@@ -29,7 +29,7 @@ def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
             code = run(Job(OmegaConf.create(graph.resolved), [], {"dataset": "x"}, None))
         except GraphError as error:
             code = refused(error)
-        errors = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("[")]  # FFmpeg's own
+        errors = capfd.readouterr().err.splitlines()
         assert code == 2
         assert len(errors) == 1, errors
         assert errors[0].startswith("error: ")

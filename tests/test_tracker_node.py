@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import msgs
-from msgs import CameraPose, Frame, GroundTruth, Keyframe, Poses, TrackedFrame, TrackerPhase, TrackingState, Trajectory
+from msgs import (
+    CameraPose,
+    Frame,
+    GroundTruth,
+    Keyframe,
+    Poses,
+    Request,
+    TrackedFrame,
+    TrackerPhase,
+    TrackingState,
+    Trajectory,
+)
 from mvsgs_core import geometry
 from mvsgs_core.held_out import is_held_out
 from nodes import Node, handlers, outputs
+from nodes.localizer import Localizer
+from nodes.photographs_tracker import PhotographsTracker
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker
 from tests.support.sequences import synthetic
@@ -30,10 +44,44 @@ def of_type(sent: list[msgs.Message], kind: type) -> list:  # type: ignore[type-
 
 
 def test_contracts() -> None:
-    assert handlers(Tracker).keys() == {Frame}
-    assert set(outputs(Tracker)) == {Keyframe, Poses, TrackedFrame, CameraPose, TrackerPhase, Trajectory}
-    assert handlers(PosedTracker).keys() == {Frame, GroundTruth}
-    assert set(outputs(PosedTracker)) == {Keyframe, Poses, Trajectory}
+    assert handlers(Tracker).keys() == {Frame, Request}
+    assert set(outputs(Tracker)) == {Keyframe, Poses, TrackedFrame, CameraPose, TrackerPhase, Trajectory, Request}
+    assert handlers(PosedTracker).keys() == {Frame, GroundTruth, Request}
+    assert set(outputs(PosedTracker)) == {Keyframe, Poses, Trajectory, Request}
+
+
+def test_a_tracker_that_can_only_be_paused_says_so() -> None:
+    for node in (PosedTracker(), PhotographsTracker()):
+        assert list(node.on_request(Request(1, "pause"))) == [Request(1, "pause")]
+        (refused,) = node.on_request(Request(2, "reset"))
+        assert isinstance(refused, Request)
+        assert refused.problem == f"{type(node).__name__} cannot: start the run with tracker=dense"
+
+
+@pytest.mark.slow
+def test_a_request_that_cannot_be_met_changes_nothing_and_says_what_to_do(tmp_path: Path) -> None:
+    def problem(node: Tracker, request: Request) -> str:
+        (answered,) = [m for m in node.on_request(request) if isinstance(m, Request)]
+        return answered.problem
+
+    empty, kept = str(tmp_path / "empty"), str(tmp_path / "kept")
+    node = Tracker()
+    for asked in ("save_map", "localize"):
+        assert "nothing is mapped yet" in problem(node, Request(1, asked, folder=kept))
+    frames, _ = messages()
+    for frame in frames:
+        list(node.on_frame(frame))
+    assert not problem(node, Request(2, "save_map", folder=kept))
+    core = node.core
+    assert "there is a map already" in problem(node, Request(3, "reset", kept=kept))
+    assert "no such directory" in problem(node, Request(4, "load_map", folder=empty, kept=empty))
+    assert "no tracker does that" in problem(node, Request(5, "fly"))
+    assert node.core is core
+    localizer = Localizer(Localizer.Config(map=kept))
+    for asked, on in (("save_map", True), ("reset", True), ("localize", False)):
+        assert "this run only localizes" in problem(localizer, Request(6, asked, on, empty, empty))
+    assert not problem(localizer, Request(7, "localize"))
+    assert not Path(empty).exists()
 
 
 @pytest.mark.slow
@@ -122,7 +170,7 @@ def test_changes_of_the_trackers_phase_are_sent() -> None:
     assert phases[0].phase == "tracking"
     counts = node.stats.counts
     assert counts["frames while lost"] == counts["frames while relocalizing"] == 3
-    assert counts["frames while initializing"] == phases[0].index
+    assert counts["frames while initializing"] == phases[0].index + 1  # the one that it begins with has no pose yet
     assert sum(n for name, n in counts.items() if name.startswith("frames while ")) == 42
 
 
@@ -235,6 +283,19 @@ def test_true_poses_come_with_depths_in_their_unit() -> None:
     assert isinstance(trajectory, Trajectory)
     np.testing.assert_array_equal(trajectory.world_from_cam, [t.world_from_cam for t in truths])
     assert trajectory.index[trajectory.keyframe].tolist() == [k.index for k in keyframes]
+
+
+def test_gps_goes_with_the_trajectory() -> None:
+    place, none = np.array([47.0, 8.0, 400.0]), np.zeros(3)  # as a receiver without a fix sends it
+    image, intrinsics = np.full((48, 64, 3), 128, np.uint8), np.array([60.0, 60.0, 31.5, 23.5])
+    for node in (Tracker(), PosedTracker(), PhotographsTracker()):
+        for n, given in enumerate((place, None, none)):
+            list(node.on_frame(Frame(n, n / 30, image, intrinsics, place=given)))
+            truth = GroundTruth(n, n / 30, image, intrinsics, np.eye(4), None)
+            list(node.on_ground_truth(truth) if isinstance(node, PosedTracker) else ())
+        trajectory = list(node.on_end())[-1]
+        assert isinstance(trajectory, Trajectory)
+        np.testing.assert_array_equal(trajectory.places, [place, [np.nan] * 3, [np.nan] * 3])
 
 
 def test_true_poses_that_hardly_move_say_what_to_lower() -> None:

@@ -43,13 +43,14 @@ def test_each_keyframe_shows_its_render_depth_and_photograph(shown: SavedMapView
     renders = {}
     for k in (0, 1, 2):
         shown.show(k)
-        renders[k] = shown._pictures["render"].image
-        assert shown._pictures["photograph"].visible == (k == 1)
+        renders[k] = shown.pictures.handles["render"].image
+        assert shown.pictures.handles["photograph"].visible == (k == 1)
     assert renders[0].shape == (*SIZE, 3)
     assert not np.array_equal(renders[0], renders[2])
     shown.show(1)
-    assert (shown._pictures["photograph"].image == 200).all()
+    assert (shown.pictures.handles["photograph"].image == 200).all()
     assert "keyframe **7**, 32x24; depth" in shown._caption.content
+    assert list(shown.page.points) == [7]
     marked = shown.page.frustums[7].color
     assert [shown.page.frustums[index].color == marked for index in (0, 7, 14)] == [False, True, False]
 
@@ -66,9 +67,9 @@ def test_the_render_is_in_the_photographs_exposure(tmp_path: Path) -> None:
     final, cameras = read_ply(run / "map.ply"), read_cameras(run / "cameras.json")
     opened = MapPage("127.0.0.1", free_port())
     try:
-        plain = SavedMapView(opened, final, cameras, run, "tiny")._pictures["render"].image.astype(int)
+        plain = SavedMapView(opened, final, cameras, run, "tiny").pictures.handles["render"].image.astype(int)
         cameras.exposures[0, :, :3] *= 0.5
-        darker = SavedMapView(opened, final, cameras, run, "tiny")._pictures["render"].image.astype(int)
+        darker = SavedMapView(opened, final, cameras, run, "tiny").pictures.handles["render"].image.astype(int)
         assert np.abs(plain - 2 * darker)[plain < 255].max() <= 2  # what is brighter is cut
         assert np.median(plain) > 50
     finally:

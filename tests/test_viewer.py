@@ -14,14 +14,18 @@ import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from msgs import Preview, TrackerPhase
+from msgs import Preview, SplatMap, TrackerPhase
+from mvsgs_core.mapping.preview import as_bytes
 from nodes import handlers, outputs
+from nodes.mapper import splat_map
 from nodes.viewer import Viewer
 from tests.support.shared_data import ROOT
+from tests.support.tiny_map import INTRINSICS, SIZE, final_map, poses_around
 from tests.support.viewer_page import free_port, page
 
 
@@ -61,7 +65,9 @@ def received(viewer: Viewer) -> str:
 
 
 def test_reads_previews_and_sends_nothing() -> None:
-    assert handlers(Viewer) == {Preview: "on_preview", TrackerPhase: "on_tracker_phase"}
+    assert handlers(Viewer) == {
+        Preview: "on_preview", TrackerPhase: "on_tracker_phase", SplatMap: "on_splat_map",
+    }  # fmt: skip
     assert outputs(Viewer) == ()
 
 
@@ -77,7 +83,7 @@ def test_browser_gets_splats_frustums_and_pictures(viewer: Viewer) -> None:
     for index in (4, 9):
         show(viewer, preview(index))
     got = received(viewer)
-    for name in ("GaussianSplats", "/splats", "/keyframes/4", "/keyframes/9", "/path", "photo", "render"):
+    for name in ("GaussianSplats", "/splats", "/keyframes/4", "/keyframes/9", "/path", "photograph", "render"):
         assert name in got, name
     assert "keyframe **9**, 50 splats, 90 iterations" in got
 
@@ -93,12 +99,12 @@ def test_the_trackers_phase_is_shown(viewer: Viewer) -> None:
 
 def test_latencies_and_efforts_of_a_live_stream_are_shown(viewer: Viewer) -> None:
     list(viewer.on_tracker_phase(TrackerPhase(7, 0.35, "tracking", np.array([0.02, 0.08]))))
-    shown = replace(preview(9), latency=np.array([[0.9, 1.8], [0.4, 1.2]]), effort=2, fusion_effort=1)
+    shown = replace(preview(9), latency=np.array([[0.9, 1.8], [0.4, 1.2]]), effort=2, fusion_effort=1, coarse=5)
     show(viewer, shown)
     got = received(viewer)
     assert "capture to pose 20 ms (99 %: 80 ms)" in got
     assert "capture to map 900 ms (99 %: 1800 ms), to preview 400 ms (99 %: 1200 ms)" in got
-    assert "0 the most: 2, 1" in got
+    assert "0 the most: 2, 1; 5 keyframes wait for the rest of their splats" in got
 
 
 def test_map_is_shown_at_unit_distance_whatever_its_scale(viewer: Viewer) -> None:
@@ -185,6 +191,89 @@ def test_finished_is_said_only_of_the_map_as_the_mapper_left_it(last: int, said:
     assert list(node.on_end()) == []
     assert said in node._status.content
     assert ("finished" in node._status.content) == (last == 90)
+
+
+def with_depth(index: int, covered: float = 0.5, **more: Any) -> Preview:
+    depth = np.full((120, 160), 2.0, np.float32)
+    depth[: round(120 * (1 - covered))] = 0.0
+    return replace(preview(index), depth=depth, memory=410_000_000, **more)
+
+
+def test_memory_and_splats_by_keyframe_are_shown(viewer: Viewer) -> None:
+    poses = np.stack([preview(index).world_from_cam for index in (4, 9)])
+    show(viewer, with_depth(4))
+    show(viewer, with_depth(9, keyframes=np.array([4, 9]), keyframe_poses=poses, splats=np.array([30, 12])))
+    got = received(viewer)
+    assert "the mapper holds 410 MB" in got
+    assert "keyframe **9**, 640x480; 12 splats came from it; depth 2 to 2, 50 % covered; mean error" in got
+
+
+def test_the_slider_goes_through_the_keyframes_seen(viewer: Viewer) -> None:
+    for index in (4, 9, 12):
+        show(viewer, with_depth(index))
+    assert not viewer._slider.disabled
+    assert (viewer._slider.max, viewer._slider.value) == (2, 2)
+    viewer.choose(0)
+    assert "keyframe **4**" in viewer._caption.content
+    assert not viewer._newest.value
+    show(viewer, with_depth(15))  # the oldest goes, the choice stays at its place
+    assert "keyframe **9**" in viewer._caption.content
+    handles = viewer.pictures.handles
+    assert [name for name, handle in handles.items() if handle.visible] == ["photograph", "render", "depth"]
+    viewer.pictures.set_visible("error", True)
+    viewer.pictures.set_visible("depth", False)
+    show(viewer, preview(20))
+    viewer._newest.value = True
+    viewer._show_chosen()
+    assert "keyframe **20**" in viewer._caption.content
+    assert [name for name, handle in handles.items() if handle.visible] == ["photograph", "render", "error"]
+
+
+def test_depth_points_lie_where_the_keyframe_sees_them(viewer: Viewer) -> None:
+    show(viewer, with_depth(4))
+    points = viewer.page.points[4]
+    assert not points.visible
+    viewer.page.set_visible("depth points", True)
+    assert points.visible
+    unit = viewer.page.unit
+    assert unit is not None
+    np.testing.assert_allclose(points.points[:, 2] * unit, 2.0, rtol=1e-5)
+    rows = points.points[:, 1] * unit / 2.0 * 500.0 + 239.5  # where the photograph shows them
+    assert rows.min() == pytest.approx(0.5 * 480 + 1.5, abs=0.1)  # what is not covered has none
+    assert rows.max() <= 479.5
+    np.testing.assert_allclose(points.position, viewer.page.frustums[4].position)
+
+
+def test_keyframes_are_colored_by_how_well_the_map_shows_them(viewer: Viewer) -> None:
+    for index, covered in ((4, 1.0), (9, 0.0), (12, 0.5)):
+        show(viewer, with_depth(index, covered))
+    viewer._figure.value = "coverage"
+    viewer._tint()
+    assert viewer.page.frustums[4].color == (69, 117, 180)
+    assert viewer.page.frustums[9].color == (215, 48, 39)
+    viewer._figure.value = "nothing"
+    viewer._tint()
+    assert viewer.page.frustums[4].color == viewer.page.frustums[9].color
+
+
+def test_the_refined_map_is_shown_whole_and_rendered(viewer: Viewer) -> None:
+    dark = np.zeros((*SIZE, 3), np.uint8)
+    show(viewer, replace(preview(0), world_from_cam=np.eye(4), intrinsics=INTRINSICS, image=dark, render=dark))
+    final = replace(final_map(), world_from_cam=poses_around([0.0]))
+    list(viewer.on_splat_map(splat_map(final, refined=False)))
+    assert "refined" not in viewer._status.content
+    list(viewer.on_splat_map(splat_map(final, refined=True)))
+    splats = viewer.server.scene.get_handle_by_name("/splats")
+    assert splats is not None
+    assert len(splats.centers) == len(final.splats)
+    assert f"the **refined** map, {len(final.splats)} splats, 5 iterations" in received(viewer)
+    expected = as_bytes(final.render(poses_around([0.0])[0], INTRINSICS, SIZE).color)
+    assert np.abs(viewer.pictures.handles["render"].image.astype(int) - expected).max() <= 1
+    assert viewer.page.frustums[0].position == pytest.approx(
+        final.relative_pose(poses_around([0.0])[0])[:3, 3] / viewer.page.unit
+    )
+    show(viewer, preview(1))  # an older state comes late
+    assert len(splats.centers) == len(final.splats)
 
 
 @pytest.mark.slow

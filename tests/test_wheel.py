@@ -47,6 +47,16 @@ def test_only_our_own_names_are_in_site_packages(site: Path) -> None:
     assert "mvsgs = mvsgs.command:main" in points.read_text()
 
 
+def test_a_program_maps_from_there(site: Path, tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.meta_path = [f for f in sys.meta_path if 'editable' not in f.__module__]; "  # the checkout
+        f"sys.path.insert(0, {str(site)!r}); from mvsgs_core import Mapping; Mapping('device=cpu'); import nodes; "
+        "print(nodes.__file__)"
+    )
+    done = subprocess.run([sys.executable, "-I", "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == f"{site / 'mvsgs/workspace/nodes/__init__.py'}\n", done.stderr
+
+
 def test_the_command_runs_from_there(site: Path, tmp_path: Path) -> None:
     def run(*words: str) -> subprocess.CompletedProcess[str]:
         start = (

@@ -27,6 +27,7 @@ from bench.depth.pictures import write_pictures
 from bench.depth.pose_refinement import refine_poses
 from bench.depth.run import Run, run, score, surest
 from bench.depth.sensor import sensor_offset, without_offset
+from bench.depth.streets import street_rows
 from bench.depth.tracked import load_tracked
 from bench.runs import DATA, folder
 from bench.table import Row, at_least, at_most, main
@@ -206,6 +207,7 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "calibration": calibration_section,
     "baselines": baselines_section,
     "photos": photos_section,
+    "streets": lambda options: [] if options.quick else street_rows(SMALL),
     "parts": partial(variants_section, title="parts", variants=part_variants(SMALL)),
     "skips": partial(variants_section, title="skips", variants=skip_variants(SMALL)),
     "curves": curves_section,

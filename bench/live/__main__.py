@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ SLOW = {
     "mapper": "mapper._target_=bench.live.slow.SlowMapper",
 }
 POSE, TO_MAP, TO_PREVIEW = "frame to pose", "keyframe to map", "keyframe to preview"  # latencies
+NO_POSE = "none had one as it came"
 HANDED_OUT = "last keyframe to the map before its refinement"
 
 
@@ -109,9 +110,11 @@ def rows_of_pace(name: str, live: Result) -> list[Row]:
     """What a camera's user sees of a run."""
     frames, seen = live.count("dataset", "frames"), live.count("tracker", "frames")
     made, mapped = live.count("tracker", "keyframes"), live.count("mapper", "views")
+    slowest, median = (1e3 * live.latency("tracker", POSE, quantile) for quantile in ("p99", "median"))
+    posed = at_most(f"{name}: frame to pose, 99 %, ms", slowest, "", 100.0)
     return [
-        at_most(f"{name}: frame to pose, 99 %, ms", 1e3 * live.latency("tracker", POSE, "p99"), "", 100.0),
-        Row(f"{name}: frame to pose, median, ms", 1e3 * live.latency("tracker", POSE, "median")),
+        posed if np.isfinite(slowest) else replace(posed, value=NO_POSE),
+        Row(f"{name}: frame to pose, median, ms", median if np.isfinite(median) else NO_POSE),
         Row(f"{name}: frames that a newer one overtook", f"{frames - seen:.0f} of {frames:.0f}"),
         Row(f"{name}: keyframes in the map", f"{mapped:.0f} of {made:.0f}", "", "all", 0 < made == mapped),
         at_most(f"{name}: keyframe to map, median, s", live.latency("mapper", TO_MAP, "median"), "", 1.5),
@@ -125,7 +128,7 @@ def rows_of_pace(name: str, live: Result) -> list[Row]:
 def efforts(live: Result) -> str:
     """Keyframes on which less than the full effort was made, by stage and effort."""
     found = []
-    for node in ("mvs", "depth_fusion"):
+    for node in ("mvs", "depth_fusion", "mapper"):
         skipped = (live.report or {}).get("skipped", {}).get(node, {})
         found += [
             f"{name.removeprefix('effort on keyframes: ')} {count:.0f}"

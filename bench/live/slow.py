@@ -66,6 +66,11 @@ class SlowMapper(Mapper):
         super().__init__(config)
         self._add = slowed(self._add, self.config.factor)  # type: ignore[method-assign]
         self.atlas.step = slowed(self.atlas.step, self.config.factor)  # type: ignore[method-assign]
+        made_up = self.atlas.make_up
+        slowly = slowed(made_up, self.config.factor)
+        self.atlas.make_up = lambda splats=True: (  # type: ignore[method-assign]
+            made_up(splats) if self.atlas.stream_ended else slowly(splats)
+        )
 
 
 __all__ = ["SlowFusion", "SlowMapper", "SlowStereo", "slowed"]

@@ -34,6 +34,8 @@ class Item:
     depth: np.ndarray | None = None  # (H, W) float32, z in the poses' unit, 0 = unknown
     intrinsics_guessed: bool = False  # the focal length is a guess, to be estimated by who can
     exposure: float = 0.0  # exposure time times gain over f-number², in a unit that the sequence keeps; 0: not known
+    place: np.ndarray | None = None  # (3,) float64 latitude, longitude (degrees), altitude (m) by GPS
+    mask: np.ndarray | None = None  # (H, W) bool, False where a pixel is to be ignored; None: all count
 
 
 class Sequence(Protocol):

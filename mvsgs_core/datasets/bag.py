@@ -14,9 +14,10 @@ from mvsgs_core.datasets import Item, dataset
 from mvsgs_core.datasets.bag_file import messages, opened_bag
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.files import Layout
+from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.ros import calibrated, lens_of, rectified, rgb_of
-from mvsgs_core.datasets.sequence import FileReader, Notices, same_shape
+from mvsgs_core.datasets.sequence import FileReader, Notices
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -64,6 +65,7 @@ class Bag(FileReader):
                 lens, notes = lens_from_option(given, self.distortion, _first_size(bag, self._topic))
                 self.warnings += notes
             self._lens = lens
+        self._open_mask(lens.size)
         self.warnings += self._framing.notice(lens.size)
         if self.start >= self._count:
             raise ValueError(f"no frame left: {self._topic} has {self._count}, wanted from {self.start}")
@@ -101,13 +103,17 @@ class Bag(FileReader):
                     continue
                 yield self._item(index, seconds, image)
                 index += 1
+        self._end_places()
         if index == 0:
             raise BadFileError(f"no image of {self._topic} could be read: " + "; ".join(self.warnings))
 
     def _item(self, index: int, seconds: float, image: np.ndarray) -> Item:
         native = image.shape[0], image.shape[1]
-        framed, intrinsics = self._framing.image(image, self._lens.at(native), self._framing.size_of(self._lens.size))
-        return Item(index, seconds, framed, intrinsics, intrinsics_guessed=self._lens.guessed)
+        lens, size = self._lens.at(native), self._framing.size_of(self._lens.size)
+        framed, intrinsics = self._framing.image(image, lens, size)
+        mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, lens, size)
+        place, guessed = self._place(seconds), self._lens.guessed
+        return Item(index, seconds, framed, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask)
 
 
 def _image_topic(bag: AnyReader, given: str | None) -> str:

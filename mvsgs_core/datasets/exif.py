@@ -1,10 +1,13 @@
-"""What the EXIF header of a photograph tells: intrinsics, good to a few percent, and its exposure."""
+"""What the EXIF header of a photograph tells: intrinsics, good to a few percent, its exposure, and GPS."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
 
+import numpy as np
+
+from mvsgs_core import geodesy
 from mvsgs_core.datasets.files import UnreadableImageError, opened_image, upright_size
 from mvsgs_core.datasets.lens import Lens
 
@@ -14,6 +17,9 @@ _EXPOSURE_TIME, _F_NUMBER, _SENSITIVITY = 0x829A, 0x829D, 0x8827  # seconds, -, 
 _PLANE_X_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210  # sensor pixels per unit
 _PIXEL_WIDTH, _PIXEL_HEIGHT = 0xA002, 0xA003  # of the picture as taken
 _UNIT_MILLIMETERS = {2: 25.4, 3: 10.0, 4: 1.0}
+_GPS_IFD = 0x8825
+_LATITUDE, _LONGITUDE, _ALTITUDE = (1, 2), (3, 4), (5, 6)  # tags of reference and value
+_BELOW = (1, 3)  # references of altitudes below the sea, below the ellipsoid (EXIF 3.0)
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)  # CIPA DCG-001: "35 mm equivalent" compares diagonals
 
 
@@ -58,6 +64,40 @@ def read_exif_exposure(path: Path) -> float:
     return _positive(seconds * iso / stop**2) or 0.0
 
 
+def read_exif_place(path: Path) -> np.ndarray | None:
+    """(3,) latitude, longitude (degrees) and altitude (m, above the sea or the ellipsoid), NaN without an altitude.
+
+    None where the header lacks a place, has one that can be none, or cannot be read.
+    """
+    try:
+        with opened_image(path, path.name) as image:
+            header = image.getexif().get_ifd(_GPS_IFD)
+    except UnreadableImageError:
+        return None
+    latitude, longitude = _angle(header, _LATITUDE, "NS"), _angle(header, _LONGITUDE, "EW")
+    if latitude is None or longitude is None:
+        return None
+    altitude, below = _number(header.get(_ALTITUDE[1])), header.get(_ALTITUDE[0])
+    below = below[0] if isinstance(below, bytes) and below else below
+    if altitude is None:
+        return (
+            np.array([latitude, longitude, np.nan]) if geodesy.is_place(np.array([latitude, longitude, 0.0])) else None
+        )
+    place = np.array([latitude, longitude, -altitude if below in _BELOW else altitude])
+    return place if geodesy.is_place(place) else None
+
+
+def _angle(header: dict[int, object], tags: tuple[int, int], signs: str) -> float | None:
+    """Degrees of degrees, minutes and seconds, some of which may be left out; negative by the reference."""
+    sign, value = header.get(tags[0]), header.get(tags[1])
+    sign = sign.decode("ascii", "replace") if isinstance(sign, bytes) else sign
+    parts = [_number(part) for part in value] if isinstance(value, tuple) else []
+    if not isinstance(sign, str) or sign[:1].upper() not in tuple(signs) or not 1 <= len(parts) <= 3 or None in parts:
+        return None
+    degrees = sum(part / 60.0**n for n, part in enumerate(parts) if part is not None)
+    return -degrees if sign[:1].upper() == signs[1] else degrees
+
+
 def _from_sensor(header: dict[int, object], longer_side: int) -> float | None:
     focal, resolution = _positive(header.get(_FOCAL_LENGTH)), _positive(header.get(_PLANE_X_RESOLUTION))
     sides = [_positive(header.get(tag)) for tag in (_PIXEL_WIDTH, _PIXEL_HEIGHT)]
@@ -68,8 +108,13 @@ def _from_sensor(header: dict[int, object], longer_side: int) -> float | None:
 
 
 def _positive(value: object) -> float | None:
+    number = _number(value)
+    return number if number is not None and number > 0 else None
+
+
+def _number(value: object) -> float | None:
     try:
         number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError):
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
-    return number if math.isfinite(number) and number > 0 else None
+    return number if math.isfinite(number) else None

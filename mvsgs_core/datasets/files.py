@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -95,13 +96,19 @@ def opened_image(source: Path | BinaryIO, name: str) -> Iterator[Image.Image]:
         raise UnreadableImageError(f"{name}: {brief(error)}") from error
 
 
-def read_image(source: Path | BinaryIO, *, name: str | None = None, turn_upright: bool = True) -> np.ndarray:
+def read_image(
+    source: Path | BinaryIO, *, name: str | None = None, turn_upright: bool = True, enough: int | None = None
+) -> np.ndarray:
     """(H, W, 3) uint8 RGB. Pillow and not OpenCV, because OpenCV fills the rest of a truncated file with gray.
 
-    name: for messages, of what is no path. turn_upright: applies the orientation of the EXIF header.
+    name: for messages, of what is no path. turn_upright: applies the orientation of the EXIF header. enough: pixels;
+    a format that can be decoded at a half, a quarter or an eighth of its size, as JPEG, is where so many are left.
     Raises UnreadableImageError.
     """
     with opened_image(source, name or (source.name if isinstance(source, Path) else "image")) as opened:
+        if enough is not None:
+            factor = min(1.0, (enough / (opened.width * opened.height)) ** 0.5)
+            opened.draft("RGB", (math.ceil(factor * opened.width), math.ceil(factor * opened.height)))
         image: Image.Image = opened
         if turn_upright:
             image = ImageOps.exif_transpose(opened)
@@ -162,6 +169,12 @@ def natural_order(name: str) -> list[tuple[int, int | str]]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Image files directly in `folder`, in natural order."""
+    """Image files directly in `folder`, in natural order, without the masks beside them."""
     found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
-    return sorted(found, key=lambda p: natural_order(p.name))
+    return sorted((p for p in found if not is_mask_beside(p)), key=lambda p: natural_order(p.name))
+
+
+def is_mask_beside(path: Path) -> bool:
+    """Whether that is the mask of an image in the same folder: NAME.jpg.png of NAME.jpg."""
+    image = path.with_suffix("")
+    return path.suffix.lower() == ".png" and image.suffix.lower() in IMAGE_SUFFIXES and image.exists()

@@ -38,6 +38,11 @@ def resize_depth(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.asarray(cv2.resize(depth, (size[1], size[0]), interpolation=cv2.INTER_NEAREST_EXACT))
 
 
+def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Sizes of one aspect ratio, to a percent (a scaled copy is rounded to whole pixels)."""
+    return abs(a[0] * b[1] - a[1] * b[0]) <= 0.01 * a[1] * b[0]
+
+
 class Framing:
     """Brings every frame of a sequence to one size; the intrinsics follow.
 
@@ -83,6 +88,10 @@ class Framing:
         padded, inside = self._border(size)
         whole = self._undistortion(lens).depth(resize_depth(depth, lens.size))
         return np.ascontiguousarray(resize_depth(whole, padded)[inside])
+
+    def mask(self, mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
+        """(h, w) bool of any size, of that lens's image -> mask at `size`; False where the lens saw nothing."""
+        return self.depth(mask.astype(np.uint8), lens, size) > 0
 
     def _border(self, size: tuple[int, int]) -> tuple[tuple[int, int], tuple[slice, slice]]:
         border = self._crop or 0

@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import image_size, lens_from_option
 from mvsgs_core.datasets.colmap import find_colmap, read_colmap
-from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens
+from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens, read_exif_place
 from mvsgs_core.datasets.files import (
     IMAGE_SUFFIXES,
     Layout,
     UnreadableImageError,
     images_in,
+    is_mask_beside,
     natural_order,
     opened_image,
     upright_size,
 )
+from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.masks import FOLDERS, masks_of
 from mvsgs_core.datasets.model import Model
 from mvsgs_core.datasets.phone_scans import find_record3d, polycam_folders, read_polycam, read_record3d
-from mvsgs_core.datasets.sequence import Found, ImageSequence, Record, same_shape
+from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
 from mvsgs_core.datasets.strecha import find_strecha, read_strecha
 from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transforms
 
@@ -31,7 +36,7 @@ LAYOUT = Layout(
     "A folder of images",
     "photographs or frames (" + ", ".join(IMAGE_SUFFIXES) + ") in the order of their names, in the folder or in its "
     "subfolder images/; beside them, if there is one, a COLMAP model (sparse/0), a transforms.json, .camera files, "
-    "or what Polycam (raw data) or Record3D exported",
+    "or what Polycam (raw data) or Record3D exported; masks (black: ignored) in masks/ under the images' names",
     "your own camera; frames of a video: ffmpeg -i video.mp4 -qscale:v 2 images/%05d.jpg (or dataset=video directly)",
 )
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
@@ -65,11 +70,16 @@ class Images(ImageSequence):
         folder = LAYOUT.folder(self.path)
         images = _find_images(folder)
         model = None if self.intrinsics is not None else _find_model(folder, images, self.model)
+        masks = masks_of(images, folder) if self.mask is None else [None] * len(images)
         if model is not None:
-            return Found(_from_model(model, folder, images, self.rate, self.warnings), turn_upright=False)
+            records = _from_model(model, folder, images, self.rate, self.warnings)
+            known = dict(zip(images, masks))
+            records = [replace(record, mask=record.mask or known[record.image]) for record in records]
+            return Found(records, turn_upright=False)
         _check_shapes(images)
         lenses = self._lenses(images)
-        return Found([Record(i / self.rate, image, lens) for i, (image, lens) in enumerate(zip(images, lenses))])
+        found = enumerate(zip(images, lenses, masks))
+        return Found([Record(i / self.rate, image, lens, mask=mask) for i, (image, lens, mask) in found])
 
     def _lenses(self, images: list[Path]) -> list[Lens]:
         if self.intrinsics is not None:
@@ -93,6 +103,13 @@ class Images(ImageSequence):
     def _exposure(self, record: Record) -> float:
         return read_exif_exposure(record.image)
 
+    def _own_place(self, record: Record) -> np.ndarray | None:
+        place = read_exif_place(record.image)
+        if place is not None and np.isnan(place[2]):
+            self._notices.tally("photographs whose GPS has no altitude, and is not used", record.image.name)
+            return None
+        return place
+
 
 def _places(folder: Path) -> list[Path]:
     """Where the images may be."""
@@ -105,10 +122,14 @@ def _find_images(folder: Path) -> list[Path]:
         images = images_in(candidate) if candidate.is_dir() else []
         if images:
             return images
-    below = [p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+    below = [p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(p, folder)]
     if not below:
         raise LAYOUT.missing(f"{folder} has no image")
     return sorted(below, key=lambda p: natural_order(p.relative_to(folder).as_posix()))
+
+
+def _is_mask(path: Path, folder: Path) -> bool:
+    return is_mask_beside(path) or any(part.lower() in FOLDERS for part in path.relative_to(folder).parts[:-1])
 
 
 def _check_shapes(images: list[Path]) -> None:
@@ -166,7 +187,7 @@ def _from_model(model: Model, folder: Path, images: list[Path], rate: float, not
     records = []
     for i, (image, shot) in enumerate(zip(images, shots)):
         if shot is not None:
-            records.append(Record(i / rate, image, shot.lens, shot.world_from_cam))
+            records.append(Record(i / rate, image, shot.lens, shot.world_from_cam, mask=shot.mask))
         elif common is not None:
             records.append(Record(i / rate, image, common))
     if unknown:

@@ -86,6 +86,10 @@ class Undistortion:
             return depth
         return np.asarray(cv2.remap(depth, *self._maps, interpolation=cv2.INTER_NEAREST))
 
+    def mask(self, mask: np.ndarray) -> np.ndarray:
+        """(H, W) bool, nearest neighbor; False outside."""
+        return self.depth(mask.astype(np.uint8)) > 0
+
 
 def _distort(lens: Lens, intrinsics: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Where pixels (N, 2) of the pinhole image lie in the distorted one, (N, 2)."""

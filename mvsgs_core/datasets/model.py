@@ -20,6 +20,7 @@ class Shot:
 
     lens: Lens
     world_from_cam: np.ndarray  # (4, 4) float64
+    mask: Path | None = None  # that the model names
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,8 @@ class SizedSelection(Selection):
 
     # [height, width], or a number of pixels at the same aspect; null: as it is, up to 1.5 million pixels
     size: list[int] | int | None = None
+    # image whose black pixels are ignored in each frame; of image files also a folder of masks, null: masks/ beside
+    mask: str | Path | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,3 +55,7 @@ class FileOptions(SizedSelection):
     intrinsics: Sequence[float] | str | None = None
     # with intrinsics, as in OpenCV: [k1, k2, p1, p2(, k3, ...)], or [fisheye, k1, k2, k3, k4]
     distortion: Sequence[float | str] = field(default_factory=list)
+    # places of the frames by time or name: .csv with a header, .gpx, or .srt as DJI writes it; null: EXIF's
+    gps: str | Path | None = None
+    # when timestamp 0 was, ISO 8601, for a gps file whose times are of a clock; null: as a video says when it began
+    gps_start: str | None = None

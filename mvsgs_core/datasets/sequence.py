@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import UnreadableImageError, read_depth, read_image
-from mvsgs_core.datasets.framing import Framing
+from mvsgs_core.datasets.framing import Framing, same_shape
+from mvsgs_core.datasets.gps import CLOCK, clock_time, read_gps
 from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.masks import CameraMask, masks_of, read_mask
 from mvsgs_core.datasets.options import FileOptions
 
 
@@ -27,6 +30,7 @@ class Record:
     lens: Lens
     world_from_cam: np.ndarray | None = None  # (4, 4) float64
     depth: Path | None = None
+    mask: Path | None = None  # that was named, or lies beside the image
 
 
 @dataclass(frozen=True)
@@ -59,11 +63,6 @@ class Notices(list[str]):
         self._lines = {text: entry for text, entry in self._lines.items() if entry[0] < length}
 
 
-def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Sizes of one aspect ratio, to a percent (a scaled copy is rounded to whole pixels)."""
-    return abs(a[0] * b[1] - a[1] * b[0]) <= 0.01 * a[1] * b[0]
-
-
 @dataclass(kw_only=True, eq=False)
 class FileReader(FileOptions):
     """Base of the readers of files. Raises ValueError for options that make no sense."""
@@ -74,8 +73,60 @@ class FileReader(FileOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._framing = Framing(self.size, self.crop)
+        self._gps = None if self.gps is None else read_gps(Path(self.gps).expanduser())
+        self._camera_mask: CameraMask | None = None  # once the camera is known
         self.warnings: list[str] = Notices()
         self._notices: Notices = self.warnings  # the same list, with its counting
+        self.warnings += [] if self._gps is None else self._gps.warnings
+        self._places: Callable[[float, str], np.ndarray | None] | None = None
+        self._placed = 0  # frames with a place of the file
+
+    def _place(
+        self, timestamp: float, name: str = "", began: Callable[[], str | None] | None = None
+    ) -> np.ndarray | None:
+        """The place (3,) of the next frame, in the order of the stream; None where dataset.gps has none for it.
+
+        began: asked when timestamp 0 was, as the file says, ISO 8601. Raises ValueError where a clock's times meet a
+        stream of which it is not known when it was taken.
+        """
+        if self._gps is None:
+            return None
+        if self._places is None:
+            self._places = self._gps.places_of(self._start_of_clock(timestamp, began))
+        place = self._places(timestamp, name)
+        self._placed += place is not None
+        return place
+
+    def _start_of_clock(self, first: float, began: Callable[[], str | None] | None) -> float | None:
+        assert self._gps is not None
+        if not self._gps.on_a_clock or first > CLOCK:
+            if self.gps_start is not None:
+                raise ValueError(f"dataset.gps_start is for times of a clock in {self.gps}, and frames without them")
+            return None
+        said = self.gps_start or (began() if began is not None else None)
+        if said is None:
+            raise ValueError(
+                f"{self.gps} has times of a clock, and the frames do not say when they were taken: set "
+                "dataset.gps_start=2026-01-31T12:00:00Z, the time of the first frame"
+            )
+        if self.gps_start is None:
+            self.warnings.append(
+                f"the video is taken to have begun at {said}, as it says; dataset.gps_start changes it"
+            )
+        with reading("dataset.gps_start" if self.gps_start else "the video", "has no time of ISO 8601"):
+            return clock_time(said)
+
+    def _end_places(self) -> None:
+        """To be called when the frames have ended."""
+        if self._gps is not None and not self._placed:
+            self.warnings.append(f"no frame has a place in {self.gps}: neither their names nor their times are in it")
+        self._places, self._placed = None, 0  # of a second pass
+
+    def _open_mask(self, size: tuple[int, int]) -> None:
+        """Of images (height, width). Raises FileNotFoundError and ValueError for a mask that cannot be theirs."""
+        if self.mask is not None:
+            self._camera_mask = CameraMask(self.mask, size)
+            self.warnings += self._camera_mask.notices
 
 
 @dataclass(frozen=True)
@@ -103,6 +154,7 @@ class ImageSequence(FileReader, ABC):
             count = len(found.records)
             raise ValueError(f"no frame left: the sequence has {count}, wanted from {self.start} to {self.stop}")
         self._depth_format, self._turn_upright = found.depth_format, found.turn_upright
+        self._find_masks()
         self._opening_warnings = len(self.warnings)
 
     @property
@@ -113,6 +165,22 @@ class ImageSequence(FileReader, ABC):
     @abstractmethod
     def _find(self) -> Found:
         """What there is; warnings go to `self.warnings`."""
+
+    def _find_masks(self) -> None:
+        """Of all images one, or each its own; one of each that was named goes before what lies beside the images."""
+        if self.mask is not None and not Path(self.mask).expanduser().is_dir():
+            self._open_mask(self.lens.size)
+            self.records = [replace(record, mask=None) for record in self.records]
+            return
+        given = None if self.mask is None else Path(self.mask).expanduser()
+        if given is not None:
+            images = [record.image for record in self.records]
+            found = masks_of(images, _common_folder(images), given)
+            self.records = [replace(record, mask=mask) for record, mask in zip(self.records, found)]
+        self._masked = any(record.mask is not None for record in self.records)
+        if self._masked and not any(record.mask is not None and record.mask.is_file() for record in self.records):
+            named = next(record.mask for record in self.records if record.mask is not None)
+            raise FileNotFoundError(f"not one of the masks of the images is there, such as {named}")
 
     def _lens(self, images: Sequence[Path], published: Lens) -> Lens:
         """The lens that was given, else the `published` one."""
@@ -126,6 +194,21 @@ class ImageSequence(FileReader, ABC):
     def __len__(self) -> int:
         """Frames selected; those that turn out unreadable are not delivered."""
         return len(self.records)
+
+    def successive(self, firsts: Iterable[int], enough: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Two images (H, W, 3) that follow each other, of `enough` pixels or more and not undistorted, and the
+        intrinsics (4,) of the first, of each place in `firsts`; none of those that iterating would leave out."""
+        for place in firsts:
+            here, there = self.records[place], self.records[place + 1]
+            try:
+                images = [
+                    read_image(record.image, turn_upright=self._turn_upright, enough=enough) for record in (here, there)
+                ]
+            except UnreadableImageError:
+                continue
+            sizes = [(image.shape[0], image.shape[1]) for image in images]
+            if same_shape(sizes[0], here.lens.size) and same_shape(sizes[1], sizes[0]):
+                yield images[0], images[1], np.array(here.lens.at(sizes[0]).intrinsics)
 
     def __iter__(self) -> Iterator[Item]:
         self._notices.truncate(self._opening_warnings)
@@ -142,6 +225,7 @@ class ImageSequence(FileReader, ABC):
                 first = first or (image.shape[0], image.shape[1])
                 index += 1
                 yield item
+        self._end_places()
         if index == 0:
             raise BadFileError("no image could be read: " + "; ".join(self._notices))
 
@@ -167,11 +251,38 @@ class ImageSequence(FileReader, ABC):
             what = "images left out because their distortion cannot be undone"
             self._notices.tally(what, f"{record.image.name}, {error}")
             return None
+        try:
+            mask = self._mask(record, lens, size)
+        except ValueError as error:  # whole, it would put into the map what is not to be there
+            self._notices.tally("images left out because of their masks", str(error))
+            return None
         depth = self._depth(record, native)
         if depth is not None:
             depth = self._framing.depth(depth, lens, size)
         pose, exposure = record.world_from_cam, self._exposure(record)
-        return Item(index, record.timestamp, framed, intrinsics, pose, depth, lens.guessed, exposure)
+        place = self._place(record.timestamp, record.image.name) if self._gps is not None else self._own_place(record)
+        return Item(index, record.timestamp, framed, intrinsics, pose, depth, lens.guessed, exposure, place, mask)
+
+    def _own_place(self, record: Record) -> np.ndarray | None:
+        """As in `Item`: of most sets nothing is known of it."""
+        return None
+
+    def _mask(self, record: Record, lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
+        """(h, w) bool at `size`, None where every pixel counts. Raises ValueError for a mask that cannot be used."""
+        if self._camera_mask is not None:
+            return self._camera_mask.framed(self._framing, lens, size)
+        if not self._masked:
+            return None
+        if record.mask is None or not record.mask.is_file():
+            self._notices.tally("images without a mask, of which every pixel counts", record.image.name)
+            return None
+        mask = read_mask(record.mask)
+        if not same_shape((mask.shape[0], mask.shape[1]), lens.size):
+            raise ValueError(f"{record.mask.name} is {_text(mask.shape)} for an image of {_text(lens.size)}")
+        mask = self._framing.mask(mask, lens, size)
+        if not mask.any():
+            raise ValueError(f"{record.mask.name} leaves no pixel of its image: black is ignored")
+        return None if mask.all() else mask
 
     def _exposure(self, record: Record) -> float:
         """As in `Item`: of most sets nothing is known of it."""
@@ -202,5 +313,9 @@ class ImageSequence(FileReader, ABC):
         return depth
 
 
-def _text(size: tuple[int, int]) -> str:
+def _common_folder(images: Sequence[Path]) -> Path:
+    return Path(os.path.commonpath([image.parent for image in images]))
+
+
+def _text(size: tuple[int, ...]) -> str:
     return f"{size[1]}x{size[0]}"

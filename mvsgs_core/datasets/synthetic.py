@@ -24,7 +24,7 @@ STRIP = 8  # rows that are read out at once
 class Film:
     """What is filmed, without what makes it hard."""
 
-    scene: Literal["room", "aerial"] = "room"
+    scene: Literal["room", "aerial", "town"] = "room"
     frames: int = 120  # length of the stream, at 20 a second
     size: tuple[int, int] = (240, 320)  # height, width
     start: int = 0  # first frame of the stream
@@ -37,7 +37,7 @@ class Film:
 
 @dataset
 class Synthetic:
-    """A sequence through the room or over the landscape."""
+    """A sequence through the room, over the landscape or along the streets of the town."""
 
     OPTIONS = (Film, Difficulties)
 

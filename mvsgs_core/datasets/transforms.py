@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core.bad_file import reading
-from mvsgs_core.datasets.files import IMAGE_SUFFIXES
+from mvsgs_core.datasets.files import IMAGE_SUFFIXES, inside
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model, Shot, rigid
 
@@ -35,7 +35,9 @@ def read_transforms(path: Path, image_size: tuple[int, int]) -> Model:
             name = frame["file_path"]
             with reading(f"frame {name!r}", "cannot be"):
                 pose = rigid(np.array(frame["transform_matrix"], dtype=np.float64), "transform_matrix")
-                shots[_relative(name)] = Shot(_lens({**content, **frame}, image_size), pose @ _OPENGL_FROM_OPENCV)
+                lens, mask = _lens({**content, **frame}, image_size), frame.get("mask_path", content.get("mask_path"))
+                masked = None if mask is None else inside(path.parent, mask, path)
+                shots[_relative(name)] = Shot(lens, pose @ _OPENGL_FROM_OPENCV, masked)
     return Model("transforms.json", shots)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import av
@@ -15,14 +17,17 @@ from mvsgs_core.bad_file import BadFileError, brief, reading
 from mvsgs_core.datasets import Item, dataset
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.files import Layout
+from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.sequence import FileReader, same_shape
+from mvsgs_core.datasets.sequence import FileReader
 
 LAYOUT = Layout(
     "A video",
     "one file that OpenCV's FFmpeg opens: mp4, mov, mkv, avi, webm, ...",
     "your own camera or phone; walk slowly, move sideways rather than turn on the spot, lock exposure and focus",
 )
+# FFmpeg writes to the terminal what our errors and counts say in words; OpenCV reads this when it first opens a video.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
 SUFFIXES = (  # by which a file is taken for a video where its format was not said
     ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts", ".3gp", ".wmv", ".flv",
     ".ogv", ".mjpg", ".mjpeg", ".y4m", ".h264", ".hevc", ".insv", ".lrv",
@@ -81,6 +86,7 @@ class Video(FileReader):
             raise BadFileError(f"{self._path} opens but has no frame: it is damaged, or no video")
         self._lens, notes = lens_from_option(self.intrinsics, self.distortion, (frame.shape[0], frame.shape[1]))
         self._native = frame.shape[0], frame.shape[1]
+        self._open_mask(self._native)
         self._count = int(count) if 0 < count < _MAX_COUNT else 0
         self._rate = rate if math.isfinite(rate) and 0 < rate < 1000 else _DEFAULT_RATE
         self.warnings += notes + self._framing.notice(self._native) + _range_notice(self._path)
@@ -127,6 +133,7 @@ class Video(FileReader):
                 index += 1
         finally:
             capture.release()
+        self._end_places()
         if index == 0:
             raise BadFileError(f"no frame of {self._path} could be read: " + "; ".join(self.warnings))
 
@@ -154,7 +161,9 @@ class Video(FileReader):
     def _item(self, index: int, picture: _Picture) -> Item:
         lens = self._lens.at((picture.rgb.shape[0], picture.rgb.shape[1]))
         image, intrinsics = self._framing.image(picture.rgb, lens, self._framing.size_of(self._native))
-        return Item(index, picture.seconds, image, intrinsics, intrinsics_guessed=self._lens.guessed)
+        mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, lens, image.shape[:2])
+        place, guessed = self._place(picture.seconds, began=partial(_began, self._path)), self._lens.guessed
+        return Item(index, picture.seconds, image, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask)
 
     def _judge_end(self, frames: int, seconds: float) -> None:
         """Warns where the file ends after `frames`, the last `seconds` after the first, and promised more than that."""
@@ -185,6 +194,15 @@ def _sharpness(frame: np.ndarray) -> float:
     """Mean square of the Laplacian, at half the size where it is the motion's blur and not the noise that counts."""
     gray = cv2.cvtColor(cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY)
     return float(np.mean(np.square(cv2.Laplacian(gray, cv2.CV_32F))))
+
+
+def _began(path: Path) -> str | None:
+    """When the file says that it was recorded, ISO 8601; None where it does not."""
+    try:
+        with av.open(str(path)) as container:
+            return container.metadata.get("creation_time")
+    except (av.FFmpegError, OSError, ValueError):
+        return None
 
 
 def _range_notice(path: Path) -> list[str]:

@@ -14,8 +14,9 @@ from mvsgs_core.evaluation import metrics, scoring, trajectory_metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.exposure import FrameExposures, frame_exposures, summary
 from mvsgs_core.evaluation.fitted_camera import fit_camera
-from mvsgs_core.evaluation.frames import Frames
-from mvsgs_core.evaluation.trajectory_metrics import known_poses
+from mvsgs_core.evaluation.frames import Frames, Photograph
+from mvsgs_core.evaluation.straight import undistortion
+from mvsgs_core.evaluation.trajectory_metrics import AlignedPath, known_poses
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.trajectory import Trajectory, velocities
 
@@ -38,6 +39,7 @@ class Evaluation:
     maps: dict[bool, Snapshot] = field(default_factory=dict)  # by `refined`
     scores: dict[bool, list[scoring.Score]] = field(default_factory=dict)
     fitting: float = 0.0  # seconds that went into fitting cameras at test time
+    masked: list[float] = field(default_factory=list)  # of each frame with a mask, the part that does not count
 
     def __post_init__(self) -> None:
         self._frames = Frames(self.folder, self.max_frames, self.max_bytes)
@@ -52,20 +54,28 @@ class Evaluation:
         intrinsics: np.ndarray,
         world_from_cam: np.ndarray | None,
         depth: np.ndarray | None,
+        mask: np.ndarray | None = None,
     ) -> None:
+        """A frame of the stream, with what is known of the truth. mask: (H, W) bool, pixels that count; None: all."""
         if self.started is None:
             self.started = time.perf_counter()
         self._received += 1
         self.size = self.size or (image.shape[0], image.shape[1])
-        self._frames.add(index, image, intrinsics, depth)
+        if mask is None or mask.any():
+            if depth is not None and mask is not None:
+                depth = np.where(mask, depth, np.float32(0))
+            self._frames.add(index, image, intrinsics, depth, mask)
+        if mask is not None:
+            self.masked.append(1.0 - float(mask.mean()))
         if world_from_cam is not None and np.isfinite(world_from_cam).all():
             self._truth[index] = world_from_cam
 
     def add_keyframe(
-        self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray, scale: float
-    ) -> None:
+        self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray, scale: float,
+        mask: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """A keyframe as it is mapped, with its filtered depth, computed at the map's scale `scale`."""
-        self._frames.add_keyframe(index, image, intrinsics, depth, scale)
+        self._frames.add_keyframe(index, image, intrinsics, depth, scale, mask)
 
     def add_map(self, finished: Snapshot, refined: bool) -> None:
         self.maps[refined] = finished
@@ -122,7 +132,7 @@ class Evaluation:
         photographs = self._frames.photographs()
         for k in np.flatnonzero(main & np.isin(tracked.index, list(photographs))):
             index = int(tracked.index[k])
-            photograph = photographs[index]
+            photograph = self._as_pinhole(photographs[index], tracked)
             focal = 1.0 if photograph.as_mapped else tracked.focal_factor
             rolling = tracked.readout_time and not photograph.as_mapped
             frames.append(
@@ -137,6 +147,7 @@ class Evaluation:
                     None if exposures is None else exposures.affines[k],
                     finished.vignetting,
                     finished.antialiased,
+                    photograph.mask,
                 )
             )
         return frames
@@ -150,8 +161,23 @@ class Evaluation:
         return frame_exposures(tracked.timestamp, tracked.exposure, mapped, affines)
 
     def photograph(self, index: int) -> np.ndarray:
-        """(H, W, 3) uint8. Raises KeyError for a frame that was not kept."""
-        return self._frames.photographs()[index].image()
+        """(H, W, 3) uint8, as renders are compared with it. Raises KeyError for a frame that was not kept."""
+        return self._as_pinhole(self._frames.photographs()[index], self.trajectory).image()
+
+    def _as_pinhole(self, photograph: Photograph, tracked: Trajectory | None) -> Photograph:
+        """Without the distortion that the tracker found: as its keyframes are."""
+        if photograph.as_mapped or tracked is None or tracked.distortion is None:
+            return photograph
+        assert self.size is not None
+        lens = undistortion(tracked, photograph.intrinsics, self.size)
+        assert lens is not None
+        given, mask = photograph.image, photograph.mask
+
+        def straightened() -> np.ndarray | None:
+            seen = mask()
+            return None if seen is None else lens.mask(seen)
+
+        return Photograph(lambda: lens.image(given()), lens.intrinsics, True, straightened)
 
     def filtered_depths(self) -> list[int]:
         """Keyframes whose filtered depth is there."""
@@ -213,29 +239,25 @@ class Evaluation:
         length = {"path_length": poses.path_length, "scale": found.scale}
         return found, {**metrics.of_all(metrics.TRAJECTORY, poses), **length, **counts}
 
-    def aligned_paths(self) -> dict[str, np.ndarray]:
-        """Camera positions (N, 3) for a plot: "estimate" in the frame of the "truth" where there is one."""
+    def aligned_path(self) -> AlignedPath | None:
+        """Of the main part of the map; None where no frame has a pose."""
         trajectory = self.final_trajectory
-        if trajectory is None:
-            return {}
-        main = trajectory.main()
+        if trajectory is None or not trajectory.main().any():
+            return None
         alignment, _ = self._score_trajectory([])
-        if alignment is None:
-            return {"estimate": trajectory.world_from_cam[main][:, :3, 3]}
-        known = main & np.isin(trajectory.index, list(self._truth))
-        return {
-            "truth": trajectory_metrics.poses_of(self._truth, trajectory.index[known])[:, :3, 3],
-            "estimate": alignment.positions(trajectory.world_from_cam[main]),
-        }
+        return trajectory_metrics.aligned_path(trajectory, self._truth, alignment)
 
     def _score_depths(self, alignment: trajectory_metrics.Alignment | None, notes: list[str]) -> dict[str, Any]:
         """After one scale for the whole run, the median ratio of true to estimated depth, as is usual for monocular
         depth; `scale_ratio` is that over the trajectory's scale, 1 where poses and depth maps of the truth agree."""
         finished = self.maps.get(True) or self.maps.get(False)
         now = dict(zip(finished.keyframes.tolist(), finished.scale.tolist())) if finished else {}
+        known_frames = None if self.trajectory is None else set(self.trajectory.index.tolist())
 
         def maps() -> Iterator[tuple[np.ndarray, np.ndarray]]:  # read again for each use: all at once are gigabytes
             for index, scale in self._frames.filtered_depths():
+                if known_frames is not None and index not in known_frames:  # of a map before, which has another scale
+                    continue
                 truth, depth = self._frames.true_depth(index), self._frames.filtered_depth(index)
                 if truth is not None and depth is not None:
                     yield depth * (now.get(index, scale) / scale), truth

@@ -35,7 +35,9 @@ class _State:
 
 def fit_camera(splats: Splats, kernel: str, frame: ScoredFrame) -> ScoredFrame:
     """The frame with the pose and the exposure from which the map shows its photograph best; the rest as it was."""
-    photograph = frame.photograph().astype(np.float32) / 255.0
+    photograph, mask = frame.photograph().astype(np.float32) / 255.0, frame.mask()
+    if mask is not None:
+        photograph[~mask] = np.nan
     height, width = photograph.shape[:2]
     found = frame
     for size in (((height + 1) // 2, (width + 1) // 2), (height, width)):
@@ -79,7 +81,7 @@ class Linear:
 
 
 def linearized(seen: Rendered, target: np.ndarray, frame: ScoredFrame) -> Linear:
-    """Of a render against its photograph (H, W, 3), with the frame's intrinsics at that size.
+    """Of a render against its photograph (H, W, 3), NaN where that does not count, with intrinsics at that size.
 
     The render follows the camera as the pixels of a still scene of its depth do; where nothing is rendered, or a color
     is cut off at 0 or 1, it follows nothing.
@@ -99,8 +101,9 @@ def linearized(seen: Rendered, target: np.ndarray, frame: ScoredFrame) -> Linear
     for channel in range(color.shape[2]):
         moves = -(columns[..., channel, None] * motion[..., 0, :] + rows[..., channel, None] * motion[..., 1, :])
         jacobian = np.concatenate([moves.reshape(-1, MOTION), affine], axis=1)
-        jacobian[((color[..., channel] <= 0.0) | (color[..., channel] >= 1.0)).ravel()] = 0.0
         residual = (target[..., channel] - color[..., channel]).ravel()
+        jacobian[((color[..., channel] <= 0.0) | (color[..., channel] >= 1.0)).ravel() | np.isnan(residual)] = 0.0
+        residual = np.nan_to_num(residual)
         unknowns = np.r_[0:MOTION, MOTION + 4 * channel : MOTION + 4 * channel + 4]
         hessian[np.ix_(unknowns, unknowns)] += jacobian.T @ jacobian
         gradient[unknowns] += jacobian.T @ residual
@@ -132,7 +135,7 @@ def _moved(frame: ScoredFrame, step: np.ndarray, length: float) -> ScoredFrame:
 
 def _seen(splats: Splats, kernel: str, frame: ScoredFrame, target: np.ndarray) -> _State:
     seen = render_frame(splats, kernel, frame, (target.shape[0], target.shape[1]))
-    return _State(frame, seen, float(np.mean((seen.color - target) ** 2, dtype=np.float64)))
+    return _State(frame, seen, float(np.nanmean((seen.color - target) ** 2, dtype=np.float64)))
 
 
 __all__ = ["Linear", "fit_camera", "linearized"]

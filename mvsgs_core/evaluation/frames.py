@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ class Photograph:
     image: Callable[[], np.ndarray]  # (H, W, 3) uint8, read when needed
     intrinsics: np.ndarray  # (4,)
     as_mapped: bool  # from a keyframe: final intrinsics, and no rolling shutter any more
+    mask: Callable[[], np.ndarray | None]  # (H, W) bool, the pixels that count; None: all
 
 
 @dataclass(frozen=True)
@@ -35,9 +37,11 @@ class _Frame:
     image: np.ndarray
     intrinsics: np.ndarray
     depth: np.ndarray | None
+    mask: np.ndarray | None
 
     def arrays(self) -> dict[str, np.ndarray]:
-        return {"image": self.image} if self.depth is None else {"image": self.image, "depth": self.depth}
+        given = {"image": self.image, "depth": self.depth, "mask": self.mask}
+        return {name: array for name, array in given.items() if array is not None}
 
 
 @dataclass(frozen=True)
@@ -60,36 +64,47 @@ class Frames:
         self._mapped: Thinned[_Mapped] = Thinned(folder, kept, max_bytes / 3)
         self._ending: dict[int, _Frame] = {}  # by index, in the order in which they came
 
-    def add(self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray | None) -> None:
-        """A frame of the stream; its true depth where it is known. The last few are held as they are."""
+    def add(
+        self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray | None,
+        mask: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        """A frame of the stream; its true depth where it is known. The last few are held as they are.
+
+        mask: (H, W) bool, the pixels that count; None: all.
+        """
         if self._none:
             return
         depth = None if depth is None else depth.astype(np.float32, copy=False)
         self._ending.pop(index, None)  # one that comes again replaces the one before
-        self._ending[index] = _Frame(image, intrinsics, depth)
+        self._ending[index] = _Frame(image, intrinsics, depth, mask)
         if len(self._ending) > ENDING:
             index = next(iter(self._ending))
             past = self._ending.pop(index)
             self._streamed[is_held_out(index)].add(index, past.intrinsics, past.arrays())
 
     def add_keyframe(
-        self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray, scale: float
-    ) -> None:
+        self, index: int, image: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray, scale: float,
+        mask: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         """A keyframe as it was mapped, with its filtered depth at the map's scale `scale`; a later one replaces it."""
         if not self._none:
-            self._mapped.add(index, _Mapped(intrinsics, scale), {"image": image, "depth": depth})
+            arrays = {"image": image, "depth": depth} | ({} if mask is None else {"mask": mask})
+            self._mapped.add(index, _Mapped(intrinsics, scale), arrays)
 
     def photographs(self) -> dict[int, Photograph]:
         """All that can be scored, by index."""
         found = {
-            index: Photograph(lambda index=index: self._read(index), mapped.intrinsics, True)  # type: ignore[misc]
+            index: self._photograph(index, mapped.intrinsics, as_mapped=True)
             for index, mapped in self._mapped.notes.items()
         }
         streamed = [item for kept in self._streamed.values() for item in kept.notes.items()]
         streamed += [(index, frame.intrinsics) for index, frame in self._ending.items()]
         for index, intrinsics in streamed:
-            found[index] = Photograph(lambda index=index: self._read(index), intrinsics, False)  # type: ignore[misc]
+            found[index] = self._photograph(index, intrinsics, as_mapped=False)
         return found
+
+    def _photograph(self, index: int, intrinsics: np.ndarray, *, as_mapped: bool) -> Photograph:
+        return Photograph(partial(self._read, index), intrinsics, as_mapped, partial(self._mask, index))
 
     def true_depth(self, index: int) -> np.ndarray | None:
         """(H, W) float32, 0 unknown; None where it is not known."""
@@ -131,6 +146,13 @@ class Frames:
     def _kinds(self) -> dict[str, Thinned[Any]]:
         held_out, others = self._streamed[True], self._streamed[False]
         return {"held-out frames": held_out, "other frames": others, "keyframes": self._mapped}
+
+    def _mask(self, index: int) -> np.ndarray | None:
+        """Of the image that `_read` gives."""
+        if index in self._ending:
+            return self._ending[index].mask
+        streamed = self._streamed[is_held_out(index)]
+        return (streamed if index in streamed.notes else self._mapped).get(index, "mask")
 
     def _read(self, index: int) -> np.ndarray:
         if index in self._ending:

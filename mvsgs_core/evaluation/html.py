@@ -5,15 +5,19 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from mvsgs_core.evaluation import metrics, svg
+from mvsgs_core.evaluation import metrics, skipped, svg
 from mvsgs_core.evaluation.origin import in_words
+from mvsgs_core.evaluation.scoring import DepthRange, depth_colors
+from mvsgs_core.georeference import in_words as in_words_of_gps
 
 _FIRST, _WATCHING = ("tracker", "dataset"), ("viewer", "recorder", "publisher", "evaluator")  # slots, by their warnings
+_ENLARGE = "this.parentNode.classList.toggle('large')"
+_PRIVATE = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"  # nothing leaves
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8882; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 2rem auto; padding: 0 1rem; }
@@ -23,34 +27,68 @@ td, th { padding: .25rem .8rem; border-bottom: 1px solid var(--line); }
 th { text-align: left; } td { text-align: right; font-variant-numeric: tabular-nums; }
 td:first-child { text-align: left; }
 .pictures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px; margin: 2px 0 14px; }
-.pictures img { width: 100%; display: block; cursor: zoom-in; } figure { margin: 0; }
+.pictures img { width: 100%; display: block; cursor: zoom-in; } figure { margin: 0; min-width: 0; }
 .pictures .large { grid-column: 1 / -1; } .large img { cursor: zoom-out; image-rendering: pixelated; }
-.run td { text-align: left; overflow-wrap: anywhere; }
+.run td { text-align: left; overflow-wrap: anywhere; } .run td:first-child { white-space: nowrap; }
+.row { margin: 1.1rem 0 .2rem; font-weight: 600; }
+.scale { height: 9px; } .ticks { display: flex; justify-content: space-between; font-size: .75rem; opacity: .8; }
 pre { overflow-x: auto; background: var(--soft); padding: .6rem; }
-@media (max-width: 700px) { .pictures { grid-template-columns: repeat(2, 1fr); } td, th { padding: .2rem .4rem; } }
+@media (max-width: 700px) {
+  body { margin-top: 1rem; } .pictures { grid-template-columns: repeat(2, 1fr); }
+  table { font-size: .8rem; } td, th { padding: .2rem .3rem; } .plot { font-size: 14px; }
+}
 figcaption { font-size: .8rem; opacity: .75; }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 16px; }
 .plot { width: 100%; font-size: 11px; fill: currentColor; background: var(--soft); border-radius: 6px; }
 .plot .grid { stroke: var(--line); stroke-width: .6; }
 .warning { border-left: 4px solid #dd6b20; padding: .1rem .8rem; background: var(--soft); margin: .3rem 0; }
+.better { color: #2f855a; } .worse { color: #c05621; } .runs td, .runs th { white-space: nowrap; }
+.runs td:first-child { white-space: normal; }
+.warning, figcaption, h1, .row { overflow-wrap: anywhere; }
 code { background: var(--soft); padding: .1rem .3rem; }
 """
 
 
-def image_tag(picture: np.ndarray, caption: str) -> str:
-    """<figure> with an RGB uint8 picture embedded as JPEG."""
+class Row(NamedTuple):
+    """Pictures (H, W, 3) uint8 RGB beside each other, each with its name."""
+
+    caption: str
+    pictures: Mapping[str, np.ndarray]
+    depths: DepthRange | None = None  # what the colors mean of those with "depth" in their name
+    columns: int | None = None  # on any screen; None: as many as it has room for
+    empty: int = 0  # columns that stay so at the beginning
+
+
+def image_tag(picture: np.ndarray, caption: str, below: str = "") -> str:
+    """<figure> with an RGB uint8 picture embedded as JPEG; below: HTML under it."""
     done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
     if not done:
         raise RuntimeError(f"could not encode the picture {caption!r}")
     encoded = base64.b64encode(data.tobytes()).decode()
     text = escape(caption)
-    enlarge = "this.parentNode.classList.toggle('large')"
-    image = f'<img alt="{text}" title="click: larger" onclick="{enlarge}" src="data:image/jpeg;base64,{encoded}">'
-    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
+    handlers = f"""onclick="{_ENLARGE}" onkeydown="if(event.key=='Enter'){_ENLARGE}" """
+    image = f'<img alt="{text}" title="click: larger" tabindex="0" {handlers}src="data:image/jpeg;base64,{encoded}">'
+    return f"<figure>{image}{below}<figcaption>{text}</figcaption></figure>"
+
+
+def _three(value: float) -> str:
+    return f"{value:#.3g}".rstrip(".")
+
+
+def depth_scale(depths: DepthRange) -> str:
+    """The colors of a depth map, and depths in the map's unit, evenly along them."""
+    ticks = "".join(f"<span>{_three(depths.at(part))}</span>" for part in (0.0, 0.25, 0.5, 0.75, 1.0))
+    colors = ", ".join(depth_colors(16))
+    bar = f'<div class="scale" style="background: linear-gradient(to right, {colors})"></div>'
+    return f'{bar}<div class="ticks">{ticks}</div>'
 
 
 def rendering_table(report: Mapping[str, Any]) -> str:
-    titles = ("frames", "refinement", *(f"{m.label} {m.unit}".strip() for m in metrics.IMAGE), "count")
+    after = report["rendering"]
+    known = [
+        m for m in metrics.IMAGE if any(after[kind][m.key] is not None for kind in ("keyframes", "held_out", "all"))
+    ]
+    titles = ("frames", "refine&shy;ment", *(f"{m.label} {m.unit}".strip() for m in known), "count")
     rows = ["<tr>" + "".join(f"<th>{title}</th>" for title in titles) + "</tr>"]
     kinds = {"keyframes": "keyframes", "held_out": "held-out", "held_out_fitted": "held-out, fitted", "all": "all"}
     for kind, name in kinds.items():
@@ -58,7 +96,7 @@ def rendering_table(report: Mapping[str, Any]) -> str:
             means = report[key][kind]
             if kind == "held_out_fitted" and not means["count"]:
                 continue
-            values = (m.text(means[m.key], unit=False) for m in metrics.IMAGE)
+            values = (m.text(means[m.key], unit=False) for m in known)
             cells = (name, when, *values, means["count"])
             rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>")
     return f"<table>{''.join(rows)}</table>"
@@ -123,14 +161,15 @@ def _some(indices: Sequence[int], limit: int = 8) -> str:
 def page(
     title: str,
     report: Mapping[str, Any],
-    comparisons: Sequence[tuple[str, Mapping[str, np.ndarray]]],
-    depth_maps: Sequence[tuple[str, Mapping[str, np.ndarray]]],
+    comparisons: Sequence[Row],
+    depth_maps: Sequence[Row],
     plots: Mapping[str, str],
 ) -> str:
-    """The whole document. comparisons and depth_maps: (caption, pictures by name) a row."""
+    """The whole document."""
     trajectory, depth = report["trajectory"], report["depth"]
     figures = {
         **_metrics("", metrics.TRAJECTORY, trajectory),
+        **(in_words_of_gps(report["georeference"]) if report.get("georeference") else {}),
         "keyframes with a true pose": trajectory["ate_keyframes"],
         "frames tracked": f"{trajectory['frames_tracked']} of {trajectory['frames']}{_span(trajectory)}",
         "frames without a pose": _listed(trajectory["frames_without_pose"]) or "none",
@@ -142,20 +181,20 @@ def page(
         **{m.name: m.text(report[place.partition(".")[0]][m.key]) for place, m in metrics.RUN.items() if m.name},
     }
     memory = {node: f"{size / 1e6:.0f} MB" for node, size in report.get("memory", {}).get("peak_bytes", {}).items()}
-    skipped = {
-        f"{node}: {what}": f"{n:,.10g}" for node, s in report.get("skipped", {}).items() for what, n in s.items()
-    }
+    left_out = skipped.in_words(report.get("skipped", {}))
+    warnings = sorted_warnings(report)
     named = str(report.get("input") or "")
     body = [
         f"<h1>{escape(f'{title}: {named}' if named else title)}</h1>",
         f'<div class="run">{figures_table(in_words(report))}</div>',
         _settings(report.get("run", {}).get("settings")),
-        "".join(f'<p class="warning">{escape(w)}</p>' for w in sorted_warnings(report)),
+        "<h2>Warnings, the costliest first</h2>" if warnings else "<p>No warnings.</p>",
+        *(f'<p class="warning">{escape(w)}</p>' for w in warnings),
         "<h2>Rendering</h2>",
         f"<p>{escape(report.get('protocol', ''))}</p>",
         rendering_table(report),
         figures_table(worst_figures(report["rendering"])),
-        *(row(caption, pictures) for caption, pictures in comparisons),
+        *map(row, comparisons),
         "<h2>Figures</h2>",
         figures_table(figures),
         *latency_table(report.get("latency", {})),
@@ -163,9 +202,9 @@ def page(
         *(f"<div><b>{escape(name)}</b>{plot}</div>" for name, plot in plots.items()),
         "</div>",
         "<h2>Depth maps of keyframes, filtered</h2>",
-        *(row(caption, pictures) for caption, pictures in depth_maps),
+        *map(row, depth_maps),
         "<h2>Skipped work</h2>",
-        figures_table(skipped) if skipped else "<p>nothing</p>",
+        figures_table(left_out) if left_out else "<p>nothing</p>",
         "<h2>Peak memory</h2>",
         figures_table(memory),
     ]
@@ -175,6 +214,7 @@ def page(
 def document(title: str, body: Sequence[str]) -> str:
     """A whole page of these parts."""
     meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    meta += f'<meta http-equiv="Content-Security-Policy" content="{_PRIVATE}">'
     head = f"{meta}<title>{escape(title)}</title><style>{_STYLE}</style>"
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
 
@@ -195,12 +235,18 @@ def _settings(text: str | None) -> str:
     return f"<details><summary>all settings</summary><pre>{escape(text)}</pre></details>" if text else ""
 
 
-def row(caption: str, pictures: Mapping[str, np.ndarray]) -> str:
-    """Pictures (H, W, 3) uint8 RGB beside each other, each with its name."""
-    figures = "".join(image_tag(picture, name) for name, picture in pictures.items())
-    return f'<b>{escape(caption)}</b><div class="pictures">{figures}</div>'
+def row(shown: Row) -> str:
+    scale = "" if shown.depths is None else depth_scale(shown.depths)
+    figures = (
+        image_tag(picture, name + (", the map's unit" if below else ""), below)
+        for name, picture in shown.pictures.items()
+        for below in [scale if "depth" in name else ""]
+    )
+    caption = f'<p class="row">{escape(shown.caption)}</p>' if shown.caption else ""
+    columns = f' style="grid-template-columns: repeat({shown.columns}, 1fr)"' if shown.columns else ""
+    return f'{caption}<div class="pictures"{columns}>{"<div></div>" * shown.empty}{"".join(figures)}</div>'
 
 
 def timing_bars(stages: Mapping[str, Mapping[str, float]]) -> str:
     values = {f"{node}: {name}": s for node, parts in stages.items() for name, s in parts.items() if s >= 0.005}
-    return svg.bars(dict(sorted(values.items(), key=lambda item: -item[1])[:24]), "s")
+    return svg.bars(dict(sorted(values.items(), key=lambda item: -item[1])[:24]), "s", width=480)

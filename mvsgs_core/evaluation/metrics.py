@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Literal
@@ -22,8 +22,8 @@ class Metric:
     digits: int  # after the point
     better: Literal["higher", "lower", ""]  # "": neither
     name: str = ""  # in full, where the report lists it; none: it is not listed
-    # What it is of: an image metric of a render and the photograph (H, W, 3) float32 in 0..1, one of depth of a
-    # DepthScore, one of poses of KnownPoses; None: given at run time, or counted
+    # What it is of: an image metric of a render and the photograph (H, W, 3) float32 in 0..1, and the mask (H, W) bool
+    # where there is one; of depth a DepthScore, of poses KnownPoses; None: given at run time, or counted
     of: Callable[..., float | None] | None = None
     factor: float = 1.0  # from the report's value to the unit
 
@@ -33,6 +33,33 @@ class Metric:
             return "–"
         shown = f"{self.factor * value:,.{self.digits}f}"
         return f"{shown} {self.unit}" if unit and self.unit else shown
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of several runs; differences are those from the first."""
+
+    name: str
+    metric: Metric
+    values: Sequence[float | None]
+
+    def cells(self) -> list[str]:
+        """The figures, after the first with what each has more."""
+        first, metric = self.values[0], self.metric
+        cells = [metric.text(first, unit=False)]
+        for value in self.values[1:]:
+            more = "" if value is None or first is None else f" ({metric.factor * (value - first):+,.{metric.digits}f})"
+            cells.append(metric.text(value, unit=False) + more)
+        return cells
+
+    def better(self) -> list[bool | None]:
+        """Of each run, whether it is better than the first; None where it shows no difference, or neither is better."""
+        first, metric = self.values[0], self.metric
+        found: list[bool | None] = []
+        for value in self.values:
+            same = value is None or first is None or metric.text(value) == metric.text(first)
+            found.append(None if same or not metric.better else (value > first) == (metric.better == "higher"))  # type: ignore[operator]
+        return found
 
 
 # The first of them ranks the frames: what is called the worst frame is the worst by it.
@@ -98,4 +125,4 @@ def listed(metrics: tuple[Metric, ...], values: Mapping[str, Any]) -> str:
     return ", ".join(f"{metric.label} {metric.text(value)}" for metric, value in known)
 
 
-__all__ = ["DEPTH", "IMAGE", "METRICS", "RUN", "TRAJECTORY", "Metric", "at", "listed", "of_all"]
+__all__ = ["DEPTH", "IMAGE", "METRICS", "RUN", "TRAJECTORY", "Figure", "Metric", "at", "listed", "of_all"]

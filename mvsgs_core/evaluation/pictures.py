@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,11 @@ from mvsgs_core.camera import resize_image
 from mvsgs_core.evaluation import html, metrics, scoring, svg
 from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.exposure import gains
+from mvsgs_core.evaluation.ground_plane import ground_axes
+from mvsgs_core.evaluation.html import Row
 
-Row = tuple[str, dict[str, np.ndarray]]
+_plot = partial(svg.plot, width=480, height=300)  # so that its words can be read on a telephone
+_SHEET = 400  # pixels of a picture's width in the sheet
 
 
 def comparisons(evaluation: Evaluation) -> list[Row]:
@@ -29,7 +33,7 @@ def comparisons(evaluation: Evaluation) -> list[Row]:
     for name, score in _picks(scores):
         figures = f"{metrics.listed(metrics.IMAGE, score.figures)}, {100 * score.coverage:.1f} % covered"
         caption = f"{name}: {score.index} ({score.kind}), {figures}"
-        rows.append((caption, scoring.comparison(finished.splats, finished.kernel, frames[score.index])))
+        rows.append(Row(caption, *scoring.comparison(finished.splats, finished.kernel, frames[score.index])))
     return rows
 
 
@@ -51,7 +55,7 @@ def _picks(scores: Sequence[scoring.Score]) -> list[tuple[str, scoring.Score]]:
 
 def write_sheet(file: Path, rows: list[Row]) -> None:
     """Writes the pictures of all rows, one below the other, as one PNG file."""
-    sheet = np.vstack([np.hstack(list(pictures.values())) for _, pictures in rows])
+    sheet = np.vstack([np.hstack([_of_width(p, _SHEET) for p in row.pictures.values()]) for row in rows])
     if not cv2.imwrite(str(file), sheet[..., ::-1]):
         raise OSError(f"could not write {file}")
 
@@ -64,42 +68,75 @@ def depth_maps(evaluation: Evaluation, count: int = 3) -> list[Row]:
         index = available[k]
         depth = evaluation.filtered_depth(index)
         assert depth is not None
-        size = (max(1, round(depth.shape[0] * 400 / depth.shape[1])), 400)
-        shown = f"filtered depth{scoring.depth_scale(depth)}"
-        pictures = {"photograph": evaluation.photograph(index), shown: scoring.colorize_depth(depth)}
+        photograph = evaluation.photograph(index)
+        width = min(640, photograph.shape[1])
+        size = (max(1, round(depth.shape[0] * width / depth.shape[1])), width)
+        colored = cv2.resize(scoring.colorize_depth(depth), size[::-1], interpolation=cv2.INTER_NEAREST)
+        pictures = {"photograph": resize_image(photograph, size), "filtered depth": colored}
         kept = 100 * float((depth > 0).mean())
         caption = f"keyframe {index}: {kept:.0f} % of the pixels kept"
-        rows.append((caption, {n: resize_image(p, size) for n, p in pictures.items()}))
+        rows.append(Row(caption, pictures, scoring.depth_range(depth)))
     return rows
+
+
+def _of_width(picture: np.ndarray, width: int) -> np.ndarray:
+    return resize_image(picture, (max(1, round(picture.shape[0] * width / picture.shape[1])), width))
 
 
 def plots(evaluation: Evaluation, stages: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
     """SVG plots by title."""
-    result = {}
-    paths = evaluation.aligned_paths()
-    if paths:
-        # the two widest directions of the path, so that a plot from above needs no gravity
-        everything = np.concatenate([p - p.mean(axis=0) for p in paths.values()])
-        axes = np.linalg.svd(everything, full_matrices=False)[2][:2] if len(everything) > 1 else np.eye(3)[:2]
-        center = next(iter(paths.values())).mean(axis=0)
-        series = [svg.Series(name, *((p - center) @ axes.T).T) for name, p in paths.items()]
-        unit = "unit of the true poses" if "truth" in paths else "the map's unit, which is arbitrary"
-        result["Trajectory, in the plane of its two widest directions"] = svg.plot(
-            series, f"first direction, {unit}", "second direction", equal=True
-        )
+    result = _from_above(evaluation)
     series, covered, first = [], [], metrics.IMAGE[0]
     for refined, name in ((False, "before refinement"), (True, "after")):
         scores = evaluation.scores.get(refined, [])
         if scores:
             index = np.array([s.index for s in scores], dtype=float)
-            series.append(svg.Series(name, index, np.array([s.figures[first.key] for s in scores], dtype=float)))
+            series.append(svg.Series(name, index, _ranking(scores)))
             covered.append(svg.Series(name, index, np.array([100 * s.coverage for s in scores])))
     if series:
-        result[f"{first.label} by frame"] = svg.plot(series, "frame", first.unit)
-        result["Coverage by frame"] = svg.plot(covered, "frame", "% of the pixels more than half opaque")
+        result[f"{first.label} by frame"] = _plot(series, "frame", first.unit)
+        result["Coverage by frame"] = _plot(covered, "frame", "% of the pixels more than half opaque")
     result |= _exposure_plot(evaluation)
     if stages:
         result["Time by stage"] = html.timing_bars(stages)
+    return result
+
+
+def _ranking(scores: Sequence[scoring.Score]) -> np.ndarray:
+    return np.array([score.figures[metrics.IMAGE[0].key] for score in scores], dtype=float)
+
+
+def _from_above(evaluation: Evaluation) -> dict[str, str]:
+    """The camera's path in the ground plane, and on it how well the finished map shows what was seen from there."""
+    path = evaluation.aligned_path()
+    if path is None:
+        return {}
+    axes, center = ground_axes(path.rotations), path.estimate.mean(axis=0)
+
+    def plotted(series: list[svg.Series]) -> str:
+        return _plot(series, f"right of the first view, {path.unit}", f"ahead, {path.unit}", equal=True)
+
+    ways = {"estimate": path.estimate} if path.truth is None else {"truth": path.truth, "estimate": path.estimate}
+    series = [svg.Series(name, *(axes @ (positions - center).T)) for name, positions in ways.items()]
+    start = axes @ (path.estimate[:1] - center).T
+    series.append(svg.Series("first frame", start[0], start[1], points=True))
+    result = {"Trajectory from above, if the camera was held level": plotted(series)}
+    if path.errors is not None:
+        index, errors = path.known.astype(float), path.errors
+        error = _plot([svg.Series("estimate", index, errors)], "frame", f"distance, {path.unit}")
+        result["Error of the position by frame, after alignment"] = error
+    scores = evaluation.scores.get(True) or evaluation.scores.get(False) or []
+    shown = [score for score in scores if score.index in set(path.index.tolist())]
+    if shown:
+        place = {int(index): k for k, index in enumerate(path.index)}
+        right, ahead = axes @ (path.estimate[[place[score.index] for score in shown]] - center).T
+        first, covered = metrics.IMAGE[0], np.array([100 * score.coverage for score in shown])
+        of_place = {
+            f"{first.label} along the path": (first.unit, _ranking(shown)),
+            "Coverage along the path": ("%", covered),
+        }
+        for title, (unit, values) in of_place.items():
+            result[title] = plotted([svg.Series(unit, right, ahead, values=values)])
     return result
 
 
@@ -112,4 +149,4 @@ def _exposure_plot(evaluation: Evaluation) -> dict[str, str]:
     main = tracked.main()
     x, y = tracked.index[main].astype(float), gains(found.affines)[main]
     series = [svg.Series(name, x, y[:, k]) for k, name in enumerate(("red", "green", "blue"))]
-    return {"Exposure by frame": svg.plot(series, "frame", "gain against the mean camera")}
+    return {"Exposure by frame": _plot(series, "frame", "gain against the mean camera")}

@@ -35,6 +35,7 @@ class ScoredFrame:
     exposure: np.ndarray | None = None  # (3, 4) color affine of the photograph; None: none
     vignetting: np.ndarray | None = None  # (3,) of the sensor; None: none
     antialiased: bool = False  # as its map is rendered, see `rasterize`
+    mask: Callable[[], np.ndarray | None] = lambda: None  # (H, W) bool, the pixels that count, read when needed
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,17 @@ class Score:
         return value if first.better == "higher" else -value
 
 
+class DepthRange(NamedTuple):
+    """Depths at the ends of a scale of colors."""
+
+    near: float
+    far: float
+
+    def at(self, part: float) -> float:
+        """The depth so far along the scale, 0 to 1: even steps are those of inverse depth."""
+        return 1.0 / ((1.0 - part) / self.near + part / self.far)
+
+
 class Rendered(NamedTuple):
     color: np.ndarray  # (H, W, 3) float32 in 0..1, as the frame's exposure, shutter and vignetting show it
     depth: np.ndarray  # (H, W) float32, 0 where nothing is rendered
@@ -90,12 +102,20 @@ def render_frame(splats: Splats, kernel: str, frame: ScoredFrame, size: tuple[in
 
 def score_frame(splats: Splats, kernel: str, frame: ScoredFrame, given: Mapping[str, Compare] | None = None) -> Score:
     """Scores one frame by metrics.IMAGE; given: those of them that are made at run time, by key. Nothing is fitted to
-    its photograph, exposure neither."""
-    photograph = frame.photograph().astype(np.float32) / 255.0
+    its photograph, exposure neither.
+
+    Pixels that the frame's mask leaves out count for nothing: the photograph is there what the render is, and figures
+    are means over the rest."""
+    photograph, mask = frame.photograph().astype(np.float32) / 255.0, frame.mask()
     color, _, opacity = render_frame(splats, kernel, frame, photograph.shape[:2])
-    compare = {m.key: (given or {}).get(m.key, m.of) for m in metrics.IMAGE}
-    figures = {key: None if of is None else of(color, photograph) for key, of in compare.items()}
-    return Score(frame.index, frame.keyframe, figures, float((opacity > 0.5).mean()))
+    given, part = given or {}, 1.0
+    if mask is not None:
+        photograph, part = np.where(mask[..., None], photograph, color), float(mask.mean())
+    pair = (color, photograph) if mask is None else (color, photograph, mask)
+    figures = {m.key: None if m.of is None else m.of(*pair) for m in metrics.IMAGE if m.key not in given}
+    figures |= {key: compare(color, photograph) / part for key, compare in given.items()}
+    shown = opacity > 0.5
+    return Score(frame.index, frame.keyframe, figures, float((shown if mask is None else shown[mask]).mean()))
 
 
 def choose(frames: list[ScoredFrame], limit: int) -> list[ScoredFrame]:
@@ -166,19 +186,25 @@ def _gap(keyframes: Sequence[Score], held_out: Sequence[Score]) -> float | None:
     return float(np.mean([s.rank for s in keyframes]) - np.mean([s.rank for s in held_out]))
 
 
-def comparison(splats: Splats, kernel: str, frame: ScoredFrame, width: int = 400) -> dict[str, np.ndarray]:
-    """Pictures (h, w, 3) uint8 of a frame for the report: photograph, render, error, rendered depth."""
+def comparison(
+    splats: Splats, kernel: str, frame: ScoredFrame, width: int = 640
+) -> tuple[dict[str, np.ndarray], DepthRange | None]:
+    """Pictures (h, w, 3) uint8 of a frame for the report, `width` pixels wide at most: photograph, render, error,
+    rendered depth; and what the colors of the last mean."""
     photograph = frame.photograph()
     color, depth, _ = render_frame(splats, kernel, frame, photograph.shape[:2])
+    width = min(width, photograph.shape[1])
     size = (max(1, round(photograph.shape[0] * width / photograph.shape[1])), width)
-    error = np.abs(color - photograph.astype(np.float32) / 255.0).mean(axis=2)
+    error, mask = np.abs(color - photograph.astype(np.float32) / 255.0).mean(axis=2), frame.mask()
+    if mask is not None:
+        error[~mask] = 0.0
     pictures = {
         "photograph": photograph,
         "render": (color * 255).round().astype(np.uint8),
         "error (x4)": colorize(np.clip(error * 4, 0, 1)),
-        f"rendered depth{depth_scale(depth)}": colorize_depth(depth),
+        "rendered depth": colorize_depth(depth),
     }
-    return {name: resize_image(picture, size) for name, picture in pictures.items()}
+    return {name: resize_image(picture, size) for name, picture in pictures.items()}, depth_range(depth)
 
 
 def colorize(values: np.ndarray) -> np.ndarray:
@@ -196,10 +222,16 @@ def colorize_depth(depth: np.ndarray) -> np.ndarray:
     return np.where(known[..., None], picture, np.uint8(40))
 
 
-def depth_scale(depth: np.ndarray) -> str:
-    """What the ends of `colorize_depth` mean for this depth map, in the map's unit; nothing where nothing is known."""
+def depth_range(depth: np.ndarray) -> DepthRange | None:
+    """What the ends of `colorize_depth` mean for this depth map, in its unit; None where nothing is known."""
     known, _, (low, high) = _inverse(depth)
-    return f", {1.0 / high:.3g} (red) to {1.0 / low:.3g} (blue)" if known.any() else ""
+    return DepthRange(1.0 / high, 1.0 / low) if known.any() else None
+
+
+def depth_colors(count: int) -> list[str]:
+    """Of `colorize_depth`, from the nearest to the farthest, as in a style sheet: even steps of inverse depth."""
+    steps = np.linspace(255, 0, count).round().astype(np.uint8)[:, None]
+    return [f"#{r:02x}{g:02x}{b:02x}" for b, g, r in cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[:, 0].tolist()]
 
 
 def _inverse(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from html import escape
 
+import cv2
 import numpy as np
 
 _COLORS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
@@ -16,6 +17,7 @@ class Series:
     x: np.ndarray
     y: np.ndarray
     points: bool = False  # dots instead of a line
+    values: np.ndarray | None = None  # dots in colors that say these, and how is beside the plot; instead of `points`
 
 
 def plot(
@@ -31,9 +33,11 @@ def plot(
     series = [s for s in series if len(s.x)]
     if not series:
         return "<p>nothing to plot</p>"
-    left, right, top, bottom = 62, 12, 26, 42
+    valued = next((s for s in series if s.values is not None), None)
     x0, x1 = _range(np.concatenate([s.x for s in series]))
     y0, y1 = _range(np.concatenate([s.y for s in series]))
+    longest = max(len(f"{tick:g}") for tick in (*_ticks(y0, y1), 0.0))
+    left, right, top, bottom = 30 + 8 * max(longest, 4), 12 if valued is None else 70, 26, 42
     plot_w, plot_h = width - left - right, height - top - bottom
     if equal:
         unit = max((x1 - x0) / plot_w, (y1 - y0) / plot_h)
@@ -55,7 +59,11 @@ def plot(
         parts.append(f'<text x="{left - 6}" y="{float(py(tick)) + 4:.1f}" text-anchor="end">{tick:g}</text>')
     for k, s in enumerate(series):
         color = _COLORS[k % len(_COLORS)]
-        if s.points:
+        if s.values is not None:
+            places = zip(px(s.x), py(s.y), _value_colors(s.values, *_ends(s.values)))
+            parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{shade}"/>' for x, y, shade in places]
+            continue  # its legend is the scale
+        elif s.points:
             parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.4" fill="{color}"/>' for x, y in zip(px(s.x), py(s.y))]
         else:
             way = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(px(s.x), py(s.y)))
@@ -68,6 +76,8 @@ def plot(
     parts.append(
         f'<text x="14" y="{middle}" text-anchor="middle" transform="rotate(-90 14 {middle})">{escape(y_label)}</text>'
     )
+    if valued is not None and valued.values is not None:
+        parts += _scale(*_ends(valued.values), valued.name, left + plot_w + 12, top, plot_h)
     parts.append("</svg>")
     return "\n".join(parts)
 
@@ -91,7 +101,39 @@ def bars(values: dict[str, float], unit: str, width: int = 560) -> str:
 
 def _finite(s: Series) -> Series:
     keep = np.isfinite(s.x) & np.isfinite(s.y)
-    return Series(s.name, np.asarray(s.x)[keep], np.asarray(s.y)[keep], s.points)
+    if s.values is not None:
+        keep &= np.isfinite(s.values)
+    values = None if s.values is None else np.asarray(s.values)[keep]
+    return Series(s.name, np.asarray(s.x)[keep], np.asarray(s.y)[keep], s.points, values)
+
+
+def _ends(values: np.ndarray) -> tuple[float, float]:
+    """Of a scale of colors: without the outermost percent, so that one frame does not take all colors."""
+    low, high = np.percentile(values, [1, 99])
+    return float(low), float(high)
+
+
+def _value_colors(values: np.ndarray, low: float, high: float) -> list[str]:
+    """Dark blue for `low` to yellow for `high` (viridis)."""
+    part = np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0)
+    found = cv2.applyColorMap((255 * part).round().astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
+    return [f"#{r:02x}{g:02x}{b:02x}" for b, g, r in found[:, 0].tolist()]
+
+
+def _scale(low: float, high: float, name: str, x: float, y: float, height: float) -> list[str]:
+    """A bar of the colors with three of its values, the high ones above."""
+    steps = 24
+    shades = _value_colors(np.linspace(high, low, steps), low, high)
+    step = height / steps
+    parts = [
+        f'<rect x="{x}" y="{y + k * step:.2f}" width="10" height="{step + 0.5:.2f}" fill="{shade}"/>'
+        for k, shade in enumerate(shades)
+    ]
+    for part in (0.0, 0.5, 1.0):
+        text = f"{high + part * (low - high):.4g}"
+        parts.append(f'<text x="{x + 14}" y="{y + part * height + 4:.1f}">{text}</text>')
+    parts.append(f'<text x="{x + 58}" y="{y - 10}" text-anchor="end">{escape(name)}</text>')
+    return parts
 
 
 def _range(values: np.ndarray) -> tuple[float, float]:
@@ -107,4 +149,4 @@ def _ticks(low: float, high: float) -> np.ndarray:
             step *= factor
             break
     ticks = np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step
-    return np.asarray(np.round(ticks, 12))
+    return np.asarray(np.round(ticks, 12) + 0.0)  # no -0

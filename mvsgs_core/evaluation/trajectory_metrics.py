@@ -100,6 +100,34 @@ def known_poses(trajectory: Trajectory, truth: Mapping[int, np.ndarray]) -> Know
     return KnownPoses(trajectory.world_from_cam[known], true, trajectory.keyframe[known])
 
 
+@dataclass(frozen=True)
+class AlignedPath:
+    """Where the camera was, in the frame of the truth where an alignment to it is known, else of the map."""
+
+    index: np.ndarray  # (N,) frames with a pose
+    estimate: np.ndarray  # (N, 3) positions
+    rotations: np.ndarray  # (N, 3, 3) world from camera
+    truth: np.ndarray | None  # (M, 3) positions of those whose true pose is known; None: no alignment
+    known: np.ndarray  # (M,) their frames
+    errors: np.ndarray | None  # (M,) their distances
+    unit: str  # of lengths, in words
+
+
+def aligned_path(trajectory: Trajectory, truth: Mapping[int, np.ndarray], alignment: Alignment | None) -> AlignedPath:
+    """Of the main part of the map; truth: poses (4, 4) by frame index."""
+    main = trajectory.main()
+    index, poses = trajectory.index[main], trajectory.world_from_cam[main]
+    if alignment is None:
+        nobody = np.zeros(0, np.int64)
+        return AlignedPath(index, poses[:, :3, 3], poses[:, :3, :3], None, nobody, None, "the map's unit (arbitrary)")
+    known = np.isin(index, list(truth))
+    true = poses_of(truth, index[known])
+    return AlignedPath(
+        index, alignment.positions(poses), alignment.rotation @ poses[:, :3, :3], true[:, :3, 3], index[known],
+        absolute_errors(poses[known], true, alignment), "unit of the true poses",
+    )  # fmt: skip
+
+
 def poses_of(truth: Mapping[int, np.ndarray], indices: np.ndarray) -> np.ndarray:
     """(N, 4, 4) float64 true poses of these frames. Raises KeyError for one that has none."""
     return np.array([truth[int(i)] for i in indices], dtype=np.float64).reshape(-1, 4, 4)

@@ -1,8 +1,9 @@
 """Turns a map.ply into other formats: `python -m mvsgs_core.export MAP.ply OUT`.
 
 OUT decides: gaussians.ply (--fold, for viewers without shapes), .splat, .spz, a mesh (.glb, .obj, or --mesh with .ply),
-a folder for a COLMAP model, with --images and --observations where they are wanted, or transforms.json for nerfstudio.
-Mesh, model and transforms are made from the keyframes in the cameras.json beside the map, or from a --trajectory.
+a folder for a COLMAP model, with --images and --observations where they are wanted, transforms.json for nerfstudio,
+cameras.json, or trajectory.txt (TUM format). Mesh, model and these are of the keyframes in the cameras.json beside the
+map, or of a --trajectory. --frame enu: in metres east, north and up, where the run had GPS.
 """
 
 from __future__ import annotations
@@ -13,15 +14,30 @@ import sys
 from pathlib import Path
 
 from mvsgs_core.export import keyframe_images
+from mvsgs_core.export.cameras import Cameras, read_source_camera, write_cameras
 from mvsgs_core.export.colmap import write_colmap
 from mvsgs_core.export.command_line import cameras_of_map, input_arguments, read_map, run
+from mvsgs_core.export.earth import (
+    cameras_on_earth,
+    in_axes_of,
+    on_earth,
+    reference_of,
+    write_origin,
+)
 from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.splat import write_splat, write_spz
 from mvsgs_core.export.transforms import write_transforms
+from mvsgs_core.trajectory_file import write_trajectory
 
 BESIDE = Path()  # --images without a folder: those beside the map
+
+
+def posed_cameras(options: argparse.Namespace) -> Cameras:
+    """Those of the map, in the frame that is written."""
+    found = cameras_of_map(options)
+    return found if options.reference is None else cameras_on_earth(found, options.reference)
 
 
 def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
@@ -35,7 +51,7 @@ def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
 
 
 def mesh(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
-    vertices, triangles = write_mesh(out, final, cameras_of_map(options), options.voxel)
+    vertices, triangles = write_mesh(out, final, posed_cameras(options), options.voxel)
     return f"{vertices} vertices, {triangles} triangles"
 
 
@@ -43,22 +59,36 @@ def colmap(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     if options.images is not None and options.trajectory is not None:
         raise ValueError("--images are those of the keyframes, of which a --trajectory knows nothing")
     images = options.map.with_name(keyframe_images.FOLDER) if options.images is BESIDE else options.images
-    written = write_colmap(out, final, cameras_of_map(options), images, options.observations)
+    written = write_colmap(out, final, posed_cameras(options), images, options.observations)
     return f"{written.images} images, {written.points} points, {written.observations} observations"
 
 
 def transforms(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     given = options.images is not None and options.images is not BESIDE
     images = options.images if given else options.map.with_name(keyframe_images.FOLDER)
-    cameras = cameras_of_map(options)
+    cameras = posed_cameras(options)
     there = write_transforms(out, cameras, images)
     missing = "" if there == len(cameras) else f", of which {there} have their image in {images}"
     return f"{len(cameras)} cameras{missing}"
 
 
+def cameras(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
+    if out.name != "cameras.json":
+        return transforms(out, final, options)
+    found, beside = posed_cameras(options), options.cameras or options.map.with_name("cameras.json")
+    write_cameras(out, found, read_source_camera(beside) if beside.is_file() else None)
+    return f"{len(found)} cameras"
+
+
+def trajectory(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
+    found = posed_cameras(options)
+    write_trajectory(out, found.timestamps, found.world_from_cam)
+    return f"{len(found)} poses"
+
+
 FORMATS = {  # by the suffix of OUT, of which a folder has none: writes the map, returns what is in the file
     ".ply": splats, ".splat": splats, ".spz": splats, ".glb": mesh, ".obj": mesh, ".stl": mesh, ".off": mesh,
-    ".json": transforms, "": colmap,
+    ".json": cameras, ".txt": trajectory, "": colmap,
 }  # fmt: skip
 
 
@@ -71,14 +101,19 @@ def export(options: argparse.Namespace) -> str:
     if write is None:
         raise ValueError(f"no format {out.suffix!r}; there are: {', '.join(filter(None, FORMATS))}, a folder")
     final, left_out = read_map(options)
-    return f"{out}: {write(out, final.scaled(options.scale), options)}{left_out}"
+    options.reference = found = reference_of(options)
+    if found is None:
+        return f"{out}: {write(out, final.scaled(options.scale), options)}{left_out}"
+    options.reference, axes = in_axes_of(out, found)
+    said = write(out, on_earth(final, options.reference), options)
+    return f"{out}: {said}{left_out}; {axes}, in metres, of the place in {write_origin(out, found, axes)}"
 
 
 def main(arguments: list[str] | None = None, prog: str = "python -m mvsgs_core.export") -> int:
     parser = argparse.ArgumentParser(prog=prog, description=__doc__)
     input_arguments(parser)
     parser.add_argument(
-        "out", type=Path, help="file.ply, .splat, .spz, .glb, .obj, .json, or a folder for a COLMAP model"
+        "out", type=Path, help="file.ply, .splat, .spz, .glb, .obj, .json, .txt, or a folder for a COLMAP model"
     )
     parser.add_argument("--fold", action="store_true", help="fold the shape into the scales (.ply)")
     parser.add_argument("--mesh", action="store_true", help="OUT.ply is a mesh, not splats")
@@ -92,6 +127,10 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mvsgs_core.e
     parser.add_argument("--every", type=int, default=1, help="of the keyframes or poses, every so many")
     parser.add_argument("--voxel", type=float, default=0.01, help="of the mesh, in median depths")
     parser.add_argument("--scale", type=float, default=1.0, help="factor on all lengths")
+    parser.add_argument(
+        "--frame", choices=("map", "enu"), default="map",
+        help="enu: metres east, north and up, where the run had GPS; OUT.origin.json says of which place",
+    )  # fmt: skip
     return run(parser, arguments, export)
 
 

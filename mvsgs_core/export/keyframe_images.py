@@ -7,6 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mvsgs_core.datasets.files import UnreadableImageError, read_image
+
 FOLDER = "keyframes"  # beside map.ply
 
 
@@ -22,3 +24,12 @@ def write_image(folder: Path, index: int, image: np.ndarray) -> None:
     if not encoded:
         raise OSError(f"the image of keyframe {index} cannot be encoded as PNG")
     (folder / image_name(index)).write_bytes(data.tobytes())
+
+
+def known_image(folder: Path, index: int) -> np.ndarray | None:
+    """(H, W, 3) uint8 RGB of a keyframe; None where it was not kept, or cannot be read."""
+    file = folder / image_name(index)
+    try:
+        return read_image(file) if file.is_file() else None
+    except UnreadableImageError:
+        return None

@@ -15,8 +15,12 @@ NEAR = 0.01  # of the splats' median distance: what is nearer to the camera is n
 def rendered_keyframe(final: Snapshot, cameras: Cameras, k: int) -> tuple[torch.Tensor, Render]:
     """Keyframe number k, from 0: color (H, W, 3), nominally 0 to 1, and the render in the map's own colors."""
     pose, (height, width) = cameras.world_from_cam[k], cameras.sizes[k].tolist()
-    distances = np.linalg.norm(final.splats.means.numpy() - final.relative_pose(pose)[:3, 3], axis=1)
-    near = NEAR * float(np.median(distances)) if len(distances) else NEAR
-    render = final.render(pose, cameras.intrinsics[k], (height, width), near=near)
+    render = final.render(pose, cameras.intrinsics[k], (height, width), near=near_plane(final, pose))
     affine = torch.from_numpy(cameras.exposures[k]).to(render.color)
     return render.color @ affine[:, :3].T + affine[:, 3], render
+
+
+def near_plane(final: Snapshot, world_from_cam: np.ndarray) -> float:
+    """In the map's unit, for a pose in the world (4, 4)."""
+    distances = np.linalg.norm(final.splats.means.numpy() - final.relative_pose(world_from_cam)[:3, 3], axis=1)
+    return NEAR * float(np.median(distances)) if len(distances) else NEAR

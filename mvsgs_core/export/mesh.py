@@ -53,11 +53,36 @@ def write_mesh(
     mesh = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
     if not len(mesh.triangles):
         raise ValueError("the depth makes no surface: try a larger --voxel")
+    vertices, triangles, colors = map(np.asarray, (mesh.vertices, mesh.triangles, mesh.vertex_colors))
     if path.suffix == ".glb":
-        vertices, triangles, colors = map(np.asarray, (mesh.vertices, mesh.triangles, mesh.vertex_colors))
         write_glb(path, vertices, triangles, colors, final.origin)
+    elif path.suffix == ".ply":
+        write_mesh_ply(path, vertices + final.origin, triangles, colors, 0.01 * edge)
     else:
         mesh.translate(final.origin)
+        if path.suffix == ".stl":
+            mesh.compute_triangle_normals()  # the format has them, and open3d writes none without
         if not o3d.io.write_triangle_mesh(str(path), mesh):
             raise OSError(f"open3d could not write {path}")
     return len(mesh.vertices), len(mesh.triangles)
+
+
+def write_mesh_ply(
+    path: Path, vertices: np.ndarray, triangles: np.ndarray, colors: np.ndarray, tolerance: float
+) -> None:
+    """Vertices (V, 3), triangles (T, 3) of their indices, colors (V, 3) in [0, 1]; binary little endian.
+
+    Positions are float32, as three.js draws no others, unless that is off by more than `tolerance`: then float64.
+    """
+    short = np.abs(vertices.astype(np.float32) - vertices).max(initial=0.0) <= tolerance
+    kind, name = ("<f4", "float") if short else ("<f8", "double")
+    points = np.zeros(len(vertices), dtype=[("position", kind, 3), ("color", "u1", 3)])
+    points["position"], points["color"] = vertices, np.clip(np.round(255.0 * colors), 0, 255)
+    faces = np.zeros(len(triangles), dtype=[("corners", "u1"), ("vertex", "<i4", 3)])
+    faces["corners"], faces["vertex"] = 3, triangles
+    header = [
+        "ply", "format binary_little_endian 1.0", f"element vertex {len(points)}",
+        *(f"property {name} {axis}" for axis in "xyz"), *(f"property uchar {c}" for c in ("red", "green", "blue")),
+        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n",
+    ]  # fmt: skip
+    path.write_bytes("\n".join(header).encode() + points.tobytes() + faces.tobytes())

@@ -30,6 +30,7 @@ class SourceCamera:
     focal_sigma: float | None = None  # standard deviation of the focal length over itself; None: not known
     doubt: str = ""  # why the focal length is not to be relied on; empty: nothing speaks against it
     readout_time: float | None = None  # seconds of the rolling shutter, first row to last; 0: none; None: not known
+    radial: tuple[float, float] | None = None  # k1 that was found and left in, its deviation; None: not looked for
 
     def __post_init__(self) -> None:
         if self.origin not in (GIVEN, ESTIMATED, GUESSED):
@@ -37,6 +38,8 @@ class SourceCamera:
         for name, value in (("focal_sigma", self.focal_sigma), ("readout_time", self.readout_time)):
             if value is not None and not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"`{name}` is {value}")
+        if self.radial is not None and not (np.isfinite(self.radial).all() and self.radial[1] >= 0):
+            raise ValueError(f"`radial` is {self.radial}")
 
     def text(self) -> str:
         """In words, for people."""
@@ -46,6 +49,8 @@ class SourceCamera:
         parts = [f"focal length {focal} at {self.lens.size[1]}x{self.lens.size[0]}, {self.origin}{sigma}"]
         if self.lens.distorted:
             parts.append("distortion " + ", ".join(f"{k:g}" for k in self.lens.distortion))
+        if self.radial is not None:
+            parts.append(f"radial distortion {self.radial[0]:.3f}, give or take {self.radial[1]:.3f}, left in")
         if self.readout_time:
             parts.append(f"rolling shutter of {1e3 * self.readout_time:.1f} ms")
         if self.doubt:
@@ -79,10 +84,12 @@ def source_camera(statistics: Mapping[str, Any]) -> SourceCamera | None:
         factor = float(values[FACTOR]) if found else 1.0
         fx, fy, cx, cy = lens.intrinsics
         doubt = str(values.get("focal_doubt") or ("" if found or not lens.guessed else UNTESTED))
+        k1, k1_sigma = values.get("radial_k1"), values.get("radial_k1_sigma")
+        radial = (float(k1), float(k1_sigma)) if found and k1 is not None and k1_sigma is not None else None
         camera = SourceCamera(
             replace(lens, intrinsics=(factor * fx, factor * fy, cx, cy), guessed=lens.guessed and not found),
             ESTIMATED if found else GUESSED if lens.guessed else GIVEN,
-            error, doubt, None if readout is None else float(readout),
+            error, doubt, None if readout is None else float(readout), radial,
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
@@ -96,16 +103,20 @@ def camera_values(camera: SourceCamera) -> dict[str, Any]:
         "focal_sigma": camera.focal_sigma,
         "doubt": camera.doubt,
         "readout_time": camera.readout_time,
+        "radial": None if camera.radial is None else list(camera.radial),
     }
 
 
 def camera_of(values: Mapping[str, Any]) -> SourceCamera:
     """What `camera_values` made. Raises ValueError for what it did not."""
     try:
-        sigma, readout = values["focal_sigma"], values["readout_time"]
+        sigma, readout, radial = values["focal_sigma"], values["readout_time"], values.get("radial")
+        if radial is not None and not (isinstance(radial, list) and len(radial) == 2):
+            raise ValueError(f"`radial` is {radial!r}")
         return SourceCamera(
             _lens(values), str(values["origin"]), None if sigma is None else float(sigma), str(values["doubt"]),
             None if readout is None else float(readout),
+            None if radial is None else (float(radial[0]), float(radial[1])),
         )  # fmt: skip
     except (KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{error!r}") from error

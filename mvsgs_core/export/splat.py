@@ -1,4 +1,4 @@
-"""Compact files for web viewers: .splat (32 bytes a splat), .spz (compressed, by open3d). Both know only Gaussians."""
+"""Compact files for web viewers: .splat (32 bytes a splat), .spz (compressed). Both know only Gaussians."""
 
 from __future__ import annotations
 
@@ -7,15 +7,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mvsgs_core.export import spz
 from mvsgs_core.export.ply import folded, relative_origin
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.turning import RUB_FROM_RDF, turned
-from mvsgs_core.open3d_loader import open3d
 from mvsgs_core.rasterizer.spherical_harmonics import C0
-
-SPZ_STEP = 1.0 / 4096.0  # .spz keeps positions as multiples of this
-SPZ_REACH = 2048.0  # in 24 bits
-SPZ_4, SPZ_FLAGS, SPZ_ANTIALIASED = b"NGSP\x04\0\0\0", 14, 1  # magic and version, place of the flags, one of them
 
 
 def write_splat(path: Path, final: Snapshot) -> None:
@@ -41,7 +37,7 @@ def write_splat(path: Path, final: Snapshot) -> None:
 
 
 def write_spz(path: Path, final: Snapshot) -> None:
-    """Through open3d. The format's axes are x right, y up, z back ("RUB"): everything is turned by 180 degrees about x,
+    """The format's axes are x right, y up, z back ("RUB"): everything is turned by 180 degrees about x,
     view-dependent colors too.
 
     Raises ValueError where the format's fixed steps of 1/4096 unit would blur the map or its 24 bits do not reach as
@@ -50,43 +46,20 @@ def write_spz(path: Path, final: Snapshot) -> None:
     splats = turned(folded(final.splats, final.kernel), RUB_FROM_RDF)
     means = splats.means.numpy() + RUB_FROM_RDF @ (final.origin - relative_origin(final))
     typical = float(splats.log_scales.max(dim=1).values.median().exp()) if len(splats) else 1.0
-    if typical < 2.0 * SPZ_STEP:
+    if typical < 2.0 * spz.STEP:
         raise ValueError(
             f".spz rounds positions to 1/4096 unit, and half of the splats are smaller than {typical:.2g}: "
             "write .ply or .splat, or enlarge the map (--scale)"
         )
-    far = int((np.abs(means) >= SPZ_REACH).any(axis=1).sum())
+    far = int((np.abs(means) >= spz.REACH).any(axis=1).sum())
     if far:
         raise ValueError(
-            f".spz holds positions within {SPZ_REACH:g} units, and {far} splats are farther away: "
+            f".spz holds positions within {spz.REACH:g} units, and {far} splats are farther away: "
             "write .ply or .splat, or make the map smaller (--scale)"
         )
-    o3d = open3d()
-
-    def tensor(values: np.ndarray) -> object:
-        return o3d.core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
-
-    cloud = o3d.t.geometry.PointCloud(tensor(means))
-    cloud.point["f_dc"] = tensor(splats.sh[:, 0].numpy())
-    cloud.point["opacity"] = tensor(splats.opacity_logits[:, None].numpy())
-    cloud.point["scale"] = tensor(splats.log_scales.exp().numpy())
-    cloud.point["rot"] = tensor(torch.nn.functional.normalize(splats.quaternions, dim=1).numpy())
-    if splats.sh.shape[1] > 1:
-        cloud.point["f_rest"] = tensor(splats.sh[:, 1:].numpy())
-    if not o3d.t.io.write_point_cloud(str(path), cloud):
-        raise OSError(f"open3d could not write {path}")
-    if final.antialiased:
-        _flag_antialiased(path)
-
-
-def _flag_antialiased(path: Path) -> None:
-    """Sets that flag in the header of a .spz of version 4, which open3d leaves 0."""
-    with path.open("r+b") as file:
-        head = bytearray(file.read(SPZ_FLAGS + 1))
-        if head[:8] != SPZ_4 or len(head) <= SPZ_FLAGS:
-            raise OSError(f"{path}: open3d wrote no .spz of version 4, in which a map is said to be antialiased")
-        file.seek(SPZ_FLAGS)
-        file.write(bytes([head[SPZ_FLAGS] | SPZ_ANTIALIASED]))
+    opacity, harmonics = torch.sigmoid(splats.opacity_logits).numpy(), splats.sh.numpy()
+    scales, quaternions = splats.log_scales.numpy(), splats.quaternions.numpy()
+    path.write_bytes(spz.packed(means, scales, quaternions, opacity, harmonics, final.antialiased))
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

@@ -43,7 +43,7 @@ class FusionConfig:
     device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
     threads: int | None = None  # of the C++ kernels; null: all
     realtime: bool = False  # less effort, see `EFFORTS`, where depth maps come faster than they are fused
-    share: float = 0.25  # of a core's time that fusion may take then
+    share: float = 0.35  # of a core's time that fusion may take then
     efforts: tuple[int, ...] | None = None  # those that may be made then, by their place among all; null: all
 
 
@@ -89,6 +89,10 @@ class OnlineFusion:
         """Fused depth of the keyframes that still wait."""
         for reference, others in self._window.flush():
             yield self._fused(reference, others)
+
+    def forget(self) -> None:
+        """The keyframes that come next are of another map. None waits: see `flush`."""
+        self._window = KeyframeWindow[KeyframeDepth](self.config.window, self.config.lag)
 
     @property
     def waiting(self) -> int | None:
@@ -164,6 +168,8 @@ def fuse(
             seeing = backend.consistent_views(maps, ANY_DEPTH, config.pixels, False)
             evidence = features_of(fused, confidence, consistent, seeing)
             confidence = np.where(depth > 0, probability_of_inlier(evidence), 0.0).astype(np.float32)
+    if reference.mask is not None:  # the neighbors may well see what is behind there
+        depth = np.where(reference.mask, depth, np.float32(0))
     keep = depth > 0
     sure = confidence >= config.confidence
     counts["rejected: confidence"] = float((keep & ~sure).sum())

@@ -21,6 +21,7 @@ class KeyframeDepth:
     world_from_cam: np.ndarray  # (4, 4) float64
     scale: float  # of the map, that pose and depth are in
     segment: int = 0
+    mask: np.ndarray | None = None  # (H, W) bool, False where no depth is to be; None: it may be anywhere
 
     @property
     def size(self) -> tuple[int, int]:

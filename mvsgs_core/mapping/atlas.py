@@ -52,17 +52,17 @@ class Atlas:
         """Of the current part: one, or those whose first keyframe is still to come there."""
         return {segment for segment, part in self.parts.items() if part is self.current}
 
-    def add(self, keyframe: RGBDKeyframe, segment: int, small: bool = False) -> TrainingView | None:
+    def add(self, keyframe: RGBDKeyframe, segment: int, halvings: int = 0) -> TrainingView | None:
         """Maps a new keyframe of that segment; returns what is trained on, None where it was refused.
 
-        small: as in `OnlineMapper.add_keyframe`.
+        halvings: as in `OnlineMapper.add_keyframe`.
         Where the map was being refined already, that begins anew after it.
         """
         # sent on its way before its segment was joined: by keyframe and not by number, as the pose is corrected so, too
         self.enter(self.segment_of.get(keyframe.index, segment))
         self.came(keyframe.index, keyframe.timestamp)
         known = len(self.current.views)
-        self.current.add_keyframe(keyframe, small)
+        self.current.add_keyframe(keyframe, halvings)
         self.take_between()
         return self.current.views[-1] if len(self.current.views) > known else None
 
@@ -101,6 +101,14 @@ class Atlas:
         log.warn(
             f"{lost}: the map shows the largest of {len(parts)} parts, {len(self.current.views)} of {total} keyframes"
         )
+
+    def make_up(self, splats: bool = True) -> bool:
+        """A piece of what a live stream left no time for, as in `OnlineMapper`; False when nothing is left.
+
+        After the stream as many iterations as the refinement has at most: one that was long would be waited for as
+        long again.
+        """
+        return self.current.make_up(self.current.config.refinement if self.stream_ended else None, splats)
 
     def refine(self) -> bool:
         """One iteration of the final refinement; False when it is done."""

@@ -34,6 +34,7 @@ class FrameBetween:
     exposure: np.ndarray | None = None  # (3, 4) from the keyframe's colors; None: no difference
     velocity: np.ndarray | None = None  # (6,) of the camera, as in `msgs`; None: not known
     readout_time: float = 0.0  # seconds from the image's first row to its last
+    mask: np.ndarray | None = None  # (H, W) bool, False where a pixel is no part of the scene; None: all are
 
 
 @dataclass
@@ -100,7 +101,7 @@ def between_view(
     checked = checked_keyframe(
         RGBDKeyframe(
             index=given.index, timestamp=given.timestamp, image=given.image, intrinsics=given.intrinsics,
-            world_from_cam=given.keyframe_from_cam, depth=NO_DEPTH, scale=given.scale,
+            world_from_cam=given.keyframe_from_cam, depth=NO_DEPTH, scale=given.scale, mask=given.mask,
         ),
         log,
     )  # fmt: skip

@@ -20,6 +20,7 @@ class TrainingConfig:
     betas: bool = False  # train the kernel's shape (exact, ges_scale)
     loss: Loss = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
     loss_weights: LossWeights = field(default_factory=LossWeights)
+    loss_function: str | None = None  # module.function of LossInputs, a loss of your own in place of these; null: none
     frequency_horizon: int = 60  # visits of a keyframe over which the frequency-modulated mask runs through its bands
     selective: bool = True  # step only the splats that were seen
     exposure: bool = True  # use the exposures and the vignetting that the tracker estimates
@@ -42,7 +43,8 @@ class MapperConfig:
     share: float = 0.3  # of a core's time that new splats may take in real time: beyond, they get larger
     max_pixels: int | None = None  # area of the training images; null: as they come
     # images that are kept and trained on; beyond, those of frames between keyframes, then of keyframes are thinned out
-    max_keyframes: int = 1000
+    max_keyframes: int = 10_000
+    images_in_memory: int = 1000  # of them; beyond, those of older keyframes wait on disk until they are trained on
     sh_degree: int = 0  # of the view-dependent color, 0 to 3
     seed: int = 0
     threads: int | None = None  # of the rasterizer and the optimizer; null: all

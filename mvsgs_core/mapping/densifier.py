@@ -88,8 +88,10 @@ class Densifier:
         assert keyframe.unfiltered is not None
         depth = checked_depth(keyframe.unfiltered, self.log)
         depth = self._near(depth * np.float32(view.scale / keyframe.scale / self.frame.length))
-        size = (depth.shape[0], depth.shape[1])
-        confidence = np.ones(size, dtype=np.float32) if keyframe.confidence is None else keyframe.confidence
+        size = (min(depth.shape[0], view.size[0]), min(depth.shape[1], view.size[1]))
+        depth = _nearest(depth, size)
+        sure = np.ones((1, 1), dtype=np.float32) if keyframe.confidence is None else keyframe.confidence
+        confidence = _nearest(sure, size)
         colors = depth_colors(view.image.cpu().numpy(), size)
         depth = continued_depth(depth, confidence, _nearest(shown, size), colors)
         return _nearest(depth, view.size), _nearest(confidence, view.size)

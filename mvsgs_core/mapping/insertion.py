@@ -63,10 +63,17 @@ def points_from_depth(
 
     depth: (h, w), intrinsics (4,) at that size, image (h, w, 3) in [0, 1], normals (h, w, 3) or None, mask (h, w) bool.
     """
+    positions, chosen, colors = _of_pixels(depth, intrinsics, image, normals, mask)
+    return Points(positions, chosen, colors, _tangents(positions, chosen, intrinsics, np.ones((len(positions), 2))))
+
+
+def _of_pixels(
+    depth: np.ndarray, intrinsics: np.ndarray, image: np.ndarray, normals: np.ndarray | None, mask: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, normals and colors (N, 3) float64 of the pixels of the mask."""
     positions = camera.unproject(depth, intrinsics)[mask].astype(np.float64)
     chosen = np.zeros_like(positions) if normals is None else normals[mask].astype(np.float64)
-    sides = np.ones((len(positions), 2))
-    return Points(positions, chosen, image[mask].astype(np.float64), _tangents(positions, chosen, intrinsics, sides))
+    return positions, chosen, image[mask].astype(np.float64)
 
 
 def points_of_rectangles(
@@ -80,7 +87,7 @@ def points_of_rectangles(
     """
     mask = parts.labels >= 0
     labels, sure = parts.labels[mask], known[mask]
-    pixels = points_from_depth(depth, intrinsics, image, normals, mask)
+    of_pixels, normals_there, colors = _of_pixels(depth, intrinsics, image, normals, mask)
     weights = np.where(sure, 1.0, DOUBTFUL)
     total = np.bincount(labels, weights, minlength=len(parts))
 
@@ -88,16 +95,16 @@ def points_of_rectangles(
         sums = [np.bincount(labels, weights * column, minlength=len(parts)) for column in values.T]
         return np.asarray(np.stack(sums, axis=-1) / total[:, None])
 
-    positions, normal = mean(pixels.positions), mean(pixels.normals)
+    positions, normal = mean(of_pixels), mean(normals_there)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.where(length > 0.5, normal / np.maximum(length, 1e-12), 0.0)
     order = np.lexsort((confidence[mask], labels))
     surest = order[np.flatnonzero(np.diff(labels[order], append=len(parts)))]
     doubtful = np.bincount(labels, sure, minlength=len(parts)) == 0
-    positions[doubtful] *= (pixels.positions[surest, 2] / positions[:, 2])[doubtful, None]
+    positions[doubtful] *= (of_pixels[surest, 2] / positions[:, 2])[doubtful, None]
     fraction = np.bincount(labels, minlength=len(parts)) / parts.sides.prod(axis=1)
     sides = parts.sides * np.sqrt(fraction)[:, None]
-    return Points(positions, normal, mean(pixels.colors), _tangents(positions, normal, intrinsics, sides))
+    return Points(positions, normal, mean(colors), _tangents(positions, normal, intrinsics, sides))
 
 
 def _tangents(positions: np.ndarray, normals: np.ndarray, intrinsics: np.ndarray, sides: np.ndarray) -> np.ndarray:

@@ -73,6 +73,8 @@ def _problem(view: RGBDKeyframe) -> str:
     maps = (view.confidence, view.normals, view.unfiltered)
     if any(given is not None and given.shape[:2] != view.depth.shape for given in maps):
         return "maps of different sizes"
+    if view.mask is not None and view.mask.shape != (height, width):
+        return "a mask of another size than its image"
     if not np.isfinite(view.intrinsics).all():
         return "a pose or intrinsics that are not finite"
     if not all(FOCAL[0] * size <= f <= FOCAL[1] * size for f in (fx, fy)):

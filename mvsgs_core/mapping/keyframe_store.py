@@ -10,19 +10,23 @@ import numpy as np
 from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.owed import Owed
+from mvsgs_core.mapping.resting_images import on_disk
 from mvsgs_core.stats import Stats
 
 
 class KeyframeStore:
     """In the order of the stream. Beyond `max_images`, images are let go: first those of frames between keyframes, and
-    these frames with them; of keyframes poses, scales and exposures all stay."""
+    these frames with them; of keyframes poses, scales and exposures all stay. Before that, older images go to disk,
+    where they are trained on as before."""
 
     def __init__(
         self, max_images: int, window: int, log: Stats, views: Iterable[TrainingView] = (),
-        between: Iterable[BetweenView] = (),
+        between: Iterable[BetweenView] = (), in_memory: int | None = None,
     ) -> None:  # fmt: skip
-        """window: newest keyframes, whose images are never let go."""
+        """window: newest keyframes, whose images are never let go. in_memory: images that do not wait on disk; None:
+        all."""
         self._max_images, self._window, self._log = max_images, window, log
+        self._in_memory = max_images if in_memory is None else max(in_memory, window)
         self.views = list(views)
         self.with_image = [view for view in self.views if view.has_image]
         self.between = list(between)
@@ -45,8 +49,8 @@ class KeyframeStore:
 
     @property
     def image_bytes(self) -> int:
-        """Of the images: what grows with the length of a run, to a bound."""
-        return sum(view.image.numel() for view in self.trained)
+        """Of the images in memory: what grows with the length of a run, to a bound."""
+        return sum(view.image.numel() for view in self.trained if not view.image_on_disk)
 
     @property
     def trained(self) -> list[TrainingView]:
@@ -117,4 +121,15 @@ class KeyframeStore:
                 f"more than {self._max_images} keyframes (max_keyframes): images of "
                 "older ones are thinned out and no longer trained on",
             )
+        self._rest()
         return changed
+
+    def _rest(self) -> None:
+        """The oldest images beyond `in_memory` go to disk; where that is full, they stay."""
+        waking = [view for view in self.trained if not view.image_on_disk]
+        for view in sorted(waking, key=lambda view: view.index)[: max(0, len(waking) - self._in_memory)]:
+            try:
+                view.image, view.image_on_disk = on_disk(view.image), True
+            except OSError as error:
+                self._log.warn(f"images stay in memory beyond mapper.images_in_memory: {error}")
+                return

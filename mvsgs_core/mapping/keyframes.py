@@ -33,6 +33,7 @@ class RGBDKeyframe:
     photograph: np.ndarray | None = None  # (H, W, 3) uint8 as a rolling shutter took it, of which `image` is free
     velocity: np.ndarray | None = None  # (6,) of the camera, as in `msgs`; with a photograph only
     readout_time: float = 0.0  # seconds from the first row of the photograph to the last
+    mask: np.ndarray | None = None  # (H, W) bool, False where a pixel is no part of the scene; None: all are
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class TrainingView:
     fixed: bool = False  # its pose is not refined: it holds the frame of reference
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))  # of the camera, twist a second, mapper's unit
     readout_time: float = 0.0  # seconds from the image's first row to its last; 0: all rows at once, or not known
+    image_on_disk: bool = False  # see resting_images.py
     as_taken: bool = True  # no shutter is taken out of the image: renders are as that saw it, as soon as it is known
     median_depth: float = 0.0  # of its depth map, in the mapper's unit; 0: it has none
     valid: Tensor | None = None  # (H, W) bool; None: every pixel is
@@ -99,22 +101,28 @@ class TrainingView:
     @property
     def target(self) -> Tensor:
         """Image (H, W, 3) float32 in [0, 1]."""
-        return self.image.to(torch.float32).div_(255.0)
+        return self.image.to(self.exposure.device, torch.float32).div_(255.0)
 
     def intrinsics_at(self, size: tuple[int, int]) -> np.ndarray:
         """(4,) at another size (height, width)."""
         return camera.scale_intrinsics(self.image_intrinsics, self.image_size, size)
 
-    def half(self) -> TrainingView:
-        """The same keyframe with half as many rows and columns."""
+    def smaller(self, halvings: int) -> TrainingView:
+        """The same keyframe with half as many rows and columns, so many times."""
+        if not halvings:
+            return self
         height, width = self.size
-        size = max(1, height // 2), max(1, width // 2)
+        size = max(1, height >> halvings), max(1, width >> halvings)
         image = torch.from_numpy(np.array(camera.resize_image(self.image.cpu().numpy(), size))).to(self.image.device)
         valid = self.valid
         if valid is not None:
-            smaller = camera.resize_image(valid.cpu().numpy().astype(np.float32), size) > 0.999
-            valid = torch.from_numpy(np.array(smaller)).to(self.image.device)
+            valid = torch.from_numpy(camera.mask_at(valid.cpu().numpy(), size)).to(self.exposure.device)
         return replace(self, image=image, valid=valid, intrinsics=self.intrinsics_at(size))
+
+    def rectified(self, image: np.ndarray) -> TrainingView:
+        """The same keyframe with its image (H, W, 3) uint8 as it is without the rolling shutter."""
+        resized = torch.from_numpy(np.array(camera.resize_image(image, self.size))).to(self.image.device)
+        return replace(self, image=resized, velocity=np.zeros(6), readout_time=0.0)
 
     def footprint(self) -> np.ndarray:
         """(4, 3) corners of what it sees, at its median depth, in the mapper's frame."""
@@ -126,7 +134,7 @@ class TrainingView:
 
     def drop_image(self) -> None:
         """Frees what only the training needs; pose, scale and exposure stay."""
-        self.image, self.valid = self.image.new_zeros((0, 0, 3)), None
+        self.image, self.valid, self.image_on_disk = self.image.new_zeros((0, 0, 3)), None, False
 
     def rescale(self, factor: float) -> None:
         """Lengths in a unit of 1 / `factor` of what it was; the moments follow, a gradient is divided by `factor`."""
@@ -142,8 +150,8 @@ class TrainingView:
         velocity: (6,) of the camera, a twist a second in its own axes, in the mapper's unit.
         """
         resized = torch.from_numpy(np.array(camera.resize_image(photograph, self.size)))
-        self.image, self.velocity, self.readout_time = resized.to(self.image.device), velocity, readout_time
-        self.as_taken = True
+        self.image, self.velocity, self.readout_time = resized.to(self.exposure.device), velocity, readout_time
+        self.as_taken, self.image_on_disk = True, False
 
     def place(self, world_from_cam: np.ndarray, local_from_cam: np.ndarray, scale: float) -> Similarity:
         """A corrected pose and scale; returns how what was seen from it moves, in the mapper's frame."""
@@ -203,8 +211,9 @@ def training_view(
     height, width = keyframe.image.shape[:2]
     size = (height, width) if max_pixels is None else camera.fit_size(height, width, max_pixels, multiple=1)
     image, valid = checked_image(keyframe.image)
-    if valid is not None:
-        valid = np.array(camera.resize_image(valid.astype(np.float32), size) > 0.999)
+    if keyframe.mask is not None:
+        valid = keyframe.mask if valid is None else valid & keyframe.mask
+    valid = camera.mask_at(valid, size)
     identity = torch.eye(3, 4, device=device)
     return TrainingView(
         index=keyframe.index,
@@ -218,7 +227,7 @@ def training_view(
         local_from_cam=local_from_cam,
         exposure=identity.clone(),
         exposure_moments=(torch.zeros_like(identity), torch.zeros_like(identity)),
-        valid=None if valid is None else torch.from_numpy(valid).to(device),
+        valid=None if valid is None else torch.from_numpy(valid.copy()).to(device),  # messages are read-only
     )
 
 

@@ -5,7 +5,8 @@ mask. The mask comes from a difference of Gaussians of the render, whose width m
 `frequency` in 0 to 100: in the first half the smooth regions are kept (the mask is inverted), in the second the edges.
 An online run, whose length is not known ahead, gives each view its own progress: see `frequency_of`.
 
-One more term: its weight in `LossWeights`, its function in `TERMS`.
+One more term: its weight in `LossWeights`, its function in `TERMS`, or in `SPLAT_TERMS`. Another loss altogether, in a
+file of one's own or in a program: `training.loss_function`, a function of `LossInputs`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from mvsgs_core.named_modules import import_named
 from mvsgs_core.rasterizer.interface import Render
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.rasterizer.ssim import image_loss
@@ -53,6 +55,52 @@ class LossInputs:
     threads: int | None  # None: all
 
 
+LossFunction = Callable[[LossInputs], Tensor]
+_GIVEN: dict[str, LossFunction] = {}  # by a program, under the name that its configuration has
+
+
+def name_of(function: LossFunction) -> str:
+    """What `training.loss_function` is for a function of this program, be it in a notebook or within another one.
+
+    Raises TypeError for what cannot be called.
+    """
+    if not callable(function):
+        raise TypeError(f"a loss is a function of LossInputs, not {type(function).__name__}")
+    plain = f"{function.__module__}.{getattr(function, '__qualname__', type(function).__qualname__)}"
+    name, number = plain, 1
+    while _GIVEN.setdefault(name, function) is not function:  # another one of that name, as a cell run twice makes
+        number += 1
+        name = f"{plain}#{number}"
+    return name
+
+
+def loss_function(name: str) -> LossFunction:
+    """The function `module.function`: one of this program, or found as `import_named` does. Raises ValueError."""
+    if name in _GIVEN:
+        return _GIVEN[name]
+    module, _, attribute = name.rpartition(".")
+    try:
+        found = getattr(import_named(module), attribute, None)
+    except (ImportError, ValueError) as error:
+        raise ValueError(f"training.loss_function={name}: must be module.function of LossInputs; {error}") from error
+    if not callable(found):
+        raise ValueError(f"training.loss_function={name}: there is no function {attribute!r} in {module}")
+    given: LossFunction = found
+    return given
+
+
+def own_loss(function: LossFunction, inputs: LossInputs) -> Tensor:
+    """What a user's loss makes of the inputs. Raises TypeError where that is nothing to be minimized."""
+    loss = function(inputs)
+    if not isinstance(loss, Tensor) or loss.ndim != 0 or not loss.requires_grad:
+        what = f"a tensor of shape {tuple(loss.shape)}" if isinstance(loss, Tensor) else type(loss).__name__
+        raise TypeError(
+            f"the loss function must return a scalar tensor with a gradient to inputs.render or inputs.splats; it "
+            f"returned {what}"
+        )
+    return loss
+
+
 def weights_of(loss: Loss, chosen: LossWeights) -> dict[str, float]:
     """The weight of each term: the chosen ones, for others the loss's."""
     given = {name: value for name, value in vars(chosen).items() if value is not None}
@@ -61,7 +109,7 @@ def weights_of(loss: Loss, chosen: LossWeights) -> dict[str, float]:
 
 def training_loss(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
     """The sum of all terms, a scalar."""
-    parts = [part for term in TERMS if (part := term(inputs, weights)) is not None]
+    parts = [part for term in (*TERMS, *SPLAT_TERMS) if (part := term(inputs, weights)) is not None]
     return sum(parts[1:], start=parts[0])
 
 
@@ -138,4 +186,6 @@ def photometric_loss(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
 
 
 # Each gives its part of the sum, weighted: a scalar; None where its weight is 0. The first is never None.
-TERMS: tuple[Callable[[LossInputs, dict[str, float]], Tensor | None], ...] = (photometric_loss,)
+Term = Callable[[LossInputs, dict[str, float]], Tensor | None]
+TERMS: tuple[Term, ...] = (photometric_loss,)
+SPLAT_TERMS: tuple[Term, ...] = ()  # whose gradients go to the splats themselves, past the render

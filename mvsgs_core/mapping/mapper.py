@@ -12,6 +12,7 @@ import torch
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.between import BetweenView, FrameBetween, between_view
+from mvsgs_core.mapping.coarse import LATER, CoarseKeyframes
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.deformation import Similarity, move_with_anchors
 from mvsgs_core.mapping.densifier import Densifier, checked_depth
@@ -27,6 +28,9 @@ from mvsgs_core.mapping.snapshot import snapshot
 from mvsgs_core.mapping.trainer import Trainer
 from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.stats import Stats
+
+LATE = 30  # part of the refinement's iterations that a keyframe's late splats bring: 1 / LATE
+NONE_NOW = 3  # halvings of an image of which nothing worth a splat is left
 
 
 class OnlineMapper:
@@ -56,9 +60,13 @@ class OnlineMapper:
             else state
         )
         self.frame = FrameOfReference()
-        self.keyframes = KeyframeStore(config.max_keyframes, config.window, self.log, views or (), between or ())
+        self.keyframes = KeyframeStore(
+            config.max_keyframes, config.window, self.log, views or (), between or (), config.images_in_memory
+        )
         self.schedule = Schedule(config.window, config.seed)
         self.trainer = Trainer(config, self.state, self.log, self.photometry)
+        self.coarse = CoarseKeyframes(self.log)
+        self._late = 0  # of these, how many got their splats after the stream
         trainer, keyframes = self.trainer, self.keyframes
 
         def render(view: TrainingView, size: tuple[int, int] | None = None) -> Render:
@@ -90,15 +98,16 @@ class OnlineMapper:
             "image_bytes": self.keyframes.image_bytes,
         }  # fmt: skip
 
-    def add_keyframe(self, keyframe: RGBDKeyframe, small: bool = False) -> int:
+    def add_keyframe(self, keyframe: RGBDKeyframe, halvings: int = 0) -> int:
         """Takes in a keyframe and adds splats where the map does not show it; returns their number.
 
-        small: splats as its image needs them at half the size, which takes a third of the time or less.
+        halvings: splats as its image needs them at half the size, a quarter and so on, which takes a fraction of the
+        time; from `NONE_NOW` on none, but in an empty map. `make_up` adds the rest.
         Without `realtime`, the pending iterations of earlier keyframes are done first, so that the result does not
         depend on how fast keyframes come. One that no camera gives is refused and counted, see `keyframe_checks`.
         """
         if self.config.realtime:
-            self.log.skip("iterations_realtime", self.schedule.drop())
+            self.log.skip("iterations_realtime", self.schedule.spare())
         else:
             while self.step():
                 pass
@@ -120,7 +129,10 @@ class OnlineMapper:
         if self.keyframes.add(view):
             self.schedule.reset()
         with self.log.time("insertion"):
-            inserted = self.densifier.add(checked, view.half() if small else view, depth)
+            later = halvings >= NONE_NOW and len(self.state) > 0
+            inserted = 0 if later else self.densifier.add(checked, view.smaller(min(halvings, NONE_NOW - 1)), depth)
+        if halvings:
+            self.coarse.wait(checked)
         view.as_taken = keyframe.photograph is None and keyframe.velocity is None
         if checked.photograph is not None and checked.velocity is not None and view.has_image:
             per_unit = scale / (checked.scale * self.frame.length)
@@ -172,6 +184,45 @@ class OnlineMapper:
     def end(self) -> None:
         """The stream has ended: no keyframe waits for what is owed, it may take as many iterations as `refine` does."""
         self.schedule.beside = self.config.refinement
+
+    def make_up(self, limit: int | None = None, splats: bool = True) -> bool:
+        """A piece of what a live stream left no time for: the splats that a keyframe lacks, and when none does a
+        canceled iteration, on any image. False when nothing is left.
+
+        limit: iterations at most that are left, None: all, beside those that keyframes bring that get their splats so
+        late: a thirtieth of the refinement each; splats: whether they may get them.
+        """
+        schedule, images = self.schedule, self.keyframes.trained
+        schedule.spare()
+        if not images or len(self.state) == 0:
+            return False
+        if splats and len(self.coarse):
+            self._late += limit is not None
+            self._complete()
+            return True
+        if limit is not None:
+            schedule.spared = min(schedule.spared, limit + self._late * (self.config.refinement // LATE))
+        if not schedule.spared:
+            return False
+        schedule.spared -= 1
+        self.log.count("iterations made up")
+        with self.log.time("optimization"):
+            self.trainer.step(self._chosen(images[schedule.next_of_all(len(images))]), self.median_depth)
+        return True
+
+    def _complete(self) -> None:
+        """Adds the splats that the keyframe lacks which has waited longest."""
+        found = self.coarse.next()
+        assert found is not None
+        keyframe, image = found
+        view = self.keyframes.of(keyframe.index)
+        if view is None or not view.has_image:
+            return
+        with self.log.time("insertion"):
+            at_once = view if image is None else view.rectified(image)
+            depth = keyframe.depth * np.float32(view.scale / keyframe.scale)
+            self.log.count("inserted", self.densifier.add(keyframe, at_once, depth))
+        self.log.count(LATER)
 
     def refine(self, done: int, total: int) -> None:
         """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates; half of
@@ -271,6 +322,8 @@ class OnlineMapper:
         self.keyframes.take_over(other.keyframes, change.scale)
         self.schedule.reset()
         self.schedule.add_budget(other.schedule.drop())
+        self.schedule.spared += other.schedule.spared
+        self.coarse.take_over(other.coarse)
         self.trainer.iterations += other.trainer.iterations
 
     def render(self, view: TrainingView, size: tuple[int, int] | None = None) -> Render:
@@ -281,7 +334,14 @@ class OnlineMapper:
         """How well the map shows its keyframes, some of them, spread over the stream; None without any."""
         images = self.keyframes.with_image
         views = images[:: -(-len(images) // max_keyframes) or 1]
-        return check([(self.render(v).color.clamp(0.0, 1.0).cpu().numpy(), v.target.cpu().numpy()) for v in views])
+        return check(self._beside(view) for view in views)
+
+    def _beside(self, view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
+        """Render and image (H, W, 3) of a keyframe; where a pixel is left out the image is the render."""
+        color, image = self.render(view).color.clamp(0.0, 1.0), view.target
+        if view.valid is not None:
+            image = torch.where(view.valid[..., None], image, color)
+        return color.cpu().numpy(), image.cpu().numpy()
 
     def snapshot(self) -> Snapshot:
         """The map in world units, relative to its origin."""
@@ -313,9 +373,11 @@ class OnlineMapper:
         view.fixed = not self.views
         view.expose(self.photometry.exposures.get(view.index))
         if view.valid is not None:
-            self.log.refuse(
-                "pixels", int((~view.valid).sum()), "pixels that are not finite were left out of the training"
-            )
+            left_out = int((~view.valid).sum())
+            if keyframe.mask is not None:
+                self.log.skip("pixels_masked", left_out)
+            else:
+                self.log.refuse("pixels", left_out, "pixels that are not finite were left out of the training")
         return view
 
 

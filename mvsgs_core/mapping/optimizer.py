@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mvsgs_core import native
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
+from mvsgs_core.rasterizer.interface import Moved, SplatStep
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -85,6 +86,15 @@ def step(state: MapState, visible: Tensor, steps: list[Group], decay_steps: int,
     )  # fmt: skip
     clear_gradients(state)
     return refused
+
+
+def splat_step(state: MapState, steps: list[Group], decay_steps: int) -> SplatStep:
+    """The same step, with what density control decides on, for a backward pass to take: no gradient is then stored and
+    read again."""
+    moved = [Moved(first=state.first[g.name], second=state.second[g.name], **vars(g)) for g in steps]
+    return SplatStep(
+        moved, state.steps, state.means2d_gradient, state.means2d_views, (BETA_1, BETA_2, EPSILON), decay_steps
+    )
 
 
 @torch.no_grad()

@@ -66,8 +66,8 @@ def partition(
     choice: dict[Key, np.ndarray] = {}
     for key in np.ndindex(LEVELS + 1, LEVELS + 1):
         rows, columns = key
-        if rows:
-            sums[key] = tuple(_by_two_rows(value) for value in sums[rows - 1, columns])
+        if rows:  # of which nothing else is made any more
+            sums[key] = tuple(_by_two_rows(value) for value in sums.pop((rows - 1, columns)))
         elif columns:
             sums[key] = tuple(_by_two_columns(value) for value in sums[0, columns - 1])
         count, nothing, number, first, second = sums[key]
@@ -81,7 +81,7 @@ def partition(
             _by_two_rows(cost[rows - 1, columns]) if rows else impossible,
             _by_two_columns(cost[rows, columns - 1]) if columns else impossible,
         ])  # fmt: skip
-        best = np.argmin(options, axis=0)
+        best = np.argmin(options, axis=0).astype(np.int8)
         choice[key] = np.where(count > 0, best, NOTHING)
         cost[key] = np.where(count > 0, np.take_along_axis(options, best[None], axis=0)[0], 0.0)
     return _chosen(choice, taken, size)

@@ -7,20 +7,22 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.rasterizer.reference import rotation_matrices
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
 
+DEPTH_WIDTH = 320  # pixels of the depth map at most: it is for the eye
 CHUNK = 16384  # splats whose covariances are made at once: on the way they take several times their size
 
 
 def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None = None) -> dict[str, Any]:
     """What a preview shows, in world units, relative to the map's origin.
 
-    Of the newest keyframe `index`, `world_from_cam` (4, 4), `intrinsics` (4,), its `image` and the `render` from its
-    pose (H, W, 3) uint8; for at most `limit` splats spread over the map `means` (N, 3), `covariances` (N, 3, 3),
-    `colors` (N, 3) uint8, `opacities` (N,); all `keyframes` (K,) and `keyframe_poses` (K, 4, 4); `origin` (3,) and the
+    Of the newest keyframe `index`, `world_from_cam` (4, 4) and what `seen` gives; for at most `limit` splats spread
+    over the map `means` (N, 3), `covariances` (N, 3, 3), `colors` (N, 3) uint8, `opacities` (N,); all `keyframes` (K,),
+    their `keyframe_poses` (K, 4, 4) and how many of the map's `splats` (K,) came from each; `origin` (3,) and the
     number of `iterations`.
 
     provisional: fewer than `limit`, in the mapper's frame and unit, all of which are shown beside the map's. The map
@@ -34,23 +36,47 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
     shown = {name: value[::stride] for name, value in final.tensors().items()}
     if provisional is not None:
         shown = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in shown.items()}
+    keyframes = np.array([view.index for view in mapper.views], dtype=np.int64)
     poses = np.stack([view.world_from_cam for view in mapper.views])
     poses[:, :3, 3] -= origin
     return {
         "index": newest.index,
         "iterations": mapper.iterations,
         "world_from_cam": poses[-1],
-        "intrinsics": newest.intrinsics,
-        "image": newest.image.cpu().numpy(),
-        "render": as_bytes(mapper.render(newest).color),
+        **seen(mapper, newest),
         "means": (shown["means"] * unit).cpu().numpy(),
         "covariances": covariances(shown["quaternions"], shown["log_scales"], unit).cpu().numpy(),
         "colors": as_bytes(0.5 + C0 * shown["sh"][:, 0]),
         "opacities": torch.sigmoid(shown["opacity_logits"]).cpu().numpy(),
-        "keyframes": np.array([view.index for view in mapper.views], dtype=np.int64),
+        "keyframes": keyframes,
+        "splats": splats_by_keyframe(mapper.state.anchors.cpu().numpy(), keyframes),
         "keyframe_poses": poses,
         "origin": origin,
     }
+
+
+def seen(mapper: OnlineMapper, view: TrainingView) -> dict[str, np.ndarray]:
+    """What a preview shows of one view: `intrinsics` (4,), `image` and `render` (H, W, 3) uint8.
+
+    And the rendered `depth` (h, w) in world units, of the same field of view, 0 where the map covers less than half of
+    a pixel.
+    """
+    render = mapper.render(view)
+    depth = torch.where(render.opacity > 0.5, render.depth * mapper.frame.length, 0.0)
+    step = -(-depth.shape[1] // DEPTH_WIDTH)
+    return {
+        "intrinsics": view.intrinsics,
+        "image": view.image.cpu().numpy(),
+        "render": as_bytes(render.color),
+        "depth": np.ascontiguousarray(depth[step // 2 :: step, step // 2 :: step].float().cpu().numpy()),
+    }
+
+
+def splats_by_keyframe(anchors: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
+    """(K,) how many of the anchors (N,) are each of the keyframes (K,)."""
+    lowest = int(anchors.min(initial=0))  # those of a kept map are negative
+    counts = np.bincount(anchors - lowest, minlength=int(keyframes.max(initial=0)) - lowest + 1)
+    return counts[np.maximum(keyframes, lowest) - lowest] * (keyframes >= lowest)
 
 
 def covariances(quaternions: torch.Tensor, log_scales: torch.Tensor, unit: float) -> torch.Tensor:

@@ -12,12 +12,14 @@ class Schedule:
 
     Keyframes are given by their position in the mapper's list. `pending` counts down to 0, then `beside` does: what
     corrected keyframes, which are owed iterations, may get beside the pending ones until the next keyframe comes.
+    `spared` are those that were canceled for want of time.
     """
 
     def __init__(self, window: int, seed: int) -> None:
         self.window = window
         self.pending = 0
         self.beside = 0
+        self.spared = 0
         self._random = np.random.default_rng(seed)
         self._local: list[int] = []
         self._all: list[int] = []
@@ -32,6 +34,12 @@ class Schedule:
     def drop(self) -> int:
         """Cancels the pending iterations; returns how many they were."""
         dropped, self.pending = self.pending, 0
+        return dropped
+
+    def spare(self) -> int:
+        """Cancels the pending iterations, which may be made up later; returns how many they were."""
+        dropped = self.drop()
+        self.spared += dropped
         return dropped
 
     def reset(self) -> None:
@@ -72,8 +80,8 @@ class Schedule:
     def state(self) -> dict[str, Any]:
         """All that the next draws depend on, as JSON has it."""
         return {
-            "pending": self.pending, "beside": self.beside, "turn": self._turn, "local": list(self._local),
-            "all": list(self._all), "random": self._random.bit_generator.state,
+            "pending": self.pending, "beside": self.beside, "spared": self.spared, "turn": self._turn,
+            "local": list(self._local), "all": list(self._all), "random": self._random.bit_generator.state,
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any], count: int, trained: int) -> None:
@@ -81,8 +89,8 @@ class Schedule:
 
         Raises ValueError for what it never returns.
         """
-        self.pending, self.beside, self._turn = (
-            _at_least_zero(state.get(name)) for name in ("pending", "beside", "turn")
+        self.pending, self.beside, self.spared, self._turn = (
+            _at_least_zero(state.get(name)) for name in ("pending", "beside", "spared", "turn")
         )
         self._local, self._all = _positions(state.get("local"), count), _positions(state.get("all"), trained)
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -59,15 +59,10 @@ class SelfCheck:
         )
 
 
-def check(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> SelfCheck | None:
-    """Of (render, image) pairs, (H, W, 3) float in 0..1; None without any."""
-    if not pairs:
-        return None
-    return SelfCheck(
-        float(np.median([psnr(render, image) for render, image in pairs])),
-        float(np.median([psnr(_fitted(render, image), image) for render, image in pairs])),
-        float(np.median([noise_of(image) for _, image in pairs])),
-    )
+def check(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> SelfCheck | None:
+    """Of (render, image) pairs, (H, W, 3) float in 0..1, one after the other; None without any."""
+    found = [(psnr(render, image), psnr(_fitted(render, image), image), noise_of(image)) for render, image in pairs]
+    return SelfCheck(*np.median(found, axis=0).tolist()) if found else None
 
 
 def why_nothing(log: Stats) -> str:

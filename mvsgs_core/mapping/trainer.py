@@ -11,11 +11,20 @@ from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation, unclipped
 from mvsgs_core.mapping.keyframes import TrainingView
-from mvsgs_core.mapping.losses import LossInputs, frequency_of, training_loss, weights_of
+from mvsgs_core.mapping.losses import (
+    SPLAT_TERMS,
+    LossInputs,
+    frequency_of,
+    loss_function,
+    own_loss,
+    training_loss,
+    weights_of,
+)
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.pruning import prune
 from mvsgs_core.photometry import vignetting_factor
-from mvsgs_core.rasterizer.rasterize import Render, rasterize
+from mvsgs_core.rasterizer.interface import SplatStep
+from mvsgs_core.rasterizer.rasterize import Render, chosen_backend, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 
@@ -42,6 +51,8 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(config.seed)  # of density control
         self._factors: dict[tuple[float, ...], Tensor] = {}
         self._weights = weights_of(config.training.loss, config.training.loss_weights)
+        own = config.training.loss_function
+        self._own_loss = None if own is None else loss_function(own)
 
     def render(self, view: TrainingView, median_depth: float, size: tuple[int, int] | None = None) -> Render:
         """The map as a keyframe's camera photographs it, without gradients. size: height, width; None: the training
@@ -62,13 +73,18 @@ class Trainer:
         exposure = None if view.measured is None else view.exposure.requires_grad_(self.exposure_rate > 0.0)
         moving = training.refine_poses and not view.fixed and view.visits >= training.pose_visits
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
-        render = self._rasterize(self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist)
-        loss = training_loss(self._loss_inputs(view, render), self._weights)
+        step = self._fused_step(median_depth)
+        render = self._rasterize(
+            self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist, step=step
+        )
+        inputs = self._loss_inputs(view, render)
+        own = self._own_loss
+        loss = training_loss(inputs, self._weights) if own is None else own_loss(own, inputs)
         view.visits += 1
         value = float(loss.detach())
         if value < float("inf"):
             loss.backward()
-            self._step_splats(render, median_depth)
+            self._step_splats(render, median_depth, step)
             self._step_camera(view, twist, median_depth)
             view.record(value)
         else:
@@ -98,13 +114,13 @@ class Trainer:
 
     def _rasterize(
         self, splats: Splats, view: TrainingView, intrinsics: np.ndarray, size: tuple[int, int], median_depth: float,
-        exposure: Tensor | None, twist: Tensor | None, *, weights: bool = False,
+        exposure: Tensor | None, twist: Tensor | None, *, weights: bool = False, step: SplatStep | None = None,
     ) -> Render:  # fmt: skip
         training = self.config.training
         render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
             exposure=exposure, pose_delta=twist, readout=view.readout, near=training.near * median_depth,
-            antialiased=training.antialiased, weights=weights, threads=self.config.threads,
+            antialiased=training.antialiased, weights=weights, threads=self.config.threads, step=step,
         )  # fmt: skip
         factor = self._vignetting(intrinsics, size)
         if factor is not None:
@@ -137,25 +153,42 @@ class Trainer:
         frequency = frequency_of(view.visits, self.config.training.frequency_horizon)
         return LossInputs(render, target, self.state.splats, frequency, self.config.threads)
 
-    def _step_splats(self, render: Render, median_depth: float) -> None:
-        """Adam on the splats that were seen, by the gradients that the backward pass left."""
+    def _groups(self, median_depth: float) -> list[optimizer.Group]:
+        config = self.config
+        return optimizer.groups(
+            config.optimizer, median_depth, self.rate, config.training.betas, config.training.kernel
+        )
+
+    def _fused_step(self, median_depth: float) -> SplatStep | None:
+        """Adam for the backward pass to take; None where gradients are needed: where a kernel or a loss leads them on,
+        splats are stepped unseen, or the back end cannot."""
+        training, state = self.config.training, self.state
+        backend = chosen_backend(training.backend, state.device)
+        leads_on = training.kernel == "ges_scale" or self._own_loss is not None or len(SPLAT_TERMS) > 0
+        if backend != "cpu" or leads_on or not training.selective:
+            return None
+        return optimizer.splat_step(state, self._groups(median_depth), self.config.optimizer.decay_steps)
+
+    def _step_splats(self, render: Render, median_depth: float, step: SplatStep | None) -> None:
+        """Adam on the splats that were seen, by the gradients that the backward pass left, or as it did itself."""
         config, log = self.config, self.log
         if render.backward.refused:
             text = "gradients of splats that were not finite were set to 0 in the rasterizer's backward pass"
             log.refuse("gradients", render.backward.refused, text)
-        if render.means2d.grad is not None:
-            gradient = render.means2d.grad.norm(dim=1).nan_to_num_(0.0, 0.0, 0.0)
-            self.state.accumulate_means2d(gradient, render.visible)
         selective = config.training.selective
-        stepped = render.visible if selective else torch.ones_like(render.visible)
-        groups = optimizer.groups(
-            config.optimizer, median_depth, self.rate, config.training.betas, config.training.kernel
-        )
-        refused = optimizer.step(self.state, stepped, groups, config.optimizer.decay_steps, config.threads or 0)
+        if step is not None:
+            refused = step.refused
+        else:
+            if render.means2d.grad is not None:
+                gradient = render.means2d.grad.norm(dim=1).nan_to_num_(0.0, 0.0, 0.0)
+                self.state.accumulate_means2d(gradient, render.visible)
+            stepped = render.visible if selective else torch.ones_like(render.visible)
+            decay_steps, threads = config.optimizer.decay_steps, config.threads or 0
+            refused = optimizer.step(self.state, stepped, self._groups(median_depth), decay_steps, threads)
         if refused:
             log.refuse("steps", refused, "steps of splats with gradients that are not finite were refused")
         if selective:
-            log.skip("splats_unseen", len(self.state) - int(stepped.sum()))
+            log.skip("splats_unseen", len(self.state) - int(render.visible.sum()))
 
     def _step_camera(self, view: TrainingView, twist: Tensor | None, median_depth: float) -> None:
         """Adam on the keyframe's exposure and pose, where they are trained."""

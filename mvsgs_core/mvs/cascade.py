@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from mvsgs_core.camera import shrunk
 from mvsgs_core.inverse_depth import enlarge_inverse_depth
 from mvsgs_core.keyframe_window import KeyframeWindow
 from mvsgs_core.mvs.backend import make_backend
@@ -32,7 +33,7 @@ class OnlineStereoConfig:
     device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
     threads: int | None = None  # of the kernels; null: all
     realtime: bool = False  # less effort, see `efforts`, where keyframes come faster than their depth
-    share: float = 0.5  # of a core's time that stereo may take then
+    share: float = 0.75  # of a core's time that stereo may take then
     efforts: tuple[int, ...] | None = None  # those that may be made then, by their place among all; null: all
 
 
@@ -55,6 +56,7 @@ class CascadeDepth:
 
 FULL = Effort("full", 1.0)
 NO_STEREO = Effort("the tracker's depth in the place of stereo", 0.01, telling=False)
+MASK_MARGIN = 2  # pixels beside a masked one without depth: the matching window's radius, which would show its rim
 DOUBTFUL = 0.09  # confidence of the tracker's depth: less than any with which a map takes part in fusion
 
 
@@ -92,6 +94,11 @@ class OnlineStereo(ABC):
         for reference, others in self._window.flush():
             yield self._depth_of(reference, others)
 
+    def forget(self) -> None:
+        """The keyframes that come next are of another map. None waits: see `flush`."""
+        self._window = KeyframeWindow[StereoKeyframe](self.config.window, self.config.lag)
+        self._previous = None
+
     @property
     def waiting(self) -> int | None:
         """Index of the keyframe that has waited longest for later ones."""
@@ -119,6 +126,8 @@ class OnlineStereo(ABC):
                 result, views = coarse_depth(reference), []
             else:
                 result = self._estimate(reference, views, search, effort)
+        if reference.mask is not None:
+            result = masked(result, shrunk(reference.mask, MASK_MARGIN))
         return CascadeDepth(reference, result, tuple(v.index for v in views), search, effort=effort)
 
     @abstractmethod
@@ -158,6 +167,12 @@ def coarse_depth(reference: StereoKeyframe) -> StereoDepth:
     """The tracker's depth at the reference's size, with a confidence that lets it fill holes of the map alone."""
     depth, confidence = enlarge_inverse_depth(reference.inverse_depth, reference.weight, reference.size)
     return StereoDepth(depth, confidence * np.float32(DOUBTFUL), None)
+
+
+def masked(found: StereoDepth, mask: np.ndarray) -> StereoDepth:
+    """Without depth where the mask (H, W) bool is False."""
+    depth, confidence = (np.where(mask, values, np.float32(0)) for values in (found.depth, found.confidence))
+    return replace(found, depth=depth, confidence=confidence)
 
 
 def enlarged(found: StereoDepth, size: tuple[int, int]) -> StereoDepth:

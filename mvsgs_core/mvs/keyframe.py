@@ -23,6 +23,7 @@ class StereoKeyframe:
     inverse_depth: np.ndarray  # (gh, gw) float32 the tracker's, 0 = unknown
     weight: np.ndarray  # (gh, gw) float32 0 to 1
     segment: int = 0
+    mask: np.ndarray | None = None  # (h, w) bool at the finest size, False where it is to be ignored; None: nowhere
 
     @property
     def size(self) -> tuple[int, int]:
@@ -56,16 +57,21 @@ def prepare_keyframe(
     weight: np.ndarray | None = None,
     scale: float = 1.0,
     segment: int = 0,
+    mask: np.ndarray | None = None,
 ) -> StereoKeyframe:
     """A view of about `area` pixels, aspect kept, of an image (H, W, 3) uint8 with intrinsics (4,) at its own size.
 
-    Without `inverse_depth` the caller must give a depth range. Raises ValueError for a pose or intrinsics with NaN.
+    Without `inverse_depth` the caller must give a depth range. mask: (H, W) bool, False where a pixel is to be ignored:
+    such pixels are flat, which matches nothing. Raises ValueError for a pose or intrinsics with NaN.
     """
     if not (np.isfinite(world_from_cam).all() and np.isfinite(intrinsics).all()):
         raise ValueError(f"keyframe {index}: pose or intrinsics are not finite")
     coarsest = max(scales)
     size = camera.fit_size(image.shape[0], image.shape[1], area, multiple=max(8, coarsest))
     gray = cv2.cvtColor(camera.resize_image(image, size), cv2.COLOR_RGB2GRAY).astype(np.float32) - 128.0
+    seen = camera.mask_at(mask, size)
+    if seen is not None:
+        gray[~seen] = 0.0
     pyramid = tuple(
         np.ascontiguousarray(gray if s == 1 else camera.resize_image(gray, (size[0] // s, size[1] // s)))
         for s in sorted(scales)
@@ -82,4 +88,5 @@ def prepare_keyframe(
         inverse_depth=grid,
         weight=np.ones_like(grid) if weight is None else np.asarray(weight, dtype=np.float32),
         segment=segment,
+        mask=seen,
     )

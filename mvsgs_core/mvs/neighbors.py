@@ -21,6 +21,7 @@ class NeighborConfig:
     min_angle: float = 0.4  # degrees: less gives no depth
     min_overlap: float = 0.3  # part of the reference that the neighbor sees
     turn: float = 30.0  # degrees between the optical axes that halve the score
+    zoom: float = 0.2  # logarithm of how much larger a point's surroundings are in one of both: the score's width
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,10 @@ def score_neighbor(
     )
     x, y, z = apply_warp(warp, u, v, w)
     oh, ow = other.size
-    overlap = float(np.mean((z > 0) & (x >= 0) & (x <= ow - 1) & (y >= 0) & (y <= oh - 1)))
-    median_depth = 1.0 / float(np.median(inverse_depths))
-    center = reference.world_from_cam[:3, 3] + median_depth * reference.world_from_cam[:3, 2]
-    ray_a = center - reference.world_from_cam[:3, 3]
-    ray_b = center - other.world_from_cam[:3, 3]
-    angle = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(ray_a, ray_b)), ray_a @ ray_b)))
+    seen = (z > 0) & (x >= 0) & (x <= ow - 1) & (y >= 0) & (y <= oh - 1)
+    overlap = float(np.mean(seen))
+    angle = _median_angle(reference, other, u[seen], v[seen], w[seen])
+    zoom = float(np.median(np.abs(np.log(z[seen])))) if seen.any() else 0.0
     turned = float(
         np.degrees(np.arccos(np.clip(reference.world_from_cam[:3, 2] @ other.world_from_cam[:3, 2], -1.0, 1.0)))
     )
@@ -56,7 +55,25 @@ def score_neighbor(
     width_of_score = config.angle_below if angle < config.best_angle else config.angle_above
     by_angle = np.exp(-0.5 * ((angle - config.best_angle) / width_of_score) ** 2)
     by_turn = 1.0 / (1.0 + (turned / config.turn) ** 2)
-    return Neighbor(other, angle, overlap, float(by_angle * by_turn * overlap) + 1e-6)
+    by_zoom = np.exp(-0.5 * (zoom / config.zoom) ** 2)
+    return Neighbor(other, angle, overlap, float(by_angle * by_turn * by_zoom * overlap) + 1e-6)
+
+
+def _median_angle(
+    reference: StereoKeyframe, other: StereoKeyframe, u: np.ndarray, v: np.ndarray, inverse_depth: np.ndarray
+) -> float:
+    """Degrees between both cameras' rays to points of the reference that both see; 0 where there are none.
+
+    The middle of the image says nothing: where the camera moves forward, it is what has no parallax at all.
+    """
+    if not len(u):
+        return 0.0
+    fx, fy, cx, cy = reference.intrinsics
+    here = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1) / inverse_depth[:, None]
+    moved = reference.world_from_cam[:3, :3].T @ (other.world_from_cam[:3, 3] - reference.world_from_cam[:3, 3])
+    there = here - moved
+    across = np.linalg.norm(np.cross(here, there), axis=-1)
+    return float(np.degrees(np.median(np.arctan2(across, np.einsum("ij,ij->i", here, there)))))
 
 
 def select_neighbors(

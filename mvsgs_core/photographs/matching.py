@@ -4,27 +4,36 @@ from __future__ import annotations
 
 import numpy as np
 
+from mvsgs_core.geodesy import earth_centered
 from mvsgs_core.photographs.features import Features
 
 RATIO = 0.8  # of the distances to the best and the second best (Lowe 2004)
+BLOCK = 512  # features whose similarities are looked at while they are in the cache
 FIRST = 200  # features of a photograph, of the largest scale, that propose its pairs
 EXHAUSTIVE = 30  # photographs: of so many all pairs are matched
 
 
 def match(a: Features, b: Features) -> np.ndarray:
     """Pairs (N, 2) int64 of features that are each other's best match and pass the ratio test in `a`."""
-    if min(len(a.points), len(b.points)) < 2:
+    count, others = len(a.points), len(b.points)
+    if min(count, others) < 2:
         return np.zeros((0, 2), np.int64)
-    similarity = a.descriptors @ b.descriptors.T
-    best, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    mutual = np.flatnonzero(back[best] == np.arange(len(best)))
-    rows = similarity[mutual]
-    at = np.arange(len(mutual))
-    first = rows[at, best[mutual]]
-    rows[at, best[mutual]] = -1.0
-    second = rows.max(axis=1)
+    best, first, second = np.zeros(count, np.int64), np.zeros(count, np.float32), np.zeros(count, np.float32)
+    back = np.full(others, -1.0, np.float32)  # similarity of each feature of `b` to the best of `a`
+    for begin in range(0, count, BLOCK):
+        rows = slice(begin, min(begin + BLOCK, count))
+        similarity = a.descriptors[rows] @ b.descriptors.T
+        np.maximum(back, similarity.max(axis=0), out=back)
+        at = np.arange(len(similarity))
+        best[rows] = similarity.argmax(axis=1)
+        first[rows] = similarity[at, best[rows]]
+        similarity[at, best[rows]] = -1.0
+        second[rows] = similarity.max(axis=1)
     distinct = np.maximum(1.0 - first, 0.0) < RATIO**2 * (1.0 - second)  # squared distances over two
-    return np.stack([mutual, best[mutual]], axis=1)[distinct]
+    mutual = np.flatnonzero((first == back[best]) & distinct)
+    _, once = np.unique(best[mutual], return_index=True)  # two that are equally alike are one match
+    mutual = mutual[np.sort(once)]
+    return np.stack([mutual, best[mutual]], axis=1)
 
 
 def propose_pairs(features: list[Features], neighbors: int) -> list[tuple[int, int]]:
@@ -40,6 +49,21 @@ def propose_pairs(features: list[Features], neighbors: int) -> list[tuple[int, i
         chosen = {(min(i, int(j)), max(i, int(j))) for i in range(count) for j in nearest[i] if alike[i, j] > 0}
         upper = [pair for pair in upper if pair in chosen]
     return sorted(upper, key=lambda pair: (-alike[pair], pair))
+
+
+def near_pairs(places: list[np.ndarray | None], nearest: int) -> list[tuple[int, int]]:
+    """Pairs (i < j) of photographs of which one is among the `nearest` of the other, by their places (geodesy)."""
+    known = [n for n, place in enumerate(places) if place is not None]
+    if len(known) < 2:
+        return []
+    at = earth_centered(np.stack([place for place in places if place is not None]))
+    pairs = set()
+    for n, here in enumerate(at):
+        away = np.sum((at - here) ** 2, axis=1)
+        away[n] = np.inf
+        others = np.argsort(away, kind="stable")[: min(nearest, len(known) - 1)].tolist()
+        pairs |= {(min(known[n], known[m]), max(known[n], known[m])) for m in others}
+    return sorted(pairs)
 
 
 def likeness(features: list[Features]) -> np.ndarray:
@@ -62,4 +86,4 @@ def likeness(features: list[Features]) -> np.ndarray:
     return alike
 
 
-__all__ = ["likeness", "match", "propose_pairs"]
+__all__ = ["likeness", "match", "near_pairs", "propose_pairs"]

@@ -26,7 +26,8 @@ PLANE = 0.8  # of the matches: where one homography explains so many, they may l
 MIN_PHOTOGRAPHS = 3  # of a model
 AGAIN = 1.2  # times as many points of the map must a photograph see to be tried again
 GROWTH = 1.2  # of the number of photographs, between two adjustments of everything
-AROUND = 8  # photographs that a local adjustment moves
+AROUND = 6  # photographs that a local adjustment moves
+SETTLED = 1e-3  # of the observations: where fewer came or went, adjusting everything once more changes nothing
 ROUGH = 1e-3  # of the cost: a smaller gain ends an adjustment while the map still grows
 FOR_FOCAL, FOR_DISTORTION = 3, 5  # photographs, from which on these are estimated
 GRIDS = (2, 4, 8, 16)  # boxes along a side, over which a photograph's points are spread
@@ -95,10 +96,10 @@ class Reconstruction:
         while len(self.order) >= 2:
             chosen = self._next(left)
             if chosen is None:
-                if len(self.order) > self._adjusted:
-                    self._adjust_all()
                 if len(self.order) <= settled or not self._failed:
                     return
+                if len(self.order) > self._adjusted:
+                    self._adjust_all()
                 settled = len(self.order)
                 self._failed.clear()  # once more, against the mended map
                 continue
@@ -212,18 +213,25 @@ class Reconstruction:
 
     def _adjust_all(self, last: bool = False) -> None:
         """Everything moves; observations that miss are left out and come back, tracks without a point try again."""
-        for _ in range(3 if last else 2):
-            if len(self.order) < 2:
-                break
+        before = 0
+        for _ in range(2):
             use, _ = self._agreeing()
-            free = np.isfinite(self.poses[:, 0, 0])
-            free[self.order[0]] = False
-            self._solve(use, free, steps=25 if last else 10, lens=True, tolerance=1e-5 if last else ROUGH)
-            self._normalize()
-            self._forget()
-            self._drop()
-            self._triangulate(None)
+            if len(self.order) < 2 or abs(len(use) - before) < SETTLED * before:
+                break
+            before = len(use)
+            self._adjust(use, steps=10, tolerance=ROUGH)
+        if last and len(self.order) >= 2:
+            self._adjust(self._agreeing()[0], steps=25, tolerance=1e-5)
         self._adjusted = len(self.order)
+
+    def _adjust(self, use: np.ndarray, steps: int, tolerance: float) -> None:
+        free = np.isfinite(self.poses[:, 0, 0])
+        free[self.order[0]] = False
+        self._solve(use, free, steps, lens=True, tolerance=tolerance)
+        self._normalize()
+        self._forget()
+        self._drop()
+        self._triangulate(None)
 
     def _solve(self, use: np.ndarray, free: np.ndarray, steps: int, lens: bool, tolerance: float) -> None:
         views = len(self.order) if lens and self.free_lens else 0

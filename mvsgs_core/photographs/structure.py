@@ -13,7 +13,7 @@ from mvsgs_core.photographs.config import PhotographsConfig
 from mvsgs_core.photographs.features import Features, find_features
 from mvsgs_core.photographs.focal import BY_HOMOGRAPHY, focal_factor
 from mvsgs_core.photographs.lens import SharedLens
-from mvsgs_core.photographs.matching import match, propose_pairs
+from mvsgs_core.photographs.matching import EXHAUSTIVE, match, near_pairs, propose_pairs
 from mvsgs_core.photographs.reconstruction import Model, all_models
 from mvsgs_core.photographs.registration import register
 from mvsgs_core.photographs.tracks import Tracks, link
@@ -30,16 +30,26 @@ class Photographs:
     config: PhotographsConfig = field(default_factory=PhotographsConfig)
     stats: Stats = field(default_factory=Stats)
     features: list[Features] = field(default_factory=list)
+    pairs: Pairs = field(default_factory=dict)  # that were verified, once solved
     _intrinsics: list[np.ndarray] = field(default_factory=list)
     _sizes: list[tuple[int, int]] = field(default_factory=list)
+    _places: list[np.ndarray | None] = field(default_factory=list)
     _guessed: bool = False
 
-    def add(self, image: np.ndarray, intrinsics: np.ndarray, guessed: bool) -> None:
-        """An RGB image (H, W, 3) uint8 with (fx, fy, cx, cy); guessed: the focal length is not known at all."""
+    def add(
+        self, image: np.ndarray, intrinsics: np.ndarray, guessed: bool, place: np.ndarray | None = None,
+        mask: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        """An RGB image (H, W, 3) uint8 with (fx, fy, cx, cy); guessed: the focal length is not known at all.
+
+        place: (3,) latitude, longitude (degrees) and altitude (m), by GPS. mask: (H, W) bool, False where a pixel is to
+        be ignored.
+        """
         with self.stats.time("features"):
-            self.features.append(find_features(image, self.config.features))
+            self.features.append(find_features(image, self.config.features, mask))
         self._intrinsics.append(np.asarray(intrinsics, np.float64))
         self._sizes.append((image.shape[0], image.shape[1]))
+        self._places.append(place)
         self._guessed |= guessed
 
     def solve(self, mapped: np.ndarray | None = None) -> list[Model]:
@@ -50,7 +60,7 @@ class Photographs:
         if len(self.features) < 2:
             return []
         mapped = np.ones(len(self.features), bool) if mapped is None else mapped
-        pairs = self._pairs()
+        pairs = self.pairs = self._pairs()
         lens = SharedLens(np.stack(self._intrinsics))
         if self._guessed:
             lens = replace(lens, factor=self._focal_factor(pairs))
@@ -69,6 +79,9 @@ class Photographs:
         """The verified ones."""
         with self.stats.time("proposed pairs"):
             proposed = propose_pairs(self.features, self.config.neighbors)
+            alike = set(proposed)
+            near = near_pairs(self._places, self.config.near) if len(self.features) > EXHAUSTIVE else []
+            proposed += [pair for pair in near if pair not in alike]
         pairs: Pairs = {}
         for i, j in proposed:
             with self.stats.time("matching"):
@@ -77,6 +90,8 @@ class Photographs:
                 views = verify(self.features[i].points, self.features[j].points, matches)
             if views is not None:
                 pairs[i, j] = views
+        if any(place is not None for place in self._places):
+            self.stats.counts["pairs of photographs that only GPS proposed"] = len(proposed) - len(alike)
         self.stats.counts["pairs of photographs that were matched"] = len(proposed)
         self.stats.counts["pairs of photographs that agree with one geometry"] = len(pairs)
         return pairs

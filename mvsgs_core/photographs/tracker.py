@@ -14,6 +14,7 @@ from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photographs.config import PhotographsConfig
+from mvsgs_core.photographs.light import Light, Look
 from mvsgs_core.photographs.ordering import chain, covisibility
 from mvsgs_core.photographs.reconstruction import Model
 from mvsgs_core.photographs.structure import Photographs
@@ -43,9 +44,12 @@ class PhotographTracker:
     def __init__(self, config: PhotographsConfig) -> None:
         self.config = config
         self.stats = Stats()
+        if config.because:
+            self.stats.warn(config.because)
         self.nothing = ""
         self.phase = Phase.INITIALIZING
         self.photographs = Photographs(config, self.stats)
+        self.light = Light(self.stats)
         self._frames: list[tuple[int, float]] = []  # index and timestamp
         self._sizes: list[tuple[int, int]] = []
         self._models: list[Model] = []
@@ -53,10 +57,15 @@ class PhotographTracker:
         self._keyframes: dict[int, tuple[int, int]] = {}  # index -> model, photograph
         self.pending: set[int] = set()
 
-    def add(self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray, guessed: bool) -> Update:
-        """The next photograph. guessed: its focal length is not known at all."""
+    def add(
+        self, index: int, timestamp: float, image: np.ndarray, intrinsics: np.ndarray, guessed: bool, exposure: float,
+        place: np.ndarray | None = None, mask: np.ndarray | None = None,
+    ) -> Update:  # fmt: skip
+        """The next photograph. guessed: its focal length is not known at all. exposure, place, mask: as of
+        `msgs.Frame`."""
         self.stats.count("frames")
-        self.photographs.add(image, intrinsics, guessed)
+        self.photographs.add(image, intrinsics, guessed, place, mask)
+        self.light.looks.append(Look.of(image, intrinsics, exposure, self.config.area, mask))
         self._frames.append((index, timestamp))
         self._sizes.append((image.shape[0], image.shape[1]))
         self.pending.add(index)
@@ -112,13 +121,24 @@ class PhotographTracker:
             keyframe=np.isin(index, list(self._keyframes)),
             state=np.where(segment >= 0, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8),
             segment=segment,
+            exposure=self.light.exposures(),
+            vignetting=self.light.vignetting,
         )
+
+    def exposure(self, index: int) -> np.ndarray | None:
+        """(3, 4) float32 color affine of a keyframe, see `msgs`; None where exposures do not vary."""
+        return self.light.exposure(self._keyframes[index][1])
 
     def _solve(self) -> None:
         count = len(self._frames)
         held_out = np.array([self._is_held_out(n) for n in range(count)], bool)
         mapped = ~held_out if count - held_out.sum() >= 2 else np.ones(count, bool)
         self._models = self.photographs.solve(mapped)
+        posed = np.zeros(count, bool)
+        for model in self._models:
+            posed |= model.registered
+        with self.stats.time("photometry"):
+            self.light.solve(self.photographs.features, self.photographs.pairs, mapped, posed)
         missing = count - sum(int(model.registered.sum()) for model in self._models)
         if missing and len(self._models):
             self.stats.warn(f"photographs without a pose, too little of them matches the others: {missing} of {count}")

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from mvsgs_core import native
 from mvsgs_core.rasterizer.differentiable import Images, Rendered
-from mvsgs_core.rasterizer.interface import RenderSettings
+from mvsgs_core.rasterizer.interface import RenderSettings, SplatStep
+from mvsgs_core.rasterizer.splats import FIELDS
 
 
 def forward(settings: RenderSettings, parameters: list[Tensor]) -> tuple[Images, Rendered]:
@@ -62,6 +63,39 @@ def backward(
         on_opacity=on_opacity,
         on_splats=[gradient.numpy() for gradient in on_splats],
         on_means2d=on_means2d.numpy(),
+        on_pose=on_pose.numpy(),
+    )
+    return on_pose, refused
+
+
+def backward_step(
+    settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images,
+    on_images: tuple[Tensor, Tensor | None, Tensor | None], step: SplatStep,
+) -> tuple[Tensor, int]:  # fmt: skip
+    """See `SteppingBackEnd`."""
+    color, depth, opacity = (image.numpy() for image in images)
+    on_color, on_depth, on_opacity = (None if gradient is None else gradient.numpy() for gradient in on_images)
+    on_pose = torch.zeros(4, 4, dtype=torch.float64)
+    moved = [
+        (FIELDS.index(m.name), m.first.numpy(), m.second.numpy(), m.rate, m.final_rate, m.low, m.high, m.lead, m.tail)
+        for m in step.moved
+        if settings.exact or m.name != "betas"
+    ]
+    refused, step.refused = native.load("rasterizer").backward_step(
+        kept,
+        values=[parameter.numpy() for parameter in parameters],
+        color=color,
+        depth=depth,
+        opacity=opacity,
+        on_color=on_color,
+        on_depth=on_depth,
+        on_opacity=on_opacity,
+        moved=moved,
+        ages=step.ages.numpy(),
+        constants=step.constants,
+        decay_steps=step.decay_steps,
+        means2d_gradient=step.means2d_gradient.numpy(),
+        means2d_views=step.means2d_views.numpy(),
         on_pose=on_pose.numpy(),
     )
     return on_pose, refused

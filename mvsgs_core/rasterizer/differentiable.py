@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, means2d_leaf
+from mvsgs_core.rasterizer.interface import Backward, Render, RenderSettings, SplatStep, means2d_leaf
 from mvsgs_core.rasterizer.splats import Splats
 
 Images = tuple[Tensor, Tensor, Tensor]  # color (H, W, 3), depth (H, W), opacity (H, W)
@@ -39,6 +39,16 @@ class BackEnd(Protocol):
     ) -> tuple[Tensor | None, int | None]:  # fmt: skip
         """Fills on_splats and on_means2d from the gradients of the images, None: 0; returns that of the pose, and how
         many splats were refused, None: not counted."""
+
+
+class SteppingBackEnd(BackEnd, Protocol):
+    """One that can step the splats in the backward pass."""
+
+    def backward_step(
+        self, settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images,
+        on_images: tuple[Tensor, Tensor | None, Tensor | None], step: SplatStep,
+    ) -> tuple[Tensor, int]:  # fmt: skip
+        """As `backward`, but the parameters are changed as `step` says, and no gradient of theirs is kept."""
 
 
 class _Rasterize(torch.autograd.Function):
@@ -73,14 +83,52 @@ class _Rasterize(torch.autograd.Function):
         return (None, None, None, None, on_means2d, on_pose, *shared, on_betas if ctx.settings.exact else None)
 
 
+class _Stepped(torch.autograd.Function):
+    """(pose, fields of Splats) -> color, depth, opacity; the backward pass steps the fields, which get no gradient."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, back_end: SteppingBackEnd, settings: RenderSettings, rest: list[Rendered], report: Backward,
+        step: SplatStep, pose: Tensor, *splats: Tensor,
+    ) -> Images:  # fmt: skip
+        parameters = [tensor.detach() for tensor in splats]
+        images, rendered = back_end.forward(settings, parameters)
+        rest.append(rendered)
+        ctx.back_end, ctx.settings, ctx.kept, ctx.report, ctx.step = back_end, settings, rendered.kept, report, step
+        ctx.parameters = parameters  # not saved for autograd: they are changed on purpose
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*images)
+        return images
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        color, depth, opacity = ctx.saved_tensors
+        on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous() for g in gradients)
+        on_images = (torch.zeros_like(color) if on_color is None else on_color, on_depth, on_opacity)
+        on_pose, ctx.report.refused = ctx.back_end.backward_step(
+            ctx.settings, ctx.kept, ctx.parameters, (color, depth, opacity), on_images, ctx.step
+        )
+        return (None, None, None, None, None, on_pose, *[None] * len(ctx.parameters))
+
+
 def render(back_end: BackEnd, splats: Splats, settings: RenderSettings) -> Render:
     """See `rasterizer.rasterize`. Raises ValueError for a dtype or device that the back end does not take."""
     means2d, rest, report = means2d_leaf(splats, settings), list[Rendered](), Backward()
-    color, depth, opacity = _Rasterize.apply(
-        back_end, settings, rest, report, means2d, settings.pose, *splats.tensors().values()
-    )
+    images = _Rasterize.apply(back_end, settings, rest, report, means2d, settings.pose, *splats.tensors().values())
+    return _render(images, rest, report, means2d)
+
+
+def render_stepping(back_end: SteppingBackEnd, splats: Splats, settings: RenderSettings, step: SplatStep) -> Render:
+    """The same, its backward pass steps the splats, which are contiguous; `Render.means2d` is empty."""
+    rest, report = list[Rendered](), Backward()
+    images = _Stepped.apply(back_end, settings, rest, report, step, settings.pose, *splats.tensors().values())
+    return _render(images, rest, report, splats.means.new_zeros(0, 2))
+
+
+def _render(images: Images, rest: list[Rendered], report: Backward, means2d: Tensor) -> Render:
     (rendered,) = rest
     return Render(
-        color, depth, opacity, rendered.radii > 0, rendered.radii, means2d, rendered.weight_sum, rendered.weight_max,
+        *images, rendered.radii > 0, rendered.radii, means2d, rendered.weight_sum, rendered.weight_max,
         rendered.refused, report,
     )  # fmt: skip

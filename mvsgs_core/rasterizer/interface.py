@@ -37,6 +37,38 @@ class RenderSettings:
     threads: int  # 0 = as many as OpenMP would take
 
 
+@dataclass(frozen=True)
+class Moved:
+    """How a field of the splats is stepped: by Adam, at a rate that falls from `rate` to `final_rate`."""
+
+    name: str
+    first: Tensor  # moments, of the field's shape
+    second: Tensor
+    rate: float
+    final_rate: float
+    low: float  # values are kept inside
+    high: float
+    lead: int  # columns of the flattened field that take the full rate,
+    tail: float  # the others this fraction of it
+
+
+@dataclass
+class SplatStep:
+    """A step of Adam that the backward pass takes while it makes the gradients, which are then not kept.
+
+    Only splats that the image shows are stepped, each by its own age; one with a gradient or a step that is not finite
+    stays as it was.
+    """
+
+    moved: list[Moved]
+    ages: Tensor  # (N,) int32 steps of each splat so far; counted on
+    means2d_gradient: Tensor  # (N,) to which the length of `Render.means2d.grad` is added,
+    means2d_views: Tensor  # (N,) and 1, of the splats that the image shows
+    constants: tuple[float, float, float]  # beta 1, beta 2, epsilon
+    decay_steps: int  # of a splat, until the rate is final
+    refused: int = 0  # splats whose step was; the backward pass says it
+
+
 @dataclass
 class Backward:
     """What a backward pass refused; it fills this in when it runs."""

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from mvsgs_core.rasterizer import cpu, differentiable, kernels, reference, spherical_harmonics
-from mvsgs_core.rasterizer.interface import Render, RenderSettings
+from mvsgs_core.rasterizer.interface import Render, RenderSettings, SplatStep
 from mvsgs_core.rasterizer.splats import Splats
 
 __all__ = ["BACKENDS", "Render", "RenderSettings", "rasterize", "se3_exp"]
@@ -66,6 +66,7 @@ def rasterize(
     degree: int | None = None,
     weights: bool = False,
     threads: int | None = None,
+    step: SplatStep | None = None,
 ) -> Render:
     """Renders `splats` from a camera; differentiable in every tensor of `splats`, in the pose and in the exposure.
 
@@ -80,6 +81,8 @@ def rasterize(
     degree: highest degree of the spherical harmonics used; None = all that `splats.sh` has.
     weights: fill `Render.weight_sum` and `weight_max` (adds about a quarter to the forward pass).
     threads: of the "cpu" back end; None = all. The result is the same for every number.
+    step: that the backward pass takes, in place of gradients of the splats; of the "cpu" back end and any kernel but
+    "ges_scale".
     backend: "auto" takes "triton" on a GPU and "cpu" otherwise.
 
     Raises ValueError for shapes, dtypes, sizes or names that do not fit, ImportError if the back end is not there.
@@ -107,7 +110,9 @@ def rasterize(
         weights=weights,
         threads=threads or 0,
     )
-    render = _render(backend, splats, settings)
+    if step is not None and kernel == "ges_scale":
+        raise ValueError('kernel "ges_scale" cannot step the splats in the backward pass: it renders others')
+    render = _render(backend, splats, settings, step)
     if exposure is not None:
         if tuple(exposure.shape) != (3, 4):
             raise ValueError(f"exposure is {tuple(exposure.shape)}: expected (3, 4)")
@@ -125,9 +130,12 @@ def _exposed(color: Tensor, exposure: Tensor) -> Tensor:
     return torch.addcmul(lift, color, gains)
 
 
-def _render(backend: str, splats: Splats, settings: RenderSettings) -> Render:
-    if backend == "auto":
-        backend = "cpu" if splats.means.device.type == "cpu" else "triton"
+def _render(backend: str, splats: Splats, settings: RenderSettings, step: SplatStep | None) -> Render:
+    backend = chosen_backend(backend, splats.means.device)
+    if step is not None:
+        if backend != "cpu":
+            raise ValueError(f"backend {backend!r} cannot step the splats in the backward pass")
+        return differentiable.render_stepping(cpu, splats, settings, step)
     if backend == "reference":
         return reference.render(splats, settings)
     if backend == "cpu":
@@ -137,6 +145,13 @@ def _render(backend: str, splats: Splats, settings: RenderSettings) -> Render:
 
         return differentiable.render(triton_backend, splats, settings)
     raise ValueError(f"backend {backend!r}: choose one of {', '.join(BACKENDS)}")
+
+
+def chosen_backend(backend: str, device: torch.device) -> str:
+    """What "auto" means for splats on this device."""
+    if backend != "auto":
+        return backend
+    return "cpu" if device.type == "cpu" else "triton"
 
 
 def _pose(world_from_cam: Tensor | np.ndarray, delta: Tensor | None) -> Tensor:

@@ -49,3 +49,6 @@ class Splats:
         """No splats."""
         shapes = [(0, 3), (0, 3), (0, 4), (0,), (0, bases, 3), (0,)]
         return Splats(*(torch.zeros(shape, dtype=dtype) for shape in shapes))
+
+
+FIELDS = tuple(field.name for field in fields(Splats))

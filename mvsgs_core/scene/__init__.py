@@ -1,1 +1,1 @@
-"""The embedded scenes: a furnished room and a landscape, ray cast with exact poses and depth."""
+"""The embedded scenes: a furnished room, a landscape and a town, ray cast with exact poses and depth."""

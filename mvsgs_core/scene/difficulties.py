@@ -15,7 +15,7 @@ from .path import CameraPath
 class Difficulties:
     """Each switch and its strength; 0 is off. Frames count in the stream before start, stop and stride."""
 
-    textureless: int = 0  # bare walls, 0 to 4; in the landscape, quarters of the fields without texture
+    textureless: int = 0  # bare walls, 0 to 4; quarters of the fields, or of the fronts, without texture
     pure_rotation: int = 0  # frames during which the camera only turns, about its center
     pure_rotation_start: int = 0  # first of them
     rest: int = 0  # frames during which the camera stands perfectly still

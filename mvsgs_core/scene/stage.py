@@ -9,29 +9,31 @@ from typing import ClassVar
 import numpy as np
 
 from .. import geometry
-from . import aerial, room
+from . import aerial, room, town
+from .drive import TownPath
 from .lighting import Lighting
 from .materials import marbled
 from .patches import blob
 from .path import CameraPath, FlightPath, RoomPath
 from .renderer import SceneRenderer
 
-SCENES = ("room", "aerial")
+SCENES = ("room", "aerial", "town")
 
 
 @dataclass(frozen=True)
 class Stage:
     """A scene ready to be filmed."""
 
-    REACH: ClassVar[dict[str, float]] = {"room": 0.12, "aerial": 4.0}  # scene units of one unit of the ball's swing
+    # scene units of one unit of the ball's swing
+    REACH: ClassVar[dict[str, float]] = {"room": 0.12, "aerial": 4.0, "town": 0.25}
     name: str
     renderer: SceneRenderer
     path: CameraPath
     ball: SceneRenderer  # stands at its own origin
-    focus: np.ndarray  # (3,) the middle of where it moves, scene units; relative to the camera in the landscape
+    focus: np.ndarray  # (3,) the middle of where it moves, scene units; relative to the camera outdoors
 
     def world_from_ball(self, s: float, world_from_cam: np.ndarray) -> np.ndarray:
-        """Pose (4, 4) of the ball at frame s: it swings and bounces over the table, or flies ahead of the camera."""
+        """Pose (4, 4) of the ball at frame s: it swings and bounces over the table, or ahead of the camera."""
         swing = np.array([6.0 * np.sin(2.0 * np.pi * s / 90.0), 4.5 * np.sin(2.0 * np.pi * s / 127.0), 0.0])
         swing[2] = 4.0 * abs(np.sin(2.0 * np.pi * s / 34.0))
         pose = np.eye(4)
@@ -39,6 +41,8 @@ class Stage:
         pose[:3, 3] = self.focus + self.REACH[self.name] * swing
         if self.name == "aerial":
             pose[:2, 3] += world_from_cam[:2, 3]
+        elif self.name == "town":
+            pose[:2, 3] += world_from_cam[:2, 3] + 9.0 * world_from_cam[:2, 2]
         return pose
 
 
@@ -47,6 +51,8 @@ def renderer_of(scene: str, seed: int, textureless: int) -> SceneRenderer:
     """The scene built and lit; the same object for the same arguments."""
     if scene == "aerial":
         return SceneRenderer(aerial.build(seed, textureless), aerial.LIGHTING, seed)
+    if scene == "town":
+        return SceneRenderer(town.build(seed, textureless), town.LIGHTING, seed)
     return SceneRenderer(room.build(seed, textureless), room.LIGHTING, seed)
 
 
@@ -70,4 +76,6 @@ def stage(scene: str, seed: int, textureless: int, loop_frames: int | None, movi
     if scene == "aerial":
         path: CameraPath = FlightPath(seed, loop_frames)
         return Stage(scene, renderer, path, ball_of(5.0 * size, seed), np.array([0.0, 30.0, 15.0]))
+    if scene == "town":
+        return Stage(scene, renderer, TownPath(seed, loop_frames), ball_of(0.5 * size, seed), np.array([0.0, 0.0, 0.8]))
     return Stage(scene, renderer, RoomPath(seed, loop_frames), ball_of(0.13 * size, seed), np.array([2.6, 2.2, 1.1]))

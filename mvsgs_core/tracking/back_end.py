@@ -18,6 +18,7 @@ class BackEndConfig:
     max_error: float = 1.0  # pixels: edges that the map contradicts by more are matched again
     steps: int = 10  # of each global bundle adjustment
     robust_scales: tuple[float, ...] = (4.0, 1.0, 0.5)  # pixels, one bundle adjustment each
+    max_keyframes: int = 300  # that are adjusted at once: a larger map is in blocks, its neighbors held
 
 
 class BackEnd:
@@ -40,13 +41,13 @@ class BackEnd:
         for other in self.local_map.nearby(index, others, self.config.max_edges, apart=1):
             if (index, other) not in self.graph.edges:
                 matched += 1
-                self.local_map.match_edge(index, other, enough=0.0)
+                self.local_map.match_edge(index, other)
         return matched
 
     def rematch_edges(self, index: int) -> int:
         """Matches again the edges from one keyframe that its poses and depths no longer agree with."""
         matched = 0
-        for source, to in [pair for pair in self.graph.edges if pair[0] == index]:
+        for source, to in [pair for pair in self.graph.edges.of([index]) if pair[0] == index]:
             edge = self.graph.edges[source, to]
             expected, inside = self.graph.predict(source, to)
             seen = (edge.weight > 0) & inside
@@ -77,19 +78,41 @@ class BackEnd:
         solutions = []
         for scale in self.config.robust_scales:
             solver = Solver(steps=self.config.steps, robust_scale=scale, lm=1e-5, threads=self.threads)
-            solution = self.graph.optimize(members, set(members[1:]), set(members), solver)
-            solutions.append(solution)
+            for block in self._blocks(members):
+                around = self.graph.edges.reached(block) & set(members)
+                solutions.append(self.graph.optimize(around, set(block) - {members[0]}, set(block), solver))
         self.graph.rescale(members, self._median_inverse_depth(members) / before)
         return solutions
 
     def step(self, segment: int) -> Solution:
-        """One step of global bundle adjustment: background work between keyframes."""
+        """One step of global bundle adjustment, of a large map around its newest keyframe: background work."""
         members = self.local_map.members(segment)
+        if len(members) > self.config.max_keyframes:
+            return self._step_around(members)
         before = self._median_inverse_depth(members)
         solver = Solver(steps=1, robust_scale=1.0, lm=1e-5, threads=self.threads)
         solution = self.graph.optimize(members, set(members[1:]), set(members), solver)
         self.graph.rescale(members, self._median_inverse_depth(members) / before)
         return solution
+
+    def _step_around(self, members: list[int]) -> Solution:
+        """One step of the keyframes that the fewest edges lead to from the newest; those around them are held."""
+        block, among = {members[-1]}, set(members)
+        while True:
+            around = self.graph.edges.reached(block) & among
+            if len(around) > self.config.max_keyframes or around == block:
+                break
+            block = around
+        solver = Solver(steps=1, robust_scale=1.0, lm=1e-5, threads=self.threads)
+        return self.graph.optimize(around, block - {members[0]}, block, solver)
+
+    def _blocks(self, members: list[int]) -> list[list[int]]:
+        """All at once, or of a large map so many after another, each with half of those of the one before."""
+        size = self.config.max_keyframes
+        if len(members) <= size:
+            return [members]
+        starts = range(0, len(members) - size // 2, size // 2)
+        return [members[start : start + size] for start in starts]
 
     def _median_inverse_depth(self, members: list[int]) -> float:
         return float(np.median([1.0 / self.graph.keyframes[index].median_depth for index in members]))

@@ -40,6 +40,7 @@ class FramesBetween:
         self.solver = Solver(steps=8, threads=threads)
         self._complete: dict[int, tuple[TrackingImage, FrameRecord]] = {}  # of keyframes that are not solved yet
         self._newest: dict[int, tuple[TrackingImage, FrameRecord]] = {}  # since the last keyframe
+        self._ended: dict[int, tuple[TrackingImage, FrameRecord]] = {}  # those of `_complete` that came last
 
     @property
     def waiting(self) -> set[int]:
@@ -57,16 +58,20 @@ class FramesBetween:
     def end(self) -> None:
         """A keyframe, which is still to be solved: others follow."""
         self._complete |= self._newest
-        self._newest = {}
+        self._ended, self._newest = self._newest, {}
 
     def forget(self) -> None:
         """The keyframes that they are between are given up."""
-        self._complete, self._newest = {}, {}
+        self._complete, self._newest, self._ended = {}, {}, {}
+
+    def reopen(self) -> None:
+        """What was to be a keyframe is none: the frames wait for the next one."""
+        self._complete = {index: frame for index, frame in self._complete.items() if index not in self._ended}
+        self._newest, self._ended = self._ended | self._newest, {}
 
     def close(self) -> frozenset[int]:
-        """The next keyframe is there: what waited for it is to be settled."""
-        closed = frozenset(self.waiting)
-        self.forget()
+        """The keyframes that the frames were to `end` at are solved: what waited for them is to be settled."""
+        closed, self._complete, self._ended = frozenset(self._complete), {}, {}
         return closed
 
     def settle(

@@ -42,11 +42,12 @@ class BothSides:
 
     def settle(self, keyframes: Sequence[int]) -> list[Callable[[], bool]]:
         """What poses the frames that wait, now that the graph has these keyframes, in order: each says if it could."""
-        waiting, self._waiting = self._waiting, {}
+        waiting = {index: frame for index, frame in self._waiting.items() if index < keyframes[-1]}
+        self._waiting = {index: frame for index, frame in self._waiting.items() if index > keyframes[-1]}
         return [
             partial(self._pose, image, record, next(k for k in keyframes if k > index))
             for index, (image, record) in waiting.items()
-            if index < keyframes[-1] and index not in self.graph.keyframes
+            if index not in self.graph.keyframes
         ]
 
     def _pose(self, image: TrackingImage, record: FrameRecord, after: int) -> bool:

@@ -44,7 +44,7 @@ class TrackerConfig(KeyframeTrackingConfig):
 
     readout_time: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
     loops: bool = True  # old keyframes are looked for by appearance
-    realtime: bool = False  # frames between keyframes are posed again as there is time, not before the next frame
+    realtime: bool = False  # keyframes are worked on as there is time, not before the next frame
     frames_between: int = 8  # frames between two keyframes, at most, that the map is trained on, too; 0: none
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
     min_texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use

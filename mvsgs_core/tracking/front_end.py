@@ -72,6 +72,19 @@ class FrontEnd:
         self.propagated = np.where(alive[:, None], matches.target, near)
         self.last, self.pose = image, pose
 
+    def move_to(self, reference: TrackingImage, pose: np.ndarray) -> Step | None:
+        """The last frame is followed from another keyframe from here on, whose pose (4, 4) is near its own.
+
+        None, and the keyframe is the last frame, where it can't be. The images alone say where points are looked for:
+        the depths of many are hardly known, and a wrong match would be followed on.
+        """
+        image = self.last
+        assert image is not None
+        self.refer_to(reference)
+        self.pose = pose
+        self.follow(image, with_pose=True)
+        return self.step
+
     def follow(self, image: TrackingImage, with_pose: bool) -> Step:
         """Finds the reference's points in the next frame, and its pose where there is a map."""
         assert self.reference is not None

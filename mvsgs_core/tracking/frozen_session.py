@@ -28,8 +28,37 @@ class FrozenSession(Session):
         self, config: TrackerConfig, stats: Stats, size: tuple[int, int], intrinsics: np.ndarray, guessed: bool
     ) -> None:
         """As of `Session`; a map must be given before the first frame, see `go_on`."""
-        every = replace(config.covisibility, min_keyframes=0, min_age=0)  # any keyframe of the map may be followed
-        super().__init__(replace(config, covisibility=every), stats, size, intrinsics, guessed)
+        super().__init__(config, stats, size, intrinsics, guessed)
+        self._follow_any()
+
+    @classmethod
+    def of(cls, session: Session) -> FrozenSession:
+        """A session's parts at work here from the next frame on; there must be a map.
+
+        What waits for a keyframe to come is let go, and so are first keyframes that no map was made of.
+        """
+        frozen = cls.__new__(cls)
+        vars(frozen).update(vars(session))
+        frozen.waiting.forget()
+        frozen._tail = {}
+        if frozen.phase is Phase.INITIALIZING:
+            frozen.initializer.abandon()
+            frozen.front_end.reference = None
+            frozen.phase = Phase.RELOCALIZING
+        frozen._follow_any()
+        return frozen
+
+    def thawed(self) -> Session:
+        """The parts at work in a session whose map grows, from the next frame on."""
+        session = Session.__new__(Session)
+        vars(session).update(vars(self))
+        session.covisible_keyframes.config = self.config.covisibility
+        session.relocalizer.found()  # patience begins anew
+        return session
+
+    def _follow_any(self) -> None:
+        """Any keyframe of the map may be followed."""
+        self.covisible_keyframes.config = replace(self.config.covisibility, min_keyframes=0, min_age=0)
 
     @property
     def pending(self) -> set[int]:

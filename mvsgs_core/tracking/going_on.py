@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.known_map import KnownMap
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.session import Session
+from mvsgs_core.trajectory import TrackingState
 
 MAX_OFFSET = 0.01  # of the image's width: by which a camera's rays may miss those of the map's camera
 LOST_AT_FIRST = "frames before the camera was found in the map"
@@ -35,7 +37,11 @@ def go_on(session: Session, known: KnownMap) -> None:
     session.photometer.update()
     for keyframe in known.keyframes:
         session.loops.add(keyframe.index)
-        session.publisher.known(keyframe.index, known.exposures.get(keyframe.index))
+        scale = known.scales.get(keyframe.index, 1.0)
+        session.publisher.known(keyframe.index, known.exposures.get(keyframe.index), scale)
+        if keyframe.index >= 0:  # of this stream, which a tracker before this one followed so far
+            record = FrameRecord(keyframe.index, keyframe.image.timestamp, TrackingState.TRACKED)
+            session.records.append(record)
         keyframe.image.release()
     session.publisher.known_vignetting(known.published_vignetting)
     session.covisible_keyframes.known(graph.keyframes)

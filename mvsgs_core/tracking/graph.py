@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mvsgs_core import geometry
+from mvsgs_core.tracking.edges import Edge, Edges
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
@@ -47,16 +48,6 @@ class Keyframe:
         return float(1.0 / np.median(self.inverse_depth[known] if known.sum() > 10 else self.inverse_depth))
 
 
-@dataclass
-class Edge:
-    """Where the points of one keyframe were found in another."""
-
-    target: np.ndarray  # (2, M) float32, 0 where lost
-    weight: np.ndarray  # (M,) float16, 0 to 1
-    shift: np.ndarray  # (2, M) float16 pixels by which a second of readout time moves the target
-    fraction: float  # of the textured points that were found
-
-
 class KeyframeGraph:
     """Keyframes in the order of their indices, and directed edges by their positions in that order."""
 
@@ -66,14 +57,14 @@ class KeyframeGraph:
         self.readout_time = 0.0  # seconds that the camera needs for an image, from the first row to the last
         self.vignetting = np.zeros(3)  # of log V = l1 r² + l2 r⁴ + l3 r⁶, as far as it is known
         self.keyframes: dict[int, Keyframe] = {}  # by frame index
-        self.edges: dict[tuple[int, int], Edge] = {}  # by frame indices
+        self.edges = Edges()  # by frame indices
 
     def add(self, keyframe: Keyframe) -> None:
         self.keyframes[keyframe.index] = keyframe
 
     def remove(self, index: int) -> None:
         del self.keyframes[index]
-        for pair in [pair for pair in self.edges if index in pair]:
+        for pair in self.edges.of([index]):
             del self.edges[pair]
 
     def connect(self, source: int, to: int, matches: Matches, min_fraction: float) -> bool:
@@ -88,7 +79,7 @@ class KeyframeGraph:
         return True
 
     def neighbors(self, index: int) -> set[int]:
-        return {b if a == index else a for a, b in self.edges if index in (a, b)}
+        return self.edges.reached([index]) - {index}
 
     def predict(self, source: int, to: int) -> tuple[np.ndarray, np.ndarray]:
         """Where the points of `source` should be seen in `to`: (M, 2), NaN behind it; and inside the image (M,)."""
@@ -125,7 +116,7 @@ class KeyframeGraph:
         number = {index: n for n, index in enumerate(order)}
         pairs = [
             (a, b)
-            for a, b in self.edges
+            for a, b in self.edges.of(free_poses | free_depths)
             if a in number and b in number and (a in free_poses or b in free_poses or a in free_depths)
         ]
         frames = [self.keyframes[index] for index in order]

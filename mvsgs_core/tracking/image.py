@@ -8,12 +8,13 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from mvsgs_core.camera import fit_size, resize_image
+from mvsgs_core.camera import fit_size, mask_at, resize_image, shrunk
 from mvsgs_core.tracking.estimation.gray_levels import Levels, Samples
 
 CELL = 8  # pixels: one point a cell
 BORDER = 24  # pixels around every pyramid level, so that windows need no bounds checks
 LEVELS = 4
+MASK_MARGIN = 4  # pixels beside a masked one where no point lies: half of a window
 
 
 @dataclass(frozen=True)
@@ -36,20 +37,24 @@ class TrackingImage:
     half_color: np.ndarray | None = None  # (H / 2, W / 2, 3) uint8 RGB: what is known of the light; None: nothing
     exposure: float = 0.0  # see `msgs.Frame`
     velocity: np.ndarray | None = None  # (H / 8, W / 8, 2) float32 pixels a second, where it is known
+    mask: np.ndarray | None = None  # (H, W) bool: where points may lie; None: everywhere
     _features: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     @staticmethod
     def of(
-        index: int, timestamp: float, image: np.ndarray, size: tuple[int, int], color: bool, exposure: float = 0.0
-    ) -> TrackingImage:
-        """From an RGB image of any size."""
+        index: int, timestamp: float, image: np.ndarray, size: tuple[int, int], color: bool, exposure: float = 0.0,
+        mask: np.ndarray | None = None,
+    ) -> TrackingImage:  # fmt: skip
+        """From an RGB image of any size, and a mask (bool) of any size: False where a pixel is to be ignored."""
         if size[0] > image.shape[0]:  # cubic: linear interpolation blurs at every other pixel
             resized = np.asarray(cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_CUBIC))
         else:
             resized = resize_image(image, size)
         gray = cv2.cvtColor(resized, cv2.COLOR_RGB2GRAY)
         half = np.asarray(cv2.resize(resized, (size[1] // 2, size[0] // 2), interpolation=cv2.INTER_AREA))
-        return TrackingImage(index, timestamp, gray, resized if color else None, half, exposure)
+        seen = mask_at(mask, size)
+        seen = None if seen is None else shrunk(seen, MASK_MARGIN)
+        return TrackingImage(index, timestamp, gray, resized if color else None, half, exposure, mask=seen)
 
     def bare(self) -> TrackingImage:
         """The same with nothing computed yet: what is kept of a frame that may not be needed again."""
@@ -77,12 +82,14 @@ class TrackingImage:
 
     @cached_property
     def cells(self) -> Cells:
-        return find_cells(self.gray)
+        return find_cells(self.gray, mask=self.mask)
 
     @cached_property
     def levels(self) -> Levels | None:
         """Gray levels for photometry, where colors are known."""
-        return None if self.half_color is None else Levels(self.half_color)
+        if self.half_color is None:
+            return None
+        return Levels(self.half_color, mask_at(self.mask, self.half_color.shape[:2]))
 
     @cached_property
     def flat_places(self) -> tuple[np.ndarray, Samples]:
@@ -101,6 +108,15 @@ class TrackingImage:
         u = np.clip(at[:, 0] / CELL, 0, columns - 1).astype(int)
         return np.asarray(self.velocity[v, u] * (at[:, 1:] / self.size[0] - 0.5))
 
+    def masked(self, points: np.ndarray) -> np.ndarray:
+        """(N,) bool: which points (N, 2) lie where nothing is to be seen; points outside, or NaN, do not."""
+        if self.mask is None:
+            return np.zeros(len(points), dtype=bool)
+        with np.errstate(invalid="ignore"):
+            inside = np.all((points > -0.5) & (points < [self.size[1] - 0.5, self.size[0] - 0.5]), axis=1)
+        u, v = np.rint(np.where(inside[:, None], points, 0.0)).astype(int).T
+        return np.asarray(inside & ~self.mask[v, u])
+
     @cached_property
     def cell_shutter(self) -> np.ndarray:
         """`shutter` of the cells' points (M, 2)."""
@@ -110,7 +126,8 @@ class TrackingImage:
         """ORB keypoints (N, 2) float32 and descriptors (N, 32) uint8."""
         if self._features is None:
             orb = cv2.ORB.create(nfeatures=count, scaleFactor=1.2, nlevels=6, fastThreshold=7)
-            keypoints, descriptors = orb.detectAndCompute(self.gray, None)
+            seen = None if self.mask is None else self.mask.astype(np.uint8)
+            keypoints, descriptors = orb.detectAndCompute(self.gray, seen)
             if descriptors is None:
                 self._features = np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
             else:
@@ -133,10 +150,11 @@ def tracking_size(height: int, width: int, area: int) -> tuple[int, int]:
     return fit_size(round(height * factor), round(width * factor), area)
 
 
-def find_cells(gray: np.ndarray, noise: float = 20.0) -> Cells:
+def find_cells(gray: np.ndarray, noise: float = 20.0, mask: np.ndarray | None = None) -> Cells:
     """Points and their information matrices, from the structure tensor (mean over 7x7 pixels).
 
-    noise: squared gradient (gray levels² per pixel²) at which a direction counts half.
+    noise: squared gradient (gray levels² per pixel²) at which a direction counts half. mask: (H, W) bool, False where
+    no point is to lie.
     """
     height, width = gray.shape
     image = cv2.GaussianBlur(gray, (3, 3), 0).astype(np.float32)
@@ -151,6 +169,8 @@ def find_cells(gray: np.ndarray, noise: float = 20.0) -> Cells:
     score = smallest + 0.05 * (half_trace + root)
     score[:3] = score[-3:] = 0.0
     score[:, :3] = score[:, -3:] = 0.0
+    if mask is not None:
+        score[~mask] = -1.0
     rows, columns = height // CELL, width // CELL
     tiles = score.reshape(rows, CELL, columns, CELL).transpose(0, 2, 1, 3).reshape(rows * columns, CELL * CELL)
     best = np.argmax(tiles, axis=1)
@@ -163,7 +183,8 @@ def find_cells(gray: np.ndarray, noise: float = 20.0) -> Cells:
     det = a * c - b * b
     information = np.stack([1.0 - noise * c / det, noise * b / det, 1.0 - noise * a / det], axis=1)
     points = np.stack([u, v], axis=1).astype(np.float32)
-    return Cells(points, information, (largest > noise) & (smallest[v, u] > 0.05 * noise))
+    textured = (largest > noise) & (smallest[v, u] > 0.05 * noise)
+    return Cells(points, information, textured if mask is None else textured & mask[v, u])
 
 
 __all__ = ["BORDER", "CELL", "LEVELS", "Cells", "TrackingImage", "find_cells", "tracking_size"]

@@ -13,6 +13,7 @@ from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches, propagate
 from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.steps import Steps, whole
 
 
 @dataclass(frozen=True)
@@ -55,13 +56,17 @@ class Initializer:
 
     def add(self, image: TrackingImage, segment: int, matches: Matches | None = None) -> None:
         """One more keyframe. matches: where the last one's points were found in it."""
+        whole(self.adding(image, segment, matches))
+
+    def adding(self, image: TrackingImage, segment: int, matches: Matches | None = None) -> Steps[None]:
+        """`add`, an edge a step."""
         ones = np.ones(len(image.cells.points))
         earlier = list(self.waiting)
         self.graph.add(Keyframe(image, np.eye(4), ones, 0.0 * ones, segment))
         self.waiting.append(image.index)
         self.diagnosis.waiting(len(self.waiting))
         if matches is not None and earlier:
-            self._connect(image, earlier, matches)
+            yield from self._connecting(image, earlier, matches)
 
     def abandon(self) -> None:
         """Forgets the waiting keyframes."""
@@ -93,7 +98,7 @@ class Initializer:
         self.waiting = []
         return True
 
-    def _connect(self, image: TrackingImage, earlier: list[int], matches: Matches) -> None:
+    def _connecting(self, image: TrackingImage, earlier: list[int], matches: Matches) -> Steps[None]:
         """Edges both ways with the keyframes before, the guesses chained from one to the next."""
         fraction = self.config.min_fraction
         points = image.cells.points.astype(np.float64)
@@ -111,12 +116,14 @@ class Initializer:
                 there = propagate(near[matches.alive], (matches.target - near)[matches.alive], hop)
                 guess = propagate(start[seen], there - start[seen], start)
                 forward, _ = self.matcher.match(old, image, guess, fraction)
+                yield
             self.graph.connect(index, image.index, forward, fraction)
             if forward.alive.sum() < 30:
                 continue
             at = forward.target[forward.alive]
             guess = propagate(at, old.cells.points[forward.alive] - at, points)
             self.graph.connect(image.index, index, self.matcher.match(image, old, guess, fraction)[0], fraction)
+            yield
 
 
 __all__ = ["InitializationConfig", "Initializer"]

@@ -36,17 +36,27 @@ class KeyframeChoice:
         """Whether the image has changed enough since the reference. limit: largest flow, as a fraction of the width."""
         return step.flow > limit * width or step.fraction < self.config.min_fraction
 
+    def saw(self, step: Step) -> None:
+        """A frame that becomes no keyframe, however much it moved."""
+        self._before = (step.reference, step.flow, step.fraction)
+
     def wants(self, index: int, step: Step, width: int, limit: float) -> bool:
         """Whether frame `index` becomes a keyframe. limit: as of `moved`."""
         known, flow, fraction = self._before
         flow, fraction = (flow, fraction) if known == step.reference else (0.0, 1.0)
-        self._before = (step.reference, step.flow, step.fraction)
+        self.saw(step)
         if not self.moved(step, width, limit):
             return False
         if not is_held_out(index):
             return True
-        late = 2.0 * step.flow - flow > LATE_FLOW * limit * width
-        return late or 2.0 * step.fraction - fraction < LATE_FRACTION * self.config.min_fraction
+        return self._late(2.0 * step.flow - flow, 2.0 * step.fraction - fraction, width, limit)
+
+    def is_late(self, step: Step, width: int, limit: float) -> bool:
+        """Whether the frames after this one may be lost without a keyframe. limit: as of `moved`."""
+        return self._late(step.flow, step.fraction, width, limit)
+
+    def _late(self, flow: float, fraction: float, width: int, limit: float) -> bool:
+        return flow > LATE_FLOW * limit * width or fraction < LATE_FRACTION * self.config.min_fraction
 
     def shows_new(self, step: Step, width: int) -> bool:
         """Whether the last frame of a stream shows enough that its reference does not."""

@@ -6,7 +6,7 @@ others; what is computed from the image (points, features) is computed again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from mvsgs_core.tracking.graph import Edge, Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import CELL, TrackingImage
 from mvsgs_core.tracking.publish import Publisher
 
-FORMAT, VERSION = "mvsgs tracker", 1
+FORMAT, VERSION = "mvsgs tracker", 2
 WHAT = "tracker's half of a map"
 
 
@@ -34,13 +34,15 @@ class KnownMap:
     keyframes: list[Keyframe]  # in the order of the stream
     exposures: dict[int, np.ndarray]  # (3, 4) as readers have them, by keyframe; none where light was steady
     edges: dict[tuple[int, int], Edge]
+    # by keyframe, depths over those when it was first published, for who goes on in the same run; none: 1
+    scales: dict[int, float] = field(default_factory=dict)
 
     @property
     def segments(self) -> set[int]:
         return {keyframe.segment for keyframe in self.keyframes}
 
     def renumbered(self, frames: int) -> KnownMap:
-        """The same, of frames whose indices are so many lower."""
+        """The same for another run, of frames whose indices are so many lower."""
         keyframes = [_renumbered(keyframe, frames) for keyframe in self.keyframes]
         exposures = {index - frames: exposure for index, exposure in self.exposures.items()}
         edges = {(a - frames, b - frames): edge for (a, b), edge in self.edges.items()}
@@ -80,12 +82,16 @@ def save(file: Path, graph: KeyframeGraph, publisher: Publisher, vignetting: np.
         "velocity": _stacked([i.velocity for i in images], (height // CELL, width // CELL, 2), np.float32, np.nan),
         "light": np.array([image.exposure for image in images], np.float64),
         "exposure": _stacked([publisher.exposure(index) for index in order], (3, 4), np.float32, np.nan),
+        "scale": np.array([publisher.scale(index) for index in order], np.float64),
         "edges": np.array(pairs, np.int64).reshape(-1, 2),
         "target": np.array([edge.target for edge in edges], np.float32).reshape(-1, 2, points),
         "weight": np.array([edge.weight for edge in edges], np.float16).reshape(-1, points),
         "shift": np.array([edge.shift for edge in edges], np.float16).reshape(-1, 2, points),
         "fraction": np.array([edge.fraction for edge in edges], np.float64),
     }
+    if any(image.mask is not None for image in images):
+        whole = np.ones((height, width), bool)
+        arrays["mask"] = np.stack([whole if image.mask is None else image.mask for image in images])
     meta = {"size": [height, width], "readout_time": graph.readout_time}
     file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(file) as aside:
@@ -131,7 +137,11 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
     half_color = _all_or_none(arrays, "half_color", count, (height // 2, width // 2, 3), np.uint8)
     color = _all_or_none(arrays, "color", count, (height, width, 3), np.uint8)
     velocity = _all_or_none(arrays, "velocity", count, (height // CELL, width // CELL, 2), np.float32)
+    mask = _all_or_none(arrays, "mask", count, (height, width), np.bool_) if "mask" in arrays else [None] * count
     exposure = _all_or_none(arrays, "exposure", count, (3, 4), np.float32)
+    scale = arrays.take("scale", np.float64, (count,))
+    if (scale <= 0).any():
+        raise ValueError("its keyframes have scales that are none")
     published_vignetting = arrays.take("published_vignetting", np.float64, (3,))
     exposures = {int(k): e for k, e in zip(index, exposure) if e is not None}
     if not all(is_exposure(e) for e in exposures.values()) or not is_vignetting(published_vignetting):
@@ -139,7 +149,8 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
     keyframes = [
         Keyframe(
             TrackingImage(
-                int(index[k]), float(timestamp[k]), gray[k], color[k], half_color[k], float(light[k]), velocity[k]
+                int(index[k]), float(timestamp[k]), gray[k], color[k], half_color[k], float(light[k]), velocity[k],
+                mask[k],
             ),
             poses[k].copy(), inverse_depth[k].copy(), information[k].copy(), int(segment[k]),
         )
@@ -148,8 +159,9 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
     edges = _edges(arrays, set(index.tolist()), points)
     vignetting = arrays.take("vignetting", np.float64, (3,)).copy()
     return KnownMap(
-        (height, width), intrinsics.copy(), readout_time, vignetting, published_vignetting, keyframes, exposures, edges
-    )
+        (height, width), intrinsics.copy(), readout_time, vignetting, published_vignetting, keyframes, exposures, edges,
+        dict(zip(index.tolist(), scale.tolist())),
+    )  # fmt: skip
 
 
 def _edges(arrays: Arrays, keyframes: set[int], points: int) -> dict[tuple[int, int], Edge]:
@@ -191,7 +203,7 @@ def _unknown(value: np.ndarray) -> bool:
 
 def _renumbered(keyframe: Keyframe, frames: int) -> Keyframe:
     i = keyframe.image
-    image = TrackingImage(i.index - frames, i.timestamp, i.gray, i.color, i.half_color, i.exposure, i.velocity)
+    image = TrackingImage(i.index - frames, i.timestamp, i.gray, i.color, i.half_color, i.exposure, i.velocity, i.mask)
     return Keyframe(image, keyframe.cam_from_world, keyframe.inverse_depth, keyframe.information, keyframe.segment)
 
 

@@ -12,6 +12,10 @@ from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.steps import Steps, whole
+
+FEW = 256  # keyframes of which the flow to each is computed; of more, to those within reach
+REACH = 5.0  # median depths of the scene
 
 
 @dataclass(frozen=True)
@@ -41,10 +45,17 @@ class LocalMap:
         self, image: TrackingImage, cam_from_world: np.ndarray, segment: int, matches: dict[int, Matches]
     ) -> Keyframe:
         """Adds a keyframe with its pose; `matches`: points of older keyframes, by index, found in it."""
+        return whole(self.inserting(image, cam_from_world, segment, matches))
+
+    def inserting(
+        self, image: TrackingImage, cam_from_world: np.ndarray, segment: int, matches: dict[int, Matches]
+    ) -> Steps[Keyframe]:
+        """`insert`, an edge a step."""
         inverse_depth = self._propagate_depth(image, cam_from_world, matches)
         keyframe = Keyframe(image, cam_from_world, inverse_depth, np.zeros(len(inverse_depth)), segment)
         earlier = self.members(segment)
         self.graph.add(keyframe)
+        yield
         recent, proximity = earlier[-self.config.recent :], self.config.proximity
         if not set(matches) <= set(recent):  # the camera was followed from an old keyframe: the newest are elsewhere
             recent, proximity = sorted(matches), proximity + self.config.recent - len(matches)
@@ -53,25 +64,35 @@ class LocalMap:
                 self.graph.connect(index, image.index, matches[index], self.config.min_fraction)
             else:
                 self.match_edge(index, image.index)
+                yield
             self.match_edge(image.index, index)
+            yield
         for index in self.nearby(image.index, [i for i in earlier if i not in recent], proximity):
             self.match_edge(image.index, index)
+            yield
             self.match_edge(index, image.index)
+            yield
         return keyframe
 
     def members(self, segment: int) -> list[int]:
         return sorted(index for index, k in self.graph.keyframes.items() if k.segment == segment)
 
-    def match_edge(self, source: int, to: int, enough: float | None = None) -> bool:
-        """Matches an edge from where the map says the points should be."""
-        guess, _ = self.graph.predict(source, to)
+    def match_edge(self, source: int, to: int) -> bool:
+        """Matches an edge from where the map says the points should be; not one that too few can be seen along.
+
+        Features could only find what contradicts the map: they are for a pose that is not known.
+        """
+        guess, inside = self.graph.predict(source, to)
+        textured = self.graph.keyframes[source].image.cells.textured
+        if (inside & textured).sum() < self.config.min_fraction * textured.sum():
+            return False
         a, b = self.graph.keyframes[source].image, self.graph.keyframes[to].image
-        matches, _ = self.matcher.match(a, b, guess, self.config.min_fraction if enough is None else enough)
+        matches, _ = self.matcher.match(a, b, guess, 0.0)
         return self.graph.connect(source, to, matches, self.config.min_fraction)
 
     def nearby(self, index: int, candidates: list[int], count: int, apart: int = 2) -> list[int]:
         """Keyframes that see the same from close by: smallest mean flow first, no two next to each other in time."""
-        flows = self.graph_flow(index, candidates)
+        flows = self.graph_flow(index, self._within_reach(index, candidates))
         limit = self.config.proximity_flow * self.graph.keyframes[index].image.size[1]
         order = {candidate: n for n, candidate in enumerate(candidates)}
         chosen: list[int] = []
@@ -81,6 +102,17 @@ class LocalMap:
             if all(abs(order[candidate] - order[c]) >= apart for c in chosen):
                 chosen.append(candidate)
         return chosen
+
+    def _within_reach(self, index: int, candidates: list[int]) -> list[int]:
+        """Of many keyframes those whose flow may be small at all: not far away, not turned away."""
+        if len(candidates) <= FEW:
+            return candidates
+        poses = np.stack([self.graph.keyframes[c].cam_from_world for c in candidates])
+        keyframe = self.graph.keyframes[index]
+        apart = poses[:, :3, :3] @ self.graph.world_from_cam(index)[:3, 3] + poses[:, :3, 3]
+        near = np.linalg.norm(apart, axis=1) < REACH * keyframe.median_depth
+        turned = poses[:, 2, :3] @ keyframe.cam_from_world[2, :3]
+        return [candidates[n] for n in np.flatnonzero(near & (turned > 0.5))]
 
     def graph_flow(self, index: int, candidates: list[int], min_overlap: float = 0.5) -> dict[int, float]:
         """Mean flow in pixels from keyframe `index` to each candidate, where enough of it would be seen there."""
@@ -121,9 +153,7 @@ class LocalMap:
     def agreement(self, index: int, pixels: float = 2.0) -> float:
         """Fraction of the matches to and from a keyframe that its pose and the depths explain."""
         good = total = 0
-        for source, to in self.graph.edges:
-            if index not in (source, to):
-                continue
+        for source, to in self.graph.edges.of([index]):
             edge = self.graph.edges[source, to]
             expected, _ = self.graph.predict(source, to)
             seen = edge.weight > 0

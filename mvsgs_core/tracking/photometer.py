@@ -2,7 +2,8 @@
 
 Every edge is looked at once, when it is matched; the whole graph is solved again when it has grown by a tenth, and
 keyframes between take their exposure from their edges. The gauge stays as it is while the graph grows; the end's
-solution has the mean over the keyframes.
+solution has the mean over the keyframes. Of a large graph the newest keyframes are solved, beside the others as they
+are: the equations are dense.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from mvsgs_core.tracking.estimation.response import radial_terms, vignetting_pol
 from mvsgs_core.tracking.graph import Edge, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.steps import Steps, timed, whole
 
 GROWTH = 1.1  # of the keyframes, at which all are solved again
+AT_ONCE = 300  # keyframes that are solved together
 
 _OBSERVATION = np.dtype(
     [("reference", "<i8"), ("moments", "<f4", (3, 2, TERMS))]
@@ -62,6 +65,7 @@ class Photometer:
         self._order: list[int] = []  # keyframes of the last solution
         self._lights: dict[int, np.ndarray] = {}  # (5,) of the keyframes, see `PhotometricCalibration.lights`
         self._moments: dict[tuple[int, int], tuple[Edge, np.ndarray | None]] = {}  # of every edge as it was matched
+        self._looked_at = 0  # changes of the graph's edges
 
     @property
     def vignetting(self) -> np.ndarray | None:
@@ -76,6 +80,10 @@ class Photometer:
             return None
         return self.photometry.affine(self._lights[index])
 
+    def known(self, index: int) -> object:
+        """What `exposure` is made of: an object that is another one whenever that changes."""
+        return self._lights.get(index) if self.photometry.varies else None
+
     def of_frames(self, records: Sequence[Seen], posed: np.ndarray) -> np.ndarray | None:
         """(N, 3, 4) float32 color affines of frames, NaN where they are not known or not `posed` (N,); None where
         exposures do not vary."""
@@ -88,43 +96,54 @@ class Photometer:
                 found[k] = self.photometry.affine(light)
         return found
 
-    def update(self, whole: bool = False) -> None:
-        """Takes in the graph's new edges and keyframes. whole: the stream has ended, all is solved for again."""
-        with self.stats.time("photometry"):
-            self._look_at_edges()
-            order = sorted(self.graph.keyframes)
-            if whole or len(order) >= GROWTH * len(self._order):
-                self._solve(order, whole)
-            elif self.photometry.varies:
-                for index in order:
-                    if index not in self._lights:
-                        self._attach(index)
+    def update(self, at_the_end: bool = False) -> None:
+        """Takes in the graph's new edges and keyframes. at_the_end: the stream has ended, all is solved for again."""
+        whole(self.updating(at_the_end))
 
-    def _look_at_edges(self) -> None:
+    def updating(self, at_the_end: bool = False) -> Steps[None]:
+        """`update`, an edge a step."""
+        yield from timed(self.stats, "photometry", self._updating(at_the_end))
+
+    def _updating(self, at_the_end: bool) -> Steps[None]:
+        yield from self._looking_at_edges()
+        order = sorted(self.graph.keyframes)
+        known = len(self._order)
+        if at_the_end or len(order) >= min(GROWTH * known, known + AT_ONCE // 2):
+            self._solve(order, at_the_end)
+        elif self.photometry.varies:
+            for index in order:
+                if index not in self._lights:
+                    self._attach(index)
+
+    def _looking_at_edges(self) -> Steps[None]:
         graph = self.graph
-        for pair in self._moments.keys() - graph.edges.keys():
-            del self._moments[pair]
-        for (a, b), edge in graph.edges.items():
-            known = self._moments.get((a, b))
-            if known is None or known[0] is not edge:
+        changed, self._looked_at = graph.edges.changes(self._looked_at)
+        for a, b in tuple(changed):
+            edge, known = graph.edges.get((a, b)), self._moments.get((a, b))
+            if edge is None:
+                self._moments.pop((a, b), None)
+            elif known is None or known[0] is not edge:
                 image = graph.keyframes[b].image
                 self._moments[a, b] = edge, _compared(graph, a, image, edge.target.T, edge.weight > 0)
+                yield
 
     def edges(self, order: Sequence[int]) -> PhotometricEdges:
         """Of the keyframes `order`, by their places in it: a pair's both directions in one, from the earlier one."""
+        number = {index: n for n, index in enumerate(order)}
         pairs: dict[tuple[int, int], np.ndarray] = {}
         for (a, b), (_, moments) in self._moments.items():
-            if moments is not None:
+            if moments is not None and a in number and b in number:
                 pair = min(a, b), max(a, b)
                 pairs[pair] = pairs.get(pair, 0.0) + (moments if a < b else backward(moments))
-        number = {index: n for n, index in enumerate(order)}
         return PhotometricEdges(
             np.array([number[a] for a, _ in pairs], np.int64),
             np.array([number[b] for _, b in pairs], np.int64),
             np.array(list(pairs.values())).reshape(-1, 3, TERMS, TERMS),
         )
 
-    def _solve(self, order: list[int], whole: bool) -> None:
+    def _solve(self, order: list[int], at_the_end: bool) -> None:
+        if len(order) > AT_ONCE:
+            return self._solve_newest(order, at_the_end)
         exposures = np.array([self.graph.keyframes[index].image.exposure for index in order])
         known = np.where(exposures > 0.0, np.log(np.maximum(exposures, 1e-300)), np.nan)
         try:
@@ -134,9 +153,24 @@ class Photometer:
             return
         self.graph.vignetting = p.vignetting
         lights = dict(zip(order, p.lights))
-        if p.varies and not whole:
+        if p.varies and not at_the_end:
             lights = self._kept_still(lights)
         self._order, self._lights = order, lights
+
+    def _solve_newest(self, order: list[int], at_the_end: bool) -> None:
+        """Those of a large graph; where their light is steady and the others' was not, it is taken from their edges."""
+        others, varied, lights, vignetting = order[:-AT_ONCE], self.photometry, self._lights, self.graph.vignetting
+        self._solve(order[-AT_ONCE:], False)
+        if varied.varies and not self.photometry.varies:
+            self.photometry, self._lights, self.graph.vignetting = varied, lights, vignetting
+        self._lights = {index: lights[index] for index in others if index in lights} | self._lights
+        self._order = order
+        for index in order if self.photometry.varies else ():
+            if index not in self._lights:
+                self._attach(index)
+        if at_the_end and self._lights:
+            mean = np.mean(list(self._lights.values()), axis=0)
+            self._lights = {index: light - mean for index, light in self._lights.items()}
 
     def _kept_still(self, lights: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
         """The same in the gauge of before: what is known does not change as a whole with each keyframe that comes."""
@@ -149,9 +183,9 @@ class Photometer:
     def _attach(self, index: int) -> None:
         """The light of a new keyframe, from those it was matched with."""
         found: list[tuple[float, np.ndarray]] = []
-        for (a, b), (_, moments) in self._moments.items():
-            other = b if a == index else a
-            if moments is not None and index in (a, b) and other in self._lights:
+        for a, b in self.graph.edges.of([index]):
+            other, moments = b if a == index else a, self._moments[a, b][1]
+            if moments is not None and other in self._lights:
                 there = moments if b == index else backward(moments)
                 information = 1.0 / (self.photometry.edge_sigma[0] ** 2 + 1.0 / there[:, 0, 0].mean())
                 found.append((float(information), self._lights[other] + self.photometry.step(there)))

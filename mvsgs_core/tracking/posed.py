@@ -52,13 +52,14 @@ class PosedTracker:
         self._tail: dict[int, tuple[TrackingImage, np.ndarray, Step]] = {}  # the last two frames since
 
     def add(
-        self, index: int, timestamp: float, image: np.ndarray, world_from_cam: np.ndarray, exposure: float = 0.0
-    ) -> list[int]:
-        """The next frame with its pose (4, 4) and its exposure, 0 where it is not known, as in `msgs.Frame`.
+        self, index: int, timestamp: float, image: np.ndarray, world_from_cam: np.ndarray, exposure: float = 0.0,
+        mask: np.ndarray | None = None,
+    ) -> list[int]:  # fmt: skip
+        """The next frame with its pose (4, 4), its exposure, 0 where it is not known, and its mask, as in `msgs.Frame`.
 
         Returns the keyframes, by index, that are complete now.
         """
-        frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color, exposure)
+        frame = TrackingImage.of(index, timestamp, image, self.size, self.flow.needs_color, exposure, mask)
         self.stats.count("frames")
         self._lights.append(FrameLight(index))
         pose = geometry.inverse(world_from_cam)
@@ -91,7 +92,7 @@ class PosedTracker:
         if last is not None:
             frame, pose, step = tail[last]
             complete = self._insert(frame, pose, {step.reference: step.matches})
-        self.photometer.update(whole=True)
+        self.photometer.update(at_the_end=True)
         self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.graph.keyframes))
         complete, self._complete, self._tail = complete + self._complete, [], {}
         return complete

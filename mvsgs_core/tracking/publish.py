@@ -9,7 +9,9 @@ from typing import Protocol
 import numpy as np
 
 from mvsgs_core.tracking.between import Between
+from mvsgs_core.tracking.graph import Keyframe
 from mvsgs_core.tracking.settling import Settling
+from mvsgs_core.tracking.steps import Steps, whole
 from mvsgs_core.trajectory import TrackingState
 
 GRAY_LEVEL = 1.0 / 255.0
@@ -59,13 +61,13 @@ class Update:
     keyframes: tuple[int, ...] = ()  # indices of frames that became keyframes, in order
     correction: Correction | None = None  # of keyframes published before
     between: tuple[Between, ...] = ()  # frames that are no keyframes, posed against ones that were published
-    # what is left to do before the next frame, and takes longer: the frame's pose is known already
-    rest: Callable[[], Update] | None = field(default=None, compare=False)
+    # what is left to do of the frame and takes longer, to be done before another update has a rest; its pose is known
+    rest: Steps[Update] | None = field(default=None, compare=False)
     later: Settling | None = field(default=None, compare=False)  # what gives `between`, before the next keyframe
 
     def begun(self) -> Update:
         """With the rest of it done, and not what can be done later."""
-        return self if self.rest is None else self.rest().begun()
+        return self if self.rest is None else whole(self.rest)
 
     def whole(self) -> Update:
         """With all of it done."""
@@ -81,12 +83,15 @@ class _Published:
     known: np.ndarray
     segment: int
     exposure: np.ndarray | None  # (3, 4) color affine; None: the identity
+    looked_at: tuple[object, ...] = ()  # what the keyframe was made of when nothing had moved; empty: not looked at
 
 
 class Light(Protocol):
     """What is known of exposures and vignetting: None, the identity."""
 
     def exposure(self, index: int) -> np.ndarray | None: ...
+
+    def known(self, index: int) -> object: ...  # the same object: the same exposure
 
     @property
     def vignetting(self) -> np.ndarray | None: ...
@@ -121,11 +126,12 @@ class Publisher:
         """A keyframe was sent as it is now, with scale 1."""
         self.known(index, None if self.light is None else self.light.exposure(index))
 
-    def known(self, index: int, exposure: np.ndarray | None) -> None:
-        """Readers have a keyframe as it is now, with scale 1 and this exposure (3, 4); None: the identity."""
+    def known(self, index: int, exposure: np.ndarray | None, scale: float = 1.0) -> None:
+        """Readers have a keyframe as it is now, with this scale and exposure (3, 4); None: the identity."""
         keyframe, segment = self.graph.keyframes[index], self._segment(index)
         known, pose = keyframe.triangulated.copy(), self.graph.world_from_cam(index)
-        self._published[index] = _Published(pose, 1.0, keyframe.inverse_depth.copy(), known, segment, exposure)
+        first = scale * keyframe.inverse_depth
+        self._published[index] = _Published(pose, scale, first, known, segment, exposure)
         self._lit |= exposure is not None
         self.highest_segment = max(self.highest_segment, segment)
 
@@ -164,6 +170,9 @@ class Publisher:
         for index, last in self._published.items():
             if index not in self.graph.keyframes:
                 continue
+            parts = self._parts(index)
+            if not everything and parts and same(parts, last.looked_at):
+                continue
             exposure = None if self.light is None else self.light.exposure(index)
             pose, scale, segment = self.graph.world_from_cam(index), self._scale(index, last), self._segment(index)
             depth = self.graph.keyframes[index].median_depth
@@ -174,6 +183,8 @@ class Publisher:
                 last.world_from_cam, last.scale, last.segment, last.exposure = pose, scale, segment, exposure
                 self._lit |= exposure is not None
                 moved.append(index)
+            else:
+                last.looked_at = parts
         if not moved:
             return None
         last_of = [self._published[index] for index in moved]
@@ -186,6 +197,15 @@ class Publisher:
             vignetting,
         )
 
+    def _parts(self, index: int) -> tuple[object, ...]:
+        """What a keyframe's corrections are made of; empty where it may change in place. Of thousands few do."""
+        keyframe = self.graph.keyframes[index]
+        if not isinstance(keyframe, Keyframe):
+            return ()
+        light = None if self.light is None else self.light.known(index)
+        segment = self._segment(index)
+        return keyframe.cam_from_world, keyframe.inverse_depth, keyframe.information, segment, light
+
     def _segment(self, index: int) -> int:
         return 0 if self.segment_of is None else self.segment_of(index)
 
@@ -195,6 +215,11 @@ class Publisher:
         if known.sum() < 20:
             return published.scale
         return float(np.median(published.inverse_depth[known] / keyframe.inverse_depth[known]))
+
+
+def same(parts: tuple[object, ...], others: tuple[object, ...]) -> bool:
+    """Whether these are the same objects, or numbers."""
+    return len(parts) == len(others) and all(a is b or (type(a) is int and a == b) for a, b in zip(parts, others))
 
 
 def changed_vignetting(now: np.ndarray | None, before: np.ndarray | None) -> np.ndarray | None:
@@ -226,4 +251,5 @@ __all__ = [
     "affine_of",
     "changed_vignetting",
     "differ",
+    "same",
 ]

@@ -5,14 +5,14 @@
     RELOCALIZING --- patience is over ---> INITIALIZING, a segment of its own, which a loop may join later
 
 Semi-dense matches (flow.py) of the newest keyframe give each frame's pose; keyframes join a graph (local_map.py) that
-dense bundle adjustment keeps consistent; loops (loop_closure.py) correct or join.
+dense bundle adjustment keeps consistent; loops (loop_closure.py) correct or join. That work is done in steps, between
+which frames may come: they are followed from the keyframe before, and none of them becomes a keyframe.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -20,11 +20,9 @@ from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.back_end import BackEnd
-from mvsgs_core.tracking.between import FramesBetween
-from mvsgs_core.tracking.both_sides import BothSides
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.diagnosis import Diagnosis
-from mvsgs_core.tracking.estimation.calibration import REESTIMATED_AT, Calibration
+from mvsgs_core.tracking.estimation.calibration import Calibration
 from mvsgs_core.tracking.estimation.focal import FocalConfig
 from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.front_end import FrontEnd, Step
@@ -32,6 +30,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.initializer import Initializer
 from mvsgs_core.tracking.keyframe_choice import KeyframeChoice, newest
+from mvsgs_core.tracking.keyframe_work import KeyframeWork
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import make_flow
 from mvsgs_core.tracking.matching.matcher import Matcher
@@ -43,8 +42,9 @@ from mvsgs_core.tracking.places.loop_closure import LoopCloser
 from mvsgs_core.tracking.places.recovery import Recovery
 from mvsgs_core.tracking.places.relocalization import Relocalizer
 from mvsgs_core.tracking.places.retrieval import Retrieval
-from mvsgs_core.tracking.publish import Publisher, Update
-from mvsgs_core.tracking.settling import Settling
+from mvsgs_core.tracking.publish import Correction, Publisher, Update
+from mvsgs_core.tracking.steps import Steps, timed, whole
+from mvsgs_core.tracking.waiting import WaitingFrames
 from mvsgs_core.trajectory import TrackingState
 
 
@@ -80,8 +80,13 @@ class Session:
         self.publisher = Publisher(
             self.graph, config.tolerance, lambda index: self.graph.keyframes[index].segment, self.photometer
         )
-        self.between = FramesBetween(self.graph, self.photometer, config.frames_between, threads)
-        self.both_sides = BothSides(self.graph, self.matcher, threads)
+        self.waiting = WaitingFrames(self.graph, self.matcher, self.photometer, config.frames_between, threads, stats)
+        self.keyframe_work = KeyframeWork(
+            config, stats, self.graph, self.calibration, self.local_map, self.covisible_keyframes, self.loops,
+            self.back_end, self.photometer,
+        )  # fmt: skip
+        self.late = False  # the work on a keyframe must go on at once, or the camera may be lost
+        self._at_work: frozenset[int] = frozenset()  # keyframes whose work has begun; frames may come meanwhile
         self._since = 0  # frames since the last keyframe
         self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
 
@@ -97,7 +102,7 @@ class Session:
     @property
     def pending(self) -> set[int]:
         """Frames that may still go out, as keyframes or between them: their images are needed until then."""
-        waiting = set(self.initializer.waiting) | set(self.publisher.held) | self.between.waiting
+        waiting = set(self.initializer.waiting) | set(self.publisher.held) | self.waiting.indices | self._at_work
         if self.phase is not Phase.INITIALIZING:
             return waiting | set(self._tail)
         last = self.front_end.last  # the end of the stream may force an initialization with it
@@ -133,6 +138,8 @@ class Session:
             return self._stand_still(frame, step, record)
         if followed:
             self.relocalizer.found()
+        if self._at_work:
+            return self._follow_beside_work(frame, step if followed else None, record)
         if initializing:
             return self._initialize(frame, step, record) if followed else self._initialize_anew(frame, record)
         return self._track(frame, step, record) if followed else self._lose(frame, record)
@@ -145,13 +152,41 @@ class Session:
             record.light = observed(self.graph, step.reference, frame, step.matches)  # the light may have changed
         return Update(record.state)
 
+    def _follow_beside_work(self, frame: TrackingImage, step: Step | None, record: FrameRecord) -> Update:
+        """A frame that came while a keyframe is worked on. step: None where it can't be followed, as yet."""
+        tracking = self.phase is not Phase.INITIALIZING
+        if step is None or not tracking:
+            self.recovery.keep(frame)
+        if step is None:
+            record.state = TrackingState.LOST if tracking else TrackingState.NOT_INITIALIZED
+            self.late = True
+            return Update(record.state)
+        if tracking:
+            record.state = TrackingState.TRACKED
+            record.follow(self.graph, step.reference, step.matches, step.pose, frame)
+            self._note_tail(frame, step)
+        self.waiting.add(frame, record)
+        self.choice.saw(step)
+        self.late |= self.choice.is_late(step, frame.size[1], self.config.keyframe_choice.max_flow)
+        return Update(record.state)
+
+    def _begin_work(self, frame: TrackingImage, record: FrameRecord, steps: Steps[Update]) -> Update:
+        """A frame becomes a keyframe; until all steps are done, frames that come are followed and no more."""
+        self._at_work = frozenset({frame.index, *self.initializer.waiting})
+        self.waiting.end()
+        return Update(record.state, rest=self._until_done(steps))
+
+    def _until_done(self, steps: Steps[Update]) -> Steps[Update]:
+        update = yield from steps
+        self._at_work, self.late = frozenset(), False
+        return update
+
     # INITIALIZING
 
     def _begin_segment(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The first keyframe of a segment, if the image has any texture."""
         self.phase = Phase.INITIALIZING
-        self.between.forget()
-        self.both_sides.forget()
+        self.waiting.forget()
         record.state = TrackingState.NOT_INITIALIZED
         if not self._has_texture(frame):
             self.diagnosis.no_texture(frame)
@@ -170,16 +205,19 @@ class Session:
             if only and is_held_out(step.reference) and not is_held_out(frame.index):  # this one is as good
                 self.initializer.abandon()
                 return self._begin_segment(frame, record)
-            self._wait(frame, record)
+            self.waiting.add(frame, record)
             return Update(record.state)
-        self.between.end()
+        self._refer_to(frame, None)
+        return self._begin_work(frame, record, self._start(frame, step, record))
+
+    def _start(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Steps[Update]:
+        """One more keyframe to solve all from, which takes longer than a frame: this one has no pose as it comes."""
+        yield from timed(self.stats, "start", self.initializer.adding(frame, self.segment, step.matches))
+        waiting = list(self.initializer.waiting)
         with self.stats.time("start"):
-            self.initializer.add(frame, self.segment, step.matches)
-            self._refer_to(frame, None)
-            waiting = list(self.initializer.waiting)
             initialized = self.initializer.initialize(focal=self._unknown_focal())
         if initialized:
-            return self._begin_tracking(waiting, record)
+            return (yield from self._begin_tracking(waiting, record))
         place = self.relocalizer.relocalize(frame) if self.segment > 0 else None
         return Update(record.state) if place is None else self._resume(frame, record, place)
 
@@ -193,21 +231,22 @@ class Session:
         self.initializer.abandon()
         return self._begin_segment(frame, record)
 
-    def _begin_tracking(self, keyframes: list[int], record: FrameRecord) -> Update:
-        """The first keyframes of a segment are solved."""
+    def _begin_tracking(self, keyframes: list[int], record: FrameRecord) -> Steps[Update]:
+        """The first keyframes of a segment are solved; frames before and between them are matched at once."""
         self.phase = Phase.TRACKING
-        self.calibration.estimate_readout_time(keyframes)
-        self.local_map.adjust_window(keyframes[-1])
-        self.calibration.refine(keyframes)
+        yield
+        yield from self.keyframe_work.first(keyframes)
         self.front_end.pose = self.graph.keyframes[keyframes[-1]].cam_from_world
-        if self.config.loops:
-            for index in keyframes:
-                self.loops.add(index)
-        self.photometer.update()
         self.stats.count("keyframes", len(keyframes))
         record.state = TrackingState.TRACKED
-        published = self._publish(keyframes)
-        return Update(record.state, published, later=self._settle_between(keyframes))
+        yield from self.recovery.filling_in([record for record in self.records if record.index >= keyframes[0]])
+        return self._published(record, keyframes)
+
+    def _published(self, record: FrameRecord, keyframes: list[int], correction: Correction | None = None) -> Update:
+        """Keyframes are ready: they go out, where the focal length is certain, and the frames before them are posed."""
+        published = self.publisher.publish_all(keyframes, self.calibration.settled)
+        later = self.waiting.settle(keyframes, self.records, self.publisher.published)
+        return Update(record.state, published, correction, later=later)
 
     def _force_initialization(self) -> Iterator[Update]:
         """The stream ended before there was a map: what was collected, with weaker criteria."""
@@ -217,9 +256,10 @@ class Session:
         if step is not None and frame.index not in self.graph.keyframes:
             self.initializer.add(frame, self.segment, step.matches)
         waiting = list(self.initializer.waiting)
+        self.waiting.end()
         if self.initializer.initialize(True, self._unknown_focal()):
             self.stats.warn(f"the start was forced at the end of the stream: {self.initializer.reason}")
-            yield self._begin_tracking(waiting, self._record(frame.index))
+            yield whole(self._begin_tracking(waiting, self._record(frame.index)))
         else:
             self.initializer.abandon()
 
@@ -236,40 +276,27 @@ class Session:
         if self.choice.moved(step, width, limit) and self._reuse_keyframe(frame, step):
             return Update(record.state)
         if not wanted:
-            self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
-            self._wait(frame, record)
+            self._note_tail(frame, step)
+            self.waiting.add(frame, record)
             return Update(record.state)
-        return Update(record.state, rest=lambda: self._add_keyframe(frame, step, record) or self._lose(frame, record))
+        return self._begin_work(frame, record, self._add_keyframe(frame, step, record))
 
-    def _add_keyframe(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update | None:
-        """A tracked frame becomes a keyframe; None, and it is none, where the map contradicts its pose."""
-        with self.stats.time("local map"):
-            self.local_map.insert(frame, step.pose, self.segment, {step.reference: step.matches})
-        with self.stats.time("local bundle adjustment"):
-            solution = self.local_map.adjust_window(frame.index)
-        if solution.failure:
-            self.stats.warn(f"local bundle adjustment failed: {solution.failure}")
-        if self.local_map.agreement(frame.index) < self.config.front_end.lost_inliers:
-            self.graph.remove(frame.index)
-            self.stats.count("keyframes taken back")
-            return None
+    def _add_keyframe(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Steps[Update]:
+        """A tracked frame becomes a keyframe; it is none, and lost, where the map contradicts its pose."""
+        if not (yield from self.keyframe_work.insert(frame, step, self.segment)):
+            self.waiting.reopen()
+            return self._lose(frame, record)
         if self.graph.keyframes[frame.index].triangulated.mean() < 0.3 * frame.cells.textured.mean():
             record.state = TrackingState.DEGENERATE
             self.stats.warn("keyframes without parallax: a camera that only turns gives no depth")
-        self.stats.count("keyframes")
-        self.covisible_keyframes.made(frame.index)
-        if len(self.graph.keyframes) in REESTIMATED_AT:
-            self.calibration.estimate_readout_time(self.members[-12:])
-        self.calibration.refine(self.members)
-        if self.config.loops:
-            self._close_loops(frame.index)
-        self.photometer.update()
-        for index in self.members[: -self.config.local_map.window]:
-            self.graph.keyframes[index].image.release()
         self._refer_to(frame, self.graph.keyframes[frame.index].cam_from_world)
+        yield
+        yield from self.keyframe_work.tie(frame.index)
+        self.segment = self.graph.keyframes[frame.index].segment  # a loop may have joined two
+        self.front_end.pose = self.graph.keyframes[frame.index].cam_from_world
         correction = self.publisher.corrections()
-        published = self._publish([frame.index])
-        return Update(record.state, published, correction, later=self._settle_between([frame.index]))
+        yield
+        return self._published(record, [frame.index], correction)
 
     def _reuse_keyframe(self, frame: TrackingImage, step: Step) -> bool:
         """An old keyframe sees this: it becomes the reference, and no further one is made."""
@@ -281,31 +308,13 @@ class Session:
         self.stats.skip("keyframes spared by covisible ones")
         return True
 
-    def _close_loops(self, index: int) -> None:
-        with self.stats.time("loops"):
-            closure = self.loops.search(index)
-            self.loops.add(index)
-        if closure is not None:
-            self.stats.count("loops")
-            if closure.failure:
-                self.stats.warn(f"a loop could not be closed: {closure.failure}")
-            if closure.moved:
-                self.stats.count("loops that moved the map")
-                self.back_end.pending = self.config.back_end.steps
-            if closure.joined is not None:
-                self.segment = self.graph.keyframes[index].segment
-                self.stats.count("segments joined")
-        with self.stats.time("background bundle adjustment"):
-            self.back_end.work(self.segment)
-
     def _end_with_a_keyframe(self) -> Iterator[Update]:
         """The last frames show what no keyframe does: one of them becomes one."""
         tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[1], t[0].size[1])}
         last = newest(tail)
         if last is not None:
-            update = self._add_keyframe(*tail[last], self._record(last))
-            if update is not None:
-                yield update
+            self.waiting.end()
+            yield whole(self._add_keyframe(*tail[last], self._record(last)))
 
     # LOST and RELOCALIZING
 
@@ -357,11 +366,18 @@ class Session:
         return enough
 
     def _refer_to(self, keyframe: TrackingImage, pose: np.ndarray | None) -> None:
-        """A new keyframe is followed from here on. pose (4, 4): its own, if there is a map."""
+        """A new keyframe is followed from here on, by frames that came since, too. pose (4, 4): its own, in a map."""
+        last, self._tail, self._since, self.late = self.front_end.last, {}, 0, False
+        later = last if last and last.index > keyframe.index else None
+        if pose is not None and later and (step := self.front_end.move_to(keyframe, pose)):
+            self._note_tail(later, step)
+            return self.choice.saw(step)
         self.front_end.refer_to(keyframe)
         self.front_end.pose = pose
-        self._tail = {}
-        self._since = 0
+
+    def _note_tail(self, frame: TrackingImage, step: Step) -> None:
+        """A frame that the stream may end with."""
+        self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
 
     def _follow_place(self, frame: TrackingImage, place: PlaceMatch) -> None:
         """An earlier keyframe is followed from here on, whose points were found in this frame."""
@@ -369,26 +385,10 @@ class Session:
         self.front_end.resume(keyframe, frame, place.matches, place.localization.cam_from_world)
         self._tail = {}
 
-    def _publish(self, keyframes: list[int]) -> tuple[int, ...]:
-        return self.publisher.publish_all(keyframes, self.calibration.settled)
-
-    def _wait(self, frame: TrackingImage, record: FrameRecord) -> None:
-        """No keyframe: the next one poses it, and it may go out then."""
-        self.both_sides.add(frame, record)
-        self.between.add(frame, record)
-
-    def _settle_between(self, keyframes: list[int]) -> Settling:
-        """The frames before these keyframes are to be posed; those of the start are matched at once."""
-        if len(keyframes) > 1:
-            self.recovery.fill_in([record for record in self.records if record.index >= keyframes[0]])
-        frames = self.between.close()
-        last = partial(self.between.settle, frames, keyframes[-1], self.records, self.publisher.published)
-        return Settling(frames, self.both_sides.settle(keyframes), last, self.stats)
-
     def _settle(self) -> tuple[int, ...]:
         """Keyframes that were held back, with the focal length as far as it is known."""
         self.calibration.settle(list(self.publisher.held))
-        return self._publish([])
+        return self.publisher.publish_all([], self.calibration.settled)
 
     def _unknown_focal(self) -> FocalConfig | None:
         return None if self.calibration.settled else self.config.focal

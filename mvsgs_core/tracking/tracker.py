@@ -17,6 +17,7 @@ import numpy as np
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.held_out import is_held_out
+from mvsgs_core.kept_map import NOTHING_MAPPED
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.config import TrackerConfig
@@ -55,16 +56,17 @@ class Tracker:
         clock: Callable[[], float] = time.perf_counter,
         known: KnownMap | None = None,
         frozen: bool = False,
+        stats: Stats | None = None,
     ) -> None:
         """clock: what the stages are timed with, in seconds. known: a map to go on in; None: a new one. frozen: the map
-        stays as it is, frames are only found in it.
+        stays as it is, frames are only found in it. stats: those of a tracker before, which are counted on.
 
         Raises ValueError where there is no such device.
         """
         config = config or TrackerConfig()
         self.config = replace(config, device=resolve_device(config.device))
         check_device(self.config.device)
-        self.stats = Stats(clock=clock)
+        self.stats = Stats(clock=clock) if stats is None else stats
         self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
         self._known, self._frozen = known, frozen
         self._seeking = known is not None  # the camera was not found in it yet, and no other map was begun
@@ -84,9 +86,24 @@ class Tracker:
         return Phase.INITIALIZING if self._session is None else self._session.phase
 
     @property
+    def frozen(self) -> bool:
+        """Whether frames are only found in the map."""
+        return self._frozen
+
+    @property
+    def mapped(self) -> bool:
+        """Whether there is a map to keep."""
+        return self._session is not None and bool(self._session.publisher.published)
+
+    @property
     def pending(self) -> set[int]:
         """Frames that may still go out, as keyframes or between them: their images are needed until then."""
         return set() if self._session is None else self._session.pending
+
+    @property
+    def late(self) -> bool:
+        """Whether the `rest` of a keyframe must go on at once: its next frame may be lost without."""
+        return self._session is not None and self._session.late
 
     @property
     def focal_factor(self) -> float:
@@ -148,6 +165,20 @@ class Tracker:
         self._session = session
         return session
 
+    def freeze(self) -> None:
+        """From the next frame on, frames are only found in the map there is. Raises ValueError where there is none."""
+        if not self._frozen and not self.mapped and self._known is None:
+            raise ValueError(NOTHING_MAPPED)
+        if not self._frozen and self._session is not None:
+            self._session = FrozenSession.of(self._session)
+        self._frozen = True
+
+    def thaw(self) -> None:
+        """From the next frame on, the map grows."""
+        if isinstance(self._session, FrozenSession):
+            self._session = self._session.thawed()
+        self._frozen = False
+
     def keep_map(self, file: Path) -> None:
         """Writes the map as it is, for another stream to go on in. Raises OSError; ValueError where there is none."""
         if self._session is None:
@@ -162,9 +193,10 @@ class Tracker:
         intrinsics: np.ndarray,
         guessed: bool = False,
         exposure: float = 0.0,
+        mask: np.ndarray | None = None,
     ) -> Update:
         """The next frame, and all that becomes of it, see `follow`."""
-        return self.follow(index, timestamp, image, intrinsics, guessed, exposure).whole()
+        return self.follow(index, timestamp, image, intrinsics, guessed, exposure, mask).whole()
 
     def follow(
         self,
@@ -174,13 +206,16 @@ class Tracker:
         intrinsics: np.ndarray,
         guessed: bool = False,
         exposure: float = 0.0,
+        mask: np.ndarray | None = None,
     ) -> Update:
         """The next frame: (H, W, 3) uint8 RGB with its intrinsics (4,); indices must grow.
 
-        Its pose is known then; whether it becomes a keyframe is the update's `rest`, before the next frame.
+        Its pose is known then; where it becomes a keyframe that is the update's `rest`. Frames may be followed before
+        all steps of that are done, and then are none themselves.
 
         guessed: the focal length is to be estimated; keyframes are published when it is settled, see `focal_factor`.
         exposure: time times gain over the f-number squared, in a unit that the stream keeps; 0: not known.
+        mask: (H, W) bool, False where a pixel is to be ignored; None: all count.
         """
         size = image.shape[0], image.shape[1]
         session = self._session or self.begin(size, intrinsics, guessed)
@@ -188,7 +223,7 @@ class Tracker:
             self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
         with self.stats.time("image"):
             color = session.matcher.flow.needs_color
-            frame = TrackingImage.of(index, timestamp, image, session.size, color, exposure)
+            frame = TrackingImage.of(index, timestamp, image, session.size, color, exposure, mask)
         self.stats.count("frames")
         update = session.add(frame)
         if self._seeking and session.phase in (Phase.INITIALIZING, Phase.TRACKING):
@@ -214,7 +249,7 @@ class Tracker:
             found = session.recovery.fill_in(session.records)
             solver = Solver(steps=8, threads=self.config.threads or 1)
             trajectory = solve_trajectory(session.records, graph, solver)
-        session.photometer.update(whole=not self._frozen)
+        session.photometer.update(at_the_end=not self._frozen)
         exposure = session.photometer.of_frames(session.records, trajectory.posed)
         self._trajectory = replace(trajectory, exposure=exposure, vignetting=session.photometer.vignetting)
         stats.count("frames posed in the end", found)

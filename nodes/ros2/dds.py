@@ -4,15 +4,19 @@ ROS 2 gives a topic `/camera/image_raw` the name `rt/camera/image_raw` in DDS an
 name `sensor_msgs::msg::dds_::Image_`. What is written and taken are bytes of our own CDR (cdr.py): Cyclone's Python
 serializer needs 0.2 to 0.4 s for an image. The types are declared to it field by field all the same, because newer
 programs of ROS 2 compare them when they meet.
+
+A service `/mvsgs/pause` is the topics `rq/mvsgs/pauseRequest` and `rr/mvsgs/pauseReply`, as rmw_cyclonedds has them.
 """
 
 from __future__ import annotations
 
 import os
 import socket
+import time
+import uuid
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 from weakref import WeakValueDictionary
 
 from cyclonedds._clayer import ddspy_take, ddspy_write
@@ -24,9 +28,10 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from nodes.ros2.cdr import Nested, NestedSequence, Number, Numbers, Text, decode, encode, kinds
-from nodes.ros2.connection import LOOPBACK, Connection, Quality
+from nodes.ros2.cdr import CdrError, Nested, NestedSequence, Number, Numbers, Text, decode, encode, kinds
+from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, Quality
 from nodes.ros2.messages import Message
+from nodes.ros2.services import ServiceMessage, ServiceType
 
 T = TypeVar("T", bound=Message)
 _BLOCKED = 100  # ms that a writer waits for a slow reader before it goes on without it
@@ -34,6 +39,7 @@ _EVERYTHING = SampleState.Any | ViewState.Any | InstanceState.Any
 _TAKEN = 64  # samples at once
 _IDL = {
     "?": bool, "u1": types.uint8, "i4": types.int32, "u4": types.uint32, "f8": types.float64,
+    "i8": types.int64, "u8": types.uint64,
 }  # fmt: skip
 
 
@@ -58,6 +64,16 @@ class Participant:
         """topic: its full name in ROS, with its first /."""
         dds = Topic(self._entity, f"rt{topic}", _idl(message_type))
         return Reader(self, DataReader(self._entity, dds, qos=_qos(quality)), message_type)
+
+    def service(self, name: str, service_type: ServiceType) -> Service:
+        """name: its full name in ROS, with its first /."""
+        requests = Topic(self._entity, f"rq{name}Request", _idl(service_type.request))
+        replies = Topic(self._entity, f"rr{name}Reply", _idl(service_type.response))
+        both = Policy.Userdata(f"serviceid={uuid.uuid4().hex};".encode())  # by which clients know that they are a pair
+        qos = Qos(Policy.EntityName(name), both, base=_qos(DEFAULT))
+        return Service(
+            self, DataReader(self._entity, requests, qos=qos), DataWriter(self._entity, replies, qos=qos), service_type
+        )
 
 
 class Writer(Generic[T]):
@@ -111,6 +127,63 @@ class Reader(Generic[T]):
     def decode(self, data: bytes) -> T:
         """Raises CdrError."""
         return decode(self.type, data)
+
+
+class Call(NamedTuple):
+    """A request of a service, to be replied to once."""
+
+    request: Any
+    writer: int  # handle of who wrote it
+
+
+class Service:
+    """Takes requests, and replies when it likes."""
+
+    def __init__(self, participant: Participant, requests: Any, replies: Any, service_type: ServiceType) -> None:
+        self._participant = participant  # which lives as long
+        self._requests, self._replies = requests, replies
+        self.type = service_type
+
+    def take(self) -> list[Call | CdrError]:
+        """All that came since, in order; errors for those that are no requests."""
+        taken: list[Call | CdrError] = []
+        found = ddspy_take(self._requests._ref, _EVERYTHING, _TAKEN)
+        if isinstance(found, int):
+            raise DdsError(f"nothing can be read: {DDSException(found)}")
+        for data, info in found:
+            if not info.valid_data:
+                continue
+            try:
+                taken.append(Call(decode(self.type.request, data), info.publication_handle))
+            except CdrError as error:
+                taken.append(error)
+        return taken
+
+    def reply(self, call: Call, success: bool, message: str) -> None:
+        """Raises DdsError. Who asked and is gone gets none."""
+        request: ServiceMessage = call.request
+        deadline = time.monotonic() + _BLOCKED / 1000
+        while not self._heard(call) and time.monotonic() < deadline:  # a client can ask before it can be answered
+            time.sleep(0.005)
+        data = encode(self.type.response(request.guid, request.seq, success, message))
+        code = ddspy_write(self._replies._ref, data + bytes(-len(data) % 4))
+        if code < 0:
+            raise DdsError(f"a reply could not be written: {DDSException(code)}")
+
+    def _heard(self, call: Call) -> bool:
+        """Whether a reply would reach the client, or there is no use in waiting for that."""
+        asking = self._requests.get_matched_publication_data(call.writer)
+        client = None if asking is None else _client(asking.qos)
+        if client is None:  # it is gone, or does not say who it is
+            return asking is None or bool(self._replies.get_matched_subscriptions())
+        matched = map(self._replies.get_matched_subscription_data, self._replies.get_matched_subscriptions())
+        return any(_client(reader.qos) == client for reader in matched if reader is not None)
+
+
+def _client(qos: Any) -> bytes | None:
+    """By what a client says that its reader and its writer are a pair."""
+    data = qos[Policy.Userdata].data if Policy.Userdata in qos else b""
+    return next((part for part in data.split(b";") if part.startswith(b"clientid=")), None)
 
 
 class _Domain:
@@ -189,9 +262,9 @@ def _qos(quality: Quality) -> Any:
 
 
 @cache
-def _idl(message_type: type) -> Any:
+def _idl(message_type: Any) -> Any:
     """The type as Cyclone declares it to others; it never serializes with it."""
-    package, kind, name = message_type.ros.split("/")  # type: ignore[attr-defined]
+    package, kind, name = message_type.ros.split("/")
     members = {member: _idl_member(of) for member, of in kinds(message_type)}
     return make_idl_struct(f"{name}_", f"{package}::{kind}::dds_::{name}_", members)
 

@@ -12,10 +12,27 @@ from collections.abc import Callable
 
 PERIOD = 0.2  # s between two returns, at least
 SHARE = 0.02  # of the time that returns may take: where one is slow, they are rarer
+LARGE = 2**20  # bytes of a block that goes back as soon as it is freed, where a process asks for that
+_MMAP_THRESHOLD = -3  # glibc's name of it in mallopt
+
+
+def return_large_blocks() -> None:
+    """From now on a block of at least `LARGE` bytes goes back to the system when it is freed.
+
+    Otherwise glibc raises that limit to the largest block that was freed, up to 32 MiB: what a growing map leaves
+    behind then stays, in pieces that the next, larger block does not fit in. Fresh memory costs time each time; this is
+    for who keeps large blocks for long. Does nothing where the C library has no mallopt.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_MMAP_THRESHOLD, LARGE)
 
 
 class FreedMemory:
-    """Give it a chance after each message. Does nothing where the C library has no malloc_trim (macOS, musl)."""
+    """Give it a chance after each message, and in long work.
+
+    Does nothing where the C library has no malloc_trim (macOS, musl).
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

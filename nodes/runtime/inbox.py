@@ -53,7 +53,9 @@ class Inbox:
         """Whether messages of other topics, sent before this reader's next one, are still to come."""
         siblings = self._siblings[reader]
         head = reader.head() if siblings and isinstance(reader, ReliableReader) else None
-        return head is not None and any(head.before.get(name, 0) > other.expected for name, other in siblings.items())
+        if head is None or not isinstance(reader, ReliableReader):
+            return False
+        return any(other.behind(reader.begun, head.before.get(name, 0)) for name, other in siblings.items())
 
 
 def _of_the_same_sender(reader: Reader, readers: Sequence[Reader]) -> dict[str, ReliableReader]:

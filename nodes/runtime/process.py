@@ -33,6 +33,7 @@ from nodes.parameters import build
 from nodes.runtime.addresses import PeerLost, load_keys
 from nodes.runtime.freed_memory import FreedMemory
 from nodes.runtime.inbox import Inbox, Reader
+from nodes.runtime.requests import Requests
 from nodes.runtime.runner import Runner, end_of, stats_of
 from nodes.runtime.signals import ABORT_SECONDS, Signals, Stopped, end_within
 from nodes.runtime.spec import Spec
@@ -94,7 +95,9 @@ class _Process:
         self._signals = signals
         self._began = time.monotonic()
         self._step = _Step()
+        self._freed = FreedMemory()
         self._runner: Runner | None = None
+        self._is_source = False
         self._readers: list[Reader] = []
         self._publishers: dict[str, Publisher] = {}  # by message type
         self.status = Status(spec.status_fd, self._snapshot)
@@ -102,10 +105,12 @@ class _Process:
     def run(self) -> None:
         self.status.set("starting")
         node_type = load_node(self._spec.target)
+        self._is_source = is_source(node_type)
         self._seed()
         config = build(node_type.Config, self._spec.config, self._spec.name)
         runner = self._runner = Runner(self._spec.name, node_type(config))
         runner.node.rest, runner.node.waiting = self._rest, self._waiting
+        runner.node.kept_in = self._spec.kept_in()
         read = {given.type for given in self._spec.outputs}
         runner.node.unread = frozenset(sent for sent in outputs(node_type) if sent.__name__ not in read)
         inbox = self._open()
@@ -118,7 +123,7 @@ class _Process:
             publisher.start()
         self.status.set("running")
         gc.freeze()  # modules and the node stay: the collector need not walk through them again and again
-        messages = self._source(runner, inbox) if is_source(node_type) else self._answers(runner, inbox)
+        messages = self._source(runner, inbox) if self._is_source else self._answers(runner, inbox)
         for message in messages:
             self._send(message)
         self.status.set("ending")
@@ -131,6 +136,7 @@ class _Process:
     def _rest(self) -> None:
         """In the midst of a hook's long work."""
         self._signals.check()
+        self._freed.give_back()
         self._step.next("working")
 
     def _waiting(self, kind: type) -> int:
@@ -161,26 +167,32 @@ class _Process:
         shared: dict[str, Any] = {
             "keys": None if spec.keys is None else load_keys(Path(spec.keys)),
             "token": spec.token,
+            "say": self._say,
         }
-        observer = spec.name if spec.observer else None
+        observer = spec.name if spec.observer or self._is_source else None  # of requests, which may come too late
         for i in spec.inputs:
             kind = msgs.TYPES[i.type]
             if i.best_effort:
-                reader: Reader = NewestReader(i.address, kind, topic=i.topic, late=False, observer=observer, **shared)
+                reader: Reader = NewestReader(
+                    i.address, kind, topic=i.topic, late=False, observer=observer, away=i.away, **shared
+                )
             else:
-                reader = ReliableReader(i.address, kind, topic=i.topic, buffer=spec.buffer, observer=observer, **shared)
+                reader = ReliableReader(
+                    i.address, kind, topic=i.topic, buffer=spec.buffer, observer=observer, away=i.away,
+                    joins=spec.returns, **shared,
+                )  # fmt: skip
             self._readers.append(reader)
         for o in spec.outputs:
             topic = f"{spec.name}.{o.type}"
             self._publishers[o.type] = Publisher(
-                o.address, topic=topic, buffer=spec.buffer, held_back=partial(self._held_back, topic), **shared
-            )
-        return Inbox(self._readers, list(self._publishers.values()))
+                o.address, topic=topic, buffer=spec.buffer, held_back=partial(self._held_back, topic), away=o.away,
+                **shared,
+            )  # fmt: skip
+        return Inbox([] if self._is_source else self._readers, list(self._publishers.values()))
 
     def _answers(self, runner: Runner, inbox: Inbox) -> Iterator[Message]:
         """What a node makes of its inputs, and of the time when none waits."""
         idle = False  # background work is left
-        freed = FreedMemory()
         while not all(reader.ended for reader in self._readers):
             self._signals.check()
             if not idle:
@@ -190,7 +202,7 @@ class _Process:
             if received is not None:
                 idle = True
                 yield from runner.handle(received[1])
-                freed.give_back()
+                self._freed.give_back()
             else:
                 produced = runner.idle()
                 idle = produced is not None
@@ -198,13 +210,18 @@ class _Process:
 
     def _source(self, runner: Runner, inbox: Inbox) -> Iterator[Message]:
         """A source runs in a thread: it may hang in a camera's read, and must still be stopped and watched."""
-        source = _Source(runner)
+        source, requests = _Source(runner), Requests(self._readers, runner.node)
         deadline = None
         while deadline is None or time.monotonic() < deadline:
             self._signals.check()
             if deadline is None and self._signals.interrupted:
                 source.stop()
                 deadline = time.monotonic() + STOP_GRACE
+            yield from requests.new()
+            if requests.pause.waits and deadline is None:
+                self._step.next("waiting")
+                inbox.watch(POLL)
+                continue
             try:
                 message = source.take(POLL)
             except queue.Empty:
@@ -213,7 +230,8 @@ class _Process:
             if message is None:
                 return
             self._step.next("working")
-            yield message
+            if not requests.pause.leaves_out(message):
+                yield message
         runner.node.stats.warn(f"{self._spec.name}: its last read did not return within {STOP_GRACE:g} s of Ctrl-C")
 
     def _send(self, message: Message) -> None:
@@ -241,6 +259,11 @@ class _Process:
         open_topics = list(self._publishers.values())
         while open_topics := [publisher for publisher in open_topics if not publisher.gone()]:
             self._wait(inbox, open_topics[0])
+
+    def _say(self, text: str) -> None:
+        """What the transport has to tell goes where the node's own warnings go."""
+        if self._runner is not None:
+            self._runner.node.stats.warn(text)
 
     def _wait(self, inbox: Inbox, publisher: Publisher) -> None:
         """For readers of that topic, which are not there yet or have not said goodbye."""

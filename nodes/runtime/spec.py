@@ -2,10 +2,10 @@
 
     {"name": "mvs", "target": "nodes.mvs.Mvs", "config": {...},
      "inputs": [{"type": "Keyframe", "slot": "tracker", "address": "ipc:///tmp/x/tracker.Keyframe",
-                 "best_effort": false}],
-     "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1, "observers": []}],
-     "observer": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "nice": 0, "keys": null, "token": "",
-     "status_fd": null}
+                 "best_effort": false, "away": 0.0}],
+     "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1, "observers": [], "away": 0.0}],
+     "observer": false, "returns": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "nice": 0, "keys": null,
+     "token": "", "status_fd": null}
 
 `readers` counts those of both kinds without observers, which are named; `buffer` is in messages; `keys` is a folder,
 see `addresses.load_keys`; `token` is a secret of the run, without which a publisher takes nobody for a reader. A
@@ -15,6 +15,7 @@ file NAME.gone beside this one says that the observer NAME is gone.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +31,7 @@ class Input:
     slot: str  # that sends it
     address: str
     best_effort: bool = False
+    away: float = 0.0  # s for which its sender is waited for, once it is lost; 0: that is an error at once
 
     @property
     def topic(self) -> str:
@@ -42,6 +44,7 @@ class Output:
     address: str
     readers: int
     observers: tuple[str, ...] = ()
+    away: float = 0.0  # s for which a reader is waited for, once it is lost
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ class Spec:
     inputs: tuple[Input, ...]
     outputs: tuple[Output, ...]
     observer: bool = False  # nobody who makes the map depends on this node
+    returns: bool = False  # it may be started again in the midst of a run
     buffer: int = 4  # messages
     seed: int = 0
     threads: int | None = None
@@ -76,6 +80,15 @@ class Spec:
             if kind not in msgs.TYPES:
                 raise ValueError(f"{path}: {kind} is no message; the types are {', '.join(msgs.TYPES)}")
         return replace(spec, folder=path.parent)
+
+    def kept_in(self) -> Path | None:
+        """Beside the file, a folder for what a process needs that is started again; emptied for another run."""
+        if not self.returns or self.folder is None:
+            return None
+        kept, own = self.folder / f"{self.name}.kept", self.folder / f"{self.name}.json"
+        if kept.exists() and own.exists() and kept.stat().st_mtime < own.stat().st_mtime:
+            shutil.rmtree(kept)
+        return kept
 
     def awaited_observers(self, output: Output) -> list[str]:
         """The observers of an output that are not known to be gone."""

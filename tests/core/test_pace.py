@@ -104,3 +104,11 @@ def test_a_slow_camera_gets_all_effort() -> None:
     stage = Stage(seconds=0.6)
     stage.serve(every(1.0, 20))
     assert set(stage.efforts[1:]) == {0}
+
+
+def test_where_there_is_time_for_work_on_some_keyframes_alone_it_is_done_on_these() -> None:
+    stage = Stage(seconds=4.0, share=0.5)
+    stage.serve(every(0.2, 300))
+    worked = np.flatnonzero(np.array(stage.efforts[50:]) == 2)
+    assert 4 <= np.median(np.diff(worked)) <= 10  # 0.4 s each, and 0.04 s on each of the others, of 0.1 s
+    assert stage.busy < 0.7 * stage.now

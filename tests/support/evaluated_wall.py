@@ -63,8 +63,11 @@ def wall_evaluator(tmp_path: Path) -> Evaluator:
     return node
 
 
-def feed(node: Evaluator, lost: tuple[int, ...] = (), upstream: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Sends it the rest; returns report.json."""
+def feed(
+    node: Evaluator, lost: tuple[int, ...] = (), upstream: dict[str, Any] | None = None,
+    places: np.ndarray | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Sends it the rest, frames with `places` (N, 3) by GPS; returns report.json."""
     world_from_cam = poses_along()
     world_from_cam[:, :3, 3] += ORIGIN
     state = np.zeros(N, np.uint8)
@@ -72,7 +75,8 @@ def feed(node: Evaluator, lost: tuple[int, ...] = (), upstream: dict[str, Any] |
         state[k], world_from_cam[k] = TrackingState.LOST, np.nan
     index = np.arange(N)
     keyframe = (index % 3 == 0) & (state == 0)
-    list(node.on_trajectory(Trajectory(index, index / 30, world_from_cam, keyframe, state, np.zeros(N, np.int32))))
+    segment = np.zeros(N, np.int32)
+    list(node.on_trajectory(Trajectory(index, index / 30, world_from_cam, keyframe, state, segment, places=places)))
     depth = np.full((H // 2, W // 2), 2.0, np.float32)
     image = np.zeros((H, W, 3), np.uint8)
     normals = np.zeros((H // 2, W // 2, 3), np.float32)

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,27 @@ DOWN = 5.0  # seconds in which a graph must be gone
 class Launch:
     """One run of the launcher, in a temporary directory of its own so that whatever it leaves there is found."""
 
-    def __init__(self, folder: Path, *overrides: str, conf: Path = FAKE, sockets: Path | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *overrides: str,
+        conf: Path = FAKE,
+        sockets: Path | None = None,
+        prefix: Sequence[str] = (),
+    ) -> None:
+        """prefix: what the command is preceded by, such as a host that it runs on."""
         self.output = folder / "out"
         self.sockets = sockets or Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))  # short: a socket's path must fit
         self.process = subprocess.Popen(
-            [sys.executable, ROOT / "launch/run_all.py", "--config-path", conf, f"output={self.output}", *overrides],
+            [
+                *prefix,
+                sys.executable,
+                ROOT / "launch/run_all.py",
+                "--config-path",
+                conf,
+                f"output={self.output}",
+                *overrides,
+            ],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -37,7 +37,7 @@ def number(code: str, rng: np.random.Generator) -> Any:
     if code[0] == "f":
         return float(rng.normal())
     info = np.iinfo(code)
-    return int(rng.integers(info.min, info.max, endpoint=True))
+    return int(rng.integers(info.min, info.max, endpoint=True, dtype=code))
 
 
 def plain(message: Any) -> Any:

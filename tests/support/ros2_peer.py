@@ -6,13 +6,20 @@ ROS_LOCALHOST_ONLY=1 configures rmw_cyclonedds.
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from multiprocessing.connection import Connection
 from typing import Any
 
+# of rmw_cyclonedds: its header, and the fields of the .srv file
+SERVICES = {
+    "Trigger": ("uint8 structure_needs_at_least_one_member", "bool success\nstring message"),
+    "SetBool": ("bool data", "bool success\nstring message"),
+}
+HEADER = "uint64 guid\nint64 seq\n"
 LOCALHOST_ONLY = (
     '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>'
     "</Domain></CycloneDDS>"
@@ -50,6 +57,28 @@ class Peer:
     def taken(self, topic: str) -> list[dict[str, Any]]:
         """All that came since."""
         return list(self._call("taken", topic))
+
+    def client(self, service: str, kind: str) -> None:
+        """kind: Trigger or SetBool; returns when the service is there."""
+        self._call("client", service, kind)
+        deadline = time.monotonic() + 60.0
+        while not self._call("available", service):
+            assert time.monotonic() < deadline, f"nobody offers {service}"
+            time.sleep(0.05)
+
+    def ask(self, service: str, *, times: int = 1, **fields: Any) -> list[int]:
+        """Sequence numbers of as many requests, sent without waiting for a reply."""
+        return list(self._call("ask", service, times, fields))
+
+    def replies(self, service: str, count: int = 1, seconds: float = 60.0) -> list[dict[str, Any]]:
+        """The next so many replies to this client."""
+        found: list[dict[str, Any]] = []
+        deadline = time.monotonic() + seconds
+        while len(found) < count:
+            found += self._call("replies", service)
+            assert time.monotonic() < deadline, f"{len(found)} of {count} replies of {service}"
+            time.sleep(0.02)
+        return found
 
     def wait_for_reader(self, topic: str, seconds: float = 20.0) -> None:
         deadline = time.monotonic() + seconds
@@ -104,6 +133,7 @@ class _Program:
         self._types: dict[str, Any] = {}
         self._writers: dict[str, Any] = {}
         self._readers: dict[str, Any] = {}
+        self._clients: dict[str, tuple[Any, Any, int, Iterator[int]]] = {}
 
     def advertise(self, topic: str, name: str, quality: dict[str, Any]) -> None:
         from cyclonedds.pub import DataWriter
@@ -130,6 +160,44 @@ class _Program:
     def taken(self, topic: str) -> list[dict[str, Any]]:
         return [_plain(sample) for sample in self._readers[topic].take(1000) if sample.sample_info.valid_data]
 
+    def client(self, service: str, kind: str) -> None:
+        """As rmw_init_cs makes one: reliable, keep last 10, the pair known by its user data."""
+        from cyclonedds.core import Policy, Qos
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+        from cyclonedds.util import duration
+
+        for end, text in zip(("Request", "Response"), SERVICES[kind]):
+            self._store.register(service_type(f"{kind}_{end}", text))
+        guid = int.from_bytes(os.urandom(7))
+        qos = Qos(
+            Policy.Reliability.Reliable(duration(milliseconds=100)),
+            Policy.Durability.Volatile,
+            Policy.History.KeepLast(10),
+            Policy.Userdata(f"clientid={guid:x};".encode()),
+        )
+        request, response = (self._type(f"std_srvs/srv/{kind}_{end}") for end in ("Request", "Response"))
+        writer = DataWriter(self._participant, Topic(self._participant, f"rq{service}Request", request), qos=qos)
+        reader = DataReader(self._participant, Topic(self._participant, f"rr{service}Reply", response), qos=qos)
+        self._clients[service] = writer, reader, guid, itertools.count(1)
+
+    def available(self, service: str) -> bool:
+        writer, reader, *_ = self._clients[service]
+        return bool(writer.get_matched_subscriptions() and reader.get_matched_publications())
+
+    def ask(self, service: str, times: int, fields: Mapping[str, Any]) -> list[int]:
+        writer, _, guid, numbers = self._clients[service]
+        asked = [next(numbers) for _ in range(times)]
+        for number in asked:
+            writer.write(self._filled(writer.data_type, {"guid": guid, "seq": number, **fields}))
+        return asked
+
+    def replies(self, service: str) -> list[dict[str, Any]]:
+        _, reader, guid, _ = self._clients[service]
+        taken = [_plain(sample) for sample in reader.take(1000) if sample.sample_info.valid_data]
+        return [reply for reply in taken if reply["guid"] == guid]
+
     def _topic(self, topic: str, name: str) -> Any:
         from cyclonedds.topic import Topic
 
@@ -140,7 +208,7 @@ class _Program:
 
         if name not in self._types:
             package, kind, short = name.split("/")
-            members = {member: self._member(spec) for member, spec in self._store.fielddefs[name][1]}
+            members = {member: self._member(spec) for member, spec in self._fields(name)}
             self._types[name] = make_idl_struct(f"{short}_", f"{package}::{kind}::dds_::{short}_", members)
         return self._types[name]
 
@@ -161,7 +229,7 @@ class _Program:
         return message_type(**{member: self._value(spec, given.get(member)) for member, spec in self._fields(name)})
 
     def _fields(self, name: str) -> Any:
-        return self._store.fielddefs[name][1]
+        return self._store.fielddefs[name.replace("/srv/", "/msg/")][1]  # rosbags knows no services
 
     def _value(self, spec: Any, given: Any) -> Any:
         kind, what = spec[0].name, spec[1]
@@ -172,6 +240,13 @@ class _Program:
         if kind == "ARRAY":
             return list(given) if given is not None else [self._value(what[0], None)] * what[1]
         return [self._value(what[0], each) for each in (given if given is not None else ())]
+
+
+def service_type(name: str, text: str) -> Any:
+    """rosbags' definition of one end of a service of std_srvs."""
+    from rosbags.typesys import get_types_from_msg
+
+    return get_types_from_msg(HEADER + text, f"std_srvs/msg/{name}")
 
 
 def _qos(reliable: bool = True, transient_local: bool = False, depth: int = 10) -> Any:

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.rasterizer.splats import Splats
 
 FINE = InsertionConfig(price=0.02)  # of images so small that a rectangle of 8 pixels is a tenth of them
 CONFIG = MapperConfig(iterations=16, refinement=20, threads=1, insertion=FINE)
+
+
+def empty_map() -> Splats:
+    """A map of nothing."""
+    none = torch.zeros(0)
+    return Splats(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), none, torch.zeros(0, 1, 3), none)
 
 
 def mapped(views: list[RGBDKeyframe], config: MapperConfig = CONFIG) -> OnlineMapper:

@@ -14,6 +14,7 @@
 #include <utility>
 #include <vector>
 
+#include "rasterizer/adam.hpp"
 #include "rasterizer/lanes.hpp"
 
 namespace splats {
@@ -157,6 +158,13 @@ struct Gradients {
     int64_t refused = 0;
 };
 
+// What a backward pass that steps the splats itself leaves.
+struct Stepped {
+    float *means2d_gradient, *means2d_views;  // (N) added to: the gradient's length on the image, 1 for each splat seen
+    double* pose;                             // as of Gradients
+    int64_t refused = 0, refused_steps = 0;   // splats with gradients, and with steps, that are not finite
+};
+
 // Projects and orders the splats and pairs them with the tiles they touch; radii (N), px, are 0 where nothing is seen.
 void bin(Frame& frame, const Parameters& parameters, float* radii, int threads);
 
@@ -173,5 +181,10 @@ void blend_backward(Frame& frame, const float* color, const float* depth, const 
 
 // Sums the slots of every splat and takes them to its parameters and to the pose.
 void project_backward(Frame& frame, const Parameters& parameters, Gradients& gradients, int threads);
+
+// The same, and each splat seen is stepped while its gradients are in the cache, instead of their being kept. fields: of
+// Splats, that each of the step's groups is.
+void project_and_step(Frame& frame, const Parameters& parameters, const adam::Step& step, const std::vector<int>& fields,
+                      Stepped& stepped, int threads);
 
 }  // namespace splats

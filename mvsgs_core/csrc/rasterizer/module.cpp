@@ -1,5 +1,6 @@
 // Python bindings of the rasterizer and of the losses.
 #include <nanobind/stl/unique_ptr.h>
+#include <nanobind/stl/vector.h>
 
 #include <mutex>
 
@@ -83,6 +84,40 @@ int64_t backward(Pass& pass, const SplatArrays& splats, In color, In depth, In o
     return gradients.refused;
 }
 
+// A group of Adam's step: field of Splats, first and second moment, and rate, final_rate, low, high, lead, tail.
+using Moved = std::tuple<int, Out, Out, float, float, float, float, int, float>;
+
+// Backward pass and step in one; beta1, beta2, epsilon. Returns how many splats had gradients, and how many steps, that
+// are not finite: those are left as they were.
+std::tuple<int64_t, int64_t> backward_step(Pass& pass, const std::array<Out, 6>& values, In color, In depth, In opacity,
+                                           In on_color, std::optional<In> on_depth, std::optional<In> on_opacity,
+                                           const std::vector<Moved>& moved, Array<int32_t> ages,
+                                           const std::tuple<float, float, float>& constants, int decay_steps,
+                                           Out means2d_gradient, Out means2d_views, Array<double> on_pose) {
+    Frame& frame = *pass.frame;
+    const auto& [means, log_scales, quaternions, opacity_logits, sh, betas] = values;
+    const Parameters p{means.data(), log_scales.data(), quaternions.data(), opacity_logits.data(), sh.data(), betas.data(),
+                       int64_t(means.shape(0)), int(sh.shape(1)), frame.degree, frame.exact, frame.antialiased};
+    const int widths[6] = {3, 3, 4, 1, 3 * p.bases, 1};
+    std::vector<adam::Group> groups;
+    std::vector<int> fields;
+    for (const auto& [field, first, second, rate, final_rate, low, high, lead, tail] : moved) {
+        if (field < 0 || field > 5 || first.size() != values[field].size() || second.size() != values[field].size())
+            throw std::invalid_argument("backward_step: moments differ in shape from what they are of");
+        fields.push_back(field);
+        groups.push_back({values[field].data(), nullptr, first.data(), second.data(), widths[field], rate, final_rate, low,
+                          high, lead, tail, {}});
+    }
+    const auto [beta1, beta2, epsilon] = constants;
+    const adam::Step step(std::move(groups), {beta1, beta2, epsilon, decay_steps}, ages.data());
+    Stepped stepped{means2d_gradient.data(), means2d_views.data(), on_pose.data()};
+    const nb::gil_scoped_release released;
+    blend_backward(frame, color.data(), depth.data(), opacity.data(), on_color.data(), data_of(on_depth),
+                   data_of(on_opacity), pass.threads);
+    project_and_step(frame, p, step, fields, stepped, pass.threads);
+    return {stepped.refused, stepped.refused_steps};
+}
+
 // (sum, max) of the blending weights of every splat; the pass must have been made with weights.
 void weights(const Pass& pass, Out weight_sum, Out weight_max) {
     const Frame& frame = *pass.frame;
@@ -124,6 +159,10 @@ SPLATS_MODULE(MVSGS_MODULE) {
     m.def("backward", &backward, nb::arg(), nb::arg("splats"), nb::arg("color"), nb::arg("depth"), nb::arg("opacity"),
           nb::arg("on_color"), nb::arg("on_depth").none(), nb::arg("on_opacity").none(), nb::arg("on_splats"),
           nb::arg("on_means2d"), nb::arg("on_pose"));
+    m.def("backward_step", &backward_step, nb::arg(), nb::arg("values"), nb::arg("color"), nb::arg("depth"),
+          nb::arg("opacity"), nb::arg("on_color"), nb::arg("on_depth").none(), nb::arg("on_opacity").none(),
+          nb::arg("moved"), nb::arg("ages"), nb::arg("constants"), nb::arg("decay_steps"), nb::arg("means2d_gradient"),
+          nb::arg("means2d_views"), nb::arg("on_pose"));
     m.def("weights", &weights);
     m.def("image_loss", &image_loss, nb::arg("image"), nb::arg("target"), nb::arg("pixel_weight").none(),
           nb::arg("l1_weight"), nb::arg("ssim_weight"), nb::arg("gradient"), nb::arg("threads"));

@@ -220,6 +220,13 @@ struct PoseSum {
         store(part, values);
         for (int i = 0; i < kLanes; ++i) lanes[entry][i] += values[i];
     }
+
+    void total(double* pose) const {
+        for (int k = 0; k < 12; ++k) {
+            pose[k] = 0.0;
+            for (const double value : lanes[k]) pose[k] += value;
+        }
+    }
 };
 
 // Clears every lane but those of `good`; for all that is finite or not seen, for what is not finite spreads otherwise.
@@ -232,14 +239,16 @@ SPLATS_INLINE void find_bad(const Lanes (&values)[Count], Ints& bad, int count =
     for (int k = 0; k < count; ++k) bad = bad | not_finite(as_bits(values[k]));
 }
 
-// The gradients of up to sixteen splats; returns how many are refused, as they are not finite.
-int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int count, Gradients& out, PoseSum& pose) {
+// The gradients of up to sixteen splats to `out`, from its row `at` on; returns how many are refused, as they are not
+// finite. Never inlined: what it rounds is then the same wherever it is called.
+[[gnu::noinline]] int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int count, size_t at,
+                                      Gradients& out, PoseSum& pose) {
     const int used = 3 * (p.degree + 1) * (p.degree + 1);
     const size_t width = 3 * size_t(p.bases);
     float has_pairs[kLanes] = {};
     for (int i = 0; i < count; ++i) has_pairs[i] = float(frame.spans[first + i].count != 0);
     const Mask in_tiles = at_least(lanes(has_pairs), 0.5f);
-    float* on_sh = out.sh + width * first;
+    float* on_sh = out.sh + width * at;
     if (p.bases > 1) std::memset(on_sh, 0, width * size_t(count) * sizeof(float));
     SplatGradient g;
     int64_t refused = 0;
@@ -275,14 +284,34 @@ int64_t backward_of(const Frame& frame, const Parameters& p, size_t first, int c
         g = SplatGradient{};
     }
     if (p.bases == 1) store_rows(reinterpret_cast<const Lanes(&)[3]>(g.sh), on_sh, count);
-    store_rows(g.mean, out.means + 3 * first, count);
-    store_rows(g.log_scale, out.log_scales + 3 * first, count);
-    store_rows(g.quaternion, out.quaternions + 4 * first, count);
-    store_rows(g.mean2d, out.means2d + 2 * first, count);
-    scatter(g.opacity_logit, out.opacity_logits + first, 1, count);
-    scatter(g.beta, out.betas + first, 1, count);
+    store_rows(g.mean, out.means + 3 * at, count);
+    store_rows(g.log_scale, out.log_scales + 3 * at, count);
+    store_rows(g.quaternion, out.quaternions + 4 * at, count);
+    store_rows(g.mean2d, out.means2d + 2 * at, count);
+    scatter(g.opacity_logit, out.opacity_logits + at, 1, count);
+    scatter(g.beta, out.betas + at, 1, count);
     return refused;
 }
+
+// Adds up the chunks' parts, in their order.
+void sum_pose(const std::vector<double>& parts, double* pose) {
+    std::fill(pose, pose + 12, 0.0);
+    for (size_t k = 0; k < parts.size(); ++k) pose[k % 12] += parts[k];
+}
+
+// Gradients of a block of splats, where they stay in the cache until they are stepped.
+struct BlockGradients {
+    static constexpr size_t kCount = adam::kBlock;
+    std::array<std::vector<float>, 7> rows;  // by field of Splats, and of the means on the image
+    Gradients out;
+
+    explicit BlockGradients(int bases) {
+        const size_t widths[7] = {3, 3, 4, 1, 3 * size_t(bases), 1, 2};
+        for (int k = 0; k < 7; ++k) rows[k].resize(widths[k] * kCount);
+        out = {rows[0].data(), rows[1].data(), rows[2].data(), rows[3].data(),
+               rows[4].data(), rows[5].data(), rows[6].data(), nullptr};
+    }
+};
 
 }  // namespace
 
@@ -295,16 +324,55 @@ void project_backward(Frame& frame, const Parameters& p, Gradients& out, int thr
         PoseSum sums;
         const size_t end = std::min(count, (chunk + 1) * kChunk);
         for (size_t first = chunk * kChunk; first < end; first += kLanes)
-            refused += backward_of(frame, p, first, int(std::min(size_t(kLanes), end - first)), out, sums);
-        for (int k = 0; k < 12; ++k) {
-            pose[12 * chunk + k] = 0.0;
-            for (const double value : sums.lanes[k]) pose[12 * chunk + k] += value;
+            refused += backward_of(frame, p, first, int(std::min(size_t(kLanes), end - first)), first, out, sums);
+        sums.total(pose.data() + 12 * chunk);
+    }
+    sum_pose(pose, out.pose);
+    out.refused = refused;
+}
+
+void project_and_step(Frame& frame, const Parameters& p, const adam::Step& step, const std::vector<int>& fields,
+                      Stepped& out, int threads) {
+    static_assert(kChunk % adam::kBlock == 0 && adam::kBlock % kLanes == 0);
+    const size_t count = size_t(p.count), chunks = (count + kChunk - 1) / kChunk;
+    std::vector<double> pose(12 * chunks);
+    int64_t refused = 0, refused_steps = 0;
+#pragma omp parallel num_threads(threads) reduction(+ : refused, refused_steps)
+    {
+        BlockGradients gradients(p.bases);
+        std::vector<adam::Group> groups = step.groups;
+        for (size_t k = 0; k < groups.size(); ++k) groups[k].gradient = gradients.rows[fields[k]].data();
+        adam::Block block;
+        bool seen[adam::kBlock];
+#pragma omp for schedule(dynamic, 1)
+        for (size_t chunk = 0; chunk < chunks; ++chunk) {
+            PoseSum sums;
+            const size_t last = std::min(count, (chunk + 1) * kChunk);
+            for (size_t begin = chunk * kChunk; begin < last; begin += adam::kBlock) {
+                const size_t end = std::min(last, begin + adam::kBlock);
+                bool any_seen = false;
+                for (size_t i = begin; i < end; ++i)
+                    any_seen |= seen[i - begin] = frame.splats[i].radius > 0.0f;
+                if (!any_seen) continue;
+                for (size_t first = begin; first < end; first += kLanes)
+                    refused += backward_of(frame, p, first, int(std::min(size_t(kLanes), end - first)), first - begin,
+                                           gradients.out, sums);
+                for (size_t i = begin; i < end; ++i) {
+                    if (!seen[i - begin]) continue;
+                    const double x = gradients.out.means2d[2 * (i - begin)], y = gradients.out.means2d[2 * (i - begin) + 1];
+                    const float length = std::sqrt(float(double(float(x * x)) + y * y));  // rounded as PyTorch's norm
+                    out.means2d_gradient[i] += finite(&length, 1) ? length : 0.0f;
+                    out.means2d_views[i] += 1.0f;
+                }
+                block.origin = int64_t(begin);
+                refused_steps += step.of_block(block, groups, seen, int64_t(begin), int64_t(end));
+            }
+            sums.total(pose.data() + 12 * chunk);
         }
     }
-    std::fill(out.pose, out.pose + 12, 0.0);
-    for (size_t chunk = 0; chunk < chunks; ++chunk)
-        for (int k = 0; k < 12; ++k) out.pose[k] += pose[12 * chunk + k];
+    sum_pose(pose, out.pose);
     out.refused = refused;
+    out.refused_steps = refused_steps;
 }
 
 }  // namespace splats

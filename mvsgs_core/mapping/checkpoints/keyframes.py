@@ -33,6 +33,11 @@ class KeptKeyframe:
         """(H, W, 3) uint8 RGB as it is trained on; None: let go. Raises ValueError for a damaged file."""
         return read_image(self.folder, self.name, torch.device("cpu"))[0].numpy() if self.name else None
 
+    def mask(self) -> np.ndarray | None:
+        """(H, W) bool, False where a pixel is not trained on; None: all are. Raises ValueError for a damaged file."""
+        valid = read_image(self.folder, self.name, torch.device("cpu"))[1] if self.name else None
+        return None if valid is None else valid.numpy()
+
 
 def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
     """Of the newest whole checkpoint in a run's output directory, in the order of the stream.

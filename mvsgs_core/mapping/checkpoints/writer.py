@@ -35,7 +35,7 @@ class CheckpointWriter:
         self._before = resumed  # newest whole state of this run,
         self._images_before: set[str] = set() if resumed is None else images_of(resumed)  # and what it refers to
         self._names: dict[int, tuple[object, str]] = {}  # by keyframe: its image, and the file of it
-        self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()  # None: no more come
         self._begun = False  # to write here
         self._changed = threading.Condition()
         self._pending = 0  # checkpoints that are not done,
@@ -59,10 +59,20 @@ class CheckpointWriter:
             self._pending += 1
         self._do(lambda: self._write(atlas, sync))
 
+    def write(self, atlas: Atlas) -> None:
+        """Writes a frozen atlas's state now, which stays there alone; nothing else is being written. Raises OSError."""
+        self._write_state(atlas, sync=True)
+        self.keep_newest()
+
     def wait(self, seconds: float | None = None) -> bool:
         """Whether all that was begun is done, by then. None: however long it takes."""
         with self._changed:
             return self._changed.wait_for(lambda: self._left == 0, seconds)
+
+    def close(self) -> None:
+        """No more is to be written; what was begun is done."""
+        if self._thread is not None:
+            self._jobs.put(None)
 
     def keep_newest(self) -> None:
         """Removes all but the newest checkpoint, where one was written; nothing is being written."""
@@ -78,9 +88,9 @@ class CheckpointWriter:
             self._thread.start()
 
     def _run(self) -> None:
-        while True:
+        while (job := self._jobs.get()) is not None:
             try:
-                self._jobs.get()()
+                job()
             except OSError as error:
                 self.problems.put(
                     f"no checkpoint can be written to {self._output / FOLDER}: {error.strerror or error}; the run goes "

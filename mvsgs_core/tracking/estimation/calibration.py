@@ -1,4 +1,4 @@
-"""What the tracker learns of the camera itself: the focal length, where that was a guess, and the readout time."""
+"""What the tracker learns of the camera itself: focal length and distortion, where it is guessed, and readout time."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import numpy as np
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.estimation.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
+from mvsgs_core.tracking.estimation.radial import Radial, estimate_radial, lens_problem
 from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout_time
 from mvsgs_core.tracking.graph import KeyframeGraph
 
+BENT_LENS = "the lens bends, and the focal length makes up for it"
+UNKNOWN_LENS = "these images hardly tell a focal length from a lens that bends"
 REESTIMATED_AT = (10, 20, 40)  # keyframes of the map at which the readout time is estimated again
 
 
@@ -87,6 +90,8 @@ class Calibration:
         used = self.focal_factor * self.pixels
         self.stats.values["focal_checked_px"] = factor * used
         self.stats.values["focal length, whole stream"] = f"{factor * used:.1f} px, give or take {100 * sigma:.1f} %"
+        if "focal_sigma_percent" in self.stats.values:
+            self._report_radial(estimate_radial(lens_problem(self.graph, members), self.threads), sigma)
         if abs(np.log(factor)) > max(self.config.drift, sigma):
             self.stats.values["focal_doubt"] = f"all keyframes together want {factor:.4f} times as much"
             self.stats.warn(
@@ -114,16 +119,37 @@ class Calibration:
         self.stats.counts["focal length over its guess"] = self.focal_factor
         if not members:
             return
-        sigma = uncertainty(self.graph, members, self.config.probe, self.threads)
-        self.stats.values["focal length"] += f", give or take {100 * sigma:.1f} %"
-        self.stats.values["focal_sigma_percent"] = 100 * sigma
-        if sigma > self.config.doubt:
+        alone = uncertainty(self.graph, members, self.config.probe, self.threads)
+        radial = estimate_radial(lens_problem(self.graph, members), self.threads)
+        self._report_radial(radial, alone)
+        self.stats.values["focal length"] += f", give or take {self.stats.values['focal_sigma_percent']:.1f} %"
+        if alone > self.config.doubt:
             self.stats.values["focal_doubt"] = "the camera hardly turned while it was estimated"
             self.stats.warn(
-                f"the focal length of {used:.0f} px is uncertain by {100 * sigma:.1f} %: the camera hardly turned "
+                f"the focal length of {used:.0f} px is uncertain by {100 * alone:.1f} %: the camera hardly turned "
                 "while it was estimated, and the map may be stretched in depth by as much; calibrate and set "
                 "dataset.intrinsics=[fx,fy,cx,cy]"
             )
+        elif float(np.hypot(alone, radial.error)) > self.config.doubt:
+            self.stats.values["focal_doubt"] = BENT_LENS if radial.clear else UNKNOWN_LENS
+        if radial.clear:
+            focal = used * radial.focal_factor
+            self.stats.warn(
+                f"the lens bends: a radial distortion of {radial.k1:.3f}, give or take {radial.k1_sigma:.3f}, which is "
+                f"left in the images; run again with dataset.intrinsics=[{focal:.0f},{focal:.0f},cx,cy] "
+                f"dataset.distortion=[{radial.k1:.4f},0,0,0], which undistorts them"
+            )
+
+    def _report_radial(self, radial: Radial, alone: float) -> None:
+        """alone: standard deviation that the focal length would have if the distortion were known, as a fraction."""
+        self.stats.values["focal_sigma_percent"] = 100 * float(np.hypot(alone, radial.error))
+        focal = self.focal_factor * self.pixels * radial.focal_factor
+        sigma = 100 * float(np.hypot(alone, radial.slope * radial.k1_sigma))
+        self.stats.values["radial_k1"], self.stats.values["radial_k1_sigma"] = radial.k1, radial.k1_sigma
+        self.stats.values["radial distortion"] = (
+            f"{radial.k1:.3f}, give or take {radial.k1_sigma:.3f}; with it a focal length of "
+            f"{focal:.1f} px, give or take {sigma:.1f} %"
+        )
 
 
 __all__ = ["REESTIMATED_AT", "Calibration"]

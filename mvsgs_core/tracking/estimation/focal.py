@@ -11,12 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
+from mvsgs_core.tracking.estimation.radial import TOGETHER
 from mvsgs_core.tracking.estimation.structure_from_motion import Reconstruction, ReconstructionCriteria, reconstruct
 from mvsgs_core.tracking.graph import KeyframeGraph
 
-# Matches that count as one: points of an image share its lens, shutter and pose, and err together. So many make the
-# curvature's deviation that of what was found on hand-held sequences whose focal length is known.
-TOGETHER = 64
 PARTS = 3  # of the keyframes, in their order, each of which is asked alone ...
 MIN_KEYFRAMES = 4  # ... where it has so many
 
@@ -92,7 +90,8 @@ def focal_of_all(graph: KeyframeGraph, members: list[int], threads: int) -> floa
 
 
 def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0) -> float:
-    """Standard deviation of the focal length that these keyframes give, as a fraction; infinite where they don't tell.
+    """Standard deviation of the focal length that these keyframes give a pinhole camera, as a fraction; infinite where
+    they don't tell. What the lens adds is in radial.py.
 
     factor: what they give, on the graph's focal length.
 

@@ -26,7 +26,8 @@ _RIDGE = 1e-4  # share of the whole: few samples tell the terms apart
 class Levels:
     """Means and spread of the windows of 3x3 of a half-size image (h, w, 3) uint8 RGB, 0 to 1."""
 
-    def __init__(self, half: np.ndarray) -> None:
+    def __init__(self, half: np.ndarray, mask: np.ndarray | None = None) -> None:
+        """mask: (h, w) bool, False where a pixel is to be ignored; None: all count."""
         values = half.astype(np.float32) * np.float32(1.0 / 255.0)
         mean, gray = np.asarray(cv2.blur(values, (3, 3))), values.mean(axis=2)
         window = np.ones((3, 3), np.uint8)
@@ -34,6 +35,8 @@ class Levels:
         clipped |= cv2.erode(half, window).min(axis=2) < 255.0 * DARKEST
         mean[clipped] = np.nan
         spread = np.sqrt(np.maximum(cv2.blur(gray * gray, (3, 3)) - cv2.blur(gray, (3, 3)) ** 2, 0.0))
+        if mask is not None:
+            mean[~mask], spread[~mask] = np.nan, 1.0
         self._windows = np.dstack([mean, spread])
 
     def flattest(self, cell: int) -> np.ndarray:

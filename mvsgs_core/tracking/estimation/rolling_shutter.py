@@ -87,13 +87,28 @@ def rectified(image: np.ndarray, frame: TrackingImage, readout_time: float) -> n
     """
     if readout_time == 0.0 or frame.velocity is None:
         return image
-    height, width = image.shape[:2]
+    x, y = _seen_at(frame, image.shape[:2], readout_time)
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+def rectified_mask(mask: np.ndarray | None, frame: TrackingImage, readout_time: float) -> np.ndarray | None:
+    """Pixels (H, W) bool that a mask leaves of the image as it was taken and of its `rectified` one alike."""
+    if mask is None or readout_time == 0.0 or frame.velocity is None:
+        return mask
+    x, y = _seen_at(frame, mask.shape, readout_time)
+    moved = cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(mask & (moved > 0))
+
+
+def _seen_at(frame: TrackingImage, size: tuple[int, ...], readout_time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where in the image as it was taken (height, width) each pixel of the rectified one is: columns and rows."""
+    assert frame.velocity is not None
+    height, width = size
     zoom = np.array([width / frame.size[1], height / frame.size[0]], np.float32)
     velocity = cv2.resize(frame.velocity * zoom, (width, height), interpolation=cv2.INTER_LINEAR)
     u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
     late = np.float32(readout_time) * (v / height - 0.5)
-    x, y = u + velocity[..., 0] * late, v + velocity[..., 1] * late
-    return np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    return u + velocity[..., 0] * late, v + velocity[..., 1] * late
 
 
 def check_readout_time(readout_time: float | None) -> None:
@@ -111,4 +126,5 @@ __all__ = [
     "check_readout_time",
     "estimate_readout_time",
     "rectified",
+    "rectified_mask",
 ]

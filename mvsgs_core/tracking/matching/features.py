@@ -13,14 +13,16 @@ def match_descriptors(a: np.ndarray, b: np.ndarray, ratio: float = 0.85) -> np.n
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.int64)
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    forward = matcher.knnMatch(a, b, k=2)
-    back = {m.queryIdx: m.trainIdx for m in matcher.match(b, a)}
-    pairs = [
+    forward = [
         (best.queryIdx, best.trainIdx)
-        for best, second in (pair for pair in forward if len(pair) == 2)
-        if best.distance < 64 and best.distance < ratio * second.distance and back[best.trainIdx] == best.queryIdx
+        for best, second in (pair for pair in matcher.knnMatch(a, b, k=2) if len(pair) == 2)
+        if best.distance < 64 and best.distance < ratio * second.distance
     ]
-    return np.array(pairs, np.int64).reshape(-1, 2)
+    if not forward:
+        return np.zeros((0, 2), np.int64)
+    asked = np.unique([there for _, there in forward])  # the way back only of those that a pair ends at
+    back = {int(asked[m.queryIdx]): m.trainIdx for m in matcher.match(b[asked], a)}
+    return np.array([pair for pair in forward if back[pair[1]] == pair[0]], np.int64).reshape(-1, 2)
 
 
 def match_features(a: TrackingImage, b: TrackingImage, threshold: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

@@ -44,6 +44,8 @@ class Matcher:
         if len(wanted):
             found = self.flow.match(a, b, cells.points[wanted], guess[wanted])
             target[wanted], weight[wanted] = found.target, found.weight
+            hidden = b.masked(target)
+            target[hidden], weight[hidden] = np.nan, 0.0
         fraction = float((weight > 0).sum() / max(1, cells.textured.sum()))
         return Matches(target, weight, b.shutter(target)), fraction
 

@@ -96,10 +96,8 @@ class CovisibleKeyframes:
 
     def _tied_to(self, reference: int) -> set[int]:
         """Keyframes at most two edges away, the reference left out: what is not tied to it may have drifted."""
-        reached = {reference}
-        for _ in range(2):
-            reached |= {n for a, b in self.graph.edges if a in reached or b in reached for n in (a, b)}
-        return reached - {reference}
+        edges = self.graph.edges
+        return edges.reached(edges.reached([reference])) - {reference}
 
     def _refer(self, index: int | None) -> None:
         if self.followed is not None:

@@ -8,12 +8,14 @@ from itertools import pairwise
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of, solve_pose_graph
+from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, relative_scale, verify_place
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 from mvsgs_core.tracking.places.retrieval import Retrieval
+from mvsgs_core.tracking.places.thinning import solve_thinned
+from mvsgs_core.tracking.steps import Steps, whole
 
 
 @dataclass(frozen=True)
@@ -51,15 +53,21 @@ class LoopCloser:
 
         What is near, in time or by at most two edges, is no loop.
         """
+        return whole(self.searching(index))
+
+    def searching(self, index: int) -> Steps[Closure | None]:
+        """`search`, a candidate a step."""
         keyframe = self.graph.keyframes[index]
         order = self.local_map.members(keyframe.segment)
         place = order.index(index)
         near = set(order[max(0, place - self.config.min_gap) :]) | self.graph.neighbors(index) | {index}
         near |= {m for n in self.graph.neighbors(index) for m in self.graph.neighbors(n)}
         descriptors = keyframe.image.features()[1]
+        yield
         usual = set(order[max(0, place - 2) : place])
         for candidate in self.retrieval.query(descriptors, self.config.max_candidates, near, usual):
             found = verify_place(self.graph, self.local_map.matcher, candidate, keyframe.image, self.config.criteria)
+            yield
             if found is None:
                 continue
             scale = relative_scale(self.graph, found, index)
@@ -104,7 +112,8 @@ class LoopCloser:
         number = {k: n for n, k in enumerate(order)}
         poses = np.stack([self.graph.keyframes[k].cam_from_world for k in order])
         unit = float(np.median([self.graph.keyframes[k].median_depth for k in order]))
-        pairs = {(min(a, b), max(a, b)) for a, b in self.graph.edges if a in number and b in number}
+        tied = self.graph.edges.of(order)
+        pairs = {(min(a, b), max(a, b)) for a, b in tied if a in number and b in number}
         pairs |= set(pairwise(order))
         source, to = np.array([(number[a], number[b]) for a, b in sorted(pairs)]).T
         edges = SimilarityEdges(
@@ -115,7 +124,7 @@ class LoopCloser:
             ),
             sigma=np.tile([0.01 * unit, 0.005, 0.01], (len(source) + 1, 1)),
         )
-        solution = solve_pose_graph(poses, edges, {0})
+        solution = solve_thinned(poses, edges)
         if solution.failure or not np.isfinite(solution.similarities).all():
             return solution.failure or "the pose graph's solution is not finite"
         for k, similarity in zip(order, solution.similarities):

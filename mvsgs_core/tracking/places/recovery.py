@@ -11,6 +11,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
+from mvsgs_core.tracking.steps import Steps, whole
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,10 @@ class Recovery:
 
         Each pose that is found meets the criteria; returns how many were found.
         """
+        return whole(self.filling_in(records))
+
+    def filling_in(self, records: list[FrameRecord]) -> Steps[int]:
+        """`fill_in`, a frame a step."""
         found = 0
         for forward in (False, True):
             start: int | None = None  # the keyframe that was passed last
@@ -49,13 +54,13 @@ class Recovery:
                     run.append(record)
                     continue
                 if run and start is not None:
-                    found += self._follow(start, run)
+                    found += yield from self._follow(start, run)
                 run = []
                 if record is not None and record.index in self.graph.keyframes:
                     start = record.index
         return found
 
-    def _follow(self, start: int, run: Iterable[FrameRecord]) -> int:
+    def _follow(self, start: int, run: Iterable[FrameRecord]) -> Steps[int]:
         """One run of frames without a pose, from the keyframe at its side; returns how many were found."""
         follower = FrontEnd(self.graph, self.matcher, self.front_end, 1)
         follower.refer_to(self.graph.keyframes[start].image)
@@ -71,6 +76,7 @@ class Recovery:
                 record.follow(self.graph, start, step.matches, step.localization.cam_from_world, image)
                 found += 1
             image.release()
+            yield
         return found
 
     def _has_pose(self, record: FrameRecord) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+
 import numpy as np
 
 TABLES = 4
@@ -14,31 +16,36 @@ class Retrieval:
     def __init__(self, seed: int = 0) -> None:
         random = np.random.default_rng(seed)
         self._bits = np.stack([random.choice(256, BITS, replace=False) for _ in range(TABLES)])
-        self._postings: dict[int, list[int]] = {}
-        self._keyframes = 0
+        self._postings: dict[int, array[int]] = {}  # of a word: places in `_indices`
+        self._indices: list[int] = []  # of keyframes, as they were added
+        self._places: dict[int, int] = {}  # in it
 
     def add(self, index: int, descriptors: np.ndarray) -> None:
         """descriptors: (N, 32) uint8."""
-        self._keyframes += 1
-        for word in np.unique(self._words(descriptors)):
-            self._postings.setdefault(int(word), []).append(index)
+        place = self._places[index] = len(self._indices)
+        self._indices.append(index)
+        for word in np.unique(self._words(descriptors)).tolist():
+            self._postings.setdefault(word, array("i")).append(place)
 
     def query(self, descriptors: np.ndarray, count: int, exclude: set[int], usual: set[int] | None = None) -> list[int]:
         """The keyframes outside `exclude` that look most alike, best first.
 
         usual: keyframes that are known to see the same: those that look less than half as much like it are no match.
         """
-        scores: dict[int, float] = {}
-        for word in np.unique(self._words(descriptors)):
-            postings = self._postings.get(int(word), ())
-            if not postings:
-                continue
-            rarity = float(np.log(1.0 + self._keyframes / len(postings)))
-            for index in postings:
-                scores[index] = scores.get(index, 0.0) + rarity
-        min_score = 0.5 * max((scores.get(index, 0.0) for index in usual or ()), default=0.0)
-        good = [index for index in scores if index not in exclude and scores[index] >= min_score]
-        return sorted(good, key=lambda index: (-scores[index], index))[:count]
+        words = np.unique(self._words(descriptors)).tolist()
+        found = [self._postings[word] for word in words if word in self._postings]
+        if not found:
+            return []
+        lengths = np.array([len(postings) for postings in found])
+        rarity = np.log(1.0 + len(self._indices) / lengths)
+        places = np.concatenate([np.frombuffer(postings, np.int32) for postings in found])
+        scores = np.bincount(places, np.repeat(rarity, lengths), len(self._indices))
+        known = [self._places[index] for index in usual or () if index in self._places]
+        min_score = 0.5 * max((scores[place] for place in known), default=0.0)
+        scores[[self._places[index] for index in exclude if index in self._places]] = 0.0
+        good = np.flatnonzero((scores > 0.0) & (scores >= min_score))
+        best = np.lexsort((np.array(self._indices)[good], -scores[good]))[:count]
+        return [self._indices[place] for place in good[best]]
 
     def _words(self, descriptors: np.ndarray) -> np.ndarray:
         if len(descriptors) == 0:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import zmq
 
 from msgs import End, Message
-from msgs.codec import NEWEST, RELIABLE, encode
+from msgs.codec import AGAIN, NEWEST, RELIABLE, encode
 from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
 from nodes.runtime.frame_pool import FramePool
-from nodes.runtime.transport.sockets import OBSERVER, guard, open_socket, readable
+from nodes.runtime.transport.kept import Kept
+from nodes.runtime.transport.sockets import GOODBYE, OBSERVER, guard, open_socket, readable
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
 NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
@@ -27,6 +29,9 @@ class Publisher:
 
     `send` holds the caller back while a reliable reader is `buffer` messages behind; meanwhile it calls `held_back`,
     which may raise. Not for use by two threads.
+
+    With `away`, a reliable reader that is lost may be started again: what it can have lost is sent to it once more, and
+    only one that stays away for longer is an error. Meanwhile `buffer` messages are kept for it, then `send` waits.
     """
 
     def __init__(
@@ -39,6 +44,8 @@ class Publisher:
         max_bytes: int | None = None,
         token: str = "",  # with which a reader's subscription must begin: who has none gets nothing
         held_back: Callable[[], None] = lambda: None,
+        away: float = 0.0,  # s for which a lost reader is waited for; 0: it is an error at once
+        say: Callable[[str], object] = lambda text: None,  # takes what a user should read
     ) -> None:
         check_address(address, bind=True, keys=keys)
         self.topic = topic or address
@@ -47,6 +54,11 @@ class Publisher:
         self.observers: dict[str, bytes] = {}  # delivery of those readers that only observe, by name
         self._essential = 0  # reliable readers that were there at the start
         self._held_back = held_back
+        self._buffer, self._away, self._say = max(1, buffer), away, say
+        self._kept = Kept(self._buffer) if away else None
+        self._missing_since: float | None = None  # by time.monotonic: when a reader was lost that is not back
+        self._not_sent = 0  # messages that a lost reader will get when it is back
+        self._goodbyes = 0
         self._max_bytes = max_bytes
         self._started = self._ended = False
         self._pool = FramePool()
@@ -80,8 +92,21 @@ class Publisher:
         while readable(self.socket):
             event = self.socket.recv()
             self._note(arrived=event[:1] == b"\x01", what=event[1:])
-        if self._started and not self._ended and self._reliable_readers() < self._essential:
+        if not self._started or (self._ended and not self._away):
+            return
+        if self._missing() <= 0:
+            self._missing_since = None
+        elif not self._away:
             raise PeerLost(f"a reader of {self.topic} left before the end")
+        elif self._missing_since is None:
+            self._missing_since, self._not_sent = time.monotonic(), 0
+            self._say(f"a reader of {self.topic} was lost: it is waited for up to {self._away:g} s")
+        elif time.monotonic() - self._missing_since > self._away:
+            raise PeerLost(f"a reader of {self.topic} left before the end, and was not back within {self._away:g} s")
+
+    def _missing(self) -> int:
+        """Reliable readers that were there at the start, are not, and have not said goodbye."""
+        return self._essential - self._reliable_readers() - self._goodbyes
 
     def _note(self, arrived: bool, what: bytes) -> None:
         if not what.startswith(self._token):
@@ -93,7 +118,11 @@ class Publisher:
                 self.observers[name] = what[1:2]
             else:
                 self.observers.pop(name, None)
+        elif what == GOODBYE:
+            self._goodbyes += arrived
         elif what in (RELIABLE, NEWEST):  # else it is no reader of ours
+            if arrived and what == RELIABLE and self._started:
+                self._send_again()
             self.readers[what] = max(0, self.readers[what] + (1 if arrived else -1))
             self.socket.setsockopt(zmq.SUBSCRIBE if arrived else zmq.UNSUBSCRIBE, what)  # of the one who just spoke
 
@@ -107,11 +136,18 @@ class Publisher:
         before: messages that the caller has sent by its other publishers, by type.
         """
         self.watch()
+        while self._missing_since is not None and self._not_sent >= self._buffer:
+            self._held_back()
+            self.socket.poll(HELD_BACK_MS)
+            self.watch()
         sequence, self.sent = self.sent, self.sent + 1
         if self.readers[NEWEST] > 0:
             self._send(message, sequence, NEWEST, before)
         if self.readers[RELIABLE] > 0:
             self._send(message, sequence, RELIABLE, before)
+        elif self._kept is not None:
+            self._kept.add(encode(message, sequence, before=before, delivery=RELIABLE, max_bytes=self._max_bytes))
+        self._not_sent += 1
 
     def end(self, message: End) -> None:
         self._ended = True
@@ -124,7 +160,8 @@ class Publisher:
         late = time.monotonic() > self._deadline
         if self.readers[NEWEST] > 0 and not late:
             self._send(self._end, self.sent - 1, NEWEST)
-        return self.readers[RELIABLE] <= 0 and (late or self.readers[NEWEST] <= 0)
+        there = self.readers[RELIABLE] > 0 or (self._away > 0 and self._missing() > 0)
+        return not there and (late or self.readers[NEWEST] <= 0)
 
     def close(self, *, farewell: bool = True) -> None:
         """Unbinds. A publisher outside a graph first sends End to those who listen and waits a second for them; without
@@ -152,12 +189,26 @@ class Publisher:
         frame = encode(
             message, sequence, before=before, delivery=delivery, max_bytes=self._max_bytes, allocate=allocate
         )
-        self.socket.setsockopt(zmq.XPUB_NODROP, int(delivery == RELIABLE))
+        if self._kept is not None and delivery == RELIABLE:
+            self._kept.add(frame)
+        self._pool.give(buffers[0], self._deliver(frame, delivery != NEWEST))
+
+    def _deliver(self, frame: memoryview | bytes, reliably: bool) -> zmq.MessageTracker:
+        self.socket.setsockopt(zmq.XPUB_NODROP, int(reliably))
         whole = zmq.Frame(frame, track=True, copy=None, copy_threshold=self.socket.copy_threshold)
         while True:
             try:
-                tracker = self.socket.send(whole, copy=False, track=True)
-                break
+                return self.socket.send(whole, copy=False, track=True)
             except zmq.Again:
                 self._held_back()
-        self._pool.give(buffers[0], tracker)
+
+    def _send_again(self) -> None:
+        """To the reader that just spoke and to nobody else, before it is sent anything new."""
+        if self._kept is None:
+            return
+        self.socket.setsockopt(zmq.SUBSCRIBE, AGAIN)
+        for frame in self._kept:
+            self._deliver(frame, True)
+        with suppress(zmq.ZMQError):  # it may be gone again
+            self.socket.setsockopt(zmq.UNSUBSCRIBE, AGAIN)
+        self._say(f"a reader of {self.topic} was started again: it was sent {len(self._kept)} messages once more")

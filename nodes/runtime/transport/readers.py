@@ -5,14 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
+from typing import Any
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from msgs import End, Message
-from msgs.codec import NEWEST, RELIABLE, CodecError, Decoded, decode, max_message_bytes, type_name
+from msgs.codec import AGAIN, NEWEST, RELIABLE, CodecError, Decoded, decode, max_message_bytes, type_name
 from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
-from nodes.runtime.transport.sockets import OBSERVER, open_socket, readable
+from nodes.runtime.transport.sockets import GOODBYE, OBSERVER, open_socket, readable
 
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 LOST = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
@@ -37,6 +39,8 @@ class _Reader:
         max_bytes: int | None = None,
         token: str = "",  # of the publisher
         observer: str | None = None,  # the name of one that only observes: its loss does not concern the publisher
+        away: float = 0.0,  # s for which a lost publisher is waited for: one that is started again begins anew
+        say: Callable[[str], object] = lambda text: None,  # takes what a user should read
     ) -> None:
         check_address(address)
         self.topic = topic or address
@@ -48,10 +52,14 @@ class _Reader:
         self._max_bytes = max_message_bytes(type) if max_bytes is None else max_bytes
         self._frames: deque[zmq.Frame] = deque()  # taken over, not asked for yet
         self._lost_at: float | None = None
+        self._away, self._say = away, say
+        self._token, self._observer = token.encode(), observer
+        self.broke = False  # the connection did, and nothing came since
         self._socket = open_socket(zmq.SUB, address, keys, self._max_bytes)
         self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 50, self.longest_pause
-        self.monitor = self._socket.get_monitor_socket(self.monitored)
+        back = zmq.EVENT_HANDSHAKE_SUCCEEDED if away else 0
+        self.monitor = self._socket.get_monitor_socket(self.monitored | back)
         self._socket.connect(address)
         self._subscription = token.encode() + self.delivery
         if observer is not None:  # first: it must not pass for another reader
@@ -64,17 +72,27 @@ class _Reader:
         """Takes note of a lost connection. Raises TransportError if the publisher refuses this reader's keys."""
         while readable(self.monitor):
             event = recv_monitor_message(self.monitor)["event"]
-            if event & REFUSED and self._keys is not None:
+            known = self._away > 0 and self.received > 0  # one that is just starting or going may fail so, too
+            if event & REFUSED and self._keys is not None and not known:
                 raise TransportError(f"the publisher of {self.topic} refused the keys: both ends need the same file")
-            if event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+            if event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL and not known:
                 raise TransportError(f"the publisher of {self.topic} speaks another protocol: keys on one side only?")
-            if self._lost_at is None:
-                self._lost_at = time.monotonic()
+            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                if self._lost_at is not None:
+                    gone = time.monotonic() - self._lost_at
+                    self._say(f"the publisher of {self.topic} is back after {gone:.1f} s")
+                self._lost_at = None
+            elif self._lost_at is None:
+                self._lost_at, self.broke = time.monotonic(), True
+                if self._away and not self.ended:
+                    self._say(f"the publisher of {self.topic} was lost: it is waited for up to {self._away:g} s")
 
     def check_peer(self) -> None:
         """Raises PeerLost if the publisher is gone without End. To be called when no message waits."""
-        if self._lost_at is not None and not self.ended and time.monotonic() - self._lost_at > PEER_GRACE:
-            raise PeerLost(f"the publisher of {self.topic} disappeared before the end")
+        grace = max(PEER_GRACE, self._away)
+        if self._lost_at is not None and not self.ended and time.monotonic() - self._lost_at > grace:
+            late = f", and was not back within {self._away:g} s" if self._away else ""
+            raise PeerLost(f"the publisher of {self.topic} disappeared before the end{late}")
 
     @property
     def sender(self) -> str:
@@ -91,6 +109,8 @@ class _Reader:
 
     def _say_goodbye(self) -> None:
         """What the publisher waits for."""
+        if self._observer is None and self.delivery == RELIABLE:
+            self._socket.subscribe(self._token + GOODBYE)  # it has read the end, and is not lost
         self._socket.unsubscribe(self._subscription)
 
     def _close_socket(self) -> None:
@@ -113,10 +133,20 @@ class _Reader:
 
 
 class ReliableReader(_Reader):
-    """Every message of a topic, in order. Takes up to `buffer` messages over before they are asked for."""
+    """Every message of a topic, in order. Takes up to `buffer` messages over before they are asked for.
+
+    joins: its process may have been started again in the midst of the stream, which it takes up where it gets it.
+    """
 
     delivery = RELIABLE
     _head: Decoded | None = None  # the next message, looked at already
+
+    def __init__(self, address: str, type: type, *, joins: bool = False, **options: Any) -> None:
+        super().__init__(address, type, **options)
+        self.begun = 0  # times that the publisher was started again and its stream came from the beginning
+        self._joining = joins
+        if joins:
+            self._socket.subscribe(AGAIN)  # for this socket's own filter: to the publisher it says nothing
 
     @property
     def pollable(self) -> zmq.Socket[bytes]:
@@ -128,11 +158,30 @@ class ReliableReader(_Reader):
             self._frames.append(self._socket.recv(copy=False))
         if self._head is None and self._frames and not self.ended:
             self._head = self._decode(self._frames.popleft())
+            if self._begins(self._head.sequence):
+                self.expected = self._head.sequence
             if self._head.sequence != self.expected:
                 raise TransportError(
                     f"{self.topic}: message {self._head.sequence} came where {self.expected} was due: some were lost"
                 )
         return self._head
+
+    def behind(self, begun: int, messages: int) -> bool:
+        """Whether some of that many messages are still to come, of a sender that was started again `begun` times."""
+        if self.begun != begun:
+            return self.begun < begun and messages > 0
+        return messages > self.expected
+
+    def _begins(self, sequence: int) -> bool:
+        """Whether another numbering holds from this message on."""
+        joining, self._joining = self._joining, False
+        if self._away and sequence == 0:
+            self.watch()
+            if self.broke:
+                self.broke = False
+                self.begun += 1
+                return True
+        return joining
 
     def take(self) -> Message | None:
         """The next message, if one has arrived; after End nothing. Raises TransportError if one was lost."""
@@ -168,10 +217,13 @@ class NewestReader(_Reader):
         max_bytes: int | None = None,
         token: str = "",
         observer: str | None = None,
+        away: float = 0.0,
+        say: Callable[[str], object] = lambda text: None,
     ) -> None:
         super().__init__(
-            address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes, token=token, observer=observer
-        )
+            address, type, topic=topic, buffer=2, keys=keys, max_bytes=max_bytes, token=token, observer=observer,
+            away=away, say=say,
+        )  # fmt: skip
         self._frames = deque(maxlen=1)  # a newer one takes the older one's place
         self._late = late
         self._odd: deque[zmq.Frame] = deque(maxlen=1)  # what took no message's place, to be reported

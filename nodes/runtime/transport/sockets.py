@@ -12,6 +12,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from nodes.runtime.addresses import Keys, save_keys
 
 OBSERVER = b"O"  # begins the subscription by which a reader says its delivery and its name: no frame begins so
+GOODBYE = b"G"  # the subscription by which a reader says that it has read the end: no frame begins so either
 
 
 def create_keys(folder: str | Path) -> Keys:

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from launch.summary import _figures
 from mvsgs_core.evaluation import html, metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH
 from mvsgs_core.evaluation.metrics import Metric
 from mvsgs_core.evaluation.scoring import ScoredFrame, score_frame, summarize, worst_of
-from mvsgs_core.rasterizer.splats import Splats
+from tests.support.small_maps import empty_map
 
 
 def frame(index: int, gray: int) -> ScoredFrame:
     lens = np.array([30.0, 30.0, 15.5, 11.5])
     return ScoredFrame(index, False, np.eye(4), lens, lambda: np.full((24, 32, 3), gray, np.uint8), 0.01)
-
-
-def empty_map() -> Splats:
-    none = torch.zeros(0)
-    return Splats(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), none, torch.zeros(0, 1, 3), none)
 
 
 def test_a_new_entry_is_scored_ranked_and_shown(monkeypatch: pytest.MonkeyPatch) -> None:

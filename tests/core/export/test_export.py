@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,12 +15,18 @@ import torch
 from plyfile import PlyData
 
 from mvsgs_core.export import __main__ as export
+from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.command_line import input_arguments, lens
+from mvsgs_core.export.earth import in_axes_of
 from mvsgs_core.export.ply import folded, read_ply, write_ply
+from mvsgs_core.export.turning import RUB_FROM_RDF
+from mvsgs_core.geometry import so3_exp
+from mvsgs_core.georeference import Georeference, write_georeference
 from mvsgs_core.rasterizer.kernels import log_scale_shift
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from tests.support.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map, save_cameras, write_poses
+from mvsgs_core.trajectory_file import read_trajectory
+from tests.support.tiny_map import INTRINSICS, ORIGIN, SIZE, final_map, save_cameras, write_poses, write_tiny_run
 
 
 @pytest.mark.parametrize("bases", [1, 4, 16])
@@ -224,3 +231,51 @@ def test_as_a_command(tmp_path: Path, module: str, arguments: list[str], written
     assert done.returncode == 0, done.stderr
     assert f"{words[-1]}: {written}" in done.stdout
     assert words[-1].stat().st_size > 0
+
+
+def test_a_map_in_metres_of_a_place_looks_the_same_from_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    final, random = final_map(), torch.Generator().manual_seed(1)
+    apart = final.splats.means + 0.01 * torch.randn(
+        final.splats.means.shape, generator=random
+    )  # of equal depth is none
+    write_ply(run / "map.ply", replace(final, splats=replace(final.splats, means=apart)))
+    out = tmp_path / "map.ply"
+    assert export.main([str(run), str(out), "--frame", "enu"]) == 1
+    assert "there is no georeference.json beside" in capsys.readouterr().err
+    turn = so3_exp(np.array([0.7, -1.1, 0.4]))
+    place = Georeference(
+        np.array([47.0, 8.0, 400.0]), 3.0, turn, np.array([5.0, -2.0, 1.0]), 9, 1, 0.5, 2.0, 0.01, 0.2, 0.1
+    )
+    write_georeference(run / "georeference.json", place)
+    assert export.main([str(run), str(out), "--frame", "enu"]) == 0
+    assert f"x east, y north, z up, in metres, of the place in {out}.origin.json" in capsys.readouterr().out
+    said = json.loads((tmp_path / "map.ply.origin.json").read_text())
+    assert said["origin"] == {"latitude": 47.0, "longitude": 8.0, "altitude": 400.0}
+    before = read_ply(run / "map.ply")
+    world = before.splats.means.numpy() + before.origin
+    expected = 3.0 * world @ turn.T + [5.0, -2.0, 1.0]
+    after = read_ply(out)
+    np.testing.assert_allclose(after.splats.means.numpy() + after.origin, expected, atol=1e-4)
+    assert export.main([str(run), str(tmp_path / "cameras.json"), "--frame", "enu"]) == 0
+    cameras, here = read_cameras(tmp_path / "cameras.json"), read_cameras(run / "cameras.json")
+    for pose, moved in zip(here.world_from_cam, cameras.world_from_cam):
+        one, other = before.render(pose, INTRINSICS, SIZE), after.render(moved, INTRINSICS, SIZE)
+        np.testing.assert_allclose(other.color, one.color, atol=1e-4)
+        np.testing.assert_allclose(other.depth, 3.0 * one.depth, rtol=1e-3)
+    assert export.main([str(run), str(tmp_path / "path.txt"), "--frame", "enu"]) == 0
+    np.testing.assert_allclose(read_trajectory(tmp_path / "path.txt")[1], cameras.world_from_cam, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".spz"])
+def test_up_is_where_a_format_says(suffix: str) -> None:
+    turn = so3_exp(np.array([0.7, -1.1, 0.4]))
+    place = Georeference(
+        np.array([47.0, 8.0, 400.0]), 3.0, turn, np.array([5.0, -2.0, 1.0]), 9, 1, 0.5, 2.0, 0.01, 0.2, 0.1
+    )
+    written, axes = in_axes_of(Path(f"map{suffix}"), place)
+    east, north, up = place.world(np.ones((1, 3)))[0]
+    np.testing.assert_allclose(RUB_FROM_RDF @ written.world(np.ones((1, 3)))[0], [east, up, -north])
+    assert axes == "x east, y up, z south"

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from plyfile import PlyData
 
 from mvsgs_core import camera
 from mvsgs_core.export import __main__ as export
 from mvsgs_core.export.glb import linear, write_glb
+from mvsgs_core.export.mesh import write_mesh_ply
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.open3d_loader import open3d
 from mvsgs_core.rasterizer.rasterize import rasterize
@@ -64,6 +66,30 @@ def test_glb_opened_by_another_program_looks_from_its_axes_as_the_map_does_from_
     difference = np.abs(shown - expected.color.numpy()[seen]).mean(axis=1)
     assert np.median(difference) < 0.02
     assert np.median(np.abs(colors[mesh.faces[face[seen]]].mean(axis=1) - expected.color.numpy()[seen])) > 0.1
+
+
+@pytest.mark.parametrize(("far", "kind"), [(0.0, "f4"), (1e6 + 0.3, "f8")])
+def test_mesh_ply_is_float32_where_that_holds_it(tmp_path: Path, far: float, kind: str) -> None:
+    """Viewers in browsers draw no doubles."""
+    vertices = np.array([[far, 0.0, 2.0], [far + 1.0, 0.1, 2.0], [far, 1.0, 3.0]])
+    colors = np.array([[0.5, 0.0, 1.0], [0.02, 0.2, 0.9], [1.0, 1.0, 1.0]])
+    write_mesh_ply(tmp_path / "one.ply", vertices, np.array([[0, 1, 2]]), colors, 1e-5)
+    assert PlyData.read(str(tmp_path / "one.ply"))["vertex"].data.dtype["x"] == np.dtype(kind)
+    mesh = trimesh.load_mesh(tmp_path / "one.ply", process=False)
+    np.testing.assert_allclose(mesh.vertices, vertices, atol=1e-5)
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+    np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3] / 255.0, colors, atol=0.5 / 255)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".stl", ".off", ".obj"])
+def test_other_formats_have_all_triangles_by_trimesh(
+    tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_cameras(tmp_path, [0.5], SIZE, INTRINSICS)
+    mesh = trimesh.load_mesh(mesh_of_box(tmp_path, f"mesh{suffix}"))
+    assert f" {len(mesh.faces)} triangles" in capsys.readouterr().out
+    assert len(mesh.faces) > 300
 
 
 def srgb(values: np.ndarray) -> np.ndarray:

@@ -70,7 +70,11 @@ def test_what_is_no_camera_is_none(statistics: dict[str, Any]) -> None:
 
 def test_it_comes_back_from_cameras_json_and_is_no_keyframe(tmp_path: Path) -> None:
     path = tmp_path / "cameras.json"
-    camera = source_camera(said(GUESS, factor=1.25, focal_sigma_percent=1.5, readout_time=0.02))
+    bent = {"radial_k1": -0.1, "radial_k1_sigma": 0.02}
+    camera = source_camera(said(GUESS, factor=1.25, focal_sigma_percent=1.5, readout_time=0.02, **bent))
+    assert camera is not None
+    assert camera.radial == (-0.1, 0.02)
+    assert "radial distortion -0.100, give or take 0.020, left in" in camera.text()
     write_cameras(path, cameras_around([0.0, 1.0]), camera)
     assert read_source_camera(path) == camera
     assert len(read_cameras(path)) == 2
@@ -78,7 +82,9 @@ def test_it_comes_back_from_cameras_json_and_is_no_keyframe(tmp_path: Path) -> N
     assert read_source_camera(path) is None
 
 
-@pytest.mark.parametrize("change", [{"origin": "x"}, {"intrinsics": [1, 2, 3]}, {"focal_sigma": -1}, {"doubt": None}])
+@pytest.mark.parametrize(
+    "change", [{"origin": "x"}, {"intrinsics": [1, 2, 3]}, {"focal_sigma": -1}, {"doubt": None}, {"radial": [1]}]
+)
 def test_damage_is_named(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "cameras.json"
     write_cameras(path, cameras_around([0.0]), SourceCamera(PHONE, "given"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -107,6 +109,27 @@ def test_std_ratio_by_integration(beta: float) -> None:
     variance = np.sum(r**3 * kernel) / np.sum(r * kernel) / 2
     ratio = float(kernels.gaussian_std_ratio(torch.tensor([beta], dtype=torch.float64)))
     assert ratio == pytest.approx(np.sqrt(variance), rel=1e-3)
+
+
+def test_a_loss_of_ones_own_is_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inputs = inputs_of(torch.rand(24, 32, 3), torch.rand(24, 32, 3), 10.0)
+
+    def make() -> losses.LossFunction:
+        return lambda given: given.splats.opacity_logits.sigmoid().mean()
+
+    first, second = make(), make()  # of one name, as a notebook's cell that is run again makes them
+    names = [losses.name_of(function) for function in (first, second, first)]
+    assert names[0] == names[2] != names[1]
+    assert [losses.loss_function(name) for name in names] == [first, second, first]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "losses_of_mine.py").write_text("def squared(given):\n    return (given.target ** 2).mean()\n")
+    with pytest.raises(TypeError, match=r"with a gradient to .*it returned a tensor of shape \(\)"):
+        losses.own_loss(losses.loss_function("losses_of_mine.squared"), inputs)
+    for name in ("losses_of_mine.cubed", "squared", "no_such_file.squared"):
+        with pytest.raises(ValueError, match=f"training.loss_function={name}: "):
+            losses.loss_function(name)
+    with pytest.raises(TypeError, match="a function of LossInputs, not int"):
+        losses.name_of(3)  # type: ignore[arg-type]
 
 
 def test_the_loss_is_the_weighted_sum_of_its_terms(monkeypatch: pytest.MonkeyPatch) -> None:

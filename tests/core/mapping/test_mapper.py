@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.mapping import losses
+from mvsgs_core.mapping import keyframe_store, losses
 from mvsgs_core.mapping.config import TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
@@ -226,6 +226,25 @@ def test_images_are_kept_for_a_bounded_number_of_keyframes_spread_over_the_run()
     shift = np.stack([view.world_from_cam for view in views])
     shift[:, 0, 3] += 1.0
     assert mapper.correct(np.arange(10), shift, np.ones(10)) == len(mapper.state)
+
+
+def test_images_on_disk_give_the_same_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = [rgbd_keyframe(k, pose_on_arc(k / 9)) for k in range(10)]
+    config = replace(CONFIG, iterations=4, window=2, refinement=4)
+    memory, disk = (mapped(views, replace(config, images_in_memory=n)) for n in (1000, 3))
+    assert [view.index for view in disk.views if not view.image_on_disk] == [7, 8, 9]
+    assert disk.keyframes.image_bytes == 3 * 48 * 64 * 3
+    assert all(torch.equal(a.image, b.image) for a, b in zip(memory.views, disk.views))
+    for name in PARAMETERS:
+        assert torch.equal(getattr(memory.state.splats, name), getattr(disk.state.splats, name))
+
+    def full(image: torch.Tensor) -> torch.Tensor:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(keyframe_store, "on_disk", full)
+    stays = mapped(views, replace(config, images_in_memory=3))
+    assert stays.keyframes.image_bytes == 10 * 48 * 64 * 3
+    assert any("no space left" in text for text in stays.log.warnings)
 
 
 def test_gradients_that_are_not_finite_are_counted_and_the_map_stays_finite(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from mvsgs_core.mapping import optimizer
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
-from mvsgs_core.mapping.optimizer import OptimizerConfig, groups, step, step_reference
+from mvsgs_core.mapping.optimizer import OptimizerConfig, groups, splat_step, step, step_reference
+from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 
 RATES = OptimizerConfig()
@@ -138,3 +141,41 @@ def test_threads_do_not_change_the_result() -> None:
         step(state, torch.ones(2000, dtype=torch.bool), all_groups(), RATES.decay_steps, threads=threads)
     for name in PARAMETERS:
         assert torch.equal(getattr(one.splats, name), getattr(two.splats, name))
+
+
+@pytest.mark.parametrize(("kernel", "bases", "threads"), [("gaussian", 1, 1), ("exact", 4, 2)])
+def test_a_step_in_the_backward_pass_is_the_step_after_it_to_the_bit(kernel: str, bases: int, threads: int) -> None:
+    apart, fused = random_state(1500, bases=bases), random_state(1500, bases=bases)
+    chosen = groups(RATES, 2.0, 0.7, kernel == "exact", kernel)
+    options: Any = {"kernel": kernel, "backend": "cpu", "threads": threads}
+    camera = np.eye(4), np.array([30.0, 30.0, 23.5, 15.5]), (32, 48)
+    for state in (apart, fused):
+        with torch.no_grad():
+            state.splats.means[:, 2] += 1.5  # some before the camera, some behind, some beside the image
+            state.splats.betas.abs_().add_(0.5)
+        state.second["sh"][7] = float("inf")
+    for iteration in range(3):
+        weight = torch.randn((*camera[2], 3), generator=torch.Generator().manual_seed(iteration))
+        render = rasterize(apart.splats, *camera, **options)
+        (render.color * weight).sum().backward()
+        assert render.means2d.grad is not None
+        apart.accumulate_means2d(render.means2d.grad.norm(dim=1).nan_to_num_(0.0, 0.0, 0.0), render.visible)
+        refused = step(apart, render.visible, chosen, RATES.decay_steps, threads)
+        within = splat_step(fused, chosen, RATES.decay_steps)
+        render = rasterize(fused.splats, *camera, **options, step=within)
+        (render.color * weight).sum().backward()
+        assert fused.splats.means.grad is None
+        assert within.refused == refused == int(render.visible[7])
+    assert 500 < int(render.visible.sum()) < 1400
+    assert bool(render.visible[7])
+    for name, value in apart.tensors().items():
+        assert torch.equal(fused.tensors()[name], value), name
+
+
+def test_a_kernel_that_renders_other_splats_is_not_stepped() -> None:
+    state = random_state(5)
+    within = splat_step(state, all_groups(), RATES.decay_steps)
+    with pytest.raises(ValueError, match="ges_scale"):
+        rasterize(state.splats, np.eye(4), np.ones(4), (8, 8), kernel="ges_scale", step=within)
+    with pytest.raises(ValueError, match="reference"):
+        rasterize(state.splats, np.eye(4), np.ones(4), (8, 8), backend="reference", step=within)

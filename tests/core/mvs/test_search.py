@@ -68,6 +68,21 @@ def test_neighbors_come_from_both_sides_and_have_a_baseline() -> None:
     assert all(n.angle > 0.4 for n in chosen)
 
 
+def test_a_camera_that_moves_forward_has_neighbors() -> None:
+    """Nothing in the middle of its images has parallax; a far step shows everything at another size."""
+
+    def ahead(index: int, z: float) -> StereoKeyframe:
+        keyframe = view(index, 0.0)
+        pose = keyframe.world_from_cam.copy()
+        pose[:3, 3] += z * pose[:3, 2]
+        return replace(keyframe, world_from_cam=pose)
+
+    others = [ahead(i, -0.5 * i) for i in range(1, 7)]
+    chosen = select_neighbors(ahead(0, 0.0), others, TYPICAL, NeighborConfig(count=2))
+    assert {n.view.index for n in chosen} == {1, 2}
+    assert all(n.angle > 2.0 for n in chosen)
+
+
 def test_what_only_turned_or_looks_elsewhere_is_no_neighbor() -> None:
     reference = view(0, 0.0)
     assert select_neighbors(reference, [view(1, 0.0, 0.2), view(2, 0.3, 2.5)], TYPICAL, NeighborConfig()) == []

@@ -5,15 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core.photographs.features import Features, find_features
-from mvsgs_core.photographs.matching import EXHAUSTIVE, FIRST, likeness, match, propose_pairs
+from mvsgs_core.photographs.matching import EXHAUSTIVE, FIRST, likeness, match, near_pairs, propose_pairs
 from tests.support.sequences import synthetic
+
+
+def described(points: np.ndarray, descriptors: np.ndarray) -> Features:
+    """Features (N) of one size and direction."""
+    return Features(points, descriptors, np.ones(len(points)), np.zeros(len(points)))
 
 
 def random_features(count: int, seed: int) -> Features:
     random = np.random.default_rng(seed)
     descriptors = np.abs(random.standard_normal((count, 128))).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return Features(random.uniform(0, 100, (count, 2)), descriptors)
+    return described(random.uniform(0, 100, (count, 2)), descriptors)
 
 
 def shuffled(of: Features, seed: int, noise: float = 0.02) -> tuple[Features, np.ndarray]:
@@ -22,7 +27,7 @@ def shuffled(of: Features, seed: int, noise: float = 0.02) -> tuple[Features, np
     order = random.permutation(len(of.points))
     descriptors = of.descriptors[order] + noise / 11.0 * random.standard_normal((len(order), 128)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return Features(of.points[order], descriptors.astype(np.float32)), order
+    return described(of.points[order], descriptors.astype(np.float32)), order
 
 
 def test_features_turn_and_grow_with_the_image() -> None:
@@ -55,7 +60,7 @@ def test_matches_are_the_same_features() -> None:
 def test_what_looks_like_two_others_is_no_match() -> None:
     here = random_features(50, 0)
     one, other = shuffled(here, 1)[0], shuffled(here, 2)[0]
-    twice = Features(np.concatenate([one.points, other.points]), np.concatenate([one.descriptors, other.descriptors]))
+    twice = described(np.concatenate([one.points, other.points]), np.concatenate([one.descriptors, other.descriptors]))
     assert len(match(here, twice)) < 5
 
 
@@ -67,7 +72,7 @@ def test_pairs_are_those_that_look_alike_and_few_photographs_are_all_paired() ->
     count = EXHAUSTIVE + 5
     places = [random_features(FIRST, seed) for seed in range(count)]
     half = [place.descriptors[: FIRST // 2] for place in places]
-    around = [Features(np.zeros((FIRST, 2)), np.concatenate([half[n], half[n - 1]])) for n in range(count)]
+    around = [described(np.zeros((FIRST, 2)), np.concatenate([half[n], half[n - 1]])) for n in range(count)]
     alike = likeness(around)
     assert alike[3, 4] > 0.4 * FIRST
     assert alike[3, 20] < 5
@@ -76,3 +81,12 @@ def test_pairs_are_those_that_look_alike_and_few_photographs_are_all_paired() ->
     assert {(n, n + 1) for n in range(count - 1)} <= set(pairs)
     assert len(pairs) <= 2 * count
     assert len(propose_pairs(around[:6], 2)) == 15
+
+
+def test_gps_proposes_the_nearest_and_nothing_where_it_is_not_known() -> None:
+    places: list[np.ndarray | None] = [np.array([47.0, 8.0 + 1e-4 * n, 400.0]) for n in (0, 5, 1, 9, 6)]
+    places.insert(2, None)
+    assert near_pairs(places, 1) == [(0, 3), (1, 5), (4, 5)]
+    assert len(near_pairs(places, 9)) == 10  # all with all
+    assert near_pairs(places, 0) == []
+    assert near_pairs([None, None, places[0]], 3) == []

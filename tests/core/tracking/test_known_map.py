@@ -179,6 +179,34 @@ def test_a_frozen_map_stays_as_it_is_and_frames_are_found_in_it(file: Path) -> N
     assert tracker.trajectory().posed.all()
 
 
+def test_a_map_that_is_frozen_for_a_while_grows_again_afterwards() -> None:
+    tracker, items = Tracker(), synthetic(frames=80)
+    with pytest.raises(ValueError, match="nothing is mapped yet"):
+        tracker.freeze()
+    for item in items[:50]:
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+    was = {index: k.cam_from_world.copy() for index, k in tracker.session.graph.keyframes.items()}
+    tracker.freeze()
+    for item in items[50:65]:
+        update = tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+        assert not update.keyframes
+        assert tracker.newest_pose() is not None
+        assert not tracker.pending
+    now = tracker.session.graph.keyframes
+    assert now.keys() == was.keys()
+    assert all(np.array_equal(now[index].cam_from_world, pose) for index, pose in was.items())
+    tracker.thaw()
+    for item in items[65:]:
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+    assert max(tracker.session.graph.keyframes) > 64
+    list(tracker.finish())
+    trajectory, first = tracker.trajectory(), tracked_room()[1]
+    depth = np.median([keyframe.median_depth for keyframe in tracker.session.graph.keyframes.values()])
+    apart = np.linalg.norm(trajectory.world_from_cam[:, :3, 3] - first.world_from_cam[:, :3, 3], axis=1)
+    assert np.nanmax(apart) < 0.03 * depth
+    assert trajectory.posed.sum() == first.posed.sum()
+
+
 def test_in_a_frozen_map_another_scene_is_found_nowhere(file: Path) -> None:
     intrinsics = synthetic(frames=80)[0].intrinsics
     tracker = Tracker(known=load(file).renumbered(STREAM), frozen=True)

@@ -183,7 +183,7 @@ def test_a_loop_that_cannot_be_closed_changes_nothing_and_says_why(
     true = ring()
     graph = drifted(true, 1.01)
     broken = PoseGraphSolution(np.full((COUNT, 4, 4), np.nan), 1.0, 1.0, 3, failure)
-    monkeypatch.setattr(loop_closure, "solve_pose_graph", lambda *_: broken)
+    monkeypatch.setattr(loop_closure, "solve_thinned", lambda *_: broken)
     before = state(graph)
     closure = closer(graph).close(*between(true, graph, 0, COUNT - 1))
     assert said in closure.failure

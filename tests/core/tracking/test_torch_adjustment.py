@@ -35,7 +35,8 @@ def assert_equal(graph: Graph, solver: Solver) -> None:
 @pytest.mark.parametrize("robust", ["none", "huber", "cauchy"])
 @pytest.mark.parametrize("focal", [False, True])
 def test_it_equals_the_kernel(robust: str, focal: bool) -> None:
-    assert_equal(replace(noisy(), free_focal=focal), Solver(steps=6, robust=robust, robust_scale=1.5, tolerance=0.0))
+    # a sixth step without robust weights has nothing left to gain but rounding, which decides whether it is taken
+    assert_equal(replace(noisy(), free_focal=focal), Solver(steps=5, robust=robust, robust_scale=1.5, tolerance=0.0))
 
 
 def test_plain_gauss_newton_with_a_prior_and_diagonal_information() -> None:

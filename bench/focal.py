@@ -1,0 +1,108 @@
+"""Focal lengths estimated from video whose camera nobody told: `python -m bench.focal`.
+
+Every video and its parts, tracked from a guess of 65 degrees across the longer side, principal point in the middle.
+What the tracker estimates, and how sure it says it is, against the calibration that came with the data.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from bench.table import Row, at_least, at_most, main
+from bench.tracking.cases import CASES, Case
+from mvsgs_core.datasets import Item
+from mvsgs_core.datasets.lens import guess_lens
+from mvsgs_core.tracking.tracker import Tracker
+
+STREET, HEAD = "kitti_piece", "hololens_000"
+VIDEOS = {
+    **{name: CASES[name] for name in ("tum_fr1_xyz", "redkitchen, color camera 525", "icl_nuim_of_kt0")},
+    STREET: Case("tum", {"size": (185, 613)}, STREET),
+    HEAD: Case("tum", {"size": (180, 270)}, HEAD),
+    **{name: CASES[name] for name in ("tum_fr3_structure_notexture_far", "room", "room, loop", "aerial")},
+}
+PART = 80  # frames
+QUICK = {"room": Case("synthetic", {"frames": 60, "threads": 1})}
+MEDIAN_ERROR, SURE_ERROR, INTERVAL, WITHIN = 2.0, 5.0, 2.0, 0.9  # %, %, standard deviations, share
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Of one stream; `error` and `sigma` in percent of the focal length."""
+
+    name: str
+    start: float  # error of the guess
+    error: float
+    sigma: float | None  # None: it was not estimated, the guess is kept
+    doubt: str
+
+    @property
+    def sure(self) -> bool:
+        return self.sigma is not None and not self.doubt
+
+    def row(self) -> Row:
+        said = f", doubted: {self.doubt}" if self.doubt else ""
+        return Row(f"{self.name}, {self.start:+.0f} % at the start{said}", self.error, "%", spread=self.sigma)
+
+
+def parts(name: str, items: Sequence[Item]) -> Iterator[tuple[str, Sequence[Item]]]:
+    """The whole, and where it is longer than a part each full part."""
+    yield name, items
+    if len(items) >= 2 * PART:
+        for start in range(0, len(items) - PART + 1, PART):
+            yield f"{name}, frames {start} to {start + PART - 1}", items[start : start + PART]
+
+
+def estimate(name: str, items: Sequence[Item]) -> Estimate:
+    height, width = items[0].image.shape[:2]
+    guess = np.array(guess_lens((height, width)).intrinsics)
+    tracker = Tracker()
+    for n, item in enumerate(items):
+        tracker.add(n, item.timestamp, item.image, guess, True)
+    for _ in tracker.finish():
+        pass
+    truth = float(np.mean(items[0].intrinsics[:2]))
+    values = tracker.stats.values
+    sigma = values.get("focal_sigma_percent")
+    return Estimate(
+        name,
+        100.0 * float(guess[0] / truth - 1.0),
+        100.0 * float(guess[0] * tracker.focal_factor / truth - 1.0),
+        None if sigma is None else float(sigma),
+        str(values.get("focal_doubt", "")),
+    )
+
+
+def summary(found: Sequence[Estimate]) -> list[Row]:
+    """What is asked of all streams together."""
+    sure = [abs(one.error) for one in found if one.sure]
+    stated = [one for one in found if one.sigma is not None]
+    inside = [one for one in stated if abs(one.error) <= INTERVAL * (one.sigma or 0.0)]
+    median = float(np.median([abs(one.error) for one in found]))
+    rows = [at_most(f"median error of {len(found)} streams", median, "%", MEDIAN_ERROR)]
+    if sure:
+        rows.append(at_most(f"largest error of the {len(sure)} that claim to be sure", max(sure), "%", SURE_ERROR))
+    if stated:
+        share = len(inside) / len(stated)
+        rows.append(at_least(f"of {len(stated)} that state how sure: truth within two sigma", share, "", WITHIN))
+    return rows
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    cv2.setNumThreads(1)
+    found = []
+    for name, case in (QUICK if options.quick else VIDEOS).items():
+        if case.there:
+            items = [replace(item, depth=None) for item in case.items()]
+            found += [estimate(part, chosen) for part, chosen in parts(name, items)]
+            print(found[-1], flush=True)
+    return [*(one.row() for one in found), *summary(found)]
+
+
+if __name__ == "__main__":
+    main(measure, "Focal lengths of video without a calibration")

@@ -1,0 +1,35 @@
+"""Where a sweep's runs are: Hydra's launchers may run them in other processes, or on a cluster's other machines."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+GRAIN = 2.0  # seconds by which a file system's times, or another host's clock, may be behind
+
+_folders: dict[Path, float] = {}  # and when the sweep began, seconds since 1970
+
+
+class SweepFolder(Callback):
+    """Hydra's callback in conf/config.yaml: keeps in this process which folder the sweep's jobs have in common."""
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        _folders[Path(config.hydra.sweep.dir)] = time.time()
+
+
+def swept() -> list[Path]:
+    """The outputs of the jobs of this process's sweep, in their order; none where nothing was swept.
+
+    What an earlier sweep left in the same folder, of more jobs, is none of them.
+    """
+    found = [
+        (int(folder.name), folder)
+        for sweep, began in _folders.items()
+        for folder in (sweep.iterdir() if sweep.is_dir() else ())
+        if folder.name.isdigit() and folder.stat().st_mtime > began - GRAIN
+    ]
+    return [folder for _, folder in sorted(found)]

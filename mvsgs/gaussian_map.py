@@ -1,0 +1,124 @@
+"""A map at rest: rendered from any pose, exported to any format, read from the folder that a run or a program left."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mvsgs_core import camera
+from mvsgs_core.export.cameras import Cameras
+from mvsgs_core.export.colmap import write_colmap
+from mvsgs_core.export.command_line import input_arguments, known_cameras, read_map
+from mvsgs_core.export.keyframe_render import near_plane
+from mvsgs_core.export.mesh import write_mesh
+from mvsgs_core.export.ply import write_ply
+from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.export.splat import write_splat, write_spz
+from mvsgs_core.export.transforms import write_transforms
+from mvsgs_core.mapping.keyframe_checks import is_pose
+from mvsgs_core.mapping.preview import as_bytes
+
+SPLATS = {".ply": write_ply, ".splat": write_splat, ".spz": write_spz}
+MESHES = (".glb", ".obj", ".stl", ".off")
+
+
+@dataclass(frozen=True)
+class View:
+    """What the map shows from a pose."""
+
+    image: np.ndarray  # (H, W, 3) uint8 RGB, in the colors of the mean camera
+    depth: np.ndarray  # (H, W) float32 z in the map's unit, 0 where nothing is seen
+    opacity: np.ndarray  # (H, W) float32, 0 to 1: where it is small the map has nothing
+
+
+@dataclass(frozen=True)
+class GaussianMap:
+    """Splats and, where they are known, the keyframes that they were seen from. It never changes."""
+
+    snapshot: Snapshot
+    cameras: Cameras | None  # None: a map.ply without cameras.json
+
+    @classmethod
+    def load(cls, path: str | Path) -> GaussianMap:
+        """The map.ply, or the one in a folder, with its cameras.json. Raises OSError, ValueError for damaged files."""
+        parser = argparse.ArgumentParser()
+        input_arguments(parser)
+        options = parser.parse_args([str(path)])
+        snapshot, _ = read_map(options)
+        return cls(snapshot, known_cameras(options))
+
+    def __len__(self) -> int:
+        """Number of splats."""
+        return len(self.snapshot.splats)
+
+    def render(
+        self, world_from_cam: np.ndarray, intrinsics: Sequence[float] | np.ndarray | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> View:  # fmt: skip
+        """What a camera would see: pose (4, 4), x right, y down, z forward.
+
+        intrinsics: (fx, fy, cx, cy) in pixels at `size` = (height, width). What is not given is the newest keyframe's.
+        Raises ValueError for a pose or a camera that is none.
+        """
+        pose = np.asarray(world_from_cam, dtype=np.float64)
+        if pose.shape != (4, 4) or not is_pose(pose, 1.0):
+            raise ValueError("world_from_cam must be (4, 4): a rotation and a position, all finite")
+        lens, size = self._camera(intrinsics, size)
+        render = self.snapshot.render(pose, lens, size, near=near_plane(self.snapshot, pose))
+        depth, opacity = render.depth.cpu().numpy(), render.opacity.cpu().numpy()
+        return View(as_bytes(render.color), depth, opacity)
+
+    def export(
+        self, path: str | Path, *, voxel: float = 0.01, images: str | Path | None = None, observations: bool = False
+    ) -> Path:
+        """Writes what the name asks for: .ply, .splat or .spz, a mesh (.glb, .obj, .stl, .off), transforms.json, or,
+        without a suffix, the folder of a COLMAP model.
+
+        voxel: edge of the mesh's grid in median depths. images: folder of the keyframes' images, for a model or
+        transforms. observations: a COLMAP model's points say which images show them.
+        Raises ValueError for another name, or where keyframes are needed and not known; OSError.
+        """
+        out = Path(path).expanduser()
+        if out.suffix in SPLATS:
+            SPLATS[out.suffix](out, self.snapshot)
+        elif out.suffix in MESHES:
+            write_mesh(out, self.snapshot, self._keyframes(out), voxel)
+        elif out.suffix == ".json":
+            write_transforms(out, self._keyframes(out), out.parent / "keyframes" if images is None else Path(images))
+        elif not out.suffix:
+            given = None if images is None else Path(images)
+            write_colmap(out, self.snapshot, self._keyframes(out), given, observations)
+        else:
+            there = ", ".join((*SPLATS, *MESHES, ".json"))
+            raise ValueError(f"{out}: no format {out.suffix!r}; there are: {there}, a folder")
+        return out
+
+    def _keyframes(self, out: Path) -> Cameras:
+        if self.cameras is None:
+            raise ValueError(f"{out} is made from the keyframes' cameras, and there is no cameras.json beside the map")
+        return self.cameras
+
+    def _camera(
+        self, intrinsics: Sequence[float] | np.ndarray | None, size: tuple[int, int] | None
+    ) -> tuple[np.ndarray, tuple[int, int]]:
+        if intrinsics is not None and size is None:
+            raise ValueError("intrinsics are in pixels of an image: give its size (height, width), too")
+        if intrinsics is None:
+            if self.cameras is None:
+                raise ValueError("there is no cameras.json beside the map: give intrinsics and size")
+            known = self.cameras.sizes[-1].tolist()
+            size = size or (known[0], known[1])
+            intrinsics = camera.scale_intrinsics(self.cameras.intrinsics[-1], (known[0], known[1]), size)
+        assert size is not None
+        lens = np.asarray(intrinsics, dtype=np.float64)
+        if lens.shape != (4,):
+            raise ValueError(f"intrinsics must be (fx, fy, cx, cy), got an array of shape {lens.shape}")
+        camera.check_intrinsics(lens, size)
+        return lens, (int(size[0]), int(size[1]))
+
+
+__all__ = ["GaussianMap", "View"]

@@ -1,0 +1,200 @@
+"""GPS of a stream: EXIF's of each photograph, or a file of places by time or by frame name (.csv, .gpx, .srt of DJI).
+
+A file's places of a time are taken to the frames by interpolation, at most one frame for each of them: those between
+say nothing new. A place is (latitude, longitude, altitude) in degrees of WGS84 and metres; one without altitude is
+none, and neither is (0, 0), which receivers write without a fix.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from mvsgs_core import geodesy
+from mvsgs_core.bad_file import BadFileError, reading
+
+MAX_BYTES = 2**26
+MAX_GAP = 5.0  # seconds between two places, over which nothing is interpolated
+CLOCK = 1e8  # seconds: more is a time since 1970, less since a stream's beginning
+_LATITUDE, _LONGITUDE = ("latitude", "lat", "gps_latitude"), ("longitude", "lon", "lng", "long", "gps_longitude")
+_ALTITUDE = ("altitude", "alt", "ele", "elevation", "height", "abs_alt", "gps_altitude")
+_TIME = ("time", "timestamp", "t", "seconds", "datetime", "date")
+_NAME = ("name", "frame", "file", "filename", "image", "sourcefile", "file_path")
+_SRT_TIME = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_NUMBER = r"\s*[:=(]?\s*([-+]?\d+(?:\.\d+)?)"
+_SRT_PLACE = (  # the drones' firmwares differ; DJI writes "longtitude" in some
+    re.compile(rf"latitude{_NUMBER}.*?long?t?itude{_NUMBER}", re.IGNORECASE | re.DOTALL),
+    re.compile(r"GPS\s*\(\s*(?P<lon>[-+]?\d+\.\d+)\s*,\s*(?P<lat>[-+]?\d+\.\d+)", re.IGNORECASE),
+)
+_SRT_ALTITUDE = tuple(  # above the sea, then above the place of the start
+    re.compile(text + _NUMBER, re.IGNORECASE) for text in (r"abs_alt", r"altitude", r"rel_alt", r"BAROMETER", r"\bH\b")
+)
+
+
+@dataclass(frozen=True)
+class GpsTrack:
+    """The places of a file: by frame name, or in the order of time."""
+
+    by_name: dict[str, np.ndarray]  # lower case, without folders
+    seconds: np.ndarray  # (N,) of `places`, ascending
+    places: np.ndarray  # (N, 3)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def on_a_clock(self) -> bool:
+        """Whether its times are since 1970, and not since the stream's beginning."""
+        return len(self.seconds) > 0 and float(self.seconds[0]) > CLOCK
+
+    def places_of(self, start: float | None) -> Callable[[float, str], np.ndarray | None]:
+        """Place of a frame from its timestamp and name, asked once in the order of the stream.
+
+        start: when timestamp 0 was, seconds since 1970; None: not known.
+        """
+        shift = start or 0.0
+        longitude = np.unwrap(self.places[:, 1], period=360.0)
+        changed = np.ones(len(self.seconds), bool)  # a receiver's fix is repeated until the next one
+        changed[1:] = (self.places[1:] != self.places[:-1]).any(axis=1)
+        fix = np.cumsum(changed)
+        last = -1
+
+        def place(timestamp: float, name: str) -> np.ndarray | None:
+            nonlocal last
+            if self.by_name:
+                return self.by_name.get(name.lower(), self.by_name.get(Path(name).stem.lower()))
+            now = timestamp + shift
+            after = int(np.searchsorted(self.seconds, now))
+            before = int(np.searchsorted(self.seconds, now, side="right")) - 1
+            if before < 0 or after >= len(self.seconds) or fix[before] == last:
+                return None
+            if self.seconds[after] - self.seconds[before] > MAX_GAP:
+                return None
+            last = int(fix[before])
+            columns = (self.places[:, 0], longitude, self.places[:, 2])
+            return np.array([np.interp(now, self.seconds, column) for column in columns])
+
+        return place
+
+
+def read_gps(path: Path) -> GpsTrack:
+    """The places in a .csv, .tsv or .txt with a header, a .gpx, or a .srt. Raises BadFileError and OSError."""
+    parse = _PARSERS.get(path.suffix.lower())
+    if parse is None:
+        raise BadFileError(f"{path}: GPS is read from {', '.join(_PARSERS)}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing: a file of GPS places, or leave dataset.gps away")
+    with reading(path, "is no file of GPS places"):
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES >> 20} MB")
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+        names: dict[str, np.ndarray] = {}
+        timed: list[tuple[float, np.ndarray]] = []
+        without = 0
+        for key, place in parse(text):
+            if place is None:
+                without += 1
+            elif isinstance(key, str):
+                names[key] = place
+            else:
+                timed.append((key, place))
+        if not names and not timed:
+            raise ValueError(f"it has no place, of {without} entries: latitude, longitude and altitude are needed")
+        timed.sort(key=lambda entry: entry[0])
+        seconds = np.array([entry[0] for entry in timed])
+        if len(seconds) and not (seconds[-1] < CLOCK or CLOCK < seconds[0] < seconds[-1] + 1 < 1e11):
+            raise ValueError("its times are neither seconds of the stream nor since 1970, nor of ISO 8601")
+        warnings = [f"entries of {path.name} without a place that can be used: {without}"] if without else []
+        return GpsTrack(names, seconds, np.array([entry[1] for entry in timed]).reshape(-1, 3), warnings)
+
+
+def clock_time(text: str) -> float:
+    """Seconds since 1970 of ISO 8601; UTC where it names no zone. Raises ValueError."""
+    found = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+
+
+_Entry = tuple[str | float, np.ndarray | None]  # a frame's name or a time, and the place
+
+
+def _csv(text: str) -> Iterator[_Entry]:
+    lines = [line for line in text.splitlines() if line.strip()]
+    header = lines[0].lstrip("# ") if lines else ""
+    rows = csv.reader([header, *lines[1:]], delimiter=max(",;\t", key=header.count), skipinitialspace=True)
+    columns = [column.strip().lower() for column in next(rows, [])]
+
+    def find(names: tuple[str, ...], wanted: str) -> int:
+        place = next((columns.index(name) for name in names if name in columns), -1)
+        if place < 0 and wanted:
+            raise ValueError(f"its header has no {wanted} ({', '.join(names)}): {', '.join(columns)[:200]!r}")
+        return place
+
+    at = [find(_LATITUDE, "latitude"), find(_LONGITUDE, "longitude"), find(_ALTITUDE, "altitude")]
+    named = find(_NAME, "")
+    key = named if named >= 0 else find(_TIME + _NAME, "time or frame name")
+    for number, row in enumerate(rows, start=2):
+        try:
+            values = [row[column].strip() for column in at]
+            place = np.array([float(value) for value in values]) if all(values) else None
+            by = Path(row[key].strip().replace("\\", "/")).name.lower() if named >= 0 else _seconds(row[key])
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"line {number}, {','.join(row)[:120]!r}: {error}") from None
+        yield by, _checked(place, f"line {number}")
+
+
+def _seconds(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return clock_time(text)
+
+
+def _gpx(text: str) -> Iterator[_Entry]:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("it defines entities, which GPX needs not")
+    points = [e for e in ElementTree.fromstring(text).iter() if e.tag.rpartition("}")[2] in ("trkpt", "wpt", "rtept")]
+    for number, point in enumerate(points, start=1):
+        inner = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in point}
+        by = inner.get("time") or inner.get("name")
+        if not by:
+            raise ValueError(f"point {number} has neither time nor name")
+        ele = inner.get("ele")
+        place = np.array([float(point.get("lat", "")), float(point.get("lon", "")), float(ele)]) if ele else None
+        yield clock_time(by) if "time" in inner else by.lower(), _checked(place, f"point {number}")
+
+
+def _srt(text: str) -> Iterator[_Entry]:
+    times = list(_SRT_TIME.finditer(text))
+    for found, following in zip(times, [*times[1:], None]):
+        hours, minutes, seconds, fraction = found.groups()
+        begin = 3600.0 * int(hours) + 60.0 * int(minutes) + int(seconds) + int(fraction) / 10.0 ** len(fraction)
+        block = re.sub(r"<[^>]*>", "", text[found.end() : following.start() if following else len(text)])
+        where = next((match for pattern in _SRT_PLACE if (match := pattern.search(block))), None)
+        height = next((match for pattern in _SRT_ALTITUDE if (match := pattern.search(block))), None)
+        if where is None or height is None:
+            yield begin, None
+            continue
+        latitude, longitude = (where["lat"], where["lon"]) if "lat" in where.groupdict() else where.groups()
+        place = np.array([float(latitude), float(longitude), float(height.group(1))])
+        yield begin, _checked(place, f"the subtitle at {begin:.2f} s")
+
+
+def _checked(place: np.ndarray | None, where: str) -> np.ndarray | None:
+    """None without a fix. Raises ValueError for what can be no place."""
+    if place is None or (place[0] == 0.0 and place[1] == 0.0):
+        return None
+    if not geodesy.is_place(place):
+        raise ValueError(f"{where}: latitude {place[0]:g}, longitude {place[1]:g}, altitude {place[2]:g} are no place")
+    return place
+
+
+_PARSERS: dict[str, Callable[[str], Iterator[_Entry]]] = {
+    ".csv": _csv, ".tsv": _csv, ".txt": _csv, ".gpx": _gpx, ".srt": _srt,
+}  # fmt: skip
+
+__all__ = ["CLOCK", "GpsTrack", "clock_time", "read_gps"]

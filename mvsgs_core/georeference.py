@@ -1,0 +1,267 @@
+"""Where on the Earth a map lies: the similarity from camera positions to their GPS places, robust to false ones.
+
+GPS says nothing about the poses among each other, which matches know better by orders of magnitude: it only gives the
+whole of them its unit, its place and its orientation, in metres east, north and up of an origin.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvsgs_core import geodesy, geometry
+from mvsgs_core.atomic_file import replace_text
+from mvsgs_core.bad_file import reading
+
+FORMAT, VERSION = "mvsgs georeference", 1
+FILE = "georeference.json"
+FIGURES = ("residual", "farthest", "scale_deviation", "angle_deviation", "position_deviation")
+FEWEST = 4  # positions that agree: three always do
+SAMPLES = 500  # of three positions each
+JUDGES = 1000  # positions, evenly of all, by which they are rated
+BEST = 10  # samples that are refined
+GATE = 3.0  # times the median residual: farther off is an outlier (4.6 standard deviations in three dimensions)
+MAX_ANGLE = 10.0  # degrees, one standard deviation, about any axis
+MOST_ALIKE = 0.98  # successive errors: of more nothing is told
+MAX_SCALE = 0.2  # one standard deviation of the unit
+LEVEL = 0.3  # sine of the angle of path and vertical, and of path and the cameras' up, above which these tell the roll
+
+
+class NoReferenceError(ValueError):
+    """GPS does not tell where the map lies; the message says why."""
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """east_north_up = scale * rotation @ map + translation. Standard deviations count in that errors drift."""
+
+    origin: np.ndarray  # (3,) latitude, longitude (degrees, WGS84), altitude (m, as the source has it)
+    scale: float  # m in a unit of the map
+    rotation: np.ndarray  # (3, 3)
+    translation: np.ndarray  # (3,) m
+    positions: int  # camera positions with a place
+    outliers: int
+    residual: float  # m, median distance of all positions
+    farthest: float  # m, largest distance
+    scale_deviation: float  # of 1
+    angle_deviation: float  # degrees, about the axis that is known least
+    position_deviation: float  # m, of the whole map
+    camera_up: bool = False  # the rotation about the path is not GPS's but that of cameras held upright
+
+    def world(self, positions: np.ndarray) -> np.ndarray:
+        """(N, 3) m east, north, up of positions in the map (N, 3)."""
+        return np.asarray(self.scale * positions @ self.rotation.T + self.translation)
+
+    def poses(self, world_from_cam: np.ndarray) -> np.ndarray:
+        """(N, 4, 4) poses in the frame of east, north and up, in metres."""
+        moved = np.array(world_from_cam, np.float64)
+        moved[:, :3, :3] = self.rotation @ moved[:, :3, :3]
+        moved[:, :3, 3] = self.world(moved[:, :3, 3])
+        return moved
+
+
+def georeference(world_from_cam: np.ndarray, places: np.ndarray, camera_up: bool = False) -> Georeference:
+    """Of poses (N, 4, 4), in the order of the stream, and their places (N, 3), in degrees and metres, all known.
+
+    The similarity whose median residual is least (least median of squares, Rousseeuw 1984) over samples of three,
+    then least squares over the positions within three times it (Umeyama 1991). camera_up: where the cameras stand on
+    a line, the rotation about it, which no position tells, is the one that has them upright.
+    Raises NoReferenceError where it is not determined, and says how sure it would be.
+    """
+    positions = world_from_cam[:, :3, 3]
+    if len(positions) < FEWEST:
+        raise NoReferenceError(f"{len(positions)} camera positions have a GPS place, {FEWEST} are needed")
+    if not np.ptp(positions, axis=0).any():
+        raise NoReferenceError("all camera positions coincide")
+    origin = geodesy.middle(places)
+    target = geodesy.east_north_up(places, origin)
+    scale, rotation, translation, kept = _robust(positions, target)
+    if kept.sum() < max(FEWEST, len(kept) / 2):
+        raise NoReferenceError(f"of {len(kept)} GPS places {int(kept.sum())} agree with the camera positions")
+    residual = scale * positions @ rotation.T + translation - target
+    off = np.linalg.norm(residual, axis=1)
+    noise = math.sqrt(float(np.sum(off[kept] ** 2)) / (3 * int(kept.sum()) - 7)) * _drift(residual, kept)
+    moved = scale * positions[kept] @ rotation.T
+    moved -= moved.mean(axis=0)
+    extent, axes = np.linalg.eigh(moved.T @ moved)  # ascending
+    scale_deviation = noise / math.sqrt(float(extent.sum()))
+    about = np.degrees(noise / np.sqrt(np.maximum([extent[0] + extent[1], extent[0] + extent[2]], 1e-30)))
+    length = float(np.ptp(moved @ axes[:, 2]))
+    upright = camera_up and about[0] > MAX_ANGLE
+    angle = float(about[1] if upright else about[0])
+    if scale_deviation > MAX_SCALE or about[1] > MAX_ANGLE:
+        raise NoReferenceError(
+            f"the path, {length:.1f} m, is too short for GPS that is off by {np.median(off):.1f} m: its unit would be "
+            f"known to {100.0 * scale_deviation:.0f} %, its direction to {min(about[1], 180.0):.0f} degrees"
+        )
+    if upright:
+        roll = _upright(axes[:, 2], rotation @ -world_from_cam[:, :3, 1].mean(axis=0))
+        center = positions[kept].mean(axis=0)
+        still = scale * rotation @ center + translation
+        rotation = roll @ rotation
+        translation = still - scale * rotation @ center
+        off = np.linalg.norm(scale * positions @ rotation.T + translation - target, axis=1)
+    elif angle > MAX_ANGLE:
+        raise NoReferenceError(
+            f"the camera positions lie nearly on a line, {length:.1f} m long: the rotation about it would be known to "
+            f"{min(angle, 180.0):.0f} degrees. evaluator.camera_up=true takes it from cameras that were held upright"
+        )
+    return Georeference(
+        origin, scale, rotation, translation, len(kept), int((~kept).sum()), float(np.median(off)), float(off.max()),
+        scale_deviation, angle, noise / math.sqrt(int(kept.sum())), upright,
+    )  # fmt: skip
+
+
+def _drift(residual: np.ndarray, kept: np.ndarray) -> float:
+    """By which factor standard deviations grow because errors that follow each other are alike: GPS drifts.
+
+    That of an autoregressive process of the correlation of successive residuals (N, 3), where it is no chance.
+    """
+    both = kept[1:] & kept[:-1]
+    pairs, size = int(both.sum()), float(np.mean(np.sum(residual[kept] ** 2, axis=1)))
+    if pairs == 0 or size == 0.0:
+        return 1.0
+    alike = float(np.sum(residual[1:][both] * residual[:-1][both])) / (pairs * size)
+    if alike < 2.0 / math.sqrt(3.0 * pairs):
+        return 1.0
+    alike = min(alike, MOST_ALIKE)
+    return math.sqrt((1.0 + alike) / (1.0 - alike))
+
+
+def _robust(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """Similarity and (N,) bool of those that it was solved from."""
+    count = len(source)
+    if math.comb(count, 3) <= SAMPLES:
+        samples = np.array(list(itertools.combinations(range(count), 3)))
+    else:
+        samples = np.random.default_rng(0).integers(count, size=(SAMPLES, 3))
+    samples = samples[np.ptp(source[samples], axis=1).any(axis=1)]
+    found = _similarities(source[samples], target[samples])
+    some = np.arange(0, count, -(-count // JUDGES))
+    off = np.einsum("sij,nj->sni", found[:, :3, :3], source[some]) + found[:, None, :3, 3] - target[some]
+    first = np.argsort(np.median(np.linalg.norm(off, axis=2), axis=1), kind="stable")[:BEST]
+    smallest = 1e-6 * float(np.ptp(target, axis=0).max())  # below it is rounding
+    best = None
+    for matrix in found[first]:
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        solved = scale, matrix[:3, :3] / scale, matrix[:3, 3]
+        kept = np.zeros(count, bool)
+        for _ in range(20):
+            off = _off(source, target, solved)
+            now = off <= max(GATE * float(np.median(off)), smallest)
+            if (now == kept).all():
+                break
+            kept = now
+            if not np.ptp(source[kept], axis=0).any():
+                break
+            solved = geometry.umeyama(source[kept], target[kept])
+        median = float(np.median(_off(source, target, solved)))
+        if best is None or median < best[0]:
+            best = median, solved, kept
+    if best is None:
+        raise NoReferenceError("all camera positions coincide")
+    return (*best[1], best[2])
+
+
+def _similarities(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(S, 4, 4) [s R | t] of samples (S, 3, 3) of three positions each, as `geometry.umeyama` of each."""
+    mean_s, mean_t = source.mean(axis=1, keepdims=True), target.mean(axis=1, keepdims=True)
+    ds, dt = source - mean_s, target - mean_t
+    u, d, vt = np.linalg.svd(np.swapaxes(dt, 1, 2) @ ds)
+    sign = np.ones_like(d)
+    sign[:, 2] = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0, -1.0, 1.0)
+    scale = np.sum(d * sign, axis=1) / np.sum(ds**2, axis=(1, 2))
+    matrices = np.tile(np.eye(4), (len(source), 1, 1))
+    matrices[:, :3, :3] = scale[:, None, None] * (u * sign[:, None]) @ vt
+    matrices[:, :3, 3] = mean_t[:, 0] - np.einsum("sij,sj->si", matrices[:, :3, :3], mean_s[:, 0])
+    return matrices
+
+
+def _off(source: np.ndarray, target: np.ndarray, solved: tuple[float, np.ndarray, np.ndarray]) -> np.ndarray:
+    scale, rotation, translation = solved
+    return np.asarray(np.linalg.norm(scale * source @ rotation.T + translation - target, axis=1))
+
+
+def _upright(path: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation about the direction of the `path` (3,) that turns the cameras' `up` (3,) as near to ours."""
+    ours = np.array([0.0, 0.0, 1.0])
+    across, wanted = up - path * (path @ up), ours - path * (path @ ours)
+    if np.linalg.norm(across) < LEVEL or np.linalg.norm(wanted) < LEVEL:
+        raise NoReferenceError(
+            "the path is too steep, or the cameras look along its side, for their up to tell the roll"
+        )
+    angle = math.atan2(float(path @ np.cross(across, wanted)), float(across @ wanted))
+    return geometry.so3_exp(angle * path)
+
+
+def in_words(found: Mapping[str, Any]) -> dict[str, str]:
+    """What a report says of `values_of` a georeference."""
+    latitude, longitude, altitude = found["origin"].values()
+    about = "about its path from the cameras' up, else " if found["camera_up"] else ""
+    return {
+        "GPS: distance to the trajectory, median": f"{found['residual']:.2f} m, of {found['positions']} positions, "
+        f"of which {found['outliers']} are outliers; at most {found['farthest']:.1f} m",
+        "GPS: origin of east, north, up": f"{latitude:.7f}, {longitude:.7f} degrees, {altitude:.2f} m",
+        "GPS: how sure, one standard deviation": f"unit {100.0 * found['scale_deviation']:.2g} %, orientation {about}"
+        f"{found['angle_deviation']:.2g} degrees, place {found['position_deviation']:.2g} m",
+    }
+
+
+def values_of(found: Georeference) -> dict[str, Any]:
+    """As JSON has it; the origin by names."""
+    values = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in asdict(found).items()}
+    return values | {"origin": dict(zip(("latitude", "longitude", "altitude"), found.origin.tolist()))}
+
+
+def write_georeference(path: Path, found: Georeference) -> None:
+    """Replaces `path` atomically. Raises OSError."""
+    said = "metres east, north and up of the origin (WGS84) = scale * rotation * position in map.ply + translation"
+    content = {"format": FORMAT, "version": VERSION, "frame": said, **values_of(found)}
+    replace_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def write_origin(path: Path, found: Georeference, axes: str) -> None:
+    """Beside a file in the frame of east, north and up, what that is. Raises OSError."""
+    content = {
+        "frame": "metres east, north and up of the origin (WGS84)", "axes": axes, "origin": values_of(found)["origin"],
+        "residual": found.residual, "scale_deviation": found.scale_deviation, "angle_deviation": found.angle_deviation,
+        "position_deviation": found.position_deviation,
+    }  # fmt: skip
+    replace_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def read_georeference(path: Path) -> Georeference:
+    """What `write_georeference` wrote. Raises BadFileError, saying what is wrong with it, and OSError."""
+    with reading(path, f"is no {FILE} of this program"):
+        content = json.loads(path.read_text(encoding="ascii"))
+        if content["format"] != FORMAT or content["version"] != VERSION:
+            raise ValueError(f"{content['format']!r} of version {content['version']!r}: version {VERSION} is read")
+        origin = np.array([content["origin"][name] for name in ("latitude", "longitude", "altitude")], np.float64)
+        rotation, translation = (np.array(content[name], np.float64) for name in ("rotation", "translation"))
+        if not geodesy.is_place(origin):
+            raise ValueError("its origin is no place")
+        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise ValueError("its rotation is none")
+        if translation.shape != (3,) or not np.isfinite(translation).all():
+            raise ValueError("its translation is no three finite numbers")
+        if not 0.0 < float(content["scale"]) < math.inf:
+            raise ValueError("its scale is not positive")
+        figures = {name: float(content[name]) for name in FIGURES}
+        return Georeference(
+            origin=origin, scale=float(content["scale"]), rotation=rotation, translation=translation,
+            positions=int(content["positions"]), outliers=int(content["outliers"]),
+            camera_up=bool(content["camera_up"]), **figures,
+        )  # fmt: skip
+
+
+__all__ = [
+    "FILE", "Georeference", "NoReferenceError", "georeference", "in_words", "read_georeference", "values_of",
+    "write_georeference", "write_origin",
+]  # fmt: skip

@@ -1,0 +1,112 @@
+"""What a new keyframe of a map takes, in steps: edges, bundle adjustment of the window, loops, light.
+
+Nothing of it is needed for the pose of the next frame, which is found against the keyframe before.
+"""
+
+from __future__ import annotations
+
+from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.back_end import BackEnd
+from mvsgs_core.tracking.config import TrackerConfig
+from mvsgs_core.tracking.estimation.calibration import REESTIMATED_AT, Calibration
+from mvsgs_core.tracking.front_end import Step
+from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.local_map import LocalMap
+from mvsgs_core.tracking.photometer import Photometer
+from mvsgs_core.tracking.places.covisibility import CovisibleKeyframes
+from mvsgs_core.tracking.places.loop_closure import Closure, LoopCloser
+from mvsgs_core.tracking.steps import Steps, timed
+
+
+class KeyframeWork:
+    """The parts of a session that a keyframe goes through."""
+
+    def __init__(
+        self,
+        config: TrackerConfig,
+        stats: Stats,
+        graph: KeyframeGraph,
+        calibration: Calibration,
+        local_map: LocalMap,
+        covisible_keyframes: CovisibleKeyframes,
+        loops: LoopCloser,
+        back_end: BackEnd,
+        photometer: Photometer,
+    ) -> None:
+        self.config, self.stats, self.graph = config, stats, graph
+        self.calibration, self.local_map, self.covisible_keyframes = calibration, local_map, covisible_keyframes
+        self.loops, self.back_end, self.photometer = loops, back_end, photometer
+
+    def insert(self, frame: TrackingImage, step: Step, segment: int) -> Steps[bool]:
+        """A frame becomes a keyframe that can be followed; False, and it is none, where the map contradicts its pose.
+
+        step: of the frame when it was followed.
+        """
+        matches = {step.reference: step.matches}
+        yield from timed(self.stats, "local map", self.local_map.inserting(frame, step.pose, segment, matches))
+        with self.stats.time("local bundle adjustment"):
+            solution = self.local_map.adjust_window(frame.index)
+        yield
+        if solution.failure:
+            self.stats.warn(f"local bundle adjustment failed: {solution.failure}")
+        if self.local_map.agreement(frame.index) < self.config.front_end.lost_inliers:
+            self.graph.remove(frame.index)
+            self.stats.count("keyframes taken back")
+            return False
+        self.stats.count("keyframes")
+        self.covisible_keyframes.made(frame.index)
+        return True
+
+    def tie(self, index: int) -> Steps[None]:
+        """What an inserted keyframe tells of the camera, of the whole map and of the light."""
+        segment = self.graph.keyframes[index].segment
+        if len(self.graph.keyframes) in REESTIMATED_AT:
+            self.calibration.estimate_readout_time(self.local_map.members(segment)[-12:])
+            yield
+        self.calibration.refine(self.local_map.members(segment))
+        yield
+        if self.config.loops:
+            yield from self._close_loops(index)
+        yield from self.photometer.updating()
+        members = self.local_map.members(self.graph.keyframes[index].segment)
+        for old in members[: -self.config.local_map.window]:
+            self.graph.keyframes[old].image.release()
+
+    def first(self, keyframes: list[int]) -> Steps[None]:
+        """The same of a segment's first keyframes, once they are solved."""
+        self.calibration.estimate_readout_time(keyframes)
+        yield
+        self.local_map.adjust_window(keyframes[-1])
+        yield
+        self.calibration.refine(keyframes)
+        yield
+        if self.config.loops:
+            for index in keyframes:
+                self.loops.add(index)
+                yield
+        yield from self.photometer.updating()
+
+    def _close_loops(self, index: int) -> Steps[None]:
+        closure: Closure | None = yield from timed(self.stats, "loops", self._searching(index))
+        yield
+        if closure is not None:
+            self.stats.count("loops")
+            if closure.failure:
+                self.stats.warn(f"a loop could not be closed: {closure.failure}")
+            if closure.moved:
+                self.stats.count("loops that moved the map")
+                self.back_end.pending = self.config.back_end.steps
+            if closure.joined is not None:
+                self.stats.count("segments joined")
+        with self.stats.time("background bundle adjustment"):
+            self.back_end.work(self.graph.keyframes[index].segment)
+        yield
+
+    def _searching(self, index: int) -> Steps[Closure | None]:
+        closure = yield from self.loops.searching(index)
+        self.loops.add(index)
+        return closure
+
+
+__all__ = ["KeyframeWork"]

@@ -1,0 +1,88 @@
+"""The pose graph of a large map: of some of its keyframes; those between them follow.
+
+A loop's error is spread over kilometers, so it changes little from one keyframe to the next: a few hundred tell where
+all of them go, and what a loop costs does not grow with the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from mvsgs_core import geometry
+from mvsgs_core.tracking.estimation.pose_graph import (
+    PoseGraphSolution,
+    SimilarityEdges,
+    inverse_similarity,
+    scale_of,
+    solve_pose_graph,
+)
+
+MAX_NODES = 300  # keyframes that are solved as they are
+THINNED = 150  # that are solved for of more
+
+
+def solve_thinned(poses: np.ndarray, edges: SimilarityEdges) -> PoseGraphSolution:
+    """Poses (K, 4, 4) in the order of the stream, whose first one stays, where the last edge is the loop.
+
+    All other edges hold as it is. See `solve_pose_graph`, which small graphs are given to.
+    """
+    count = len(poses)
+    if count <= MAX_NODES:
+        return solve_pose_graph(poses, edges, {0})
+    nodes = thinned(count, {int(edges.source[-1]), int(edges.to[-1])})
+    solution = solve_pose_graph(poses[nodes], _between(poses, edges, nodes), {0})
+    if solution.failure or not np.isfinite(solution.similarities).all():
+        return solution
+    return replace(solution, similarities=follow(poses, nodes, solution.similarities))
+
+
+def thinned(count: int, kept: set[int]) -> np.ndarray:
+    """Places of the nodes, ascending: evenly spaced, both ends, and these."""
+    even = np.linspace(0, count - 1, THINNED).round().astype(int).tolist()
+    return np.array(sorted({*even, *kept}))
+
+
+def _between(poses: np.ndarray, edges: SimilarityEdges, nodes: np.ndarray) -> SimilarityEdges:
+    """Edges between the nodes: each step as loose as the steps that it stands for, and where others tie two of them."""
+    # An edge counts for the nodes that its ends are nearest to.
+    middles = 0.5 * (nodes[1:] + nodes[:-1])
+    source, to = (np.searchsorted(middles, ends[:-1]) for ends in (edges.source, edges.to))
+    pairs = {(min(a, b), max(a, b)) for a, b in zip(source.tolist(), to.tolist()) if a != b}
+    pairs |= set(pairwise(range(len(nodes))))
+    a, b = np.array(sorted(pairs)).T
+    steps = np.where(b - a == 1, nodes[b] - nodes[a], len(poses) / len(nodes))
+    relative = poses[nodes[b]] @ geometry.inverse(poses[nodes[a]])
+    loop = [int(np.searchsorted(nodes, end[-1])) for end in (edges.source, edges.to)]
+    return SimilarityEdges(
+        source=np.append(a, loop[0]),
+        to=np.append(b, loop[1]),
+        relative=np.concatenate([relative, edges.relative[-1:]]),
+        sigma=np.concatenate([edges.sigma[0] * np.sqrt(steps)[:, None], edges.sigma[-1:]]),
+    )
+
+
+def follow(poses: np.ndarray, nodes: np.ndarray, solved: np.ndarray) -> np.ndarray:
+    """Similarities (K, 4, 4) of all, where the nodes (N,), the first and the last among them, go to solved (N, 4, 4).
+
+    One between two nodes keeps its place beside either, the more the nearer it is.
+    """
+    result = np.empty_like(poses)
+    after = np.clip(np.searchsorted(nodes, np.arange(len(poses)), side="right"), 1, len(nodes) - 1)
+    first, last = nodes[after - 1], nodes[after]
+    beside_first = poses @ geometry.inverse(poses[first]) @ solved[after - 1]
+    beside_last = poses @ geometry.inverse(poses[last]) @ solved[after]
+    part = (np.arange(len(poses)) - first) / (last - first)
+    apart = beside_last @ inverse_similarity(beside_first)
+    scale = scale_of(apart)
+    for k, s in enumerate(part):
+        step = np.eye(4)
+        step[:3, :3] = scale[k] ** s * geometry.so3_exp(s * geometry.so3_log(apart[k, :3, :3] / scale[k]))
+        step[:3, 3] = s * apart[k, :3, 3]
+        result[k] = step @ beside_first[k]
+    return result
+
+
+__all__ = ["follow", "solve_thinned", "thinned"]

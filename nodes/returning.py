@@ -1,0 +1,104 @@
+"""What a tracker leaves while it runs, for a process that is started in its place once it was killed.
+
+Its keyframes with their matches, as a map that is kept has them, saved whenever that takes little of its time; and,
+line by line, what was sent, which readers have whatever became of the tracker since.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from msgs import Keyframe, Message, Poses, Request
+from mvsgs_core.stats import Stats
+from mvsgs_core.tracking import known_map
+from mvsgs_core.tracking.known_map import KnownMap
+from mvsgs_core.tracking.tracker import Tracker
+
+SHARE = 0.02  # of the time that saving may take
+MODE, ANOTHER = "Frozen", "Another"  # lines of the log that name no message
+
+
+class Returning:
+    def __init__(self, folder: Path, stats: Stats, clock: Callable[[], float] = time.monotonic) -> None:
+        """folder: of this node and run alone; what an earlier process left in it is gone on with."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = folder / "tracker.npz"
+        self._stats, self._clock = stats, clock
+        self._due = 0.0
+        self._changed = False
+        self.revision = 0  # of the newest corrections that were sent
+        self.frozen = False  # frames were only found in the map, as was asked for
+        self.met: set[int] = set()  # requests
+        self.newest = -1  # keyframe that the earlier process sent
+        self._sent: set[int] = set()  # keyframes of the map that it had
+        self._log = folder / "sent"
+        for line in self._log.read_text().splitlines() if self._log.exists() else ():
+            kind, _, number = line.removesuffix(";").partition(" ")
+            if not line.endswith(";"):
+                continue  # cut off
+            if kind == Keyframe.__name__ and number.isdecimal():
+                self._sent.add(int(number))
+                self.newest = int(number)
+            elif kind == Poses.__name__ and number.isdecimal():
+                self.revision = max(self.revision, int(number))
+            elif kind == Request.__name__ and number.isdecimal():
+                self.met.add(int(number))
+            elif kind == MODE and number.isdecimal():
+                self.frozen = bool(int(number))
+            elif kind == ANOTHER:
+                self._sent.clear()
+
+    def known(self) -> KnownMap | None:
+        """The map as the earlier process saved it last; None: there was none. Raises ValueError for a damaged file."""
+        if not self._file.exists():
+            if self._sent:
+                raise ValueError("this tracker was killed before it had saved its map, and cannot go on in it")
+            return None
+        known = known_map.load(self._file)
+        orphans = self._sent - {keyframe.index for keyframe in known.keyframes}
+        self._stats.skip("keyframes that a killed tracker sent after it had saved its map", len(orphans))
+        self._stats.warn(
+            f"the tracker was started again: it goes on in its map of {len(known.keyframes)} keyframes; {len(orphans)} "
+            "that it sent later are mapped and no longer corrected, other frames before have no pose"
+        )
+        return known
+
+    def note(self, message: Message) -> None:
+        """To be called before a message is sent."""
+        if isinstance(message, Keyframe):
+            self._write(f"{Keyframe.__name__} {message.index}")
+            self._changed = True
+        elif isinstance(message, Poses):
+            self._write(f"{Poses.__name__} {message.revision}")
+        elif isinstance(message, Request):
+            self._write(f"{Request.__name__} {message.number}")
+
+    def note_mode(self, frozen: bool) -> None:
+        self._write(f"{MODE} {int(frozen)}")
+
+    def forget(self) -> None:
+        """Another map was begun on request: it is to be saved as soon as it has keyframes."""
+        self._file.unlink(missing_ok=True)
+        self._write(f"{ANOTHER} 0")
+        self._changed, self._due = True, 0.0
+
+    def save(self, tracker: Tracker) -> None:
+        """Between two frames, where it is time."""
+        if not self._changed or not tracker.mapped or self._clock() < self._due:
+            return
+        began = self._clock()
+        try:
+            tracker.keep_map(self._file)
+        except OSError as error:
+            self._stats.warn(f"if this tracker is killed it cannot go on: {error}")
+        now = self._clock()
+        self._changed, self._due = False, now + (now - began) / SHARE
+
+    def _write(self, line: str) -> None:
+        with self._log.open("a") as log:
+            log.write(f"\n{line};")  # begins a line: one that was cut off stays by itself
+
+
+__all__ = ["Returning"]

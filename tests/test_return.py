@@ -1,0 +1,179 @@
+"""An end of a topic that is lost and comes back: what it can have lost is sent again, what begins anew is taken."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msgs import End, Frame, Keyframe, Message, Poses
+from mvsgs_core.stats import Stats
+from nodes.once import Once
+from nodes.runtime.addresses import PeerLost
+from nodes.runtime.inbox import Inbox
+from nodes.runtime.transport import Publisher, ReliableReader, kept
+from nodes.runtime.transport.kept import Kept
+
+AWAY = 5.0  # s
+ONE = np.ones((2, 2), np.float32)
+
+
+def frame(index: int) -> Frame:
+    return Frame(index, index / 30, np.full((48, 64, 3), index, np.uint8), np.ones(4))
+
+
+def keyframe(index: int) -> Keyframe:
+    return Keyframe(index, index / 30, np.zeros((4, 4, 3), np.uint8), np.ones(4), np.eye(4), 1.0, ONE, ONE, 0)
+
+
+def poses(revision: int, *index: int) -> Poses:
+    return Poses(revision, np.array(index), np.tile(np.eye(4), (len(index), 1, 1)), np.ones(len(index)))
+
+
+def until(condition: Callable[[], object], seconds: float = 10.0) -> None:
+    limit = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < limit
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def opened() -> Iterator[Callable]:
+    """Notes what a test opens, and closes it."""
+    ends: list[Publisher | ReliableReader] = []
+
+    def note(end: Publisher | ReliableReader) -> object:
+        ends.append(end)
+        return end
+
+    yield note
+    for end in reversed(ends):
+        end.close()
+
+
+def taken(inbox: Inbox, count: int) -> list[Message]:
+    found: list[Message] = []
+    limit = time.monotonic() + 10.0
+    while len(found) < count and time.monotonic() < limit:
+        received = inbox.receive(0.1)
+        if received is not None:
+            found.append(received[1])
+    return found
+
+
+def seen(publisher: Publisher, said: list[str], what: str) -> bool:
+    publisher.watch()
+    return any(what in text for text in said)
+
+
+def ready(publisher: Publisher, inbox: Inbox) -> bool:
+    """A reader that is not looked at does not subscribe again."""
+    inbox.watch(0.01)
+    return publisher.ready(1)
+
+
+def indices(messages: list[Message]) -> list[int]:
+    return [message.index for message in messages if isinstance(message, Frame)]
+
+
+def test_a_reader_that_is_started_again_gets_what_it_can_have_lost_and_nobody_else_does(
+    tmp_path: Path, opened: Callable
+) -> None:
+    address, said = f"ipc://{tmp_path}/s", list[str]()
+    publisher: Publisher = opened(Publisher(address, buffer=4, away=AWAY, say=said.append))
+    other: ReliableReader = opened(ReliableReader(address, Frame, buffer=64))
+    mortal: ReliableReader = opened(ReliableReader(address, Frame, joins=True))
+    until(lambda: publisher.ready(2))
+    publisher.start()
+    for n in range(6):
+        publisher.send(frame(n))
+    assert indices(taken(Inbox([mortal], []), 3)) == [0, 1, 2]
+    mortal.close()
+    until(lambda: seen(publisher, said, "was lost"))
+    publisher.send(frame(6))
+    again: ReliableReader = opened(ReliableReader(address, Frame, buffer=64, joins=True))
+    until(lambda: seen(publisher, said, "was started again"))
+    publisher.send(frame(7))
+    publisher.end(End())
+    assert indices(taken(Inbox([again], []), 9)) == list(range(8))
+    assert not publisher.gone()
+    assert indices(taken(Inbox([other], []), 9)) == list(range(8))
+    assert (again.ended, other.ended) == (True, True)
+    until(publisher.gone)
+
+
+def test_who_stays_away_is_an_error_and_holds_the_sender_back_until_then(tmp_path: Path, opened: Callable) -> None:
+    address, said = f"ipc://{tmp_path}/s", list[str]()
+    publisher: Publisher = opened(Publisher(address, buffer=2, away=1.5, say=said.append))
+    mortal: ReliableReader = opened(ReliableReader(address, Frame, joins=True))
+    until(lambda: publisher.ready(1))
+    publisher.start()
+    mortal.close()
+    until(lambda: seen(publisher, said, "was lost"))
+    began = time.monotonic()
+    publisher.send(frame(0))
+    publisher.send(frame(1))
+    assert time.monotonic() - began < 1.0
+    with pytest.raises(PeerLost, match=r"was not back within 1\.5 s"):
+        publisher.send(frame(2))
+    assert time.monotonic() - began >= 1.0
+
+
+def test_a_sender_that_is_started_again_begins_anew_and_keeps_the_order_of_its_topics(
+    tmp_path: Path, opened: Callable
+) -> None:
+    addresses = f"ipc://{tmp_path}/k", f"ipc://{tmp_path}/p"
+    readers = [
+        opened(ReliableReader(address, kind, topic=f"tracker.{kind.__name__}", away=AWAY))
+        for address, kind in zip(addresses, (Keyframe, Poses), strict=True)
+    ]
+    inbox = Inbox(readers, [])
+
+    def start() -> tuple[Publisher, Publisher]:
+        ends = opened(Publisher(addresses[0])), opened(Publisher(addresses[1]))
+        for end in ends:
+            until(lambda: ready(end, inbox))  # noqa: B023
+            end.start()
+        return ends
+
+    keyframes, corrections = start()
+    for n in range(4):
+        corrections.send(poses(n + 1, n), {"Keyframe": n})
+        keyframes.send(keyframe(n), {"Poses": n + 1})
+    first = taken(inbox, 7)
+    keyframes.close()
+    corrections.close()
+    time.sleep(0.8)  # longer than a lost sender without a return is given
+    keyframes, corrections = start()
+    keyframes.send(keyframe(3), {"Poses": 1})
+    corrections.send(poses(4, 3))
+    keyframes.send(keyframe(4), {"Poses": 1})
+    second = taken(inbox, 4)
+    order = [(type(message).__name__, getattr(message, "index", None)) for message in (*first, *second)]
+    assert [kind for kind, _ in order] == ["Poses", "Keyframe"] * 4 + ["Poses", "Keyframe", "Keyframe"]
+    assert [reader.begun for reader in readers] == [1, 1]
+
+
+def test_what_came_already_is_told_and_so_is_what_never_came() -> None:
+    once = Once(Stats())
+    assert [once.keyframe(keyframe(n)) for n in (0, 5, 5, 7)] == [True, True, False, True]
+    assert [once.poses(p) for p in (poses(1, 0, 5), poses(2, 7, 8), poses(1, 0, 5))] == [True, True, False]
+    once.report_missing()
+    assert once.stats.skipped == {
+        "keyframes that came again": 1, "corrections that came again": 1, "keyframes that never came": 1,
+    }  # fmt: skip
+    assert "such as 8" in once.stats.warnings[0]
+
+
+def test_as_much_is_kept_as_can_be_on_the_way_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept, "ON_THE_WAY", 1000)
+    monkeypatch.setattr(kept, "MAX_BYTES", 5000)
+    for size, left in ((10, 100), (100, 28), (1000, 5)):
+        ring = Kept(4)
+        for n in range(200):
+            ring.add(memoryview(b"R" + bytes([n]) * (size - 1)))
+        assert len(ring) == left
+        assert [frame[:2] for frame in ring] == [b"A" + bytes([n]) for n in range(200 - left, 200)]

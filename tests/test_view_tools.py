@@ -1,0 +1,98 @@
+"""What the page of a saved map can do, without a browser: measure, crop, fly, export."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from mvsgs.view import SavedMapView
+from mvsgs_core.export.cameras import read_cameras
+from mvsgs_core.export.ply import read_ply
+from nodes.map_page import MapPage
+from tests.support.tiny_map import SIZE, write_tiny_run
+from tests.support.viewer_page import free_port
+
+HALF = np.array([[0.0, 50.0], [0.0, 100.0], [0.0, 100.0]])
+
+
+@pytest.fixture
+def shown(tmp_path: Path) -> Iterator[SavedMapView]:
+    run = write_tiny_run(tmp_path / "run")
+    opened = MapPage("127.0.0.1", free_port())
+    yield SavedMapView(opened, read_ply(run / "map.ply"), read_cameras(run / "cameras.json"), run / "keyframes", "tiny")
+    opened.server.stop()
+
+
+def click(shown: SavedMapView, right: float, down: float = 0.0) -> np.ndarray:
+    """From the first keyframe's place; where it meets the map, in the page."""
+    pose = shown._poses[0]
+    shown.measuring.click(pose[:3, 3] / shown.page.unit, pose[:3, :3] @ [right, down, 1.0])
+    return shown.measuring.ruler.points[-1]
+
+
+def test_two_clicks_measure_and_a_known_length_scales_what_is_exported(shown: SavedMapView, tmp_path: Path) -> None:
+    one = click(shown, 0.1)
+    other = click(shown, 0.4)
+    distance = float(np.linalg.norm(other - one))
+    assert f"**{distance:.4g} map units**" in shown.measuring.said.content
+    shown.measuring.calibrate(10 * distance)
+    assert f"**{10 * distance:.4g} true units**" in shown.measuring.said.content
+    shown.exporting.write(tmp_path / "map.ply")
+    scaled, before = read_ply(tmp_path / "map.ply"), shown._final
+    np.testing.assert_allclose(
+        scaled.splats.means.numpy() + scaled.origin, 10 * (before.splats.means.numpy() + before.origin), atol=1e-3
+    )
+
+
+def test_a_click_beside_the_map_is_said(shown: SavedMapView) -> None:
+    pose = shown._poses[0]
+    shown.measuring.click(pose[:3, 3] / shown.page.unit, -pose[:3, 2])
+    assert shown.measuring.said.content == "There is nothing of the map."
+    shown.measuring.calibrate(1.0)
+    assert "measure a distance first" in shown.measuring.said.content
+
+
+def test_what_is_cropped_is_gone_from_page_render_and_export(shown: SavedMapView, tmp_path: Path) -> None:
+    before, whole = shown.pictures.handles["render"].image.copy(), len(shown._final.splats)
+    shown.cropping.crop(HALF)
+    splats = shown.page.splats
+    assert splats is not None
+    assert 0.3 * whole < len(splats.centers) < 0.7 * whole
+    after = shown.pictures.handles["render"].image
+    assert (after.sum(axis=2) == 0).mean() > (before.sum(axis=2) == 0).mean() + 0.05
+    for suffix in (".ply", ".splat", ".spz"):
+        shown.exporting.write(tmp_path / f"map{suffix}")
+    assert len(read_ply(tmp_path / "map.ply").splats) == len(splats.centers)
+    assert (tmp_path / "map.splat").stat().st_size == 32 * len(splats.centers)
+    shown.cropping.crop(np.array([[49.9, 49.9]] * 3))
+    assert shown.cropping.said.content == "Nothing would be left."
+    shown.cropping.crop(np.tile([0.0, 100.0], (3, 1)))
+    assert len(splats.centers) == whole
+
+
+def test_a_path_is_rendered_to_a_video_that_begins_and_ends_where_it_does(shown: SavedMapView, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="two views or more"):
+        shown.flight.render(tmp_path / "flight.mp4", 1.0)
+    shown.flight.take(list(shown._poses))
+    assert shown.flight.said.content == "3 views"
+    assert shown.flight.render(tmp_path / "flight.mp4", 0.5) == 15
+    with av.open(tmp_path / "flight.mp4") as video:
+        assert video.streams.video[0].codec_context.name == "h264"
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in video.decode(video=0)]
+    assert frames[0].shape == (*SIZE, 3)
+    for frame, k in ((frames[0], 0), (frames[-1], 2)):
+        shown.show(k)
+        assert np.abs(frame - shown.pictures.handles["render"].image).mean() < 12  # chroma at half the size
+    assert np.abs(frames[0] - frames[-1]).mean() > 24
+
+
+def test_keyframes_are_colored_by_what_the_map_covers(shown: SavedMapView) -> None:
+    shown.tint("coverage")
+    colors = [shown.page.frustums[index].color for index in (7, 14)]
+    assert len(set(colors)) == 2  # the last sees less of it
+    shown.tint("nothing")
+    assert shown.page.frustums[7].color == shown.page.frustums[14].color
