@@ -1,8 +1,8 @@
 """Runs a graph as processes: starts them, watches them, stops them, and leaves nothing behind.
 
-First Ctrl-C: only the sources end, so that the map and the report are finished. Second: everything stops. A stage that
-fails stops the graph, in an orderly way: every node may save what it has. Who only observes fails alone. SIGTERM and a
-closed terminal stop everything.
+First Ctrl-C: only the sources end, so that the map and the report are finished. Second, or before all nodes are
+started: everything stops. A stage that fails stops the graph, in an orderly way: every node may save what it has. Who
+only observes fails alone. SIGTERM and a closed terminal stop everything.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ class Supervisor:
         self._waker, self._wakeup = socket.socketpair()
         self._signals: list[int] = []
         self._interrupts = 0
+        self._started = False  # all nodes that are started here
         self._selector = selectors.DefaultSelector()
         self._watchdog = Watchdog(graph.settings.supervise, screen.note, graph.observers)
         self._failed_observers: dict[str, Failure] = {}
@@ -99,6 +100,7 @@ class Supervisor:
             self._children[name] = child
             self._selector.register(child.pipe, selectors.EVENT_READ, child)
             processes[name] = psutil.Process(child.process.pid)
+        self._started = True
 
     def _watch(self, directory: RunDirectory) -> Outcome:
         """Until every process has ended by itself, a stage has failed, or a signal says to stop."""
@@ -114,7 +116,7 @@ class Supervisor:
                 if number != signal.SIGINT:
                     return self._stopped(number)
                 self._interrupts += 1
-                if self._interrupts > 1:
+                if self._interrupts > 1 or not self._started:  # a source would wait for readers that never come
                     return self._stopped(number)
                 self._end_sources()
             watched = [child for name, child in self._children.items() if name not in self._failed_observers]

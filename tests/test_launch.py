@@ -6,6 +6,7 @@ import json
 import re
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -159,6 +160,37 @@ def test_ctrl_c_while_starting(launch: type[Launch], delay: float) -> None:
     run.ctrl_c()
     code, _, err = run.finish(20)
     assert code in (0, 130, -signal.SIGINT), err
+
+
+INTERRUPTED = """
+import os, runpy, signal, sys
+del sys.argv[:2]
+sys.path.insert(0, os.path.dirname(os.path.dirname(sys.argv[0])))
+import launch.supervise as supervise
+
+class Interrupted(supervise.Child):
+    def __init__(self, *given):
+        super().__init__(*given)
+        if not os.path.exists("interrupted"):
+            open("interrupted", "w").close()
+            os.kill(os.getpid(), signal.SIGINT)
+
+supervise.Child = Interrupted
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def test_ctrl_c_between_the_starts_of_two_nodes_stops_the_one_that_runs(tmp_path: Path) -> None:
+    """Nobody will ever read what it sends: it must not be waited for."""
+    run = Launch(tmp_path, "source=live", prefix=[sys.executable, "-c", INTERRUPTED])
+    try:
+        code, out, _ = run.finish(30)
+    finally:
+        run.kill()
+    assert (tmp_path / "interrupted").exists()
+    assert [log.stem for log in (run.output / "logs").iterdir()] == ["source"]
+    assert code == 130
+    assert "stopped by Ctrl-C" in out
 
 
 def test_a_node_that_ignores_sigterm_is_killed(launch: type[Launch]) -> None:
