@@ -14,7 +14,7 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.photographs.adjustment import SparseProblem, adjust_sparse, reprojection
 from mvsgs_core.photographs.lens import SharedLens
-from mvsgs_core.photographs.registration import MAX_ERROR, MIN_SEEN, ROBUST, register
+from mvsgs_core.photographs.registration import BENT, MAX_ERROR, MIN_SEEN, ROBUST, register
 from mvsgs_core.photographs.tracks import Tracks
 from mvsgs_core.photographs.triangulation import triangulate
 from mvsgs_core.photographs.two_views import TwoViews, relative_poses
@@ -30,6 +30,7 @@ AROUND = 6  # photographs that a local adjustment moves
 SETTLED = 1e-3  # of the observations: where fewer came or went, adjusting everything once more changes nothing
 ROUGH = 1e-3  # of the cost: a smaller gain ends an adjustment while the map still grows
 FOR_FOCAL, FOR_DISTORTION = 3, 5  # photographs, from which on these are estimated
+FOR_OTHERS = 10  # photographs of a model whose lens holds for what is put together after it
 GRIDS = (2, 4, 8, 16)  # boxes along a side, over which a photograph's points are spread
 
 
@@ -92,19 +93,20 @@ class Reconstruction:
         return None
 
     def _grow(self, left: np.ndarray) -> None:
-        settled = 0  # photographs when those that failed were last tried again
+        settled, bent = 0, False  # photographs when those that failed were last tried again, and how
         while len(self.order) >= 2:
             chosen = self._next(left)
             if chosen is None:
-                if len(self.order) <= settled or not self._failed:
+                if not self._failed or (len(self.order) <= settled and bent):
                     return
+                bent = len(self.order) <= settled  # the mended map has brought no more: it may be bent there
                 if len(self.order) > self._adjusted:
                     self._adjust_all()
                 settled = len(self.order)
-                self._failed.clear()  # once more, against the mended map
+                self._failed.clear()  # once more
                 continue
             index, seen = chosen
-            if not self._register(index):
+            if not self._register(index, BENT * MAX_ERROR if bent else MAX_ERROR):
                 self._failed[index] = seen
                 continue
             self._triangulate(index)
@@ -171,11 +173,11 @@ class Reconstruction:
         index = int(np.argmax(np.where(open_, score, -1.0)))
         return index, int(count[index])
 
-    def _register(self, index: int) -> bool:
+    def _register(self, index: int, max_error: float) -> bool:
         """PnP of one photograph against the map; whether it has a pose now."""
         mine = np.flatnonzero((self.tracks.photograph == index) & self._known()[self.tracks.track])
         world = self.points[self.tracks.track[mine]]
-        pose = register(index, world, self.tracks.pixels[mine], self.lens)
+        pose = register(index, world, self.tracks.pixels[mine], self.lens, max_error)
         if pose is None:
             return False
         self.poses[index] = pose
@@ -323,13 +325,18 @@ def all_models(
     mapped: np.ndarray,
     free_lens: bool,
 ) -> Iterator[Model]:
-    """The model that grows from the best two views, then those of the photographs that it leaves, of `mapped` (P,)."""
+    """The model that grows from the best two views, then those of the photographs that it leaves, of `mapped` (P,).
+
+    All have one lens: that of a model of enough photographs stays, as few views of a part may fit any.
+    """
     left = mapped.copy()
     while left.sum() >= 2:
         model = Reconstruction(tracks, lens, sizes, free_lens).run(pairs, points, left)
         if model is None:
             return
         yield model
+        if free_lens and len(model.order) >= FOR_OTHERS:
+            lens, free_lens = model.lens, False
         left &= ~model.registered
 
 

@@ -11,12 +11,18 @@ from mvsgs_core.photographs.lens import SharedLens
 MIN_SEEN = 20  # points that agree with the pose
 MIN_AGREE = 0.25  # of those that were matched
 MAX_ERROR = 4.0  # pixels of an observation that agrees
+BENT = 3.0  # times as many where the map may be bent, as it is far from where it began
 ROBUST = 1.0  # pixels
 TRIALS = 2000
 
 
-def register(photograph: int, points: np.ndarray, pixels: np.ndarray, lens: SharedLens) -> np.ndarray | None:
-    """cam_from_world (4, 4) of a photograph that sees points (N, 3) at pixels (N, 2); None where too few agree."""
+def register(
+    photograph: int, points: np.ndarray, pixels: np.ndarray, lens: SharedLens, max_error: float = MAX_ERROR
+) -> np.ndarray | None:
+    """cam_from_world (4, 4) of a photograph that sees points (N, 3) at pixels (N, 2); None where too few agree.
+
+    max_error: pixels of a point that agrees.
+    """
     if len(points) < MIN_SEEN:
         return None
     focal = lens.focal(photograph)
@@ -26,7 +32,7 @@ def register(photograph: int, points: np.ndarray, pixels: np.ndarray, lens: Shar
     try:
         found, _, _, inliers = cv2.solvePnPRansac(
             points, flat, camera, None,
-            iterationsCount=TRIALS, reprojectionError=MAX_ERROR, confidence=0.9999, flags=cv2.SOLVEPNP_P3P,
+            iterationsCount=TRIALS, reprojectionError=max_error, confidence=0.9999, flags=cv2.SOLVEPNP_P3P,
         )  # fmt: skip
         if not found or inliers is None or len(inliers) < max(MIN_SEEN, MIN_AGREE * len(points)):
             return None
@@ -52,4 +58,4 @@ def register(photograph: int, points: np.ndarray, pixels: np.ndarray, lens: Shar
     return np.asarray(adjust_sparse(alone, 10, ROBUST).cam_from_world[0])
 
 
-__all__ = ["MAX_ERROR", "MIN_SEEN", "ROBUST", "register"]
+__all__ = ["BENT", "MAX_ERROR", "MIN_SEEN", "ROBUST", "register"]

@@ -77,6 +77,32 @@ def test_a_photograph_of_something_else_gets_no_pose() -> None:
     assert np.flatnonzero(~model.registered).tolist() == [3]
 
 
+def test_a_photograph_that_the_map_fits_roughly_comes_last() -> None:
+    """As where the map is bent, far from where it began."""
+    of = ring(6)
+    pixels = of.pixels.copy()
+    pixels[3] += np.random.default_rng(1).normal(0.0, 8.0, pixels[3].shape)
+    rough = replace(of, pixels=pixels)
+    (model,) = models_of(rough, rough.pairs())
+    assert model.order[-1] == 3
+    assert position_error(model.cam_from_world, of.cam_from_world) < 0.05
+
+
+def test_a_small_part_has_the_lens_of_the_large_one() -> None:
+    large, small = ring(10, k1=-0.05), ring(3, k1=-0.05, seed=5)
+    pixels = np.full((13, 800, 2), np.nan)
+    pixels[:10, :400], pixels[10:, 400:] = large.pixels, small.pixels
+    both = Ring(
+        np.concatenate([large.cam_from_world, small.cam_from_world]),
+        np.concatenate([large.world, small.world]),
+        pixels,
+        replace(large.lens, intrinsics=np.concatenate([large.lens.intrinsics, small.lens.intrinsics])),
+    )
+    first, second = models_of(both, both.pairs(), factor=1.15)
+    assert [int(model.registered.sum()) for model in (first, second)] == [10, 3]
+    assert second.lens == first.lens
+
+
 def test_two_photographs_alone_are_no_model() -> None:
     of = ring(2)
     assert models_of(of, of.pairs()) == []
