@@ -22,6 +22,7 @@ from nodes.localization_file import HEADER
 from nodes.localizer import Localizer
 from nodes.mapper import Mapper
 from nodes.tracker import Tracker
+from tests.support.patience import LONG
 from tests.support.small_atlas import PLAIN, begun, view
 
 SMALL = (
@@ -60,10 +61,17 @@ def test_a_run_without_a_map_is_refused_before_anything_starts(tmp_path: Path, c
     assert "keep_map=true" in capsys.readouterr().err
 
 
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that keeps its map, shared by those that begin in it."""
+    output = tmp_path_factory.mktemp("kept") / "first"
+    run_inline(compose([*SMALL, "dataset.stop=40", "keep_map=true", f"output={output}"]))
+    return output
+
+
 @pytest.mark.slow
-def test_a_run_goes_on_in_the_map_of_another(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
-    run_inline(compose([*SMALL, "dataset.stop=40", "keep_map=true", f"output={first}"]))
+def test_a_run_goes_on_in_the_map_of_another(first: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    second = tmp_path / "second"
     assert tracker_file(first).is_file()
     assert len(list((first / "checkpoint").glob("state-*.npz"))) == 1, "the finished map alone"
     graph = compose([*SMALL, "dataset.start=40", f"map={first}", f"output={second}"])
@@ -89,9 +97,8 @@ def test_a_run_goes_on_in_the_map_of_another(tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.mark.slow
-def test_frames_are_found_in_a_frozen_map(tmp_path: Path) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
-    run_inline(compose([*SMALL, "dataset.stop=40", "keep_map=true", f"output={first}"]))
+def test_frames_are_found_in_a_frozen_map(first: Path, tmp_path: Path) -> None:
+    second = tmp_path / "second"
     before = {file: file.read_bytes() for file in first.rglob("*") if file.is_file()}
     words = ["mapper=frozen", "dataset.start=20", "dataset.stop=40", f"map={first}", f"output={second}"]
     nodes = run_inline(compose([*SMALL[:3], "mapper.threads=1", "evaluator.fitted=false", *words]))
@@ -125,7 +132,7 @@ def test_a_frozen_map_must_be_named(node: type[Node]) -> None:
 def test_the_frozen_map_is_shown_with_the_camera_in_it(tmp_path: Path) -> None:
     writer = CheckpointWriter(tmp_path, PLAIN)
     writer.submit(begun(PLAIN).frozen(), sync=False)
-    assert writer.wait(20.0)
+    assert writer.wait(LONG)
     tracker_file(tmp_path).touch()
     given = view(3)
     node = FrozenMapper(FrozenMapper.Config(map=str(tmp_path), threads=1))

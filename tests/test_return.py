@@ -16,6 +16,7 @@ from nodes.runtime.addresses import PeerLost
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.transport import Publisher, ReliableReader, kept
 from nodes.runtime.transport.kept import Kept
+from tests.support.patience import LONG, until
 
 AWAY = 5.0  # s
 ONE = np.ones((2, 2), np.float32)
@@ -31,13 +32,6 @@ def keyframe(index: int) -> Keyframe:
 
 def poses(revision: int, *index: int) -> Poses:
     return Poses(revision, np.array(index), np.tile(np.eye(4), (len(index), 1, 1)), np.ones(len(index)))
-
-
-def until(condition: Callable[[], object], seconds: float = 10.0) -> None:
-    limit = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.002)
 
 
 @pytest.fixture
@@ -56,7 +50,7 @@ def opened() -> Iterator[Callable]:
 
 def taken(inbox: Inbox, count: int) -> list[Message]:
     found: list[Message] = []
-    limit = time.monotonic() + 10.0
+    limit = time.monotonic() + LONG
     while len(found) < count and time.monotonic() < limit:
         received = inbox.receive(0.1)
         if received is not None:

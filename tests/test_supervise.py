@@ -14,6 +14,7 @@ import pytest
 from launch.status import NodeStatus
 from launch.summary import summary
 from tests.support.launches import DOWN, Launch, launch
+from tests.support.patience import LONG, Stopwatch, until
 
 pytestmark = pytest.mark.slow
 
@@ -56,10 +57,9 @@ def test_an_observer_that_hangs_is_given_up_and_its_senders_go_on(launch: type[L
         run.node("sink").suspend()
     code, out, err = run.finish()
     assert code == 4, err
-    assert re.search(r"sink failed: (silent for \d s: it was stopped|it has held \w+ back for \d s)", out), out
-    named = (
-        r"sink has been silent for \d s" if stopped else r"sink has held \w+ back for 1 s; after 2.5 s the run goes on"
-    )
+    assert re.search(r"sink failed: (silent for \d+ s: it was stopped|it has held \w+ back for \d+ s)", out), out
+    held = r"sink has held \w+ back for \d+ s; after 2.5 s the run goes on"
+    named = r"sink has been silent for \d+ s" if stopped else held
     assert re.search(named, out), out
     assert "done" in (run.output / "logs" / "relay.log").read_text()
 
@@ -67,13 +67,13 @@ def test_an_observer_that_hangs_is_given_up_and_its_senders_go_on(launch: type[L
 def test_a_stage_that_is_stopped_is_named_and_ends_the_run(launch: type[Launch]) -> None:
     run = launch("source.count=0", "source.period=0.01", *SHORT)
     run.wait_until_running()
-    began = time.monotonic()
+    watch = Stopwatch()
     run.node("relay").suspend()
     code, out, err = run.finish()
-    assert time.monotonic() - began < 2.5 + DOWN
+    assert watch.within(2.5 + DOWN)
     assert code == 1
-    assert re.search(r"relay has been silent for \d s: its process was stopped \(kill -CONT \d+ lets it go on\)", out)
-    assert re.search(r"relay failed: silent for \d s: it was stopped by a signal", err)
+    assert re.search(r"relay has been silent for \d+ s: its process was stopped \(kill -CONT \d+ lets it go on\)", out)
+    assert re.search(r"relay failed: silent for \d+ s: it was stopped by a signal", err)
     assert run.report() | {"written": ""} == {
         "finished": False,
         "reason": f"relay failed: {run.report()['error']}",
@@ -88,7 +88,7 @@ def test_a_stage_whose_process_hangs_is_named_with_where_it_stands(launch: type[
     run = launch("source.count=20", "relay.long_at=5", "relay.long=1000", "relay.how=locked", *SHORT)
     code, out, err = run.finish()
     assert code == 1
-    assert re.search(r"relay has been silent for \d s: its process hangs; after 2.5 s the run ends\.", out), out
+    assert re.search(r"relay has been silent for \d+ s: its process hangs; after 2.5 s the run ends\.", out), out
     assert "in take" in out
     assert "relay failed: silent for" in err
 
@@ -100,7 +100,7 @@ def test_a_slow_stage_is_not_a_dead_one(launch: type[Launch], how: str) -> None:
     code, out, err = run.finish()
     assert code == 0, out + err
     assert "silent" not in out
-    assert "relay has been at the same piece of work for 2 s; it is alive, so it is left alone" in out
+    assert re.search("relay has been at the same piece of work for [2-5] s; it is alive, so it is left alone", out), out
 
 
 def test_a_launcher_that_was_stopped_itself_takes_nobody_for_dead(launch: type[Launch]) -> None:
@@ -118,10 +118,10 @@ def test_a_launcher_that_was_stopped_itself_takes_nobody_for_dead(launch: type[L
 def test_a_stage_ended_from_outside_ends_the_run_in_time(launch: type[Launch], victim: str) -> None:
     run = launch("source=live")
     run.wait_until_running()
-    began = time.monotonic()
+    watch = Stopwatch()
     run.node(victim).terminate()
     code, out, err = run.finish()
-    assert time.monotonic() - began < DOWN
+    assert watch.within(DOWN)
     assert code == 1
     assert f"{victim} failed: stopped (SIGTERM)" in err
     assert out.rstrip().endswith(f"nothing to go on with: no checkpoint in {run.output}")
@@ -188,10 +188,7 @@ def test_run_directories_of_killed_launchers_are_removed_by_the_next(launch: typ
     killed = launch("source=live")
     killed.wait_until_running()
     living = launch("source=live", f"output={killed.output}2", sockets=killed.sockets)
-    until = time.monotonic() + 20
-    while not (Path(f"{killed.output}2") / "logs" / "sink.log").exists():
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    until((Path(f"{killed.output}2") / "logs" / "sink.log").exists)
     killed.process.kill()
     killed.process.wait()
     foreign = killed.sockets / "mvsgs-12345678"  # no launcher's: without its lock
@@ -199,7 +196,7 @@ def test_run_directories_of_killed_launchers_are_removed_by_the_next(launch: typ
     left = {path.name for path in killed.sockets.iterdir()}
     assert len(left) == 3
     third = launch("source.count=3", f"output={killed.output}3", sockets=killed.sockets)
-    _, err = third.process.communicate(timeout=60)
+    _, err = third.process.communicate(timeout=LONG)
     assert third.process.returncode == 0, err
     now = {path.name for path in killed.sockets.iterdir()}
     assert len(now) == 2

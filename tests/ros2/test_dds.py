@@ -15,6 +15,7 @@ import pytest
 
 from nodes.ros2.connection import DEFAULT, LATCHED, LOOPBACK, SENSOR_DATA, Connection, Quality
 from nodes.ros2.messages import Header, Time
+from tests.support.patience import LONG, until
 from tests.support.ros2_messages import TYPES, example, plain
 from tests.support.ros2_peer import OWN_DOMAIN, Peer
 from tests.support.shared_data import ROOT
@@ -37,7 +38,7 @@ def test_every_type_there_and_back(peer: Peer, participant: Any, message_type: A
     message = example(message_type, np.random.default_rng(7))
     peer.subscribe(topic, message_type.ros)
     writer = participant.writer(topic, message_type, DEFAULT)
-    _until(lambda: writer.readers > 0)
+    until(lambda: writer.readers > 0)
     assert writer.write(message)
     assert peer.wait_for(topic) == [plain(message)]
 
@@ -46,7 +47,7 @@ def test_every_type_there_and_back(peer: Peer, participant: Any, message_type: A
     peer.advertise(back, message_type.ros)
     peer.wait_for_reader(back)
     peer.publish(back, plain(message))
-    reader.wait(10.0)
+    reader.wait(LONG)
     taken = reader.take()
     assert [plain(reader.decode(data)) for data in taken] == [plain(message)]
 
@@ -60,7 +61,7 @@ def test_a_late_reader_gets_what_is_kept_for_it(peer: Peer, participant: Any) ->
     for topic in ("/late/kept", "/late/lost"):
         peer.subscribe(topic, Header.ros, transient_local=topic.endswith("kept"))
     assert [message["stamp"]["sec"] for message in peer.wait_for("/late/kept")] == [2]
-    _until(lambda: lost.readers > 0)
+    until(lambda: lost.readers > 0)
     lost.write(Header(Time(9, 0), "map"))
     assert [message["stamp"]["sec"] for message in peer.wait_for("/late/lost")] == [9]
 
@@ -71,7 +72,7 @@ def test_qualities_meet_as_in_ros(peer: Peer, participant: Any, offered: Quality
     writer = participant.writer(topic, Header, offered)
     peer.subscribe(topic, Header.ros, reliable=wanted)
     if meet:
-        _until(lambda: writer.readers > 0)
+        until(lambda: writer.readers > 0)
     else:
         time.sleep(1.0)
         assert writer.readers == 0
@@ -83,9 +84,9 @@ def test_an_image_of_a_megabyte_arrives_whole(peer: Peer, participant: Any) -> N
     data = np.random.default_rng(0).integers(0, 255, 480 * 640 * 3, np.uint8)
     writer = participant.writer("/large", Image, DEFAULT)
     reader = participant.reader("/large", Image, DEFAULT)
-    _until(lambda: writer.readers > 0)
+    until(lambda: writer.readers > 0)
     writer.write(Image(Header(Time(1, 2), "camera"), 480, 640, "rgb8", 0, 1920, data))
-    reader.wait(10.0)
+    reader.wait(LONG)
     (taken,) = reader.take()
     assert (reader.decode(taken).data == data).all()
 
@@ -116,7 +117,8 @@ def test_nothing_listens_beyond_loopback_unless_it_is_told_to() -> None:
 
     def devices(interface: str) -> str:
         command = [sys.executable, "-c", code, interface]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=LONG)
+        return done.stdout.strip()
 
     assert devices(LOOPBACK) == "{'lo'}"
     assert devices("auto") == "{''}"
@@ -132,10 +134,3 @@ def test_an_interface_that_is_none_or_another_is_refused() -> None:
         Participant(Connection(domain=OWN_DOMAIN + 2, interface="auto"))
     del here
     Participant(Connection(domain=OWN_DOMAIN + 2))
-
-
-def _until(met: Any, seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not met():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)

@@ -15,6 +15,7 @@ from msgs import CameraPose, FusedKeyframe, Keyframe, Poses, Preview
 from mvsgs_core import geometry
 from nodes.odometry import Odometry
 from nodes.ros2_publisher import Frames, Ros2Publisher
+from tests.support.patience import until
 from tests.support.ros2_peer import OWN_DOMAIN, Peer
 
 pytest.importorskip("cyclonedds", reason="ROS 2 is reached by cyclonedds (pip install cyclonedds)")
@@ -52,10 +53,7 @@ class Graph:
             self.node._tf,
             self.node._points,
         )
-        deadline = time.monotonic() + 20
-        while not all(writer is not None and writer.readers for writer in writers):
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+        until(lambda: all(writer is not None and writer.readers for writer in writers))
 
     def topic(self, name: str) -> str:
         return f"{self.space}/{name}" if name.startswith("tf") else f"{self.space}/mvsgs/{name}"

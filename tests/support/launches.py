@@ -16,6 +16,8 @@ from typing import Any
 import psutil
 import pytest
 
+from tests.support.patience import LONG
+
 ROOT = Path(__file__).resolve().parents[2]
 FAKE = ROOT / "tests" / "support" / "fake_graph" / "conf"
 DOWN = 5.0  # seconds in which a graph must be gone
@@ -53,7 +55,7 @@ class Launch:
             env={**os.environ, "TMPDIR": str(self.sockets), "PYTHONPATH": ""},
         )
 
-    def finish(self, seconds: float = 60.0) -> tuple[int, str, str]:
+    def finish(self, seconds: float = LONG) -> tuple[int, str, str]:
         """Exit code and what was printed; then no process, socket or temporary file of the run may be left."""
         out, err = self.process.communicate(timeout=seconds)
         assert self.nodes() == []
@@ -77,9 +79,14 @@ class Launch:
     def node(self, name: str) -> psutil.Process:
         return next(p for p in map(psutil.Process, self.nodes()) if f"/{name}.json" in " ".join(p.cmdline()))
 
+    def log(self, node: str) -> str:
+        """What that node wrote so far."""
+        file = self.output / "logs" / f"{node}.log"
+        return file.read_text() if file.exists() else ""
+
     def wait_until_running(self) -> None:
         """Until the sink's log says so, and every node's that it is past its start: they come up in any order."""
-        until = time.monotonic() + 30
+        until = time.monotonic() + LONG
         logs = self.output / "logs"
         while time.monotonic() < until and self.process.poll() is None:
             said = {log.stem: log.read_text() for log in logs.glob("*.log")}
@@ -91,6 +98,14 @@ class Launch:
     def ctrl_c(self) -> None:
         """As a terminal does it: to all processes of the foreground group."""
         os.killpg(self.process.pid, signal.SIGINT)
+
+    def wait_until_it_says(self, text: str) -> None:
+        """A second signal before the first one was taken would be one with it."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if text in line:
+                return
+        raise AssertionError(f"never said: {text}")
 
     def kill(self) -> None:
         if self.process.poll() is None:

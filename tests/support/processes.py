@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from nodes.runtime.signals import STARTING
+from tests.support.patience import LONG, until
 from tests.support.shared_data import ROOT
 
 ENVIRONMENT = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -40,11 +41,13 @@ class Process:
         with os.fdopen(fd) as file:
             self.lines.extend(json.loads(line) for line in iter(file.readline, ""))
 
-    def wait_for(self, reached: Any, seconds: float = 20.0) -> None:
-        until = time.monotonic() + seconds
-        while not reached(self.last):
-            assert time.monotonic() < until, f"{self.name}: {self.last}\n{self.log.read_text()}"
-            time.sleep(0.005)
+    def wait_for(self, reached: Any, seconds: float = LONG) -> None:
+        """Until one of its status lines says so: a state may be over before anybody looks."""
+        until(
+            lambda: any(reached(line) for line in [*self.lines]),
+            seconds,
+            lambda: f"{self.name}: {self.last}\n{self.log.read_text()}",
+        )
 
 
 class Graph:
@@ -135,12 +138,12 @@ class Graph:
     def aborted(self) -> dict[str, Any]:
         return json.loads((self.directory / "joined.aborted").read_text())
 
-    def wait(self, seconds: float) -> dict[str, int]:
+    def wait(self, seconds: float = LONG) -> dict[str, int]:
         """Exit codes by node; fails if one is still running after that time."""
-        until = time.monotonic() + seconds
+        limit = time.monotonic() + seconds
         for process in self.processes.values():
             try:
-                process.popen.wait(max(0.01, until - time.monotonic()))
+                process.popen.wait(max(0.01, limit - time.monotonic()))
             except subprocess.TimeoutExpired:
                 logs = "\n".join(f"{p.name}: {p.last}\n{p.log.read_text()}" for p in self.processes.values())
                 raise AssertionError(f"{process.name} is still running\n{logs}") from None

@@ -9,10 +9,11 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
-import time
 from collections.abc import Iterator, Mapping
 from multiprocessing.connection import Connection
 from typing import Any
+
+from tests.support.patience import until
 
 # of rmw_cyclonedds: its header, and the fields of the .srv file
 SERVICES = {
@@ -61,39 +62,31 @@ class Peer:
     def client(self, service: str, kind: str) -> None:
         """kind: Trigger or SetBool; returns when the service is there."""
         self._call("client", service, kind)
-        deadline = time.monotonic() + 60.0
-        while not self._call("available", service):
-            assert time.monotonic() < deadline, f"nobody offers {service}"
-            time.sleep(0.05)
+        until(lambda: self._call("available", service), what=f"nobody offers {service}")
 
     def ask(self, service: str, *, times: int = 1, **fields: Any) -> list[int]:
         """Sequence numbers of as many requests, sent without waiting for a reply."""
         return list(self._call("ask", service, times, fields))
 
-    def replies(self, service: str, count: int = 1, seconds: float = 60.0) -> list[dict[str, Any]]:
+    def replies(self, service: str, count: int = 1) -> list[dict[str, Any]]:
         """The next so many replies to this client."""
         found: list[dict[str, Any]] = []
-        deadline = time.monotonic() + seconds
-        while len(found) < count:
-            found += self._call("replies", service)
-            assert time.monotonic() < deadline, f"{len(found)} of {count} replies of {service}"
-            time.sleep(0.02)
+        until(
+            lambda: found.extend(self._call("replies", service)) or len(found) >= count,
+            what=lambda: f"{len(found)} of {count} replies of {service}",
+        )
         return found
 
-    def wait_for_reader(self, topic: str, seconds: float = 20.0) -> None:
-        deadline = time.monotonic() + seconds
-        while not self.readers(topic):
-            assert time.monotonic() < deadline, f"nobody reads {topic}"
-            time.sleep(0.05)
+    def wait_for_reader(self, topic: str) -> None:
+        until(lambda: self.readers(topic), what=f"nobody reads {topic}")
 
-    def wait_for(self, topic: str, count: int = 1, seconds: float = 20.0) -> list[dict[str, Any]]:
+    def wait_for(self, topic: str, count: int = 1) -> list[dict[str, Any]]:
         """At least so many messages."""
         found: list[dict[str, Any]] = []
-        deadline = time.monotonic() + seconds
-        while len(found) < count:
-            found += self.taken(topic)
-            assert time.monotonic() < deadline, f"{len(found)} messages at {topic}"
-            time.sleep(0.02)
+        until(
+            lambda: found.extend(self.taken(topic)) or len(found) >= count,
+            what=lambda: f"{len(found)} messages at {topic}",
+        )
         return found
 
     def close(self) -> None:

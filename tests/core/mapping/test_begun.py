@@ -15,6 +15,7 @@ from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.stats import Stats
+from tests.support.patience import LONG
 from tests.support.small_atlas import PLAIN, begun, view
 
 
@@ -23,7 +24,7 @@ def kept(tmp_path: Path, config: MapperConfig = PLAIN) -> Atlas:
     atlas = begun(config)
     writer = CheckpointWriter(tmp_path, atlas.current.config)
     writer.submit(atlas.frozen(), sync=False)
-    assert writer.wait(20.0)
+    assert writer.wait(LONG)
     return atlas
 
 

@@ -16,6 +16,7 @@ from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.trajectory_file import read_trajectory
 from tests.support.full_disk import full_after
+from tests.support.patience import LONG
 from tests.support.small_atlas import PLAIN, begun, view
 
 
@@ -33,7 +34,7 @@ class Clock:
 def times(checkpoints: Checkpointing, atlas: Atlas) -> float:
     """How often was saved so far, after a look."""
     checkpoints.keep(atlas)
-    assert checkpoints._writer.wait(20.0)
+    assert checkpoints._writer.wait(LONG)
     return atlas.current.log.counts.get("checkpoints", 0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import logging
 import os
 import signal
 import time
@@ -54,6 +55,7 @@ class Relay(Node):
         fail_at: int | None = None  # frame at which it raises
         kill_at: int | None = None  # frame at which it is killed, as by the system
         hang_at: int | None = None  # frame at which it stops answering, SIGTERM included
+        tell_at: int | None = None  # frame at which its log says so
         seconds: float = 0.0  # work per frame
         long_at: int | None = None  # frame that takes long
         long: float = 0.0  # seconds of it
@@ -94,12 +96,15 @@ class Relay(Node):
         yield Poses(1, np.zeros(1, np.int64), np.eye(4)[None], np.ones(1))
 
     def _misbehave(self, index: int) -> None:
+        if index == self.config.tell_at:
+            logging.info("is at frame %d", index)
         if index == self.config.fail_at:
             raise ArithmeticError(f"frame {index} cannot be relayed")
         if index == self.config.kill_at:
             os.kill(os.getpid(), signal.SIGKILL)
         if index == self.config.hang_at:
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            logging.info("hangs")
             while True:
                 time.sleep(1)
         if index == self.config.long_at:
