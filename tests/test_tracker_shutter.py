@@ -12,6 +12,7 @@ from msgs import Frame, GroundTruth, Keyframe, Poses, TrackedFrame, Trajectory
 from mvsgs_core import geometry
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
 from mvsgs_core.image_metrics import psnr
+from mvsgs_core.tracking.estimation import calibration
 from mvsgs_core.trajectory import Trajectory as CameraTrajectory
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker, in_milliseconds
@@ -122,6 +123,21 @@ def test_keyframes_sent_before_the_readout_time_was_known_get_it_with_their_next
     off = [np.linalg.norm(v[3:] - known[i][3:]) / np.linalg.norm(known[i][3:]) for i, v in told.items()]
     assert np.median(off) < 0.3, off
     assert np.isfinite([known[i] for i in without]).all()
+
+
+def test_a_readout_time_that_falls_to_zero_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses are then those of a camera without a rolling shutter, and the map has to render like that."""
+    found = [0.5 / FPS]
+    monkeypatch.setattr(calibration, "estimate_readout_time", lambda graph, indices, threads: found[-1])
+    frames, _ = rolling_messages(24)
+    node = Tracker()
+    early: list[msgs.Message] = [m for frame in frames for m in node.on_frame(frame)]
+    assert max(k.readout_time for k in of_type(early, Keyframe)) == found[0]
+    found.append(0.0)
+    final = of_type(list(node.on_end()), Poses)[-1]
+    assert node.core.readout_time == final.readout_time == 0.0
+    assert final.velocity is not None
+    assert np.isfinite(final.velocity).any()  # those on their way to the map take it by their velocity
 
 
 @pytest.mark.slow

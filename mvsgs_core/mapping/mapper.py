@@ -276,13 +276,16 @@ class OnlineMapper:
         """Takes velocities (K, 6) of the camera at the keyframes `index` (K,), world units a second, NaN: as it was.
 
         And the time, seconds, in which their photographs were read; for those that are trained on as they were taken,
-        whether that was known of them before or not, and for the frames between them, whose velocities stay.
+        whether that was known of them before or not, and for the frames between them, whose velocities stay. A readout
+        time of 0 holds for all keyframes, as poses are those of a camera without one then.
         """
         known = dict(zip(index.tolist(), velocity / np.repeat([self.frame.length, 1.0], 3)))
         for view in self.views:
             found = known.get(view.index)
             if view.as_taken and found is not None and np.isfinite(found).all():
                 view.velocity, view.readout_time = found, readout_time
+            elif readout_time == 0.0:
+                view.readout_time = 0.0
         for between in self.keyframes.between:
             if between.twist.any():
                 between.readout_time = readout_time

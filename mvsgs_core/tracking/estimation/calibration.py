@@ -36,6 +36,7 @@ class Calibration:
             self.stats.values["readout_time"] = self.readout_time
         self.given = self.graph.intrinsics  # (4,) that came with the frames, at the tracker's size
         self.guessed = not self.settled
+        self.rolled = False  # a readout time above 0 was used before the one that is now, by a map gone on with, too
 
     @property
     def focal_factor(self) -> float:
@@ -103,6 +104,7 @@ class Calibration:
         """Of a rolling shutter, from these keyframes."""
         if self.readout_time is not None:
             return
+        self.rolled |= self.graph.readout_time > 0.0
         with self.stats.time("rolling shutter"):
             self.graph.readout_time = estimate_readout_time(self.graph, members, self.threads)
         self.stats.values["readout_time"] = self.graph.readout_time

@@ -85,6 +85,18 @@ def test_a_velocity_that_is_known_better_replaces_the_first() -> None:
     np.testing.assert_allclose(mapper.views[1].readout, 0.03 * in_unit)
 
 
+def test_where_there_is_no_rolling_shutter_after_all_no_keyframe_has_one() -> None:
+    """Those of a map that is gone on with neither, whose velocities this stream does not tell."""
+    views = shaking()
+    mapper = mapped(views)
+    assert all(view.readout is not None for view in mapper.views)
+    index = np.array([view.index for view in views])
+    velocity = np.full((len(views), 6), np.nan)
+    velocity[0] = 1.0
+    mapper.move(index, velocity, 0.0)
+    assert all(view.readout is None for view in mapper.views)
+
+
 def test_keyframes_sent_before_the_readout_time_was_known_get_it_when_it_is() -> None:
     """What was trained without the shutter is then refined with it."""
     views = shaking()
