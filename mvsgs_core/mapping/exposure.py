@@ -80,13 +80,6 @@ def colors_of_map(colors: np.ndarray, exposure: np.ndarray, factor: np.ndarray |
     return np.clip(flat @ back[:, :3].T + back[:, 3], 0.0, BRIGHTEST)
 
 
-def unclipped(target: Tensor, color: Tensor) -> Tensor:
-    """A photograph (H, W, 3) as a loss compares a render `color` with it: where it is white, or black, and the render
-    beyond that, as the render. So a pixel that is cut off pulls in the one direction that it tells of, and no other."""
-    color = color.detach()
-    return torch.where(color.clamp(0.0, 1.0) == target, color, target)
-
-
 @torch.no_grad()
 def recolor_with_anchors(state: MapState, changes: dict[int, np.ndarray]) -> int:
     """Takes the colors of all splats whose anchor is a key through an affine (3, 4); returns their number.

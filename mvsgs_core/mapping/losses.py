@@ -185,6 +185,11 @@ def photometric_loss(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
     )  # fmt: skip
 
 
+def only_photometric(weights: dict[str, float]) -> bool:
+    """Whether the loss is L1 and SSIM alone, which `photograph_loss` makes of the photograph at once."""
+    return TERMS == (photometric_loss,) and not SPLAT_TERMS and weights["frequency"] == 0.0
+
+
 # Each gives its part of the sum, weighted: a scalar; None where its weight is 0. The first is never None.
 Term = Callable[[LossInputs, dict[str, float]], Tensor | None]
 TERMS: tuple[Term, ...] = (photometric_loss,)

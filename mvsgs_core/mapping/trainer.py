@@ -9,13 +9,14 @@ from torch import Tensor
 from mvsgs_core.mapping import density_control, optimizer
 from mvsgs_core.mapping.camera_optimizer import step_exposure, step_pose
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.exposure import ImageFormation, unclipped
+from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import (
     SPLAT_TERMS,
     LossInputs,
     frequency_of,
     loss_function,
+    only_photometric,
     own_loss,
     training_loss,
     weights_of,
@@ -24,6 +25,7 @@ from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.pruning import prune
 from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.interface import SplatStep
+from mvsgs_core.rasterizer.photograph_loss import Formation, photograph_loss
 from mvsgs_core.rasterizer.rasterize import Render, chosen_backend, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
@@ -74,12 +76,16 @@ class Trainer:
         moving = training.refine_poses and not view.fixed and view.visits >= training.pose_visits
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
         step = self._fused_step(median_depth)
+        at_once = self._own_loss is None and only_photometric(self._weights)
         render = self._rasterize(
-            self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist, step=step
-        )
-        inputs = self._loss_inputs(view, render)
-        own = self._own_loss
-        loss = training_loss(inputs, self._weights) if own is None else own_loss(own, inputs)
+            self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist, step=step,
+            formed=not at_once,
+        )  # fmt: skip
+        if at_once:
+            loss = self._photograph_loss(view, render, exposure)
+        else:
+            inputs, own = self._loss_inputs(view, render), self._own_loss
+            loss = training_loss(inputs, self._weights) if own is None else own_loss(own, inputs)
         view.visits += 1
         value = float(loss.detach())
         if value < float("inf"):
@@ -115,14 +121,16 @@ class Trainer:
     def _rasterize(
         self, splats: Splats, view: TrainingView, intrinsics: np.ndarray, size: tuple[int, int], median_depth: float,
         exposure: Tensor | None, twist: Tensor | None, *, weights: bool = False, step: SplatStep | None = None,
+        formed: bool = True,
     ) -> Render:  # fmt: skip
+        """formed: as the camera photographs it, exposure and vignetting done; else the map's own colors."""
         training = self.config.training
         render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
-            exposure=exposure, pose_delta=twist, readout=view.readout, near=training.near * median_depth,
+            exposure=exposure if formed else None, pose_delta=twist, readout=view.readout, near=training.near * median_depth,
             antialiased=training.antialiased, weights=weights, threads=self.config.threads, step=step,
         )  # fmt: skip
-        factor = self._vignetting(intrinsics, size)
+        factor = self._vignetting(intrinsics, size) if formed else None
         if factor is not None:
             render.color = render.color * factor
         return render
@@ -144,12 +152,20 @@ class Trainer:
             self._factors[key] = factor[..., None].to(self.state.device)
         return self._factors[key]
 
+    def _formation(self, view: TrainingView, exposure: Tensor | None) -> Formation:
+        # where it is photographed, white, or black, says that the color is at least, or most, that
+        return Formation(
+            exposure, self._vignetting(view.intrinsics, view.size), view.valid, self._photographed(view)
+        )  # fmt: skip
+
+    def _photograph_loss(self, view: TrainingView, render: Render, exposure: Tensor | None) -> Tensor:
+        return photograph_loss(
+            render.color, view.image, self._formation(view, exposure), l1_weight=self._weights["l1"],
+            ssim_weight=self._weights["ssim"], threads=self.config.threads,
+        )  # fmt: skip
+
     def _loss_inputs(self, view: TrainingView, render: Render) -> LossInputs:
-        target = view.target
-        if view.valid is not None:  # equal to the render where a pixel is left out: no loss, no gradient
-            target = torch.where(view.valid[..., None], target, render.color.detach())
-        if self._photographed(view):  # white, or black, says that the color is at least, or most, that
-            target = unclipped(target, render.color)
+        target = self._formation(view, None).target(view.target, render.color)
         frequency = frequency_of(view.visits, self.config.training.frequency_horizon)
         return LossInputs(render, target, self.state.splats, frequency, self.config.threads)
 

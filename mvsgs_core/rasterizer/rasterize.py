@@ -116,11 +116,11 @@ def rasterize(
     if exposure is not None:
         if tuple(exposure.shape) != (3, 4):
             raise ValueError(f"exposure is {tuple(exposure.shape)}: expected (3, 4)")
-        render.color = _exposed(render.color, exposure.to(render.color.dtype))
+        render.color = exposed(render.color, exposure.to(render.color.dtype))
     return render
 
 
-def _exposed(color: Tensor, exposure: Tensor) -> Tensor:
+def exposed(color: Tensor, exposure: Tensor) -> Tensor:
     """A color + b for colors (H, W, 3) and [A | b] (3, 4). On a CPU a matrix product of three columns takes four times
     as long as what gains of the three channels alone need, as they are mostly."""
     matrix, lift = exposure[:, :3], exposure[:, 3]

@@ -50,6 +50,12 @@ class _ImageLoss(torch.autograd.Function):
         return gradient * on_loss, None, None
 
 
+def loss_with_gradient(image: Tensor, loss: Tensor, gradient: Tensor) -> Tensor:
+    """The loss, a scalar, whose gradient by `image` is `gradient`."""
+    joined: Tensor = _ImageLoss.apply(image, loss, gradient)
+    return joined
+
+
 def chosen_backend(image: Tensor) -> str:
     """For float32 with three channels "cpu" (C++) or on a GPU "triton"; "reference" (PyTorch) for anything else."""
     if image.dtype != torch.float32 or image.shape[-1] != 3:
@@ -84,11 +90,10 @@ def image_loss(
         if chosen == "cpu":
             made = _cpu_loss(x, y, weight, l1_weight, ssim_weight, threads or 0)
         else:
-            from mvsgs_core.rasterizer.triton.ssim import loss_with_gradient
+            from mvsgs_core.rasterizer.triton import ssim as triton_ssim
 
-            made = loss_with_gradient(x, y, weight, l1_weight, ssim_weight)
-        loss: Tensor = _ImageLoss.apply(image, *made)
-        return loss
+            made = triton_ssim.loss_with_gradient(x, y, weight, l1_weight, ssim_weight)
+        return loss_with_gradient(image, *made)
     if chosen != "reference":
         raise ValueError(f"backend {backend!r}: choose one of auto, cpu, triton, reference")
     target = target.detach().to(image)

@@ -144,6 +144,19 @@ std::tuple<double, double> image_loss(In image, In target, std::optional<In> pix
     return {result.l1, result.ssim};
 }
 
+// (L1, SSIM) of a photograph, see photometric.hpp; `gradient` gets that by the color. What may be None is not there.
+std::tuple<double, double> photograph(In color, Array<const uint8_t> image, std::optional<In> exposure,
+                                      std::optional<In> factor, std::optional<Array<const bool>> valid, bool clipped,
+                                      float l1_weight, float ssim_weight, Out gradient, int threads) {
+    const nb::gil_scoped_release released;
+    const uint8_t* mask = valid ? reinterpret_cast<const uint8_t*>(valid->data()) : nullptr;
+    const Formation formation{data_of(exposure), data_of(factor), mask, clipped};
+    const Photometric result =
+        photograph_loss(color.data(), image.data(), formation, int(color.shape(0)), int(color.shape(1)), l1_weight,
+                        ssim_weight, gradient.data(), thread_count(threads));
+    return {result.l1, result.ssim};
+}
+
 }  // namespace
 
 #define SPLATS_MODULE(name) NB_MODULE(name, m)
@@ -166,4 +179,7 @@ SPLATS_MODULE(MVSGS_MODULE) {
     m.def("weights", &weights);
     m.def("image_loss", &image_loss, nb::arg("image"), nb::arg("target"), nb::arg("pixel_weight").none(),
           nb::arg("l1_weight"), nb::arg("ssim_weight"), nb::arg("gradient"), nb::arg("threads"));
+    m.def("photograph_loss", &photograph, nb::arg("color"), nb::arg("photograph"), nb::arg("exposure").none(),
+          nb::arg("factor").none(), nb::arg("valid").none(), nb::arg("clipped"), nb::arg("l1_weight"),
+          nb::arg("ssim_weight"), nb::arg("gradient"), nb::arg("threads"));
 }

@@ -158,7 +158,7 @@ Photometric photometric(const float* image, const float* target, const float* pi
             lines.filter(3);
             const float *a = lines.out(0), *p = lines.out(1), *r = lines.out(2);
             const float *x = image + size_t(row) * length, *y = target + size_t(row) * length;
-            float* __restrict out = gradient + size_t(row) * length;
+            float* out = gradient + size_t(row) * length;  // may be x
             float* __restrict weight = lines.inner(0);
             for (int column = 0; column < width; ++column) {
                 const float extra = pixel_weight ? pixel_weight[size_t(row) * width + column] : 0.0f;

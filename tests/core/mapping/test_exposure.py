@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
-from mvsgs_core.mapping.exposure import BRIGHTEST, ImageFormation, colors_of_map, recolored, relative_to_mean, unclipped
+from mvsgs_core.mapping.exposure import BRIGHTEST, ImageFormation, colors_of_map, recolored, relative_to_mean
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.photometry import IDENTITY, compose, inverse, vignetting_factor
+from mvsgs_core.rasterizer.photograph_loss import unclipped
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
