@@ -68,6 +68,27 @@ def backward(
     return on_pose, refused
 
 
+def backward_opacity(
+    kept: Any, opacity_logits: Tensor, images: Images, on_images: tuple[Tensor, Tensor | None, Tensor | None]
+) -> tuple[Tensor, int]:
+    """See `OpacityBackEnd`."""
+    color, depth, opacity = (image.numpy() for image in images)
+    on_color, on_depth, on_opacity = (None if gradient is None else gradient.numpy() for gradient in on_images)
+    on_logits = torch.empty_like(opacity_logits)
+    refused: int = native.load("rasterizer").backward_opacity(
+        kept,
+        opacity_logits=opacity_logits.numpy(),
+        color=color,
+        depth=depth,
+        opacity=opacity,
+        on_color=on_color,
+        on_depth=on_depth,
+        on_opacity=on_opacity,
+        on_logits=on_logits.numpy(),
+    )
+    return on_logits, refused
+
+
 def backward_step(
     settings: RenderSettings, kept: Any, parameters: list[Tensor], images: Images,
     on_images: tuple[Tensor, Tensor | None, Tensor | None], step: SplatStep,

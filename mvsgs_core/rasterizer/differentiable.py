@@ -41,6 +41,15 @@ class BackEnd(Protocol):
         many splats were refused, None: not counted."""
 
 
+class OpacityBackEnd(BackEnd, Protocol):
+    """One that can give the gradients of opacities without the others."""
+
+    def backward_opacity(
+        self, kept: Any, opacity_logits: Tensor, images: Images, on_images: tuple[Tensor, Tensor | None, Tensor | None]
+    ) -> tuple[Tensor, int]:
+        """As `backward`; the gradient of the logits, and how many splats were refused."""
+
+
 class SteppingBackEnd(BackEnd, Protocol):
     """One that can step the splats in the backward pass."""
 
@@ -110,6 +119,46 @@ class _Stepped(torch.autograd.Function):
             ctx.settings, ctx.kept, ctx.parameters, (color, depth, opacity), on_images, ctx.step
         )
         return (None, None, None, None, None, on_pose, *[None] * len(ctx.parameters))
+
+
+class _OfOpacities(torch.autograd.Function):
+    """(opacity_logits) -> color, depth, opacity, of splats nothing else of which is trained."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, back_end: OpacityBackEnd, settings: RenderSettings, rest: list[Rendered], report: Backward,
+        splats: Splats, opacity_logits: Tensor,
+    ) -> Images:  # fmt: skip
+        images, rendered = back_end.forward(settings, [t.detach().contiguous() for t in splats.tensors().values()])
+        rest.append(rendered)
+        ctx.back_end, ctx.kept, ctx.report = back_end, rendered.kept, report
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(opacity_logits, *images)
+        return images
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        opacity_logits, color, depth, opacity = ctx.saved_tensors
+        on_color, on_depth, on_opacity = (None if g is None else g.detach().contiguous() for g in gradients)
+        on_images = (torch.zeros_like(color) if on_color is None else on_color, on_depth, on_opacity)
+        on_logits, ctx.report.refused = ctx.back_end.backward_opacity(
+            ctx.kept, opacity_logits.contiguous(), (color, depth, opacity), on_images
+        )
+        return (None, None, None, None, None, on_logits)
+
+
+def render_for_opacities(back_end: OpacityBackEnd, splats: Splats, settings: RenderSettings) -> Render:
+    """The same as `render`, differentiable in the opacities alone; `Render.means2d` takes no gradient."""
+    rest, report = list[Rendered](), Backward()
+    images = _OfOpacities.apply(back_end, settings, rest, report, splats, splats.opacity_logits)
+    return _render(images, rest, report, splats.means.new_zeros(len(splats), 2))
+
+
+def trains_opacities_alone(splats: Splats, settings: RenderSettings) -> bool:
+    """Whether a gradient is wanted of the opacities, and of nothing else."""
+    wanted = [name for name, tensor in splats.tensors().items() if tensor.requires_grad]
+    return torch.is_grad_enabled() and wanted == ["opacity_logits"] and not settings.pose.requires_grad
 
 
 def render(back_end: BackEnd, splats: Splats, settings: RenderSettings) -> Render:

@@ -85,6 +85,7 @@ class Render:
     opacity: Tensor  # (H, W), 0 to 1
     visible: Tensor  # (N,) bool: in front, on the image, opacity at least 1/255
     radii: Tensor  # (N,), half of the longer side of the splat's box on the image, px; 0 if not visible
+    # empty, or without gradient, where the splats are stepped, or nothing but opacities is trained
     means2d: Tensor  # (N, 2) zeros; after backward .grad is dL/d(mean on the image) in halves of the image, as in 3DGS
     weight_sum: Tensor | None  # (N,), blending weight alpha * T summed over the pixels; None unless asked for
     weight_max: Tensor | None  # (N,), the largest blending weight at any pixel; None unless asked for

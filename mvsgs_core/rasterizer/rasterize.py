@@ -138,6 +138,8 @@ def _render(backend: str, splats: Splats, settings: RenderSettings, step: SplatS
         return differentiable.render_stepping(cpu, splats, settings, step)
     if backend == "reference":
         return reference.render(splats, settings)
+    if backend == "cpu" and differentiable.trains_opacities_alone(splats, settings):
+        return differentiable.render_for_opacities(cpu, splats, settings)
     if backend == "cpu":
         return differentiable.render(cpu, splats, settings)
     if backend == "triton":

@@ -28,7 +28,7 @@ class FrameRecord:
     state: TrackingState
     reference: int | None = None  # keyframe that the frame's pose was found against; None: no pose, or as `same_as`
     points: bytes = b""  # of its matches, see sample.py
-    cam_from_reference: bytes = b""  # (4, 4) float32: where the search for the pose begins
+    cam_from_reference: bytes = b""  # (4, 4) float64: where the search for the pose begins
     after: int | None = None  # keyframe after the frame that it was matched with, too
     points_after: bytes = b""
     same_as: int | None = None  # frame that this one did not move against
@@ -66,7 +66,7 @@ class FrameRecord:
         assert self.reference is not None
         self.points = sample(graph, self.reference, matches, cam_from_world)
         relative = cam_from_world @ graph.world_from_cam(self.reference)
-        self.cam_from_reference = relative.astype(np.float32).tobytes()
+        self.cam_from_reference = relative.tobytes()
 
 
 def followed_pose(record: FrameRecord, graph: KeyframeGraph, solver: Solver) -> np.ndarray | None:
@@ -77,7 +77,7 @@ def followed_pose(record: FrameRecord, graph: KeyframeGraph, solver: Solver) -> 
     if record.reference is None or record.reference not in graph.keyframes:
         return None
     reference = graph.keyframes[record.reference]
-    relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
+    relative = np.frombuffer(record.cam_from_reference).reshape(4, 4)
     cells = len(reference.inverse_depth)
     matches = {record.reference: restored(record.points, cells)}
     if record.after is not None and record.after in graph.keyframes:
@@ -99,7 +99,7 @@ def seen_pose(records: list[FrameRecord], k: int, graph: KeyframeGraph) -> tuple
         return graph.world_from_cam(record.index), own.segment
     if record.reference is None or record.reference not in graph.keyframes:
         return None
-    relative = np.frombuffer(record.cam_from_reference, np.float32).reshape(4, 4).astype(np.float64)
+    relative = np.frombuffer(record.cam_from_reference).reshape(4, 4)
     segment = graph.keyframes[record.reference].segment
     return graph.world_from_cam(record.reference) @ geometry.inverse(relative), segment
 

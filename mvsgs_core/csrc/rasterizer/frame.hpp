@@ -182,7 +182,10 @@ void blend_backward(Frame& frame, const float* color, const float* depth, const 
 // Sums the slots of every splat and takes them to its parameters and to the pose.
 void project_backward(Frame& frame, const Parameters& parameters, Gradients& gradients, int threads);
 
-// The same, and each splat seen is stepped while its gradients are in the cache, instead of their being kept. fields: of
+// The gradients (N) of the opacities' logits alone, from the same slots. Returns how many were not finite: they are 0.
+int64_t opacity_backward(const Frame& frame, const float* opacity_logits, int64_t count, float* on_logits, int threads);
+
+// As project_backward, and each splat seen is stepped while its gradients are in the cache, instead of their being kept. fields: of
 // Splats, that each of the step's groups is.
 void project_and_step(Frame& frame, const Parameters& parameters, const adam::Step& step, const std::vector<int>& fields,
                       Stepped& stepped, int threads);

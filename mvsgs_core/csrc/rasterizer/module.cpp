@@ -84,6 +84,17 @@ int64_t backward(Pass& pass, const SplatArrays& splats, In color, In depth, In o
     return gradients.refused;
 }
 
+// The same for the logits of the opacities alone.
+int64_t backward_opacity(Pass& pass, In opacity_logits, In color, In depth, In opacity, In on_color,
+                         std::optional<In> on_depth, std::optional<In> on_opacity, Out on_logits) {
+    Frame& frame = *pass.frame;
+    const nb::gil_scoped_release released;
+    blend_backward(frame, color.data(), depth.data(), opacity.data(), on_color.data(), data_of(on_depth),
+                   data_of(on_opacity), pass.threads);
+    return opacity_backward(frame, opacity_logits.data(), int64_t(opacity_logits.shape(0)), on_logits.data(),
+                            pass.threads);
+}
+
 // A group of Adam's step: field of Splats, first and second moment, and rate, final_rate, low, high, lead, tail.
 using Moved = std::tuple<int, Out, Out, float, float, float, float, int, float>;
 
@@ -172,6 +183,9 @@ SPLATS_MODULE(MVSGS_MODULE) {
     m.def("backward", &backward, nb::arg(), nb::arg("splats"), nb::arg("color"), nb::arg("depth"), nb::arg("opacity"),
           nb::arg("on_color"), nb::arg("on_depth").none(), nb::arg("on_opacity").none(), nb::arg("on_splats"),
           nb::arg("on_means2d"), nb::arg("on_pose"));
+    m.def("backward_opacity", &backward_opacity, nb::arg(), nb::arg("opacity_logits"), nb::arg("color"),
+          nb::arg("depth"), nb::arg("opacity"), nb::arg("on_color"), nb::arg("on_depth").none(),
+          nb::arg("on_opacity").none(), nb::arg("on_logits"));
     m.def("backward_step", &backward_step, nb::arg(), nb::arg("values"), nb::arg("color"), nb::arg("depth"),
           nb::arg("opacity"), nb::arg("on_color"), nb::arg("on_depth").none(), nb::arg("on_opacity").none(),
           nb::arg("moved"), nb::arg("ages"), nb::arg("constants"), nb::arg("decay_steps"), nb::arg("means2d_gradient"),

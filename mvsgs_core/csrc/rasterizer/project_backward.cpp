@@ -331,6 +331,22 @@ void project_backward(Frame& frame, const Parameters& p, Gradients& out, int thr
     out.refused = refused;
 }
 
+int64_t opacity_backward(const Frame& frame, const float* opacity_logits, int64_t count, float* on_logits, int threads) {
+    int64_t refused = 0;
+#pragma omp parallel for num_threads(threads) schedule(static) reduction(+ : refused)
+    for (int64_t i = 0; i < count; ++i) {
+        const SlotSpan span = frame.spans[i];
+        float on_log_alpha = 0.0f;  // alpha is the opacity, sigmoid(logit), times what does not depend on it
+        for (uint32_t slot = span.first; slot < span.first + span.count; ++slot)
+            on_log_alpha += frame.slots[slot][kSumLane[kAlpha]];
+        const float gradient = on_log_alpha / (1.0f + std::exp(opacity_logits[i]));
+        const bool usable = finite(&gradient, 1);
+        refused += !usable;
+        on_logits[i] = usable ? gradient : 0.0f;
+    }
+    return refused;
+}
+
 void project_and_step(Frame& frame, const Parameters& p, const adam::Step& step, const std::vector<int>& fields,
                       Stepped& out, int threads) {
     static_assert(kChunk % adam::kBlock == 0 && adam::kBlock % kLanes == 0);
