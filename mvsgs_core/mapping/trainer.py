@@ -127,8 +127,9 @@ class Trainer:
         training = self.config.training
         render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
-            exposure=exposure if formed else None, pose_delta=twist, readout=view.readout, near=training.near * median_depth,
-            antialiased=training.antialiased, weights=weights, threads=self.config.threads, step=step,
+            exposure=exposure if formed else None, pose_delta=twist, readout=view.readout,
+            near=training.near * median_depth, antialiased=training.antialiased, weights=weights,
+            threads=self.config.threads, step=step,
         )  # fmt: skip
         factor = self._vignetting(intrinsics, size) if formed else None
         if factor is not None:
@@ -154,9 +155,7 @@ class Trainer:
 
     def _formation(self, view: TrainingView, exposure: Tensor | None) -> Formation:
         # where it is photographed, white, or black, says that the color is at least, or most, that
-        return Formation(
-            exposure, self._vignetting(view.intrinsics, view.size), view.valid, self._photographed(view)
-        )  # fmt: skip
+        return Formation(exposure, self._vignetting(view.intrinsics, view.size), view.valid, self._photographed(view))
 
     def _photograph_loss(self, view: TrainingView, render: Render, exposure: Tensor | None) -> Tensor:
         return photograph_loss(

@@ -64,9 +64,7 @@ def photograph_loss(
         return loss_with_gradient(color, *_fused(color, photograph, formation, l1_weight, ssim_weight, threads or 0))
     image = formation.image(color)
     target = formation.target(photograph.to(color.device, color.dtype) / 255.0, image)
-    return image_loss(
-        image, target, l1_weight=l1_weight, ssim_weight=ssim_weight, threads=threads, backend=backend
-    )  # fmt: skip
+    return image_loss(image, target, l1_weight=l1_weight, ssim_weight=ssim_weight, threads=threads, backend=backend)
 
 
 def _fused(

@@ -9,7 +9,10 @@ from mvsgs_core.rasterizer.photograph_loss import Formation, photograph_loss
 
 GAINS = torch.tensor([[1.3, 0, 0, -0.05], [0, 1.2, 0, 0.02], [0, 0, 0.8, 0.03]])
 MIXING = torch.tensor([[1.1, 0.1, 0, -0.05], [0.05, 0.9, 0.02, 0.02], [0, -0.1, 0.8, 0.03]])
-WEIGHTS = {"l1_weight": 0.7, "ssim_weight": 0.3}
+
+
+def loss(color: torch.Tensor, photograph: torch.Tensor, formation: Formation) -> torch.Tensor:
+    return photograph_loss(color, photograph, formation, l1_weight=0.7, ssim_weight=0.3, threads=2)
 
 
 def taken(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -39,8 +42,8 @@ def test_value_and_gradient_match_the_twin(size: tuple[int, int], name: str) -> 
     color, photograph = taken(*size)
     formation = formations(*size)[name]
     fused, twin = color.clone().requires_grad_(), color.double().requires_grad_()
-    value = photograph_loss(fused, photograph, formation, threads=2, **WEIGHTS)
-    expected = photograph_loss(twin, photograph, formation, **WEIGHTS)
+    value = loss(fused, photograph, formation)
+    expected = loss(twin, photograph, formation)
     assert value.item() == pytest.approx(expected.item(), abs=1e-5)
     (2.0 * value).backward()
     (2.0 * expected).backward()
@@ -55,16 +58,16 @@ def test_twin_gradcheck(exposure: torch.Tensor) -> None:
     color, photograph = taken(6, 7)
     factor = 0.5 + 0.5 * torch.rand(6, 7, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
 
-    def loss(color: torch.Tensor, affine: torch.Tensor) -> torch.Tensor:
-        return photograph_loss(color, photograph, Formation(affine, factor), **WEIGHTS)
+    def of(color: torch.Tensor, affine: torch.Tensor) -> torch.Tensor:
+        return loss(color, photograph, Formation(affine, factor))
 
-    assert torch.autograd.gradcheck(loss, (color.double().requires_grad_(), exposure.double().requires_grad_()))
+    assert torch.autograd.gradcheck(of, (color.double().requires_grad_(), exposure.double().requires_grad_()))
 
 
 def test_an_exposure_that_is_trained_gets_its_gradient() -> None:
     color, photograph = taken(12, 9)
     exposure = GAINS.clone().requires_grad_()
-    photograph_loss(color.requires_grad_(), photograph, Formation(exposure), **WEIGHTS).backward()
+    loss(color.requires_grad_(), photograph, Formation(exposure)).backward()
     assert exposure.grad is not None
     assert exposure.grad.abs().max() > 0
 
@@ -84,4 +87,4 @@ def test_what_a_camera_cuts_off_pulls_in_one_direction() -> None:
 
 def test_two_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="expected two"):
-        photograph_loss(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3, dtype=torch.uint8), Formation(), **WEIGHTS)
+        loss(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3, dtype=torch.uint8), Formation())
