@@ -77,7 +77,7 @@ def test_the_camera_is_in_the_output(room: tuple[Path, str]) -> None:
 
 
 def test_the_same_command_gives_the_same_map(room: tuple[Path, str], tmp_path: Path) -> None:
-    run_all(tmp_path, *SMALL, "evaluator.max_frames=0")
+    run_all(tmp_path, *SMALL, "evaluator._target_=null")
     maps = [(folder / "out" / "map.ply").read_bytes() for folder in (room[0], tmp_path)]
     assert maps[0] == maps[1]
 
@@ -125,7 +125,10 @@ def test_inline_tracks_exactly_as_the_processes_do(room: tuple[Path, str], tmp_p
 
 def test_a_tracker_from_outside_the_repository(tmp_path: Path) -> None:
     shutil.copy(ROOT / "examples" / "my_tracker.py", tmp_path)
-    printed = run_all(tmp_path, *SMALL[:-1], "tracker._target_=my_tracker.Strided", "tracker.stride=6").stdout
+    printed = run_all(
+        tmp_path, *SMALL[:-1], "tracker._target_=my_tracker.Strided", "tracker.stride=6",
+        "mapper.iterations=10", "mapper.refinement=20", "evaluator.max_frames=10", "evaluator.fitted=false",
+    ).stdout  # fmt: skip
     scores = report(tmp_path)
     assert scores["trajectory"]["frames_tracked"] >= 50
     assert scores["trajectory"]["keyframes"] >= 8
@@ -144,7 +147,8 @@ def test_a_real_sequence_end_to_end(tmp_path: Path) -> None:
     path = shared("data/tum_fr1_xyz").resolve()
     run_all(
         tmp_path, "dataset=tum", f"dataset.path={path}", "dataset.stop=30", "dataset.size=[240,320]", "device=cpu",
-        "mapper.iterations=10", "mapper.refinement=50", "evaluator.lpips=off",
+        "mapper.iterations=10", "mapper.refinement=20", "evaluator.lpips=off", "evaluator.max_frames=10",
+        "evaluator.fitted=false", "--inline",
     )  # fmt: skip
     scores = report(tmp_path)
     assert scores["trajectory"]["frames"] == 30

@@ -211,11 +211,11 @@ def test_what_an_earlier_checkout_left_out_of_its_trajectory_is_had_otherwise() 
 
 @pytest.mark.slow
 def test_pictures_of_runs_show_what_their_reports_say(tmp_path: Path) -> None:
-    settings = ["dataset.options.scene=room", "dataset.size=[96,128]", "dataset.stop=30", "evaluator.lpips=off"]
+    settings = ["dataset.options.scene=room", "dataset.size=[96,128]", "dataset.stop=20", "evaluator.lpips=off"]
     earlier, place = (tmp_path / before.place("room", 0, side) / "0" for side in ("before", "after"))
     launch(
-        *settings, f"hydra.searchpath=[file://{CONF}]", "recorder=track", "mapper.iterations=10",
-        "mapper.refinement=10", f"output={place}", "inline=true", "screen=plain",
+        *settings, f"hydra.searchpath=[file://{CONF}]", "recorder=track", "mapper.iterations=4",
+        "mapper.refinement=4", f"output={place}", "inline=true", "screen=plain",
     )  # fmt: skip
     shutil.copytree(place, earlier)
     command = [sys.executable, "-m", "bench.pictures", str(tmp_path), "--scenes", "room", "--to", str(tmp_path)]

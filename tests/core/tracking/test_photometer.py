@@ -94,7 +94,9 @@ def test_a_robots_exposures_say_what_the_exponent_is() -> None:
     assert len(keyframes) > 3
 
 
-@pytest.mark.parametrize("options", [{}, {"noise": 3.0, "motion_blur": 0.5, "stop": 30}], ids=["clean", "noise"])
+@pytest.mark.parametrize(
+    "options", [{}, {"noise": 3.0, "motion_blur": 0.5, "stop": 30, "size": (120, 160)}], ids=["clean", "noise"]
+)
 def test_steady_light_has_no_exposure(options: dict[str, Any]) -> None:
     tracker, trajectory, updates = track(synthetic(frames=80, **options))
     assert trajectory.exposure is None
