@@ -9,9 +9,11 @@ _STEPS = 5000  # of a filter in int16: per unit of the logarithm of depth, so 1 
 
 
 def discontinuity_mask(depth: np.ndarray, radius: int, jump: float = 0.05) -> np.ndarray:
-    """True within `radius` pixels of a known depth that is farther by more than `jump`, relative.
+    """True within `radius` pixels of a depth that is farther by more than `jump`, relative, than a slope makes it.
 
     The windows of stereo let a near surface grow over what lies behind it, in all views alike: no other view objects.
+    A plane's inverse depth is linear in the pixel: what falls on one side as it rises on the other is a slope, such as
+    a road, whose depth changes by more than `jump` over a few pixels. Where the other side is unknown, any fall counts.
     """
     if radius <= 0:
         return np.zeros(depth.shape, dtype=bool)
@@ -19,7 +21,24 @@ def discontinuity_mask(depth: np.ndarray, radius: int, jump: float = 0.05) -> np
     inverse = np.where(depth > 0, 1.0 / np.maximum(depth, 1e-30), unknown).astype(np.float32)
     side = 2 * radius + 1
     farthest = cv2.erode(inverse, np.ones((side, side), np.uint8))
-    return np.asarray((depth > 0) & (farthest <= (1.0 - jump) * inverse))
+    mask = np.asarray((depth > 0) & (farthest <= (1.0 - jump) * inverse))
+    rows, columns = np.nonzero(mask)
+    mask[rows, columns] = _falls_at(inverse, rows, columns, radius, jump)
+    return mask
+
+
+def _falls_at(inverse: np.ndarray, rows: np.ndarray, columns: np.ndarray, radius: int, jump: float) -> np.ndarray:
+    """(K,) bool: whether an inverse depth (H, W), huge where unknown, falls by `jump` around pixels, slope aside."""
+    unknown = np.finfo(np.float32).max
+    here, padded = inverse[rows, columns], np.pad(inverse, radius, constant_values=unknown)
+    falls = np.zeros(len(rows), dtype=bool)
+    for dv in range(-radius, radius + 1):
+        for du in range(-radius, radius + 1):
+            there = padded[rows + radius + dv, columns + radius + du]
+            opposite = padded[rows + radius - dv, columns + radius - du]
+            slope = np.where(opposite < unknown, np.maximum(opposite - here, 0), 0)
+            falls |= there <= here - slope - jump * here
+    return falls
 
 
 def speckle_mask(depth: np.ndarray, max_pixels: int, relative: float) -> np.ndarray:

@@ -26,6 +26,27 @@ def test_a_slanted_surface_has_no_edge() -> None:
     assert not discontinuity_mask(depth, 3).any()
 
 
+def test_a_steep_road_has_no_edge_and_what_stands_on_it_has() -> None:
+    rows = np.arange(40, dtype=np.float32)
+    depth = np.tile((100.0 / (rows + 6.0))[:, None], (1, 60))  # a plane: three pixels change its depth by 7 to 50 %
+    assert not discontinuity_mask(depth, 3)[3:-3, 3:-3].any()  # beside the image's border there is one side only
+    depth[10:30, 20:30] = 100.0 / 36.0  # an upright board: its foot is on the road, its sides and top before it
+    reject = discontinuity_mask(depth, 3)
+    assert reject[10:24, 20:23].all()
+    assert reject[10:24, 27:30].all()
+    assert reject[10:13, 20:30].all()
+    assert not reject[3:-3, 3:17].any()
+
+
+def test_beside_unknown_depth_a_fall_is_an_edge() -> None:
+    depth = np.full((20, 30), 4.0, np.float32)
+    depth[:, 10:15] = 2.0
+    depth[:, :10] = 0.0
+    reject = discontinuity_mask(depth, 3)
+    assert reject[:, 12:15].all()
+    assert not reject[:, 15:].any()
+
+
 def test_small_patches_go_at_any_scale_and_large_ones_stay() -> None:
     for scale in (1e-3, 1.0, 1e4):
         depth = np.zeros((40, 40), np.float32)
