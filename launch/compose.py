@@ -64,8 +64,16 @@ def prepare(overrides: Sequence[str], conf: Path = CONF, *, all_choices_known: b
     `all_choices_known` is False where choices can come from other directories: Hydra refuses them then.
     """
     choices = {slot: choices_of(slot, conf) for slot in slots_of(conf)}
+    overrides = [text if "refine" in choices else _spelled_out(text) for text in overrides]
     overrides = [*_implied(overrides, choices, conf), *overrides]
     return [_prepare(text, choices, parameter_names(Settings), all_choices_known) for text in overrides]
+
+
+def _spelled_out(text: str) -> str:
+    """`refine=ray` and `refine.address=...` as the mapper has them: it is no slot, but is written like one."""
+    if text.startswith("refine="):
+        return f"mapper.refine.by={text.removeprefix('refine=')}"
+    return f"mapper.{text}" if text.startswith("refine.") else text
 
 
 def _implied(overrides: Sequence[str], slots: Mapping[str, list[str]], conf: Path) -> list[str]:

@@ -31,6 +31,7 @@ Maps a video, a photo sequence or a live camera with Gaussian splats.
   python launch/run_all.py dataset=camera map=DIR mapper=frozen  only finds the camera in it
   python launch/run_all.py -m mapper.iterations=100,300      a sweep
   python launch/run_all.py -m hydra/launcher=submitit_slurm mapper.iterations=100,300    the same on a Slurm cluster
+  python launch/run_all.py refine=ray refine.address=HOST:6379  refines the map on a Ray cluster's machines
   python launch/run_all.py --inline                          everything in one process, for a debugger
   python launch/run_all.py --graph mapper=paper              shows the graph of any command line, and runs nothing
   python launch/run_all.py --help mapper=paper               this, for what that command line composes

@@ -39,7 +39,7 @@ from launch.named_input import SLOT, with_named_input
 from launch.refusal import GraphError
 from launch.resume import WORD as RESUME
 from launch.resume import leave_out_refused, resumed_config
-from launch.sweep import swept
+from launch.sweep import check_launcher, swept
 from mvsgs_core.atomic_file import replace_text
 
 COMPARISON = "comparison.html"  # of a sweep
@@ -120,6 +120,7 @@ def hydra_arguments(arguments: Sequence[str]) -> list[str]:
     """The command line as Hydra takes it. Raises GraphError for overrides that name nothing there is."""
     words = ["inline=true" if word == "--inline" else word for word in arguments]
     conf = Path(_option(words, "--config-path", "-cp") or CONF).absolute()
+    check_launcher(words)
     words = with_named_input(words, choices_of(SLOT, conf))
     overrides = [word for word in words if "=" in word and not word.startswith("-")]
     elsewhere = _option(words, "--config-dir", "-cd") or any(word.startswith("hydra.searchpath") for word in overrides)

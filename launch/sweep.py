@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from launch.refusal import GraphError
+
+SUBMITIT = "hydra_plugins.hydra_submitit_launcher"
 GRAIN = 2.0  # seconds by which a file system's times, or another host's clock, may be behind
 
 _folders: dict[Path, float] = {}  # and when the sweep began, seconds since 1970
@@ -19,6 +24,13 @@ class SweepFolder(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         _folders[Path(config.hydra.sweep.dir)] = time.time()
+
+
+def check_launcher(words: Sequence[str]) -> None:
+    """Raises GraphError for a sweep on a Slurm cluster without what hands its jobs on."""
+    for word in words:
+        if word.startswith("hydra/launcher=submitit") and importlib.util.find_spec(SUBMITIT) is None:
+            raise GraphError(f"{word} needs Hydra's launcher for Slurm: pip install 'mvsgs[slurm]'")
 
 
 def swept() -> list[Path]:

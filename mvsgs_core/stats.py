@@ -71,5 +71,15 @@ class Stats:
         self.values.update(part.values)
         self.warnings.include(part.warnings)
 
+    def add(self, other: Stats) -> None:
+        """What another has counted, timed, skipped and warned of, once, beside its own."""
+        for own, others in (
+            (self.counts, other.counts), (self.seconds, other.seconds), (self.skipped, other.skipped)
+        ):  # fmt: skip
+            for name, n in others.items():
+                own[name] = own.get(name, 0) + n
+        for text in other.warnings:
+            self.warn(text)
+
 
 __all__ = ["Stats"]

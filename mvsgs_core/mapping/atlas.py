@@ -7,12 +7,14 @@ of the stream, the one with the most keyframes is refined.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from mvsgs_core.camera import MAX_READOUT_TIME
 from mvsgs_core.mapping.between import FrameBetween, FramesBetween
+from mvsgs_core.mapping.blocks.refinement import refined_in_blocks
 from mvsgs_core.mapping.checkpoints.state import copy_of
 from mvsgs_core.mapping.keyframe_checks import NO_POSE, is_pose
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
@@ -37,6 +39,7 @@ class Atlas:
     stream_ended: bool = False
     between: FramesBetween = field(default_factory=FramesBetween)  # frames that are no keyframes, on their way
     refined: int = 0  # iterations of the final refinement that are done
+    _in_blocks: Iterator[None] | None = None  # what is left of it where the map is refined in blocks
 
     @property
     def largest(self) -> OnlineMapper:
@@ -111,12 +114,20 @@ class Atlas:
         return self.current.make_up(self.current.config.refinement if self.stream_ended else None, splats)
 
     def refine(self) -> bool:
-        """One iteration of the final refinement; False when it is done."""
+        """A piece of the final refinement, an iteration or a wait for one elsewhere; False when it is done.
+
+        In blocks the map stays as it is until all are done: who goes on from it begins the refinement anew.
+        """
         total = self.current.config.refinement
         if self.refined >= total:
             return False
-        self.current.refine(self.refined, total)
-        self.refined += 1
+        if self.refined == 0 and self._in_blocks is None:
+            self._in_blocks = refined_in_blocks(self.current, total)
+        if self._in_blocks is None:
+            self.current.refine(self.refined, total)
+            self.refined += 1
+        elif next(self._in_blocks, True):
+            self._in_blocks, self.refined = None, total
         return True
 
     def correct(
@@ -182,7 +193,7 @@ class Atlas:
         """How far the stream has come: the newest keyframe and its timestamp."""
         self.newest_view = max(self.newest_view, index)
         self.stream_seconds = seconds if math.isfinite(seconds) else self.stream_seconds
-        self.stream_ended, self.refined = False, 0
+        self.stream_ended, self.refined, self._in_blocks = False, 0, None
         for part in self.parts.values():
             part.trainer.rate = 1.0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mvsgs_core.mapping.blocks.config import RefineConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import ConvergenceConfig
@@ -38,6 +39,7 @@ class MapperConfig:
 
     iterations: int = 30  # optimization budget of each keyframe, half on the newest, half on all (the paper: 1000)
     refinement: int = 300  # iterations over all keyframes at the end
+    refine: RefineConfig = field(default_factory=RefineConfig)  # on which machines, in which parts
     window: int = 6  # newest keyframes, on which the local half of the budget goes
     realtime: bool = False  # a new keyframe waits for no iteration: it cancels the pending ones of older keyframes
     share: float = 0.3  # of a core's time that new splats may take in real time: beyond, they get larger

@@ -79,6 +79,11 @@ class MapState:
         self._replace(lambda name, value: torch.cat([value, added[name]]))
 
     @torch.no_grad()
+    def become(self, tensors: dict[str, Tensor]) -> None:
+        """Has these `tensors()` in place of its own; whoever holds the state goes on with them."""
+        self._replace(lambda name, _: tensors[name])
+
+    @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
         """Drops the splats where `mask` (N,) bool is False."""
         if not bool(mask.all()):

@@ -172,7 +172,7 @@ class OnlineMapper:
         with self.log.time("optimization"):
             images, convergence = self.keyframes.trained, self.config.convergence
             position = self.schedule.next(len(self.keyframes.with_image), len(images), owed is not None)
-            view = owed if position is None else self._chosen(images[position])
+            view = owed if position is None else self.chosen(images[position])
             assert view is not None
             done = convergence.skip and view.converged(convergence)
             if done and not self.schedule.chance(convergence.keep):
@@ -207,7 +207,7 @@ class OnlineMapper:
         schedule.spared -= 1
         self.log.count("iterations made up")
         with self.log.time("optimization"):
-            self.trainer.step(self._chosen(images[schedule.next_of_all(len(images))]), self.median_depth)
+            self.trainer.step(self.chosen(images[schedule.next_of_all(len(images))]), self.median_depth)
         return True
 
     def _complete(self) -> None:
@@ -240,7 +240,7 @@ class OnlineMapper:
             view = self.keyframes.owed.first(self.config.iterations) if done % 2 else None
             if view is None:
                 images = self.keyframes.trained
-                view = self._chosen(images[self.schedule.next_of_all(len(images))])
+                view = self.chosen(images[self.schedule.next_of_all(len(images))])
             self.trainer.step(view, self.median_depth, refining=True)
 
     def correct(self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray) -> int:
@@ -354,7 +354,7 @@ class OnlineMapper:
             training.antialiased,
         )  # fmt: skip
 
-    def _chosen(self, view: TrainingView) -> TrainingView:
+    def chosen(self, view: TrainingView) -> TrainingView:
         """To train on now: a frame between keyframes where its keyframe stands."""
         if isinstance(view, BetweenView):
             keyframe = self.keyframes.of(view.keyframe)

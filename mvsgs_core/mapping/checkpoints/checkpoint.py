@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from mvsgs_core.atomic_file import replacing
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.between import FramesBetween
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, nothing_there, read_state, state_files, write_state
-from mvsgs_core.mapping.checkpoints.state import Corrections, pack, photometry_of, unpack, whole
+from mvsgs_core.mapping.checkpoints.images import read_image
+from mvsgs_core.mapping.checkpoints.state import Corrections, pack, photometry_arrays, photometry_of, unpack, whole
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.stats import Stats
 
@@ -33,7 +35,6 @@ def save(
     Raises OSError.
     """
     log, corrections, photometry = atlas.current.log, atlas.current.corrections, atlas.current.photometry
-    exposed = sorted(photometry.exposures)
     index = sorted(corrections)
     poses = np.array([corrections[k][0] for k in index], dtype=np.float64).reshape(-1, 4, 4)
     arrays: dict[str, np.ndarray] = {
@@ -43,10 +44,8 @@ def save(
         "corrections/index": np.array(index, dtype=np.int64),
         "corrections/world_from_cam": poses,
         "corrections/scale": np.array([corrections[k][1] for k in index], dtype=np.float64),
-        "photometry/index": np.array(exposed, dtype=np.int64),
-        "photometry/exposure": np.array([photometry.exposures[k] for k in exposed], np.float32).reshape(-1, 3, 4),
-        "photometry/vignetting": np.zeros(0) if photometry.vignetting is None else photometry.vignetting,
     }
+    arrays |= {f"photometry/{name}": value for name, value in photometry_arrays(photometry).items()}
     mappers: list[dict[str, Any]] = []
     for segment, part in atlas.parts.items():
         head, own = pack(part, f"map{len(mappers)}", *names[segment])
@@ -115,9 +114,9 @@ def _load(file: Path, config: MapperConfig, log: Stats, counted: bool) -> Atlas:
         or len(chosen) != 1
     ):
         raise ValueError("its segments are not clear")
-    images = file.parent / KEYFRAMES
+    image = partial(read_image, file.parent / KEYFRAMES)
     mappers = [
-        unpack(part, arrays.of(f"map{k}"), config, log, corrections, photometry, images) for k, part in enumerate(parts)
+        unpack(part, arrays.of(f"map{k}"), config, log, corrections, photometry, image) for k, part in enumerate(parts)
     ]
     pairs = arrays.take("segment_of", np.int64, (None, 2))
     atlas = Atlas(

@@ -23,14 +23,14 @@ NAME = re.compile(r"-?\d{1,19}-[0-9a-f]{8}\.png", re.ASCII)  # frame index, chec
 
 def image_name(view: TrainingView) -> str:
     """File name of a keyframe's image; empty where it was let go."""
-    return f"{view.index:06d}-{_checksum(_pixels(view)):08x}.png" if view.has_image else ""
+    return f"{view.index:06d}-{_checksum(pixels_of(view)):08x}.png" if view.has_image else ""
 
 
 def write_image(folder: Path, view: TrainingView, name: str, *, sync: bool) -> None:
     """A keyframe's image, if it is not there yet. Raises OSError."""
     if (folder / name).exists():
         return
-    pixels = _pixels(view)
+    pixels = pixels_of(view)
     channels = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
     whole, data = cv2.imencode(".png", cv2.cvtColor(pixels, channels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not whole:
@@ -58,11 +58,16 @@ def read_image(folder: Path, name: str, device: torch.device) -> tuple[Tensor, T
     pixels = cv2.cvtColor(found, cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGB)
     if f"{_checksum(pixels):08x}" != name[-12:-4]:
         raise ValueError(f"{folder / name} is damaged: it shows something else than its name says")
-    image = torch.from_numpy(np.ascontiguousarray(pixels[..., :3])).to(device)
+    return image_of(pixels, device)
+
+
+def image_of(pixels: np.ndarray, device: torch.device) -> tuple[Tensor, Tensor | None]:
+    """The image (H, W, 3) and its valid pixels (H, W) bool, None where all are, of what `pixels_of` gave."""
+    image = torch.from_numpy(np.array(pixels[..., :3], order="C")).to(device)
     return image, torch.from_numpy(pixels[..., 3] > 0).to(device) if pixels.shape[2] == 4 else None
 
 
-def _pixels(view: TrainingView) -> np.ndarray:
+def pixels_of(view: TrainingView) -> np.ndarray:
     """(H, W, 3), or with the valid pixels as alpha (H, W, 4), uint8."""
     image = np.ascontiguousarray(view.image.cpu().numpy())
     return image if view.valid is None else np.dstack([image, view.valid.cpu().numpy().astype(np.uint8) * 255])

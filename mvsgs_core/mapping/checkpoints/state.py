@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,7 +13,6 @@ import torch
 from mvsgs_core.array_file import Arrays
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.mapping.between import BetweenView
-from mvsgs_core.mapping.checkpoints.images import read_image
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframes import TrainingView
@@ -50,19 +48,34 @@ NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "readout
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
 
 
-def copy_of(mapper: OnlineMapper, log: Stats, corrections: Corrections, photometry: ImageFormation) -> OnlineMapper:
+def copy_of(
+    mapper: OnlineMapper, log: Stats, corrections: Corrections, photometry: ImageFormation,
+    splats: torch.Tensor | None = None, images: Collection[int] | None = None,
+) -> OnlineMapper:  # fmt: skip
     """A mapper on the CPU that shares nothing that changes: what is saved while the other goes on.
+
+    splats: (N,) bool, those that are wanted; images: keyframes, by index, whose images are, with the frames between
+    them; None: all.
 
     Raises ValueError where what is kept of the splats is not of one length: an iteration was cut off.
     """
     lengths = {len(value) for value in mapper.state.tensors().values()}
     if len(lengths) > 1:
         raise ValueError(f"the map is in the middle of a change: {sorted(lengths)} splats")
-    state = MapState.of(mapper.state.tensors(), torch.device("cpu"))
+    tensors = mapper.state.tensors()
+    if splats is not None and not bool(splats.all()):
+        tensors = {name: value[splats.to(value.device)] for name, value in tensors.items()}
+    state = MapState.of(tensors, torch.device("cpu"))
     views = [_copied(view) for view in mapper.views]
-    between = [_copied(view) for view in mapper.keyframes.between]
+    between = [_copied(view) for view in mapper.keyframes.between if images is None or view.keyframe in images]
+    for view in views:
+        if images is not None and view.index not in images:
+            view.drop_image()
     copied = OnlineMapper(replace(mapper.config, device="cpu"), log, corrections, state, views, between, photometry)
-    _restore(copied, mapper.schedule.state())
+    schedule = mapper.schedule.state()
+    if len(copied.keyframes.trained) < len(mapper.keyframes.trained):
+        schedule |= {"local": [], "all": []}  # positions have changed
+    _restore(copied, schedule)
     copied.frame.origin, copied.frame.unit = mapper.frame.origin, mapper.frame.unit
     copied.trainer.iterations, copied.trainer.rate = mapper.trainer.iterations, mapper.trainer.rate
     copied.trainer.generator.set_state(mapper.trainer.generator.get_state())
@@ -78,8 +91,8 @@ def pack(
     """
     frame = mapper.frame
     arrays = {f"{prefix}/splats/{name}": value.cpu().numpy() for name, value in mapper.state.tensors().items()}
-    arrays |= _columns(mapper.views, VIEWS, f"{prefix}/views/")
-    arrays |= _columns(mapper.keyframes.between, BETWEEN, f"{prefix}/between/")
+    arrays |= columns(mapper.views, VIEWS, f"{prefix}/views/")
+    arrays |= columns(mapper.keyframes.between, BETWEEN, f"{prefix}/between/")
     arrays[f"{prefix}/origin"] = np.zeros(0) if frame.origin is None else frame.origin
     arrays[f"{prefix}/generator"] = mapper.trainer.generator.get_state().numpy()
     meta = {
@@ -91,15 +104,15 @@ def pack(
 
 def unpack(
     meta: Any, arrays: Arrays, config: MapperConfig, log: Stats, corrections: Corrections, photometry: ImageFormation,
-    images: Path,
+    image: Callable[[str, torch.device], tuple[torch.Tensor, torch.Tensor | None]],
 ) -> OnlineMapper:  # fmt: skip
-    """The mapper that was packed. images: the folder of its keyframes' images. Raises ValueError for damage."""
+    """The mapper that was packed. image: a keyframe's by its name, as `read_image`. Raises ValueError for damage."""
     if not isinstance(meta, dict):
         raise ValueError("a mapper's part is no object")
     device = torch.device(resolve_device(config.device))
-    views = [_view(row, device, images, TrainingView) for row in keyframe_rows(arrays.of("views"), meta.get("images"))]
+    views = [_view(row, device, image, TrainingView) for row in keyframe_rows(arrays.of("views"), meta.get("images"))]
     rows = keyframe_rows(arrays.of("between"), meta.get("between"), BETWEEN)
-    between = [_view(row, device, images, BetweenView) for row in rows]
+    between = [_view(row, device, image, BetweenView) for row in rows]
     if not {view.keyframe for view in between} <= {view.index for view in views} or not all(
         b.has_image for b in between
     ):
@@ -134,6 +147,16 @@ def photometry_of(arrays: Arrays) -> ImageFormation:
         raise ValueError("there are exposures that no camera has")
     found = {int(k): affine.copy() for k, affine in zip(index, exposures)}
     return ImageFormation(found, vignetting.copy() if len(vignetting) else None)
+
+
+def photometry_arrays(photometry: ImageFormation) -> dict[str, np.ndarray]:
+    """What `photometry_of` reads."""
+    exposed = sorted(photometry.exposures)
+    return {
+        "index": np.array(exposed, dtype=np.int64),
+        "exposure": np.array([photometry.exposures[k] for k in exposed], np.float32).reshape(-1, 3, 4),
+        "vignetting": np.zeros(0) if photometry.vignetting is None else photometry.vignetting,
+    }
 
 
 def whole(value: Any, name: str) -> int:
@@ -178,8 +201,11 @@ def keyframe_rows(
 V = TypeVar("V", bound=TrainingView)
 
 
-def _view(row: dict[str, Any], device: torch.device, folder: Path, kind: type[V]) -> V:
-    row["image"], row["valid"] = read_image(folder, row.pop("file"), device)
+def _view(
+    row: dict[str, Any], device: torch.device,
+    image: Callable[[str, torch.device], tuple[torch.Tensor, torch.Tensor | None]], kind: type[V],
+) -> V:  # fmt: skip
+    row["image"], row["valid"] = image(row.pop("file"), device)
     row["image_size"] = tuple(row["image_size"].tolist())
     row["exposure"] = torch.from_numpy(row["exposure"]).to(device)
     row["measured"] = None if np.isnan(row["measured"]).any() else row["measured"]
@@ -191,7 +217,7 @@ def _restore(mapper: OnlineMapper, schedule: dict[str, Any]) -> None:
     mapper.schedule.restore(schedule, len(mapper.keyframes.with_image), len(mapper.keyframes.trained))
 
 
-def _columns(
+def columns(
     views: Sequence[TrainingView], kept: dict[str, tuple[type, tuple[int, ...]]], prefix: str
 ) -> dict[str, np.ndarray]:
     """Each value of the views as an array, by its name after the prefix."""

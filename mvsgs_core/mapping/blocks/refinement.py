@@ -1,0 +1,71 @@
+"""The final refinement of a large map in blocks: here, one after the other, or on a cluster, one a worker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mvsgs_core.mapping.blocks.job import Result, iterations_of, job_of, merge, parting_of, plain, refined
+from mvsgs_core.mapping.blocks.parting import Parting
+from mvsgs_core.mapping.blocks.ray_cluster import ClusterError, RayCluster
+from mvsgs_core.mapping.mapper import OnlineMapper
+
+WORTH = 1.5  # times the iterations of the whole map that blocks of it may take in one process
+
+
+def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[None] | None:
+    """`total` iterations over the map, a piece at a time; the map changes when all are done. None: the map is to be
+    refined whole, as it is small and no cluster is named."""
+    config = mapper.config.refine
+    if not mapper.views or not len(mapper.state):
+        return None
+    if config.by == "ray":
+        return _on_cluster(mapper, total)
+    count = _blocks(mapper)
+    if count == 1:
+        return None
+    parting = parting_of(mapper, count)
+    if config.blocks is None and sum(iterations_of(mapper, parting, total)) > WORTH * total:
+        return None  # all keyframes see the same: one after the other, blocks would only take longer
+    return _here(mapper, total, parting)
+
+
+def _blocks(mapper: OnlineMapper, machines: int = 1) -> int:
+    config = mapper.config.refine
+    return config.blocks or max(machines, -(-len(mapper.views) // config.keyframes))
+
+
+def _here(
+    mapper: OnlineMapper, total: int, parting: Parting, results: dict[int, Result] | None = None
+) -> Iterator[None]:
+    """results: of blocks that are done already."""
+    results = results or {}
+    for block, iterations in enumerate(iterations_of(mapper, parting, total)):
+        if block in results:
+            continue
+        for result in refined(job_of(mapper, parting, block, iterations), mapper.config):
+            if result is not None:
+                results[block] = result
+            yield
+    merge(mapper, [results[block] for block in sorted(results)])
+    mapper.log.values["blocks"] = len(parting)
+
+
+def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
+    """What the cluster cannot do is done here: a stream's map is not lost for want of a machine."""
+    results: dict[int, Result] = {}
+    parting = None
+    try:
+        with mapper.log.time("refinement on Ray"), RayCluster(mapper.config.refine.address) as cluster:
+            parting = parting_of(mapper, _blocks(mapper, cluster.machines))
+            parts = iterations_of(mapper, parting, total)
+            jobs = (job_of(mapper, parting, block, iterations) for block, iterations in enumerate(parts))
+            for finished in cluster.refined(jobs, plain(mapper.config)):
+                results.update(finished)
+                yield
+            mapper.log.values["machines"] = cluster.machines
+    except ClusterError as error:
+        mapper.log.warn(f"the Ray cluster at {mapper.config.refine.address} failed, the map is refined here: {error}")
+    yield from _here(mapper, total, parting or parting_of(mapper, _blocks(mapper)), results)
+
+
+__all__ = ["refined_in_blocks"]

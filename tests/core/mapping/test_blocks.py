@@ -1,0 +1,148 @@
+"""The final refinement in blocks: the same as of the whole map where there is one, every splat in one of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.blocks.config import RefineConfig
+from mvsgs_core.mapping.blocks.job import NOBODY, iterations_of, job_of, merge, parting_of, refined
+from mvsgs_core.mapping.blocks.refinement import refined_in_blocks
+from mvsgs_core.mapping.mapper import OnlineMapper
+from tests.support.small_atlas import PLAIN, begun
+from tests.support.small_maps import CONFIG, mapped, score
+from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
+
+SIZE = (24, 32)
+MOVING = replace(PLAIN, refinement=12, training=replace(PLAIN.training, refine_poses=True, pose_visits=0))
+
+
+def corridor(blocks: int | None = 2, keyframes: int = 8, overlap: float = 0.1) -> OnlineMapper:
+    """Keyframes along a line that each see a part of it; not yet refined."""
+    config = replace(CONFIG, refinement=0, iterations=4, refine=RefineConfig(blocks=blocks, overlap=overlap))
+    views = [rgbd_keyframe(k, pose_on_arc(k / (keyframes - 1)), SIZE) for k in range(keyframes)]
+    return mapped(views, config)
+
+
+def refine(mapper: OnlineMapper, total: int) -> int:
+    """In pieces; how many they were, 0: it is to be refined whole."""
+    pieces = refined_in_blocks(mapper, total)
+    return 0 if pieces is None else sum(1 for _ in pieces)
+
+
+def test_one_block_is_the_refinement_of_the_whole_map_to_the_bit() -> None:
+    """With exposures, pixels left out, frames between keyframes, corrected keyframes and poses that are refined."""
+    whole, parted = begun(MOVING).largest, begun(MOVING).largest
+    for done in range(12):
+        whole.refine(done, 12)
+    parting = parting_of(parted, 1)
+    *pieces, result = refined(job_of(parted, parting, 0, 12), parted.config)
+    assert pieces == [None] * 12
+    assert result is not None
+    merge(parted, [result])
+    for name, value in whole.state.tensors().items():
+        assert torch.equal(value, parted.state.tensors()[name]), name
+    for a, b in zip(whole.keyframes.trained, parted.keyframes.trained, strict=True):
+        assert (a.visits, a.visits_here, a.pose_steps, a.fixed) == (b.visits, b.visits_here, b.pose_steps, b.fixed)
+        assert np.array_equal([a.loss_fast, a.loss_slow], [b.loss_fast, b.loss_slow], equal_nan=True)
+    for a, b in zip(whole.views, parted.views, strict=True):
+        assert np.array_equal(a.pose_delta, b.pose_delta)
+    assert whole.iterations == parted.iterations
+    assert whole.log.counts == parted.log.counts
+    assert whole.trainer.rate == parted.trainer.rate
+
+
+@pytest.mark.parametrize("blocks", [2, 3])
+def test_every_splat_is_owned_and_trained_once(blocks: int) -> None:
+    mapper = corridor(blocks)
+    splats, parting = len(mapper.state), parting_of(mapper, blocks)
+    assert len(parting) == blocks
+    assert np.ptp(np.bincount(parting.home)) <= 1
+    for b in range(blocks):
+        assert parting.needed[b][parting.owner == b].all()
+        assert parting.trained[b][parting.home == b].all()
+    none = replace(mapper.config, density_control=replace(mapper.config.density_control, mode="none"))
+    results = [list(refined(job_of(mapper, parting, b, 2), none))[-1] for b in range(blocks)]
+    owned = [len(result.arrays["splats/steps"]) for result in results if result is not None]
+    assert owned == np.bincount(parting.owner, minlength=blocks).tolist()
+    before = np.sort(mapper.state.anchors.numpy())
+    merge(mapper, [result for result in results if result is not None])
+    assert len(mapper.state) == splats
+    assert np.array_equal(np.sort(mapper.state.anchors.numpy()), before)
+
+
+def test_what_pruning_takes_is_gone_and_nothing_of_another_block_comes() -> None:
+    mapper = corridor(2)
+    splats, needless = len(mapper.state), mapper.log.counts.get("needless", 0.0)
+    refine(mapper, 12)
+    assert len(mapper.state) == splats - (mapper.log.counts["needless"] - needless) < splats
+    assert int(mapper.state.anchors.min()) > NOBODY
+
+
+def test_an_image_has_as_many_iterations_in_each_block_and_the_map_ends_as_well() -> None:
+    whole, parted = corridor(), corridor()
+    for done in range(40):
+        whole.refine(done, 40)
+    before, parting = parted.iterations, parting_of(parted, 2)
+    refine(parted, 40)
+    assert parted.iterations - before == 5 * parting.trained.sum()  # 40 for 8 images
+    held_out = [rgbd_keyframe(0, pose_on_arc(t), SIZE) for t in (0.21, 0.5, 0.77)]
+    psnr = [np.mean([score(mapper, view) for view in held_out]) for mapper in (whole, parted)]
+    assert psnr[1] > psnr[0] - 0.2
+
+
+def test_the_same_blocks_come_out_each_time() -> None:
+    first, second = corridor(), corridor()
+    refine(first, 8)
+    refine(second, 8)
+    assert all(torch.equal(value, second.state.tensors()[name]) for name, value in first.state.tensors().items())
+
+
+def test_keyframes_that_see_enough_of_a_block_are_guests_and_no_others() -> None:
+    alone, all_ = parting_of(corridor(overlap=1.0), 2), parting_of(corridor(overlap=0.0), 2)
+    assert alone.trained.sum() == 8
+    assert 8 < all_.trained.sum() <= 16
+    assert iterations_of(corridor(), alone, 80) == [40, 40]
+
+
+def test_a_pose_is_refined_at_home_and_not_where_its_keyframe_is_a_guest() -> None:
+    mapper = begun(MOVING).largest
+    parting = parting_of(mapper, 2)
+    guests = parting.trained & (parting.home != np.arange(2)[:, None])
+    assert guests.any()
+    steps = [view.pose_steps for view in mapper.views]
+    results = [list(refined(job_of(mapper, parting, b, 12), mapper.config))[-1] for b in range(2)]
+    assert [view.pose_steps for view in mapper.views] == steps  # the map waits for all blocks
+    merge(mapper, [result for result in results if result is not None])
+    learned = np.concatenate([result.arrays["views/index"] for result in results if result is not None])
+    assert sorted(learned) == [view.index for view in mapper.views]
+    assert sum(view.pose_steps for view in mapper.views) > sum(steps)
+    assert [view.fixed for view in mapper.views] == [view.fixed for view in begun(MOVING).largest.views]
+
+
+def test_a_small_map_is_refined_whole_and_a_large_one_in_blocks() -> None:
+    assert refined_in_blocks(corridor(blocks=None), 4) is None
+    atlas = Atlas(corridor(blocks=None, keyframes=4))
+    config = replace(atlas.current.config, refinement=6, refine=RefineConfig(keyframes=2, overlap=1.0))
+    atlas.current.config = config
+    while atlas.refine():
+        assert len(atlas.current.log.values) == 0 or atlas.refined == 6
+    assert atlas.current.log.values["blocks"] == 2
+    assert not atlas.refine()
+
+
+def test_keyframes_that_all_see_the_same_are_refined_whole_unless_blocks_are_asked_for() -> None:
+    mapper = corridor(overlap=0.0)
+    assert refined_in_blocks(mapper, 4) is not None
+    mapper.config = replace(mapper.config, refine=RefineConfig(keyframes=2, overlap=0.0))
+    assert refined_in_blocks(mapper, 4) is None
+
+
+@pytest.mark.parametrize("wrong", [{"blocks": 0}, {"keyframes": 0}, {"overlap": 1.5}, {"address": "auto"}])
+def test_wrong_settings_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError):
+        RefineConfig(**wrong)
