@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from bench.runs import ROOT
 
 STORE = 256 << 20  # bytes of each node's object store
+LOOPBACK = "127.0.0.2"  # Ray takes 127.0.0.1 for the address that others reach this machine by
 
 
 @contextmanager
@@ -19,7 +20,7 @@ def ray_nodes(count: int) -> Iterator[str]:
 
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *([before] if before else [])])  # workers need the core
-    one = {"num_cpus": 1, "num_gpus": 0, "object_store_memory": STORE, "node_ip_address": "127.0.0.1"}
+    one = {"num_cpus": 1, "num_gpus": 0, "object_store_memory": STORE, "node_ip_address": LOOPBACK}
     cluster = Cluster()
     try:
         for _ in range(count):
