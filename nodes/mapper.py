@@ -19,7 +19,6 @@ from mvsgs_core.export.source_camera import source_camera
 from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.between import FrameBetween
-from mvsgs_core.mapping.blocks.ray_cluster import check_installed
 from mvsgs_core.mapping.checkpoints import checkpoint
 from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
@@ -105,8 +104,7 @@ class Mapper(Node):
     def check(cls, config: Config) -> None:
         if config.training.loss_function is not None:
             loss_function(config.training.loss_function)
-        if config.refine.by == "ray":
-            check_installed()
+        config.refine.check()
         if config.resume is not None:
             checkpoint_info(config.resume)
         elif config.map is not None:

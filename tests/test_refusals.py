@@ -13,6 +13,7 @@ from launch.jobs import Job, refused, run
 from launch.named_input import with_named_input
 from launch.output import Output
 from launch.refusal import GraphError
+from launch.sweep import check_launcher
 from tests.support.dataset_folders import write_image, write_photos, write_tum
 
 CHOICES = choices_of("dataset")
@@ -105,3 +106,26 @@ def test_a_few_images_of_another_shape_are_left_out_and_no_reason_to_refuse(tmp_
     for i in range(5, 10):
         write_image(tmp_path / "mixed" / f"{i}.png", 9, (48, 64))
     check("images", path=tmp_path / "mixed")
+
+
+def test_a_refinement_on_ray_needs_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvsgs_core.mapping.blocks.config.importlib.util.find_spec", lambda name: None)
+    graph = compose(["refine=ray", "refine.address=10.0.0.1:6379"])
+    config = graph.slots["mapper"].parameters
+    assert (config.refine.by, config.refine.address) == ("ray", "10.0.0.1:6379")
+    with pytest.raises(ValueError, match=r"pip install 'mvsgs\[ray\]'"):
+        graph.slots["mapper"].node.check(config)
+    with pytest.raises(GraphError, match="must name the cluster"):
+        compose(["refine=ray", "refine.address=auto"])
+    with pytest.raises(GraphError, match="'here' or 'ray'"):
+        compose(["refine=slurm"])
+
+
+def test_a_sweep_on_slurm_needs_its_launcher(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["-m", "hydra/launcher=submitit_slurm", "mapper.iterations=1,2"]
+    monkeypatch.setattr("launch.sweep.importlib.util.find_spec", lambda name: None)
+    with pytest.raises(GraphError, match=r"pip install 'mvsgs\[slurm\]'"):
+        check_launcher(words)
+    monkeypatch.setattr("launch.sweep.importlib.util.find_spec", lambda name: name)
+    check_launcher(words)
+    check_launcher(["-m", "mapper.iterations=1,2"])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 from typing import Literal
+
+MISSING = "refine=ray needs Ray: pip install 'mvsgs[ray]', here and on the cluster's machines"
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,11 @@ class RefineConfig:
             raise ValueError(f"overlap={self.overlap}: must be from 0 to 1")
         if not self.address or self.address in ("auto", "local"):
             raise ValueError(f"address={self.address!r}: must name the cluster, as HOST:PORT or ray://HOST:PORT")
+
+    def check(self) -> None:
+        """Raises ValueError where what it asks for is not installed."""
+        if self.by == "ray" and importlib.util.find_spec("ray") is None:
+            raise ValueError(MISSING)
 
 
 __all__ = ["RefineConfig"]

@@ -6,7 +6,6 @@ and what they exchange is pickled, by Ray. So none is started or looked for here
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import threading
@@ -15,21 +14,15 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self
 
+from mvsgs_core.mapping.blocks.config import RefineConfig
 from mvsgs_core.mapping.blocks.job import Job, Result, refined
 from mvsgs_core.mapping.config import MapperConfig
 
 WAIT = 0.1  # seconds between two looks
-MISSING = "refine=ray needs Ray: pip install 'mvsgs[ray]', here and on the cluster's machines"
 
 
 class ClusterError(Exception):
     """The cluster is not there, or lost what it was given."""
-
-
-def check_installed() -> None:
-    """Raises ValueError where Ray is not."""
-    if importlib.util.find_spec("ray") is None:
-        raise ValueError(MISSING)
 
 
 def refine_job(job: Job, config: MapperConfig) -> Result:
@@ -43,14 +36,14 @@ def refine_job(job: Job, config: MapperConfig) -> Result:
 class RayCluster:
     """Joined in a `with`. Raises ClusterError."""
 
-    def __init__(self, address: str) -> None:
-        """address: HOST:PORT of its head, of which this machine is a member, or ray://HOST:PORT of a client's server"""
-        self._address = address
+    def __init__(self, config: RefineConfig) -> None:
+        """`config.address`: HOST:PORT of its head, where this machine is a member, or ray://HOST:PORT of a server."""
+        self._config = config
         self.machines = self.cpus = self.gpus = 0  # machines; cores and GPUs of the smallest of them
 
     def __enter__(self) -> Self:
         try:
-            check_installed()
+            self._config.check()
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is told to anybody
             import ray
 
@@ -58,7 +51,7 @@ class RayCluster:
             main = threading.current_thread() is threading.main_thread()
             handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)} if main else {}
             try:
-                ray.init(address=self._address, log_to_driver=False, logging_level="error")
+                ray.init(address=self._config.address, log_to_driver=False, logging_level="error")
             finally:
                 for number, handler in handlers.items():  # Ray sets its own
                     signal.signal(number, handler)
@@ -109,4 +102,4 @@ class RayCluster:
         return found
 
 
-__all__ = ["ClusterError", "RayCluster", "check_installed"]
+__all__ = ["ClusterError", "RayCluster"]

@@ -55,7 +55,7 @@ def _on_cluster(mapper: OnlineMapper, total: int) -> Iterator[None]:
     results: dict[int, Result] = {}
     parting = None
     try:
-        with mapper.log.time("refinement on Ray"), RayCluster(mapper.config.refine.address) as cluster:
+        with mapper.log.time("refinement on Ray"), RayCluster(mapper.config.refine) as cluster:
             parting = parting_of(mapper, _blocks(mapper, cluster.machines))
             parts = iterations_of(mapper, parting, total)
             jobs = (job_of(mapper, parting, block, iterations) for block, iterations in enumerate(parts))

@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvsgs_core.mapping.blocks import ray_cluster
 from mvsgs_core.mapping.blocks.config import RefineConfig
 from mvsgs_core.mapping.blocks.refinement import refined_in_blocks
 from mvsgs_core.mapping.mapper import OnlineMapper
@@ -44,10 +43,10 @@ def test_a_cluster_of_two_nodes_refines_as_one_process_does() -> None:
 
 
 def test_a_cluster_that_is_not_there_is_said_and_the_map_refined_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing() -> None:
+    def missing(self: RefineConfig) -> None:
         raise ValueError("no Ray in this test")
 
-    monkeypatch.setattr(ray_cluster, "check_installed", missing)
+    monkeypatch.setattr(RefineConfig, "check", missing)
     here, there = refined(RefineConfig(blocks=2)), refined(RefineConfig(by="ray", blocks=2))
     assert "no Ray in this test" in there.log.warnings[0]
     assert all(torch.equal(value, there.state.tensors()[name]) for name, value in here.state.tensors().items())
