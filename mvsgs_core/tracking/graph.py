@@ -3,49 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.tracking.edges import Edge, Edges
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
-from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.keyframes import Keyframe, KeyframeTable
 from mvsgs_core.tracking.matching.flow import Matches
 
 # What resists a change of an inverse depth d in each step, as a fraction of 1 / d². It is no prior: drawn to the depths
 # that keyframes were given, whole maps bend (rotation against depth), by 5 % on the synthetic room.
 DAMPING = 0.5
-
-
-@dataclass
-class Keyframe:
-    """A kept frame. M points, one a cell; the map's unit is the median depth of the first keyframes."""
-
-    image: TrackingImage
-    cam_from_world: np.ndarray  # (4, 4) float64
-    inverse_depth: np.ndarray  # (M,) float64
-    information: np.ndarray  # (M,) float64 of the inverse depth, pixels^-2; 0: never triangulated
-    segment: int
-
-    @property
-    def index(self) -> int:
-        return self.image.index
-
-    @property
-    def points(self) -> np.ndarray:
-        """(M, 2) float32."""
-        return self.image.cells.points
-
-    @property
-    def triangulated(self) -> np.ndarray:
-        """(M,) bool: the depth is known to better than about 30 %, for an error of one pixel."""
-        return self.information * self.inverse_depth**2 > 10.0
-
-    @property
-    def median_depth(self) -> float:
-        known = self.triangulated
-        return float(1.0 / np.median(self.inverse_depth[known] if known.sum() > 10 else self.inverse_depth))
 
 
 class KeyframeGraph:
@@ -56,7 +26,7 @@ class KeyframeGraph:
         self.device = device  # of the bundle adjustments of several keyframes, see Solver
         self.readout_time = 0.0  # seconds that the camera needs for an image, from the first row to the last
         self.vignetting = np.zeros(3)  # of log V = l1 r² + l2 r⁴ + l3 r⁶, as far as it is known
-        self.keyframes: dict[int, Keyframe] = {}  # by frame index
+        self.keyframes = KeyframeTable()  # by frame index
         self.edges = Edges()  # by frame indices
 
     def add(self, keyframe: Keyframe) -> None:

@@ -67,7 +67,8 @@ class LocalMap:
                 yield
             self.match_edge(image.index, index)
             yield
-        for index in self.nearby(image.index, [i for i in earlier if i not in recent], proximity):
+        near = set(recent)
+        for index in self.nearby(image.index, [i for i in earlier if i not in near], proximity):
             self.match_edge(image.index, index)
             yield
             self.match_edge(index, image.index)
@@ -75,7 +76,7 @@ class LocalMap:
         return keyframe
 
     def members(self, segment: int) -> list[int]:
-        return sorted(index for index, k in self.graph.keyframes.items() if k.segment == segment)
+        return self.graph.keyframes.members(segment)
 
     def match_edge(self, source: int, to: int) -> bool:
         """Matches an edge from where the map says the points should be; not one that too few can be seen along.
@@ -92,9 +93,10 @@ class LocalMap:
 
     def nearby(self, index: int, candidates: list[int], count: int, apart: int = 2) -> list[int]:
         """Keyframes that see the same from close by: smallest mean flow first, no two next to each other in time."""
-        flows = self.graph_flow(index, self._within_reach(index, candidates))
+        places = self._within_reach(index, candidates)
+        flows = self.graph_flow(index, [candidates[n] for n in places])
         limit = self.config.proximity_flow * self.graph.keyframes[index].image.size[1]
-        order = {candidate: n for n, candidate in enumerate(candidates)}
+        order = {candidates[n]: n for n in places}
         chosen: list[int] = []
         for candidate in sorted(flows, key=lambda c: flows[c]):
             if flows[candidate] > limit or len(chosen) == count:
@@ -104,15 +106,15 @@ class LocalMap:
         return chosen
 
     def _within_reach(self, index: int, candidates: list[int]) -> list[int]:
-        """Of many keyframes those whose flow may be small at all: not far away, not turned away."""
+        """Places in the list: of many keyframes those whose flow may be small at all, not far away nor turned away."""
         if len(candidates) <= FEW:
-            return candidates
-        poses = np.stack([self.graph.keyframes[c].cam_from_world for c in candidates])
+            return list(range(len(candidates)))
+        poses = self.graph.keyframes.poses(candidates)
         keyframe = self.graph.keyframes[index]
         apart = poses[:, :3, :3] @ self.graph.world_from_cam(index)[:3, 3] + poses[:, :3, 3]
         near = np.linalg.norm(apart, axis=1) < REACH * keyframe.median_depth
         turned = poses[:, 2, :3] @ keyframe.cam_from_world[2, :3]
-        return [candidates[n] for n in np.flatnonzero(near & (turned > 0.5))]
+        return list(np.flatnonzero(near & (turned > 0.5)).tolist())
 
     def graph_flow(self, index: int, candidates: list[int], min_overlap: float = 0.5) -> dict[int, float]:
         """Mean flow in pixels from keyframe `index` to each candidate, where enough of it would be seen there."""

@@ -74,6 +74,10 @@ class Photometer:
             return None
         return vignetting_polynomial(self.photometry.vignetting, self.photometry.vignetting_response).astype(np.float32)
 
+    @property
+    def varies(self) -> bool:
+        return self.photometry.varies
+
     def exposure(self, index: int) -> np.ndarray | None:
         """(3, 4) float32 color affine of a keyframe; None where exposures do not vary."""
         if not self.photometry.varies or index not in self._lights:

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from mvsgs_core.tracking.between import Between
-from mvsgs_core.tracking.graph import Keyframe
+from mvsgs_core.tracking.keyframes import Keyframe, KeyframeTable
 from mvsgs_core.tracking.settling import Settling
 from mvsgs_core.tracking.steps import Steps, whole
 from mvsgs_core.trajectory import TrackingState
@@ -94,6 +94,9 @@ class Light(Protocol):
     def known(self, index: int) -> object: ...  # the same object: the same exposure
 
     @property
+    def varies(self) -> bool: ...  # False: `known` is the same object for good
+
+    @property
     def vignetting(self) -> np.ndarray | None: ...
 
 
@@ -121,6 +124,9 @@ class Publisher:
         self._published: dict[int, _Published] = {}
         self._vignetting: np.ndarray | None = None  # that was published last
         self._lit = False  # an exposure was published
+        self._varied = False  # the light, when it was looked at last
+        self._new: set[int] = set()  # published and not yet looked at
+        self._clock = 0  # of the graph's keyframes when they were looked at last
 
     def publish(self, index: int) -> None:
         """A keyframe was sent as it is now, with scale 1."""
@@ -132,6 +138,7 @@ class Publisher:
         known, pose = keyframe.triangulated.copy(), self.graph.world_from_cam(index)
         first = scale * keyframe.inverse_depth
         self._published[index] = _Published(pose, scale, first, known, segment, exposure)
+        self._new.add(index)
         self._lit |= exposure is not None
         self.highest_segment = max(self.highest_segment, segment)
 
@@ -167,9 +174,8 @@ class Publisher:
         vignetting = changed_vignetting(None if self.light is None else self.light.vignetting, self._vignetting)
         if vignetting is not None:
             everything, self._vignetting = True, vignetting
-        for index, last in self._published.items():
-            if index not in self.graph.keyframes:
-                continue
+        for index in self._to_look_at(everything):
+            last = self._published[index]
             parts = self._parts(index)
             if not everything and parts and same(parts, last.looked_at):
                 continue
@@ -196,6 +202,18 @@ class Publisher:
             np.stack([affine_of(last.exposure) for last in last_of]) if self._lit else None,
             vignetting,
         )
+
+    def _to_look_at(self, everything: bool) -> list[int]:
+        """Published keyframes that may have changed since the last time, in the order in which they were published."""
+        keyframes, light = self.graph.keyframes, self.light
+        new, self._new = self._new, set()
+        if isinstance(keyframes, KeyframeTable):
+            varied, self._varied = self._varied, light is not None and light.varies
+            changed = keyframes.changed(self._clock) | new
+            self._clock = keyframes.clock
+            if not (everything or varied or self._varied):
+                return [index for index in self._published if index in changed and index in keyframes]
+        return [index for index in self._published if index in keyframes]
 
     def _parts(self, index: int) -> tuple[object, ...]:
         """What a keyframe's corrections are made of; empty where it may change in place. Of thousands few do."""
