@@ -7,7 +7,9 @@ A topic has one publisher, one message type and one address. What ZeroMQ does no
 - A best-effort reader must never slow the publisher, which NODROP would let it do on the same socket. The first byte
   of a frame says for whom it is ("R" or "N"), readers subscribe to theirs, and the "N" copy is sent with NODROP off.
 - XPUB_MANUAL reports each reader's arrival and departure and leaves it to the publisher whom it serves: a stranger who
-  does not begin its subscription with the graph's token gets nothing and holds nobody up. A publisher waits for its
+  does not begin its subscription with the graph's token gets nothing and holds nobody up. Where one sends messages,
+  which ZeroMQ then confuses with subscriptions of others, these are not acted on, and are said again under the
+  reader's name. A publisher waits for its
   readers at the start and for their goodbyes after `End`, because closing earlier throws away what a stalled reader
   has not read yet (libzmq issue 4660), whatever the linger.
 - A reader whose publisher disappears without `End`, and a publisher whose reader leaves before it, raise PeerLost. A

@@ -16,7 +16,7 @@ from msgs.codec import AGAIN, NEWEST, RELIABLE, encode
 from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
 from nodes.runtime.frame_pool import FramePool
 from nodes.runtime.transport.kept import Kept
-from nodes.runtime.transport.sockets import GOODBYE, OBSERVER, guard, open_socket, readable
+from nodes.runtime.transport.sockets import GOODBYE, NAME_BYTES, OBSERVER, guard, open_socket, readable
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
 NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
@@ -50,7 +50,7 @@ class Publisher:
         check_address(address, bind=True, keys=keys)
         self.topic = topic or address
         self.sent = 0
-        self.readers: Counter[bytes] = Counter()  # by delivery
+        self._arrived: Counter[bytes] = Counter()  # attempts of readers that were served, by what they said
         self.observers: dict[str, bytes] = {}  # delivery of those readers that only observe, by name
         self._essential = 0  # reliable readers that were there at the start
         self._held_back = held_back
@@ -83,15 +83,31 @@ class Publisher:
         self.watch()
         return self.readers.total() - len(self.observers) >= readers and set(observers) <= self.observers.keys()
 
+    @property
+    def readers(self) -> Counter[bytes]:
+        """Those that are there, by delivery. A reader is one however often it has said so."""
+        there = [what for what, count in self._arrived.items() if count > 0]
+        named = {what[: 1 + NAME_BYTES] for what in there if len(what) > 1}
+        nameless = {what: self._arrived[what] for what in there if len(what) == 1}
+        return Counter(what[:1] for what in named) + Counter(nameless)
+
     def start(self) -> None:
         self._started = True
         self._essential = self._reliable_readers()
 
     def watch(self) -> None:
-        """Takes note of arrivals and departures. Raises PeerLost."""
+        """Takes note of arrivals and departures. Raises PeerLost.
+
+        ZeroMQ takes the next one who speaks for the sender of a stranger's message: of what is read together with one,
+        nobody knows who said it. Nobody is served for that; a reader that nothing comes to says it again.
+        """
+        doubted = False
         while readable(self.socket):
             event = self.socket.recv()
-            self._note(arrived=event[:1] == b"\x01", what=event[1:])
+            if event[:1] in (b"\x00", b"\x01"):
+                self._note(event[:1] == b"\x01", event[1:], doubted)
+            else:
+                doubted = True
         if not self._started or (self._ended and not self._away):
             return
         if self._missing() <= 0:
@@ -108,7 +124,7 @@ class Publisher:
         """Reliable readers that were there at the start, are not, and have not said goodbye."""
         return self._essential - self._reliable_readers() - self._goodbyes
 
-    def _note(self, arrived: bool, what: bytes) -> None:
+    def _note(self, arrived: bool, what: bytes, doubted: bool) -> None:
         if not what.startswith(self._token):
             return  # a stranger
         what = what[len(self._token) :]
@@ -120,11 +136,15 @@ class Publisher:
                 self.observers.pop(name, None)
         elif what == GOODBYE:
             self._goodbyes += arrived
-        elif what in (RELIABLE, NEWEST):  # else it is no reader of ours
-            if arrived and what == RELIABLE and self._started:
+        elif what[:1] in (RELIABLE, NEWEST) and not (arrived and doubted):  # else it is no reader of ours, or whose?
+            repeated = len(what) > 1 + NAME_BYTES and any(
+                count > 0 and other[: 1 + NAME_BYTES] == what[: 1 + NAME_BYTES]
+                for other, count in self._arrived.items()
+            )
+            if arrived and not repeated and what[:1] == RELIABLE and self._started:
                 self._send_again()
-            self.readers[what] = max(0, self.readers[what] + (1 if arrived else -1))
-            self.socket.setsockopt(zmq.SUBSCRIBE if arrived else zmq.UNSUBSCRIBE, what)  # of the one who just spoke
+            self._arrived[what] = max(0, self._arrived[what] + (1 if arrived else -1))
+            self.socket.setsockopt(zmq.SUBSCRIBE if arrived else zmq.UNSUBSCRIBE, what[:1])  # of the one who just spoke
 
     def _reliable_readers(self) -> int:
         """Without observers."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import deque
@@ -14,10 +15,12 @@ from zmq.utils.monitor import recv_monitor_message
 from msgs import End, Message
 from msgs.codec import AGAIN, NEWEST, RELIABLE, CodecError, Decoded, decode, max_message_bytes, type_name
 from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
-from nodes.runtime.transport.sockets import GOODBYE, OBSERVER, open_socket, readable
+from nodes.runtime.transport.sockets import GOODBYE, NAME_BYTES, OBSERVER, open_socket, readable
 
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 LOST = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
+REPEATS = 8  # times that a reader which nothing comes to says again that it is there
+FIRST_REPEAT = 1.0  # s after which it does for the first time; then after twice as long each time
 PEER_GRACE = 0.5  # s between a disconnection and its report: whoever failed first should be heard first
 
 
@@ -61,10 +64,12 @@ class _Reader:
         back = zmq.EVENT_HANDSHAKE_SUCCEEDED if away else 0
         self.monitor = self._socket.get_monitor_socket(self.monitored | back)
         self._socket.connect(address)
-        self._subscription = token.encode() + self.delivery
+        # Where strangers can knock, one's message can hide who said this: it is then said again, under the same name.
+        self._said = [token.encode() + self.delivery + (os.urandom(NAME_BYTES) if token else b"")]
+        self._opened = time.monotonic()
         if observer is not None:  # first: it must not pass for another reader
             self._socket.subscribe(token.encode() + OBSERVER + self.delivery + observer.encode())
-        self._socket.subscribe(self._subscription)
+        self._socket.subscribe(self._said[0])
         if token:  # what frames begin with, for this socket's own filter: to the publisher it says nothing
             self._socket.subscribe(self.delivery)
 
@@ -111,7 +116,17 @@ class _Reader:
         """What the publisher waits for."""
         if self._observer is None and self.delivery == RELIABLE:
             self._socket.subscribe(self._token + GOODBYE)  # it has read the end, and is not lost
-        self._socket.unsubscribe(self._subscription)
+        for said in self._said:
+            self._socket.unsubscribe(said)
+
+    def _say_again(self) -> None:
+        """In the thread that uses the socket: that this reader is there, should it not have been understood."""
+        count = len(self._said)
+        if not self._token or self._frames or self.received or self.ended or count > REPEATS:
+            return
+        if time.monotonic() - self._opened >= FIRST_REPEAT * (2**count - 1):
+            self._said.append(self._said[0] + bytes([count]))
+            self._socket.subscribe(self._said[-1])
 
     def _close_socket(self) -> None:
         if not self._socket.closed:
@@ -151,6 +166,10 @@ class ReliableReader(_Reader):
     @property
     def pollable(self) -> zmq.Socket[bytes]:
         return self._socket
+
+    def watch(self) -> None:
+        self._say_again()
+        super().watch()
 
     def head(self) -> Decoded | None:
         """The next message, if one has arrived; `take` gives it. Raises TransportError if one was lost."""
@@ -292,6 +311,7 @@ class NewestReader(_Reader):
     def _drain(self) -> None:
         while not self._closing:
             self._attend()
+            self._say_again()
             try:
                 frame = self._socket.recv(copy=False)
             except zmq.Again:

@@ -13,6 +13,7 @@ from nodes.runtime.addresses import Keys, save_keys
 
 OBSERVER = b"O"  # begins the subscription by which a reader says its delivery and its name: no frame begins so
 GOODBYE = b"G"  # the subscription by which a reader says that it has read the end: no frame begins so either
+NAME_BYTES = 8  # of the name that follows the delivery in a reader's subscription: which of its attempts are its own
 
 
 def create_keys(folder: str | Path) -> Keys:
