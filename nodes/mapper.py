@@ -28,7 +28,7 @@ from mvsgs_core.mapping.checkpoints.saved_map import SavedMap
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.losses import loss_function
-from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.mapper import FINAL_RATE, OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
 from mvsgs_core.mapping.self_check import why_nothing
@@ -191,17 +191,21 @@ class Mapper(Node):
     def on_idle(self) -> list[Preview | Reply] | None:
         replies: list[Preview | Reply] = list(self._replies())
         deadline = time.perf_counter() + _SLICE
-        if self._frozen or not self._piece(self._pace.fits):
+        if self._frozen or not self._piece():
             return replies or None
-        while time.perf_counter() < deadline and self._piece(self._pace.fits):
+        while time.perf_counter() < deadline and self._piece():
             pass
         self._keep()
         self._report()
         return [*replies, *self._preview()]
 
-    def _piece(self, splats: bool) -> bool:
+    def _piece(self) -> bool:
         """An iteration; of a live stream, where none is pending, a piece of what there was no time for."""
-        return self.atlas.step() or (self.config.realtime and self._last_captured > 0.0 and self.atlas.make_up(splats))
+        return self.atlas.step() or (self._live and self.atlas.make_up(self._pace.fits))
+
+    @property
+    def _live(self) -> bool:
+        return self.config.realtime and self._last_captured > 0.0
 
     def on_end(self) -> Iterator[SplatMap | Preview | Reply]:
         yield from self._replies(wait=True)
@@ -211,8 +215,8 @@ class Mapper(Node):
         self.atlas.finish()
         self._settle_last()
         self.stats.arrived("last keyframe to the map before its refinement", self._last_captured)
-        yield self._map(refined=False)
-        while not self._frozen and self._finishing():
+        yield splat_map(self.atlas.current.snapshot(), refined=False)
+        while not self._frozen and ((self.config.realtime and self.atlas.make_up()) or self.atlas.refine()):
             self._keep()
             if self.config.realtime:
                 yield from self._preview()
@@ -221,14 +225,10 @@ class Mapper(Node):
         if self._checkpoints is not None and len(self.atlas.current.state):
             self.stats.values["map_bytes"] = self._checkpoints.finish(self.atlas, source_camera(self.upstream))
         yield from self._preview(due=True)  # who watches is left with the map as it is now
-        yield self._map(refined=True)
+        yield splat_map(self.atlas.current.snapshot(), refined=True)
         if self._checkpoints is not None:
             self._checkpoints.close(self.atlas, keep=self.config.keep_map)
             self._checkpoints = None
-
-    def _finishing(self) -> bool:
-        """One piece of work after the stream; False when all are done."""
-        return (self.config.realtime and self.atlas.make_up()) or self.atlas.refine()
 
     def on_abort(self, reason: str) -> None:
         if self._checkpoints is not None:
@@ -313,9 +313,12 @@ class Mapper(Node):
             self._keep()
 
     def _settle_last(self) -> None:
-        """The stream has ended: the pending iterations; of a live one as many as its last frame may wait for."""
-        until = self._last_captured + LAST_SECONDS if self._last_captured else math.inf
-        while not self._frozen and time.time() < until and self._piece(splats=False):
+        """The stream has ended: the pending iterations; of a live one those that its last frame may wait for."""
+        start, until = time.time(), self._last_captured + LAST_SECONDS if self._last_captured else math.inf
+        while not self._frozen and (now := time.time()) < until:
+            rate = FINAL_RATE ** ((now - start) / (until - start))  # what the last images pulled at would show
+            if not (self.atlas.make_up(splats=False, rate=rate) if self._live else self.atlas.step()):
+                break
             self._keep()
 
     def _came(self, keyframe: FusedKeyframe | Keyframe) -> None:
@@ -355,9 +358,6 @@ class Mapper(Node):
         self.stats.values |= {"keyframe_psnr": found.psnr, "image_noise": found.noise}
         if found.warning:
             self.stats.warn(found.warning)
-
-    def _map(self, refined: bool) -> SplatMap:
-        return splat_map(self.atlas.current.snapshot(), refined)
 
     @property
     def _previewing(self) -> bool:

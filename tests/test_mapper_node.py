@@ -23,7 +23,7 @@ from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.mapping.preview import splats_by_keyframe
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
-from nodes.mapper import LAST_SECONDS, Mapper
+from nodes.mapper import Mapper
 from nodes.parameters import build
 from tests.support.mapper_messages import settings, view_message
 from tests.support.shared_data import ROOT
@@ -142,25 +142,6 @@ def test_without_refinement_both_maps_are_the_same() -> None:
     before, after = list(node.on_end())
     assert np.array_equal(before.means, after.means)
     assert before.iterations == after.iterations == 4
-
-
-def test_a_live_map_is_handed_out_soon_after_the_last_frame() -> None:
-    """However many iterations are left: as many of them as the refinement has are made up before it."""
-
-    def maps(age: float) -> tuple[Mapper, SplatMap, SplatMap]:
-        node = Mapper(replace(settings(iterations=100_000, refinement=2), realtime=True))
-        list(node.on_fused_keyframe(replace(view_message(0, 0.5), captured=time.time() - age)))
-        before, after = (message for message in node.on_end() if isinstance(message, SplatMap))
-        assert after.iterations == before.iterations + 2 + 2
-        assert node.stats.counts["iterations made up"] == 2
-        return node, before, after
-
-    began = time.monotonic()
-    node, before, _ = maps(age=0.5 * LAST_SECONDS)
-    assert time.monotonic() - began < 30.0
-    assert 0 < before.iterations < 100_000
-    assert node.stats.values["latency"]["keyframe to map"]["count"] == 1
-    assert maps(age=60.0)[1].iterations == 0
 
 
 def test_where_keyframes_wait_new_splats_get_larger_and_none_is_left_out() -> None:

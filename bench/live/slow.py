@@ -68,8 +68,8 @@ class SlowMapper(Mapper):
         self.atlas.step = slowed(self.atlas.step, self.config.factor)  # type: ignore[method-assign]
         made_up = self.atlas.make_up
         slowly = slowed(made_up, self.config.factor)
-        self.atlas.make_up = lambda splats=True: (  # type: ignore[method-assign]
-            made_up(splats) if self.atlas.stream_ended else slowly(splats)
+        self.atlas.make_up = lambda splats=True, rate=None: (  # type: ignore[method-assign]
+            made_up(splats, rate) if self.atlas.stream_ended else slowly(splats, rate)
         )
 
 

@@ -105,13 +105,13 @@ class Atlas:
             f"{lost}: the map shows the largest of {len(parts)} parts, {len(self.current.views)} of {total} keyframes"
         )
 
-    def make_up(self, splats: bool = True) -> bool:
+    def make_up(self, splats: bool = True, rate: float | None = None) -> bool:
         """A piece of what a live stream left no time for, as in `OnlineMapper`; False when nothing is left.
 
         After the stream as many iterations as the refinement has at most: one that was long would be waited for as
         long again.
         """
-        return self.current.make_up(self.current.config.refinement if self.stream_ended else None, splats)
+        return self.current.make_up(self.current.config.refinement if self.stream_ended else None, splats, rate)
 
     def refine(self) -> bool:
         """A piece of the final refinement, an iteration or a wait for one elsewhere; False when it is done.

@@ -30,6 +30,7 @@ from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.stats import Stats
 
 LATE = 30  # part of the refinement's iterations that a keyframe's late splats bring: 1 / LATE
+FINAL_RATE = 0.1  # of the learning rates, with which a map is handed out
 NONE_NOW = 3  # halvings of an image of which nothing worth a splat is left
 
 
@@ -185,12 +186,13 @@ class OnlineMapper:
         """The stream has ended: no keyframe waits for what is owed, it may take as many iterations as `refine` does."""
         self.schedule.beside = self.config.refinement
 
-    def make_up(self, limit: int | None = None, splats: bool = True) -> bool:
+    def make_up(self, limit: int | None = None, splats: bool = True, rate: float | None = None) -> bool:
         """A piece of what a live stream left no time for: the splats that a keyframe lacks, and when none does a
         canceled iteration, on any image. False when nothing is left.
 
         limit: iterations at most that are left, None: all, beside those that keyframes bring that get their splats so
-        late: a thirtieth of the refinement each; splats: whether they may get them.
+        late: a thirtieth of the refinement each; splats: whether they may get them; rate: factor on all learning rates
+        of an iteration that is still the stream's own, None: it is made up.
         """
         schedule, images = self.schedule, self.keyframes.trained
         schedule.spare()
@@ -205,9 +207,11 @@ class OnlineMapper:
         if not schedule.spared:
             return False
         schedule.spared -= 1
-        self.log.count("iterations made up")
+        self.log.count("iterations made up", rate is None)
         with self.log.time("optimization"):
+            self.trainer.rate = 1.0 if rate is None else rate
             self.trainer.step(self.chosen(images[schedule.next_of_all(len(images))]), self.median_depth)
+            self.trainer.rate = 1.0
         return True
 
     def _complete(self) -> None:
@@ -236,7 +240,7 @@ class OnlineMapper:
         if done == total // 6:
             self.trainer.prune(self.keyframes.with_image, self.median_depth)
         with self.log.time("refinement"):
-            self.trainer.rate = 0.1 ** (done / max(total, 1))
+            self.trainer.rate = FINAL_RATE ** (done / max(total, 1))
             view = self.keyframes.owed.first(self.config.iterations) if done % 2 else None
             if view is None:
                 images = self.keyframes.trained

@@ -1,0 +1,55 @@
+"""The mapper node at the end of a live stream: what is handed out before the refinement."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msgs import SplatMap
+from nodes.mapper import LAST_SECONDS, Mapper
+from tests.support.mapper_messages import settings, view_message
+
+
+def test_a_live_map_is_handed_out_soon_after_the_last_frame() -> None:
+    """However many iterations are left: as many of them as the refinement has are made up before it."""
+
+    def maps(age: float) -> tuple[Mapper, SplatMap, SplatMap]:
+        node = Mapper(replace(settings(iterations=100_000, refinement=2), realtime=True))
+        list(node.on_fused_keyframe(replace(view_message(0, 0.5), captured=time.time() - age)))
+        before, after = (message for message in node.on_end() if isinstance(message, SplatMap))
+        assert after.iterations == before.iterations + 2 + 2
+        assert node.stats.counts["iterations made up"] == 2
+        return node, before, after
+
+    began = time.monotonic()
+    node, before, _ = maps(age=0.5 * LAST_SECONDS)
+    assert time.monotonic() - began < 30.0
+    assert 0 < before.iterations < 100_000
+    assert node.stats.values["latency"]["keyframe to map"]["count"] == 1
+    assert maps(age=60.0)[1].iterations == 0
+
+
+def test_a_live_map_is_handed_out_at_falling_rates_and_goes_on_at_full_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At full rates it shows most what the last few images pulled at."""
+    node = Mapper(replace(settings(iterations=1000, refinement=3), realtime=True))
+    now = iter(np.linspace(100.0, 100.0 + LAST_SECONDS, 21))  # no clock that others' load could hold up
+    list(node.on_fused_keyframe(replace(view_message(0, 0.5), captured=100.0)))
+    trainer, rates = node.atlas.current.trainer, []
+    step = trainer.step
+
+    def noted(*given: Any, **more: Any) -> None:
+        rates.append(trainer.rate)
+        step(*given, **more)
+
+    monkeypatch.setattr(trainer, "step", noted)
+    monkeypatch.setattr("nodes.mapper.time.time", lambda: float(next(now, 1e9)))
+    before = next(m for m in node.on_end() if isinstance(m, SplatMap))
+    assert before.iterations == len(rates) > 5
+    assert rates == sorted(rates, reverse=True)
+    assert rates[0] > 0.8
+    assert rates[-1] < 0.2
+    assert trainer.rate == 1.0
