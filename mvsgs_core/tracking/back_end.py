@@ -10,6 +10,7 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
+from mvsgs_core.tracking.steps import Steps, whole
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,13 @@ class BackEnd:
 
     def work(self, segment: int) -> None:
         """A portion of the background work, if there is any: one step for each new keyframe."""
+        whole(self.working(segment))
+
+    def working(self, segment: int) -> Steps[None]:
+        """`work`: what is to be solved is set up in one step and solved in the other."""
         if self.pending > 0 and len(self.local_map.members(segment)) >= 3:
-            self.pending = 0 if self.step(segment).failure else self.pending - 1
+            solution = yield from self._adjusting(segment)
+            self.pending = 0 if solution.failure else self.pending - 1
 
     def extend_edges(self, index: int, segment: int) -> int:
         """Adds edges from one keyframe to those that see the same; returns how many were matched."""
@@ -86,16 +92,19 @@ class BackEnd:
 
     def step(self, segment: int) -> Solution:
         """One step of global bundle adjustment, of a large map around its newest keyframe: background work."""
+        return whole(self._adjusting(segment))
+
+    def _adjusting(self, segment: int) -> Steps[Solution]:
         members = self.local_map.members(segment)
         if len(members) > self.config.max_keyframes:
-            return self._step_around(members)
+            return (yield from self._adjusting_around(members))
         before = self._median_inverse_depth(members)
         solver = Solver(steps=1, robust_scale=1.0, lm=1e-5, threads=self.threads)
-        solution = self.graph.optimize(members, set(members[1:]), set(members), solver)
+        solution = yield from self.graph.optimizing(members, set(members[1:]), set(members), solver)
         self.graph.rescale(members, self._median_inverse_depth(members) / before)
         return solution
 
-    def _step_around(self, members: list[int]) -> Solution:
+    def _adjusting_around(self, members: list[int]) -> Steps[Solution]:
         """One step of the keyframes that the fewest edges lead to from the newest; those around them are held."""
         block, among = {members[-1]}, set(members)
         while True:
@@ -104,7 +113,7 @@ class BackEnd:
                 break
             block = around
         solver = Solver(steps=1, robust_scale=1.0, lm=1e-5, threads=self.threads)
-        return self.graph.optimize(around, block - {members[0]}, block, solver)
+        return (yield from self.graph.optimizing(around, block - {members[0]}, block, solver))
 
     def _blocks(self, members: list[int]) -> list[list[int]]:
         """All at once, or of a large map so many after another, each with half of those of the one before."""

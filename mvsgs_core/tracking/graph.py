@@ -12,6 +12,7 @@ from mvsgs_core.tracking.edges import Edge, Edges
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
 from mvsgs_core.tracking.keyframes import Keyframe, KeyframeTable
 from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.steps import Steps, whole
 
 # What resists a change of an inverse depth d in each step, as a fraction of 1 / d². It is no prior: drawn to the depths
 # that keyframes were given, whole maps bend (rotation against depth), by 5 % on the synthetic room.
@@ -121,9 +122,21 @@ class KeyframeGraph:
         free_focal: bool = False,
     ) -> Solution:
         """Bundle adjustment of a part of the graph, written back unless it failed."""
+        return whole(self.optimizing(indices, free_poses, free_depths, solver, free_focal))
+
+    def optimizing(
+        self,
+        indices: Iterable[int],
+        free_poses: set[int],
+        free_depths: set[int],
+        solver: Solver,
+        free_focal: bool = False,
+    ) -> Steps[Solution]:
+        """`optimize`: the problem is set up in one step and solved in the other, and then the graph changes."""
         order = sorted(indices)
         problem = self.problem(order, free_poses, free_depths)
         problem.free_focal = free_focal
+        yield
         solution = adjust(problem, replace(solver, device=self.device))
         if not solution.failure:
             self.intrinsics = self.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]

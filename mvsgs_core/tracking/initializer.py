@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvsgs_core.tracking.diagnosis import Diagnosis
-from mvsgs_core.tracking.estimation.focal import FocalConfig, reconstruct_with_unknown_focal
-from mvsgs_core.tracking.estimation.structure_from_motion import ReconstructionCriteria, reconstruct
+from mvsgs_core.tracking.estimation.focal import FocalConfig, reconstructing_with_unknown_focal
+from mvsgs_core.tracking.estimation.structure_from_motion import ReconstructionCriteria, reconstructing
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches, propagate
@@ -79,13 +79,19 @@ class Initializer:
 
         focal: how the graph's focal length is found too; None where it is known.
         """
+        return whole(self.initializing(forced, focal))
+
+    def initializing(self, forced: bool = False, focal: FocalConfig | None = None) -> Steps[bool]:
+        """`initialize`, a bundle adjustment a step."""
         if len(self.waiting) < (3 if forced else self.config.min_keyframes):
             return False
         criteria = self.config.forced if forced else self.config.criteria
         if focal is None:
-            start = reconstruct(self.graph, self.waiting, criteria, self.threads)
+            start = yield from reconstructing(self.graph, self.waiting, criteria, self.threads)
         else:
-            start = reconstruct_with_unknown_focal(self.graph, self.waiting, criteria, focal, self.threads)
+            start = yield from reconstructing_with_unknown_focal(
+                self.graph, self.waiting, criteria, focal, self.threads
+            )
         if start.failure:
             self.diagnosis.failed(start.failure)
             if len(self.waiting) >= self.config.max_keyframes:

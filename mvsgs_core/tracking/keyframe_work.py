@@ -62,7 +62,7 @@ class KeyframeWork:
         """What an inserted keyframe tells of the camera, of the whole map and of the light."""
         segment = self.graph.keyframes[index].segment
         if len(self.graph.keyframes) in REESTIMATED_AT:
-            self.calibration.estimate_readout_time(self.local_map.members(segment)[-12:])
+            yield from self.calibration.estimating_readout_time(self.local_map.members(segment)[-12:])
             yield
         self.calibration.refine(self.local_map.members(segment))
         yield
@@ -75,7 +75,7 @@ class KeyframeWork:
 
     def first(self, keyframes: list[int]) -> Steps[None]:
         """The same of a segment's first keyframes, once they are solved."""
-        self.calibration.estimate_readout_time(keyframes)
+        yield from self.calibration.estimating_readout_time(keyframes)
         yield
         self.local_map.adjust_window(keyframes[-1])
         yield
@@ -99,8 +99,8 @@ class KeyframeWork:
                 self.back_end.pending = self.config.back_end.steps
             if closure.joined is not None:
                 self.stats.count("segments joined")
-        with self.stats.time("background bundle adjustment"):
-            self.back_end.work(self.graph.keyframes[index].segment)
+        segment = self.graph.keyframes[index].segment
+        yield from timed(self.stats, "background bundle adjustment", self.back_end.working(segment))
         yield
 
     def _searching(self, index: int) -> Steps[Closure | None]:

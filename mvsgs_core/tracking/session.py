@@ -214,9 +214,7 @@ class Session:
         """One more keyframe to solve all from, which takes longer than a frame: this one has no pose as it comes."""
         yield from timed(self.stats, "start", self.initializer.adding(frame, self.segment, step.matches))
         waiting = list(self.initializer.waiting)
-        with self.stats.time("start"):
-            initialized = self.initializer.initialize(focal=self._unknown_focal())
-        if initialized:
+        if (yield from timed(self.stats, "start", self.initializer.initializing(focal=self._unknown_focal()))):
             return (yield from self._begin_tracking(waiting, record))
         place = self.relocalizer.relocalize(frame) if self.segment > 0 else None
         return Update(record.state) if place is None else self._resume(frame, record, place)

@@ -10,8 +10,9 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.estimation.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
 from mvsgs_core.tracking.estimation.radial import Radial, estimate_radial, lens_problem
-from mvsgs_core.tracking.estimation.rolling_shutter import estimate_readout_time
+from mvsgs_core.tracking.estimation.rolling_shutter import estimating_readout_time
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.steps import Steps, timed, whole
 
 BENT_LENS = "the lens bends, and the focal length makes up for it"
 UNKNOWN_LENS = "these images hardly tell a focal length from a lens that bends"
@@ -102,11 +103,15 @@ class Calibration:
 
     def estimate_readout_time(self, members: list[int]) -> None:
         """Of a rolling shutter, from these keyframes."""
+        whole(self.estimating_readout_time(members))
+
+    def estimating_readout_time(self, members: list[int]) -> Steps[None]:
+        """`estimate_readout_time`, a time that is tried a step."""
         if self.readout_time is not None:
             return
         self.rolled |= self.graph.readout_time > 0.0
-        with self.stats.time("rolling shutter"):
-            self.graph.readout_time = estimate_readout_time(self.graph, members, self.threads)
+        estimating = estimating_readout_time(self.graph, members, self.threads)
+        self.graph.readout_time = yield from timed(self.stats, "rolling shutter", estimating)
         self.stats.values["readout_time"] = self.graph.readout_time
         self.stats.values["rolling shutter"] = f"{1e3 * self.graph.readout_time:.1f} ms"
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.estimation.radial import TOGETHER
-from mvsgs_core.tracking.estimation.structure_from_motion import Reconstruction, ReconstructionCriteria, reconstruct
+from mvsgs_core.tracking.estimation.structure_from_motion import Reconstruction, ReconstructionCriteria, reconstructing
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.steps import Steps
 
 PARTS = 3  # of the keyframes, in their order, each of which is asked alone ...
 MIN_KEYFRAMES = 4  # ... where it has so many
@@ -32,17 +33,20 @@ class FocalConfig:
     drift: float = 0.01  # fraction by which the whole stream may contradict what was used, beyond its own uncertainty
 
 
-def reconstruct_with_unknown_focal(
+def reconstructing_with_unknown_focal(
     graph: KeyframeGraph, order: list[int], criteria: ReconstructionCriteria, config: FocalConfig, threads: int
-) -> Reconstruction:
-    """`reconstruct` from several focal lengths, each then free; the lowest cost wins and is written to the graph."""
+) -> Steps[Reconstruction]:
+    """`reconstruct` from several focal lengths, each then free; the lowest cost wins and is written to the graph.
+
+    In steps, between which the graph has the focal length that it had.
+    """
     guess = graph.intrinsics
     criteria = replace(criteria, certain_cost=0.0)  # with a free focal length, a wrong start can be cheap too
     best: tuple[Reconstruction, np.ndarray] | None = None
     failed: Reconstruction | None = None
     for factor in config.factors:
-        graph.intrinsics = guess * [factor, factor, 1.0, 1.0]
-        start = reconstruct(graph, order, criteria, threads, free_focal=True)
+        tried = guess * [factor, factor, 1.0, 1.0]
+        start = yield from _with_intrinsics(graph, tried, reconstructing(graph, order, criteria, threads, True))
         if not start.failure and not config.bounds[0] < factor * start.focal_factor < config.bounds[1]:
             start = replace(
                 start, failure=f"no focal length in a sensible range: {factor * start.focal_factor:.2f} times the guess"
@@ -50,13 +54,29 @@ def reconstruct_with_unknown_focal(
         if start.failure:
             failed = failed or start
         elif best is None or start.cost < best[0].cost:
-            best = start, graph.intrinsics * [start.focal_factor, start.focal_factor, 1.0, 1.0]
-    graph.intrinsics = guess
+            best = start, tried * [start.focal_factor, start.focal_factor, 1.0, 1.0]
     if best is None:
         assert failed is not None
         return failed
     graph.intrinsics = best[1]
     return best[0]
+
+
+def _with_intrinsics(
+    graph: KeyframeGraph, intrinsics: np.ndarray, steps: Steps[Reconstruction]
+) -> Steps[Reconstruction]:
+    """The same steps, each with other intrinsics (4,) of the graph."""
+    before = graph.intrinsics
+    while True:
+        graph.intrinsics = intrinsics
+        try:
+            next(steps)
+        except StopIteration as end:
+            found: Reconstruction = end.value
+            return found
+        finally:
+            graph.intrinsics = before
+        yield
 
 
 def refine_focal(graph: KeyframeGraph, members: list[int], threads: int) -> str:
@@ -123,7 +143,7 @@ __all__ = [
     "FocalConfig",
     "focal_of_all",
     "observability",
-    "reconstruct_with_unknown_focal",
+    "reconstructing_with_unknown_focal",
     "refine_focal",
     "uncertainty",
 ]

@@ -20,6 +20,7 @@ from mvsgs_core.camera import MAX_READOUT_TIME
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.steps import Steps, whole
 
 MAX_ESTIMATED = 0.035  # seconds: most cameras need less than a frame at 30 a second
 MIN_POINTS = 50  # whose depth is known: from fewer the camera's velocity is not
@@ -32,19 +33,25 @@ def estimate_readout_time(graph: KeyframeGraph, indices: Iterable[int], threads:
 
     The graph's own readout time where nothing can be said: an adjustment failed, or the cost has no least.
     """
+    return whole(estimating_readout_time(graph, indices, threads))
+
+
+def estimating_readout_time(graph: KeyframeGraph, indices: Iterable[int], threads: int) -> Steps[float]:
+    """`estimate_readout_time`, a time that is tried a step; the graph is as it was between them, too."""
     order = sorted(indices)
     tried = np.linspace(0.0, MAX_ESTIMATED, 4)
     before, costs = graph.readout_time, []
-    try:
-        for readout_time in tried:
-            graph.readout_time = float(readout_time)
+    for readout_time in tried:
+        graph.readout_time = float(readout_time)
+        try:
             problem = graph.problem(order, set(order[1:]), set(order))
-            solution = adjust(problem, Solver(steps=3, robust_scale=1.0, tolerance=0.0, threads=threads))
-            if solution.failure:
-                return before
-            costs.append(solution.cost)
-    finally:
-        graph.readout_time = before
+        finally:
+            graph.readout_time = before
+        solution = adjust(problem, Solver(steps=3, robust_scale=1.0, tolerance=0.0, threads=threads))
+        if solution.failure:
+            return before
+        costs.append(solution.cost)
+        yield
     bend, slope, level = np.polyfit(tried, costs, 2)
     if bend <= 0.0:
         return before
@@ -125,6 +132,7 @@ __all__ = [
     "camera_velocity",
     "check_readout_time",
     "estimate_readout_time",
+    "estimating_readout_time",
     "rectified",
     "rectified_mask",
 ]

@@ -15,6 +15,7 @@ from mvsgs_core import geometry
 from mvsgs_core.camera import matrix
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.steps import Steps, whole
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,18 @@ def reconstruct(
     graph: KeyframeGraph, order: list[int], criteria: ReconstructionCriteria, threads: int, free_focal: bool = False
 ) -> Reconstruction:
     """Solves keyframes `order` of the graph, without changing it. free_focal: the focal length is unknown too."""
+    return whole(reconstructing(graph, order, criteria, threads, free_focal))
+
+
+def reconstructing(
+    graph: KeyframeGraph, order: list[int], criteria: ReconstructionCriteria, threads: int, free_focal: bool = False
+) -> Steps[Reconstruction]:
+    """`reconstruct`, a bundle adjustment a step."""
     everything = set(order)
     problem = graph.problem(order, everything - {order[0]}, everything)
     k, m = problem.inverse_depth.shape
     none = Reconstruction(problem.cam_from_world, np.ones((k, m)), np.zeros((k, m)), np.inf, "")
-    turned = _rotation_error(problem, threads, free_focal)
+    turned = yield from _rotation_error(problem, threads, free_focal)
     if turned < criteria.min_turn_error:
         reason = (
             f"no parallax: a camera that only turned explains the matches to {turned:.1f} pixels, "
@@ -57,7 +65,8 @@ def reconstruct(
         return replace(none, failure=reason)
     starts = [np.tile(np.eye(4), (k, 1, 1)), *_essential_starts(graph, order)]
     matched = float(np.sum(_matched(problem)))
-    best = _best_of(problem, starts, criteria.certain_cost * matched, threads, free_focal)
+    yield
+    best = yield from _best_of(problem, starts, criteria.certain_cost * matched, threads, free_focal)
     if best is None:
         return replace(none, failure="no start could be solved: every bundle adjustment failed")
     poses, depths = best.cam_from_world, best.inverse_depth
@@ -86,7 +95,7 @@ def reconstruct(
 
 def _best_of(
     problem: Graph, starts: list[np.ndarray], certain_cost: float, threads: int, free_focal: bool
-) -> Solution | None:
+) -> Steps[Solution | None]:
     """The solution of lowest cost from several poses (K, 4, 4) and unit depths; the first that is certain ends it."""
     best: Solution | None = None
     ones = np.ones_like(problem.inverse_depth)
@@ -97,6 +106,7 @@ def _best_of(
             last = free_focal and scale == 1.0
             solver = Solver(steps=2 * steps if last else steps, robust_scale=scale, lm=1e-3, threads=threads)
             attempt = adjust(replace(current, prior_weight=held, free_focal=last), solver)
+            yield
             if attempt.failure:
                 break
             current = replace(current, cam_from_world=attempt.cam_from_world, inverse_depth=attempt.inverse_depth)
@@ -107,7 +117,7 @@ def _best_of(
     return best
 
 
-def _rotation_error(problem: Graph, threads: int, free_focal: bool) -> float:
+def _rotation_error(problem: Graph, threads: int, free_focal: bool) -> Steps[float]:
     """Pixels by which the best rotations miss the matches: the largest median over the edges."""
     k, m = problem.inverse_depth.shape
     far = replace(
@@ -123,6 +133,7 @@ def _rotation_error(problem: Graph, threads: int, free_focal: bool) -> float:
             return np.inf
         intrinsics = far.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]
         far = replace(far, cam_from_world=solution.cam_from_world, intrinsics=intrinsics)
+        yield
     pixels, z = reproject(far.cam_from_world, far.inverse_depth, far.pixels, far.intrinsics, far.source, far.to)
     return _largest_median(np.linalg.norm(pixels - far.target, axis=1), _matched(far) & (z > 0.05))
 
@@ -176,4 +187,4 @@ def _essential_starts(graph: KeyframeGraph, order: list[int]) -> list[np.ndarray
     return starts
 
 
-__all__ = ["Reconstruction", "ReconstructionCriteria", "reconstruct"]
+__all__ = ["Reconstruction", "ReconstructionCriteria", "reconstruct", "reconstructing"]

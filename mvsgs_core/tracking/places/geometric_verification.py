@@ -20,6 +20,7 @@ from mvsgs_core.tracking.matching.flow import Matches, propagate
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.places.localization import Localization, localize
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
+from mvsgs_core.tracking.steps import Steps, whole
 
 
 @dataclass(frozen=True)
@@ -35,15 +36,24 @@ def verify_place(
     graph: KeyframeGraph, matcher: Matcher, index: int, image: TrackingImage, criteria: PoseCriteria
 ) -> PlaceMatch | None:
     """None where the keyframe's points are not found or no pose explains them."""
+    return whole(verifying_place(graph, matcher, index, image, criteria))
+
+
+def verifying_place(
+    graph: KeyframeGraph, matcher: Matcher, index: int, image: TrackingImage, criteria: PoseCriteria
+) -> Steps[PlaceMatch | None]:
+    """`verify_place`: features, matches and pose, a step each."""
     keyframe = graph.keyframes[index]
     from_keyframe, in_image = match_features(keyframe.image, image, threshold=1.5)
     if len(from_keyframe) < 15:
         return None
+    yield
     guess = propagate(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * image.size[1])
     matches, fraction = matcher.match(keyframe.image, image, guess, 0.0)
     known = matches.alive & keyframe.triangulated
     if fraction < criteria.min_fraction or known.sum() < criteria.min_matches:
         return None
+    yield
     u, v = keyframe.points[known].T.astype(np.float64)
     fx, fy, cx, cy = graph.intrinsics
     depth = 1.0 / keyframe.inverse_depth[known]
@@ -90,4 +100,4 @@ def relative_scale(graph: KeyframeGraph, place: PlaceMatch, index: int) -> float
     return float(np.median(ratio))
 
 
-__all__ = ["PlaceMatch", "relative_scale", "verify_place"]
+__all__ = ["PlaceMatch", "relative_scale", "verify_place", "verifying_place"]

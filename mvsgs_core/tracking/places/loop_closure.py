@@ -11,7 +11,7 @@ from mvsgs_core import geometry
 from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
-from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, relative_scale, verify_place
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, relative_scale, verifying_place
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 from mvsgs_core.tracking.places.retrieval import Retrieval
 from mvsgs_core.tracking.places.thinning import solve_thinned
@@ -56,7 +56,7 @@ class LoopCloser:
         return whole(self.searching(index))
 
     def searching(self, index: int) -> Steps[Closure | None]:
-        """`search`, a candidate a step."""
+        """`search`, a part of a candidate's verification a step."""
         keyframe = self.graph.keyframes[index]
         order = self.local_map.members(keyframe.segment)
         place = order.index(index)
@@ -65,8 +65,12 @@ class LoopCloser:
         descriptors = keyframe.image.features()[1]
         yield
         usual = set(order[max(0, place - 2) : place])
-        for candidate in self.retrieval.query(descriptors, self.config.max_candidates, near, usual):
-            found = verify_place(self.graph, self.local_map.matcher, candidate, keyframe.image, self.config.criteria)
+        candidates = self.retrieval.query(descriptors, self.config.max_candidates, near, usual)
+        yield
+        for candidate in candidates:
+            found = yield from verifying_place(
+                self.graph, self.local_map.matcher, candidate, keyframe.image, self.config.criteria
+            )
             yield
             if found is None:
                 continue
