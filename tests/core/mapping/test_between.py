@@ -59,7 +59,7 @@ def test_it_stands_where_it_was_seen_and_goes_with_its_keyframe() -> None:
     np.testing.assert_allclose(found.refined_from_cam, mapper.frame.local(pose_on_arc(3 / 8)), atol=1e-12)
     moved = geometry.se3_exp(np.array([0.1, 0.2, -0.1, 0.05, 0.1, 0.0])) @ pose_on_arc(2 / 8)
     atlas.correct(np.array([2]), moved[None], np.array([1.5]))
-    mapper._chosen(found)
+    mapper.chosen(found)
     relative = geometry.inverse(pose_on_arc(2 / 8)) @ pose_on_arc(3 / 8)
     relative[:3, 3] *= 1.5
     np.testing.assert_allclose(found.refined_from_cam, mapper.frame.local(moved @ relative), atol=1e-12)
@@ -67,7 +67,7 @@ def test_it_stands_where_it_was_seen_and_goes_with_its_keyframe() -> None:
     keyframe = mapper.keyframes.of(2)
     assert keyframe is not None
     keyframe.pose_delta = step  # what the map makes of the keyframe's pose
-    mapper._chosen(found)
+    mapper.chosen(found)
     relative[:3, 3] /= mapper.frame.length
     np.testing.assert_allclose(found.refined_from_cam, keyframe.refined_from_cam @ relative, atol=1e-12)
 
@@ -85,7 +85,7 @@ def test_its_light_is_its_keyframes_and_what_changed_since() -> None:
     np.testing.assert_allclose(dark.measured[:, :3], expected, rtol=1e-6)
     assert plain.measured is None  # as its keyframe's
     atlas.correct(np.array([2]), pose_on_arc(2 / 8)[None], np.ones(1), None, gain(1.3)[None])
-    atlas.current._chosen(dark)
+    atlas.current.chosen(dark)
     np.testing.assert_allclose(dark.measured[:, :3], gain(1.1)[:, :3] @ gain(1.3)[:, :3], rtol=1e-6)
 
 

@@ -153,7 +153,7 @@ def test_a_frame_between_keyframes_is_rendered_as_its_shutter_saw_it() -> None:
     np.testing.assert_allclose(view.readout, expected)
     mapper.correct(np.array([0]), keyframe.world_from_cam[None], np.array([3.0]))
     mapper.move(np.array([7]), np.ones((1, 6)), 0.03)
-    mapper._chosen(view)
+    mapper.chosen(view)
     np.testing.assert_allclose(view.readout, 1.5 * expected * np.repeat([3.0, 1.0], 3))
 
 
