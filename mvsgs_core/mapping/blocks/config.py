@@ -16,7 +16,7 @@ class RefineConfig:
     by: Literal["here", "ray"] = "here"  # this process, one block after the other; ray: a cluster's workers, one each
     keyframes: int = 2000  # in a block: a map with more is refined in as many as that takes
     blocks: int | None = None  # so many; null: by `keyframes`, on a cluster at least one a machine
-    overlap: float = 0.1  # part of what a keyframe sees in another block from which on it is trained on there, too
+    overlap: float = 0.0  # part of what a keyframe sees in another block from which on it is trained on there, too
     address: str = "127.0.0.1:6379"  # of the Ray cluster, as `ray start --head` says; no other one is looked for
 
     def __post_init__(self) -> None:
