@@ -14,13 +14,13 @@ class RefineConfig:
     """Who does the final refinement, and in how many parts of the map."""
 
     by: Literal["here", "ray"] = "here"  # this process, one block after the other; ray: a cluster's workers, one each
-    keyframes: int = 2000  # in a block: a map with more is refined in as many as that takes
+    keyframes: int | None = None  # in a block: a map with more is refined in as many as that takes; null: any number
     blocks: int | None = None  # so many; null: by `keyframes`, on a cluster at least one a machine
     overlap: float = 0.0  # part of what a keyframe sees in another block from which on it is trained on there, too
     address: str = "127.0.0.1:6379"  # of the Ray cluster, as `ray start --head` says; no other one is looked for
 
     def __post_init__(self) -> None:
-        if self.keyframes < 1 or (self.blocks is not None and self.blocks < 1):
+        if any(count is not None and count < 1 for count in (self.keyframes, self.blocks)):
             raise ValueError("keyframes and blocks must be at least 1")
         if not 0.0 <= self.overlap <= 1.0:
             raise ValueError(f"overlap={self.overlap}: must be from 0 to 1")

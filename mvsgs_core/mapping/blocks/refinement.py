@@ -14,7 +14,7 @@ WORTH = 1.5  # times the iterations of the whole map that blocks of it may take 
 
 def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[None] | None:
     """`total` iterations over the map, a piece at a time; the map changes when all are done. None: the map is to be
-    refined whole, as it is small and no cluster is named."""
+    refined whole, as it is small, or neither blocks nor a cluster are asked for."""
     config = mapper.config.refine
     if not mapper.views or not len(mapper.state):
         return None
@@ -30,8 +30,8 @@ def refined_in_blocks(mapper: OnlineMapper, total: int) -> Iterator[None] | None
 
 
 def _blocks(mapper: OnlineMapper, machines: int = 1) -> int:
-    config = mapper.config.refine
-    return config.blocks or max(machines, -(-len(mapper.views) // config.keyframes))
+    config, keyframes = mapper.config.refine, len(mapper.views)
+    return config.blocks or max(machines, -(-keyframes // (config.keyframes or keyframes)))
 
 
 def _here(
