@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ import zmq
 
 from msgs import End, Frame
 from nodes.runtime.transport import NewestReader, Publisher, ReliableReader
+from nodes.runtime.transport.sockets import readable
 from tests.support.launches import Launch
 from tests.support.patience import Stopwatch, until
 
@@ -57,6 +58,17 @@ def strangers(ports: list[int]) -> Iterator[list[zmq.Socket[bytes]]]:
         finally:
             for stranger in sockets:
                 stranger.close()
+
+
+def hear(publisher: Publisher) -> None:
+    """Time for what was said to arrive at its socket, none of which it reads."""
+    for _ in range(20):
+        readable(publisher.socket)
+        time.sleep(0.01)
+
+
+def reader_of(address: str, opened: ExitStack) -> ReliableReader:
+    return opened.enter_context(closing(ReliableReader(address, Frame, token=TOKEN)))
 
 
 def test_strangers_are_no_readers_get_nothing_and_end_nothing() -> None:
@@ -135,3 +147,52 @@ def test_a_run_over_tcp_is_not_held_up_or_ended_by_strangers(tmp_path: Path, lea
         code, out, err = run.finish()
         assert code == 0, out + err
         assert watch.within(40.0)
+
+
+def test_a_strangers_message_neither_hides_a_reader_nor_serves_the_stranger() -> None:
+    """ZeroMQ takes the next ones who speak for the sender of what it reads then."""
+    address = f"tcp://127.0.0.1:{free_port(1)}"
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.XSUB) as stranger,
+        closing(Publisher(address, token=TOKEN)) as publisher,
+        ExitStack() as opened,
+    ):
+        stranger.linger = 0
+        stranger.connect(address)
+        for _ in range(3):
+            stranger.send(b"a message")
+        until(lambda: readable(publisher.socket))
+        readers = [reader_of(address, opened)]
+        hear(publisher)
+        stranger.send(b"\x01a topic")
+        hear(publisher)
+        readers.append(reader_of(address, opened))
+        hear(publisher)
+        until(lambda: ([reader.watch() for reader in readers], publisher.ready(2))[1])
+        publisher.start()
+        publisher.send(Frame(3, 0.1, np.zeros((4, 6, 3), np.uint8), np.ones(4)))
+        until(lambda: readers[0].take() is not None)
+        until(lambda: readers[1].take() is not None)
+        assert stranger.poll(200) == 0
+        publisher.end(End())
+        until(lambda: isinstance(readers[0].take(), End))
+        until(lambda: isinstance(readers[1].take(), End))
+        until(publisher.gone)
+
+
+def test_a_reader_that_says_so_again_is_one_reader(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nodes.runtime.transport.readers.FIRST_REPEAT", 0.0)
+    address = f"tcp://127.0.0.1:{free_port(1)}"
+    with closing(Publisher(address, token=TOKEN)) as publisher, ExitStack() as opened:
+        readers = [reader_of(address, opened) for _ in range(2)]
+        until(lambda: ([reader.watch() for reader in readers], len(readers[0]._said) == 3)[1])
+        until(lambda: publisher.ready(2))
+        hear(publisher)
+        publisher.watch()
+        assert publisher.readers.total() == 2
+        publisher.start()
+        publisher.end(End())
+        until(lambda: isinstance(readers[0].take(), End))
+        until(lambda: isinstance(readers[1].take(), End))
+        until(publisher.gone)

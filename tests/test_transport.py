@@ -20,7 +20,6 @@ from msgs.codec import NEWEST, CodecError, encode
 from nodes.runtime.addresses import IPC_PATH_BYTES, PeerLost, TransportError, check_address, load_keys
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.transport import NewestReader, Publisher, ReliableReader, create_keys
-from nodes.runtime.transport.sockets import readable
 from tests.support.patience import LONG, until
 
 
@@ -173,59 +172,6 @@ def test_a_publisher_survives_whoever_knocks(opened: Callable) -> None:
     until(lambda: (reader.watch(), publisher.ready(1))[1])
     publisher.send(frame(3))
     until(lambda: reader.take() is not None)
-
-
-@pytest.mark.slow
-def test_a_strangers_message_neither_hides_a_reader_nor_serves_the_stranger(opened: Callable) -> None:
-    """ZeroMQ takes the next ones who speak for the sender of what it reads then."""
-    address = tcp_address()
-    publisher = opened(Publisher(address, token="secret"))
-    with zmq.Context() as context, context.socket(zmq.XSUB) as stranger:
-        stranger.linger = 0
-        stranger.connect(address)
-        for _ in range(3):
-            stranger.send(b"a message")
-        until(lambda: readable(publisher.socket))
-        readers = [opened(ReliableReader(address, Frame, token="secret"))]
-        hear(publisher)
-        stranger.send(b"\x01a topic")
-        hear(publisher)
-        readers.append(opened(ReliableReader(address, Frame, token="secret")))
-        hear(publisher)
-        until(lambda: ([reader.watch() for reader in readers], publisher.ready(2))[1])
-        publisher.start()
-        publisher.send(frame(3))
-        until(lambda: readers[0].take() is not None)
-        until(lambda: readers[1].take() is not None)
-        assert stranger.poll(200) == 0
-        publisher.end(End())
-        until(lambda: isinstance(readers[0].take(), End))
-        until(lambda: isinstance(readers[1].take(), End))
-        until(publisher.gone)
-
-
-def test_a_reader_that_says_so_again_is_one_reader(opened: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nodes.runtime.transport.readers.FIRST_REPEAT", 0.0)
-    address = tcp_address()
-    publisher = opened(Publisher(address, token="secret"))
-    readers = [opened(ReliableReader(address, Frame, token="secret")) for _ in range(2)]
-    until(lambda: ([reader.watch() for reader in readers], len(readers[0]._said) == 3)[1])
-    until(lambda: publisher.ready(2))
-    hear(publisher)
-    publisher.watch()
-    assert publisher.readers.total() == 2
-    publisher.start()
-    publisher.end(End())
-    until(lambda: isinstance(readers[0].take(), End))
-    until(lambda: isinstance(readers[1].take(), End))
-    until(publisher.gone)
-
-
-def hear(publisher: Publisher) -> None:
-    """Time for what was said to arrive at its socket, none of which it reads."""
-    for _ in range(20):
-        readable(publisher.socket)
-        time.sleep(0.01)
 
 
 def test_a_reader_refuses_a_message_length_beyond_the_limit(opened: Callable) -> None:
