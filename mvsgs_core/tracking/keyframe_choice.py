@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.front_end import Step
 
+DOUBT = 0.5  # of the flow that makes a keyframe: where few matches agree with the pose, so much is enough
 LATE_FLOW = 2.0  # of the flow that makes a keyframe: the next frame may have moved by so much, and not further
 LATE_FRACTION = 0.8  # of the fraction of points below which a keyframe is made: the next frame must still find so many
 LAST = 0.25  # of the flow that makes a keyframe: what is enough at the end of the stream
@@ -23,6 +24,9 @@ HELD_OUT = "keyframes that were to be held out"
 class KeyframeChoiceConfig:
     max_flow: float = 0.05  # of the width: a larger median flow since the last keyframe makes another
     min_fraction: float = 0.5  # of the textured points: fewer found make a keyframe
+    # of the matches, within 2 pixels of one pose: fewer make a keyframe after half the flow, well before the frame is
+    # lost (front_end.lost_inliers). Beside what is near the camera, points are found to the end and agree no more.
+    min_inliers: float = 0.75
 
 
 class KeyframeChoice:
@@ -34,7 +38,10 @@ class KeyframeChoice:
 
     def moved(self, step: Step, width: int, limit: float) -> bool:
         """Whether the image has changed enough since the reference. limit: largest flow, as a fraction of the width."""
-        return step.flow > limit * width or step.fraction < self.config.min_fraction
+        if step.flow > limit * width or step.fraction < self.config.min_fraction:
+            return True
+        doubted = step.localization is not None and step.localization.inliers < self.config.min_inliers
+        return doubted and step.flow > DOUBT * limit * width
 
     def saw(self, step: Step) -> None:
         """A frame that becomes no keyframe, however much it moved."""

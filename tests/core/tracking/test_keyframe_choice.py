@@ -11,6 +11,7 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, KeyframeChoiceConfig, newest
 from mvsgs_core.tracking.matching.flow import Matches
+from mvsgs_core.tracking.places.localization import Localization
 from tests.support.sequences import synthetic, track, tracked_room
 
 WIDTH, LIMIT = 320, 0.05  # a keyframe after 16 pixels
@@ -43,6 +44,13 @@ def test_the_newest_frame_that_is_not_held_out_ends_the_stream() -> None:
     assert newest([18, 19]) == 19
     assert newest([19, 20]) == 19
     assert newest([20]) == 20
+
+
+def test_few_matches_that_agree_with_the_pose_make_a_keyframe_after_half_the_flow() -> None:
+    choice = KeyframeChoice(KeyframeChoiceConfig())
+    for flow, inliers, wanted in ((9.0, 0.7, True), (7.0, 0.7, False), (9.0, 0.8, False), (17.0, 0.8, True)):
+        seen = replace(step(flow), localization=Localization(np.eye(4), inliers))
+        assert choice.moved(seen, WIDTH, LIMIT) == wanted
 
 
 @pytest.mark.slow
