@@ -41,7 +41,7 @@ def test_parameters_are_the_choice_files_then_the_command_lines_then_the_default
     slot = fake("relay.stride=7", "relay.gain=2").slots["relay"]
     assert slot.config == {
         "stride": 7, "gain": 2.0, "fail_at": None, "kill_at": None, "hang_at": None, "seconds": 0.0,
-        "long_at": None, "long": 0.0, "how": "asleep", "says": None, "nothing": None,
+        "long_at": None, "long": 0.0, "tell_at": None, "how": "asleep", "says": None, "nothing": None,
     }  # fmt: skip
     assert isinstance(slot.config["gain"], float)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import replace
 
 import numpy as np
@@ -128,7 +129,12 @@ def test_keyframes_sent_before_the_readout_time_was_known_get_it_with_their_next
 def test_a_readout_time_that_falls_to_zero_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses are then those of a camera without a rolling shutter, and the map has to render like that."""
     found = [0.5 / FPS]
-    monkeypatch.setattr(calibration, "estimate_readout_time", lambda graph, indices, threads: found[-1])
+
+    def estimating(graph: object, indices: object, threads: int) -> Generator[None, None, float]:
+        yield
+        return found[-1]
+
+    monkeypatch.setattr(calibration, "estimating_readout_time", estimating)
     frames, _ = rolling_messages(24)
     node = Tracker()
     early: list[msgs.Message] = [m for frame in frames for m in node.on_frame(frame)]

@@ -187,7 +187,7 @@ def photometric_loss(inputs: LossInputs, weights: dict[str, float]) -> Tensor:
 
 def only_photometric(weights: dict[str, float]) -> bool:
     """Whether the loss is L1 and SSIM alone, which `photograph_loss` makes of the photograph at once."""
-    return len(TERMS) == 1 and not SPLAT_TERMS and weights["frequency"] == 0.0
+    return TERMS[0] is photometric_loss and len(TERMS) == 1 and not SPLAT_TERMS and weights["frequency"] == 0.0
 
 
 # Each gives its part of the sum, weighted: a scalar; None where its weight is 0. The first is never None.

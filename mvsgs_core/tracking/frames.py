@@ -28,7 +28,7 @@ class FrameRecord:
     state: TrackingState
     reference: int | None = None  # keyframe that the frame's pose was found against; None: no pose, or as `same_as`
     points: bytes = b""  # of its matches, see sample.py
-    cam_from_reference: bytes = b""  # (4, 4) float64: where the search for the pose begins
+    cam_from_reference: bytes = b""  # (3, 4) float64: where the search for the pose begins
     after: int | None = None  # keyframe after the frame that it was matched with, too
     points_after: bytes = b""
     same_as: int | None = None  # frame that this one did not move against
@@ -66,7 +66,7 @@ class FrameRecord:
         assert self.reference is not None
         self.points = sample(graph, self.reference, matches, cam_from_world)
         relative = cam_from_world @ graph.world_from_cam(self.reference)
-        self.cam_from_reference = relative.tobytes()
+        self.cam_from_reference = relative[:3].tobytes()
 
 
 def followed_pose(record: FrameRecord, graph: KeyframeGraph, solver: Solver) -> np.ndarray | None:
@@ -77,13 +77,17 @@ def followed_pose(record: FrameRecord, graph: KeyframeGraph, solver: Solver) -> 
     if record.reference is None or record.reference not in graph.keyframes:
         return None
     reference = graph.keyframes[record.reference]
-    relative = np.frombuffer(record.cam_from_reference).reshape(4, 4)
+    relative = _relative(record)
     cells = len(reference.inverse_depth)
     matches = {record.reference: restored(record.points, cells)}
     if record.after is not None and record.after in graph.keyframes:
         matches[record.after] = restored(record.points_after, cells)
     found = localize_by(graph, matches, relative @ reference.cam_from_world, solver)
     return None if found.failure or found.inliers < AGREEMENT else geometry.inverse(found.cam_from_world)
+
+
+def _relative(record: FrameRecord) -> np.ndarray:
+    return np.vstack([np.frombuffer(record.cam_from_reference).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
 
 
 def seen_pose(records: list[FrameRecord], k: int, graph: KeyframeGraph) -> tuple[np.ndarray, int] | None:
@@ -99,7 +103,7 @@ def seen_pose(records: list[FrameRecord], k: int, graph: KeyframeGraph) -> tuple
         return graph.world_from_cam(record.index), own.segment
     if record.reference is None or record.reference not in graph.keyframes:
         return None
-    relative = np.frombuffer(record.cam_from_reference).reshape(4, 4)
+    relative = _relative(record)
     segment = graph.keyframes[record.reference].segment
     return graph.world_from_cam(record.reference) @ geometry.inverse(relative), segment
 
