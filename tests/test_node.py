@@ -168,8 +168,8 @@ def test_sigterm_stops_a_node_that_waits_for_others(busy: dict[str, dict[str, fl
         waits = "join" if "left" in busy else "left"
         g.processes["left"].wait_for(lambda status: sum(status.get("in", {}).values()) >= 1)
         if waits == "left":
-            g.processes["left"].wait_for(lambda status: status.get("doing") == "held back")
-            assert g.processes["left"].last["topic"] == "left.Keyframe"
+            left = g.processes["left"]
+            until(lambda: (left.last.get("doing"), left.last.get("topic")) == ("held back", "left.Keyframe"))
         watch = Stopwatch()
         g.processes[waits].popen.send_signal(signal.SIGTERM)
         assert g.processes[waits].popen.wait(LONG) == 128 + signal.SIGTERM
@@ -256,8 +256,7 @@ def test_an_observer_that_is_killed_takes_nobody_along() -> None:
         source = g.start("source", f"{here}.Source", {}, {}, {"count": 2000, "delay": 0.002}, outputs=[frames])
         watcher.wait_for(lambda status: sum(status.get("in", {}).values()) > 3)
         watcher.popen.send_signal(signal.SIGSTOP)
-        source.wait_for(lambda status: status.get("doing") == "held back")
-        assert source.last["topic"] == "source.Frame"
+        until(lambda: (source.last.get("doing"), source.last.get("topic")) == ("held back", "source.Frame"))
         watcher.popen.kill()
         assert g.wait() == {"left": 0, "watcher": -signal.SIGKILL, "source": 0}
         assert g.processes["left"].last["in"] == {"source.Frame": 2000}

@@ -271,7 +271,7 @@ class _Process:
         inbox.watch(POLL)
 
     def _held_back(self, topic: str) -> None:
-        self._step.doing, self._step.topic = "held back", topic
+        self._step.topic, self._step.doing = topic, "held back"  # in this order: another thread reads them
         self._signals.check()
 
     def _seed(self) -> None:
