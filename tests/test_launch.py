@@ -138,7 +138,7 @@ def test_the_first_ctrl_c_ends_the_stream_and_finishes_the_run(launch: type[Laun
     assert sent > 5
 
 
-@pytest.mark.parametrize("delay", [0.0, 1.0])
+@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
 def test_a_second_ctrl_c_stops_everything(launch: type[Launch], delay: float) -> None:
     run = launch("source.count=100", "relay.seconds=1")
     run.wait_until_running()

@@ -121,7 +121,7 @@ def test_sigint_ends_a_source_and_the_graph_finishes_with_what_it_has() -> None:
         time.sleep(random.uniform(0.0, 1.0))  # from before the imports are done to the middle of the stream
         for process in g.processes.values():
             process.popen.send_signal(signal.SIGINT)
-        assert set(g.wait().values()) == {0}
+        assert set(g.wait(DOWN).values()) == {0}
         received = g.joined["received"]
         assert received["Keyframe"] == received["GroundTruth"] == list(range(len(received["Keyframe"])))
         assert g.sockets() == []
@@ -132,7 +132,7 @@ def test_sigint_ends_a_source_whose_read_hangs() -> None:
         g.diamond(source={"count": 10**6, "hang_at": 7})
         g.processes["join"].wait_for(lambda status: sum(status.get("in", {}).values()) == 14)
         g.processes["source"].popen.send_signal(signal.SIGINT)
-        assert set(g.wait().values()) == {0}
+        assert set(g.wait(DOWN).values()) == {0}
         assert g.joined["received"]["Keyframe"] == list(range(7))
         assert "did not return" in g.joined["upstream"]["source"]["warnings"][0]
 
@@ -243,7 +243,7 @@ def test_a_frozen_best_effort_reader_never_holds_its_sender_back() -> None:
         viewer.popen.send_signal(signal.SIGSTOP)
         source.wait_for(lambda status: status.get("state") == "ending")
         assert source.last["out"] == {"Frame": 1000}
-        assert source.popen.wait(LONG) == 0  # its goodbye is not waited for without end
+        assert source.popen.wait(10) == 0  # its goodbye is not waited for without end
 
 
 def test_an_observer_that_is_killed_takes_nobody_along() -> None:

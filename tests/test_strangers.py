@@ -101,7 +101,7 @@ def test_strangers_are_no_readers_get_nothing_and_end_nothing() -> None:
                 for stranger in sockets[::2]:
                     stranger.close()  # nobody is missed
         publisher.end(End())
-        until(lambda: (newest.take(), publisher.gone())[1])
+        until(lambda: (newest.take(), publisher.gone())[1], 10.0)
         thread.join()
         newest.close()
         reader.close()

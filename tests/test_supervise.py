@@ -57,9 +57,9 @@ def test_an_observer_that_hangs_is_given_up_and_its_senders_go_on(launch: type[L
         run.node("sink").suspend()
     code, out, err = run.finish()
     assert code == 4, err
-    assert re.search(r"sink failed: (silent for \d+ s: it was stopped|it has held \w+ back for \d+ s)", out), out
-    held = r"sink has held \w+ back for \d+ s; after 2.5 s the run goes on"
-    named = r"sink has been silent for \d+ s" if stopped else held
+    assert re.search(r"sink failed: (silent for \d s: it was stopped|it has held \w+ back for \d s)", out), out
+    held = r"sink has held \w+ back for 1 s; after 2.5 s the run goes on"
+    named = r"sink has been silent for \d s" if stopped else held
     assert re.search(named, out), out
     assert "done" in (run.output / "logs" / "relay.log").read_text()
 
@@ -72,8 +72,8 @@ def test_a_stage_that_is_stopped_is_named_and_ends_the_run(launch: type[Launch])
     code, out, err = run.finish()
     assert watch.within(2.5 + DOWN)
     assert code == 1
-    assert re.search(r"relay has been silent for \d+ s: its process was stopped \(kill -CONT \d+ lets it go on\)", out)
-    assert re.search(r"relay failed: silent for \d+ s: it was stopped by a signal", err)
+    assert re.search(r"relay has been silent for \d s: its process was stopped \(kill -CONT \d+ lets it go on\)", out)
+    assert re.search(r"relay failed: silent for \d s: it was stopped by a signal", err)
     assert run.report() | {"written": ""} == {
         "finished": False,
         "reason": f"relay failed: {run.report()['error']}",
@@ -88,7 +88,7 @@ def test_a_stage_whose_process_hangs_is_named_with_where_it_stands(launch: type[
     run = launch("source.count=20", "relay.long_at=5", "relay.long=1000", "relay.how=locked", *SHORT)
     code, out, err = run.finish()
     assert code == 1
-    assert re.search(r"relay has been silent for \d+ s: its process hangs; after 2.5 s the run ends\.", out), out
+    assert re.search(r"relay has been silent for \d s: its process hangs; after 2.5 s the run ends\.", out), out
     assert "in take" in out
     assert "relay failed: silent for" in err
 
@@ -100,7 +100,7 @@ def test_a_slow_stage_is_not_a_dead_one(launch: type[Launch], how: str) -> None:
     code, out, err = run.finish()
     assert code == 0, out + err
     assert "silent" not in out
-    assert re.search("relay has been at the same piece of work for [2-5] s; it is alive, so it is left alone", out), out
+    assert "relay has been at the same piece of work for 2 s; it is alive, so it is left alone" in out
 
 
 def test_a_launcher_that_was_stopped_itself_takes_nobody_for_dead(launch: type[Launch]) -> None:
