@@ -36,8 +36,9 @@ class Child:
         self.pipe = pipe[0]
         self.heard = self.moved = time.monotonic()  # when it last said anything, and when it last got on with its work
         self._text = b""
-        # These signals wait, blocked, until the node can handle them. Its own session: the terminal's Ctrl-C reaches
-        # only the launcher, which decides whom to stop.
+        # These signals wait, blocked, until the node can handle them. Its own process group: the terminal's Ctrl-C
+        # reaches only the launcher, which decides whom to stop. The same session for all: Linux with autogroups shares
+        # cores between sessions first, and niceness decides nothing between them, nor who waits how long for a core.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, STARTING)
         with log.open("wb") as output:
             self.process = subprocess.Popen(
@@ -46,7 +47,7 @@ class Child:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 pass_fds=[pipe[1]],
-                start_new_session=True,
+                process_group=0,
                 env={**os.environ, **python_environment(), "PYTHONUNBUFFERED": "1", **environment},
             )
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -127,6 +127,15 @@ def test_a_stage_ended_from_outside_ends_the_run_in_time(launch: type[Launch], v
     assert out.rstrip().endswith(f"nothing to go on with: no checkpoint in {run.output}")
 
 
+def test_nodes_share_a_session_so_that_niceness_decides_between_them_but_no_signals(launch: type[Launch]) -> None:
+    run = launch(*STREAM)
+    run.wait_until_running()
+    nodes = [run.node(name).pid for name in ("source", "relay", "sink")]
+    assert {os.getsid(pid) for pid in nodes} == {os.getsid(run.process.pid)}
+    assert [os.getpgid(pid) for pid in nodes] == nodes  # a terminal's Ctrl-C reaches none of them
+    assert run.finish()[0] == 0
+
+
 def test_an_empty_result_is_no_success(launch: type[Launch]) -> None:
     run = launch("source.count=3", "relay.nothing=too little motion: 0.3 pixels", "sink.observer=true")
     code, out, _ = run.finish()
