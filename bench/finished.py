@@ -142,5 +142,5 @@ def _array(values: list[Any]) -> np.ndarray | None:
 
 def _told_readout(report: dict[str, Any]) -> float:
     """Seconds of the rolling shutter, as the protocol in the report says it; 0 where it says nothing of one."""
-    found = re.search(r"\(([\d.]+) ms a frame\)", report.get("protocol", ""))
-    return 1e-3 * float(found.group(1)) if found else 0.0
+    found = re.search(r"\(([\d.]+) ms a frame(, the last row first)?\)", report.get("protocol", ""))
+    return 0.0 if found is None else (-1e-3 if found.group(2) else 1e-3) * float(found.group(1))

@@ -13,6 +13,19 @@ _LONGEST_SIDE = 2**20  # pixels
 MAX_READOUT_TIME = 0.2  # seconds from the first row to the last: a longer one is a mistake, of the unit for one
 
 
+def is_readout_time(seconds: float) -> bool:
+    """Whether a rolling shutter may take so long from the first row to the last.
+
+    Below 0 the last row is read first, as of a camera that is held upside down, whose images are turned.
+    """
+    return abs(seconds) <= MAX_READOUT_TIME
+
+
+def told_readout_time(seconds: float, each: str = "") -> str:
+    """As people read it. each: of what, such as " a frame"."""
+    return f"{1e3 * abs(seconds):.1f} ms{each}" + (", the last row first" if seconds < 0.0 else "")
+
+
 def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int]) -> None:
     """Raises ValueError for (fx, fy, cx, cy) that no camera with images of `size` (height, width) has."""
     fx, fy, cx, cy = (float(v) for v in intrinsics)

@@ -17,6 +17,7 @@ import torch
 from msgs import FusedKeyframe, GroundTruth, SplatMap, Trajectory
 from mvsgs_core import machine, trajectory, weights
 from mvsgs_core.atomic_file import replace_text, replacing
+from mvsgs_core.camera import told_readout_time
 from mvsgs_core.evaluation import html, pictures, statistics
 from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.lpips import Lpips
@@ -204,7 +205,9 @@ def _fitted(report: dict[str, Any]) -> str:
 def _shutter(found: trajectory.Trajectory | None) -> str:
     if found is None or found.readout_time == 0.0:
         return ""
-    return f"Renders are as the camera's rolling shutter saw them ({1e3 * found.readout_time:.1f} ms a frame). "
+    return (
+        f"Renders are as the camera's rolling shutter saw them ({told_readout_time(found.readout_time, ' a frame')}). "
+    )
 
 
 def _exposure(found: dict[str, Any] | None) -> str:

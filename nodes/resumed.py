@@ -54,5 +54,5 @@ class Resumed(Node):
             segment=np.array([keyframe.segment for keyframe in keyframes], dtype=np.int32),
             exposure=np.array([keyframe.exposure for keyframe in keyframes], dtype=np.float32).reshape(-1, 3, 4),
             velocity=np.array([keyframe.velocity for keyframe in keyframes], dtype=np.float64).reshape(-1, 6),
-            readout_time=max((keyframe.readout_time for keyframe in keyframes), default=0.0),
+            readout_time=max((keyframe.readout_time for keyframe in keyframes), key=abs, default=0.0),
         )

@@ -227,7 +227,7 @@ class Tracker(TrackerNode):
         with self.stats.time("rectification"):
             image = rectified(frame.image, keyframe.image, self._readout_time)
         self._readout_times.append(0.0 if keyframe.image.velocity is None else self._readout_time)
-        if max(self._readout_times) > 0.0:
+        if any(self._readout_times):
             self.stats.values["rolling shutter taken out of keyframes"] = in_milliseconds(self._readout_times)
         if self._readout_time and keyframe.image.velocity is None:
             self.stats.count("keyframes with the rolling shutter still in: no velocity")

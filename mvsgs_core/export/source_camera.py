@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mvsgs_core.camera import check_intrinsics
+from mvsgs_core.camera import check_intrinsics, told_readout_time
 from mvsgs_core.datasets.lens import Lens
 
 GIVEN, ESTIMATED, GUESSED = "given", "estimated", "guessed"  # by the user or the data set; by the tracker; by nobody
@@ -52,7 +52,7 @@ class SourceCamera:
         if self.radial is not None:
             parts.append(f"radial distortion {self.radial[0]:.3f}, give or take {self.radial[1]:.3f}, left in")
         if self.readout_time:
-            parts.append(f"rolling shutter of {1e3 * self.readout_time:.1f} ms")
+            parts.append(f"rolling shutter of {told_readout_time(self.readout_time)}")
         if self.doubt:
             parts.append(f"doubtful: {self.doubt}")
         return "; ".join(parts)

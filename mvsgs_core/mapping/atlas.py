@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mvsgs_core.camera import MAX_READOUT_TIME
+from mvsgs_core.camera import MAX_READOUT_TIME, is_readout_time
 from mvsgs_core.mapping.between import FrameBetween, FramesBetween
 from mvsgs_core.mapping.blocks.refinement import refined_in_blocks
 from mvsgs_core.mapping.checkpoints.state import copy_of
@@ -144,9 +144,9 @@ class Atlas:
         usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
         if not usable.all():
             self.current.log.refuse("poses", int((~usable).sum()), NO_POSE)
-        if velocity is not None and not 0.0 <= readout_time <= MAX_READOUT_TIME:
+        if velocity is not None and not is_readout_time(readout_time):
             self.current.log.refuse(
-                "readout times", 1, f"a readout time outside of 0 to {MAX_READOUT_TIME:g} s was refused"
+                "readout times", 1, f"a readout time of more than {MAX_READOUT_TIME:g} s was refused"
             )
             velocity = None
         for part in self.parts.values() or [self.current]:

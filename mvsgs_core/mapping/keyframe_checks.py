@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvsgs_core.camera import MAX_READOUT_TIME
+from mvsgs_core.camera import is_readout_time
 from mvsgs_core.mapping.frame_of_reference import FAR
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.stats import Stats
@@ -49,7 +49,7 @@ def checked_keyframe(view: RGBDKeyframe, log: Stats) -> RGBDKeyframe | None:
 
 def is_read_out(velocity: np.ndarray | None, readout_time: float) -> bool:
     """Whether that is how a camera's rolling shutter reads an image: velocity (6,), seconds."""
-    return velocity is not None and bool(np.isfinite(velocity).all() and 0.0 <= readout_time <= MAX_READOUT_TIME)
+    return velocity is not None and bool(np.isfinite(velocity).all() and is_readout_time(readout_time))
 
 
 def is_pose(world_from_cam: np.ndarray, scale: float) -> bool:

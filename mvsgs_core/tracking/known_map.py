@@ -13,6 +13,7 @@ import numpy as np
 
 from mvsgs_core.array_file import Arrays, read_arrays, write_arrays
 from mvsgs_core.atomic_file import replacing
+from mvsgs_core.camera import is_readout_time
 from mvsgs_core.photometry import is_exposure, is_vignetting
 from mvsgs_core.tracking.graph import Edge, Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import CELL, TrackingImage
@@ -113,7 +114,7 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
         isinstance(size, list) and len(size) == 2 and all(type(n) is int and n > 0 and n % CELL == 0 for n in size)
     ):
         raise ValueError(f"{size!r} is no size of the tracker's images")
-    if type(readout_time) is not float or not 0.0 <= readout_time < 1.0:
+    if type(readout_time) is not float or not is_readout_time(readout_time):
         raise ValueError(f"{readout_time!r} is no readout time")
     height, width = size
     index = arrays.take("index", np.int64, (None,))

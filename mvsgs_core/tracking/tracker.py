@@ -268,7 +268,7 @@ class Tracker:
         warn_of_few_matches(stats, graph, self.config.min_matches)
         state = TrackingState.TRACKED if tracking else TrackingState.NOT_INITIALIZED
         correction = None if self._frozen else session.publisher.corrections(everything=True)
-        if correction is not None and (graph.readout_time > 0.0 or session.calibration.rolled):
+        if correction is not None and (graph.readout_time != 0.0 or session.calibration.rolled):
             velocity = self._trajectory.velocities_of(correction.index)
             correction = replace(correction, velocity=velocity, readout_time=graph.readout_time)
         yield Update(state, correction=correction)

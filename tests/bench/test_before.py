@@ -206,6 +206,8 @@ def test_what_an_earlier_checkout_left_out_of_its_trajectory_is_had_otherwise() 
     assert found.timestamp.tolist() == [0.0, 0.5]
     assert found.state.tolist() == [TrackingState.TRACKED, TrackingState.LOST]
     assert found.posed.tolist() == [True, False]
+    turned = {"protocol": told["protocol"].replace("a frame", "a frame, the last row first")}
+    assert finished.trajectory_of(track, turned, frames).readout_time == pytest.approx(-0.0253)
     assert finished.trajectory_of(track, {"protocol": "no shutter"}, frames).readout_time == 0.0
 
 

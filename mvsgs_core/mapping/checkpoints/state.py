@@ -44,7 +44,7 @@ BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
     "keyframe": (np.int64, ()), "keyframe_from_cam": (np.float64, (4, 4)), "from_keyframe": (np.float32, (3, 4)),
     "twist": (np.float64, (6,)),
 }  # fmt: skip
-NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "readout_time")
+NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth")
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
 
 

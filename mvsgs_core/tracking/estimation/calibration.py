@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mvsgs_core.camera import told_readout_time
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.estimation.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
@@ -37,7 +38,9 @@ class Calibration:
             self.stats.values["readout_time"] = self.readout_time
         self.given = self.graph.intrinsics  # (4,) that came with the frames, at the tracker's size
         self.guessed = not self.settled
-        self.rolled = False  # a readout time above 0 was used before the one that is now, by a map gone on with, too
+        self.rolled = (
+            False  # a readout time that is not 0 was used before the one that is now, by a map gone on with, too
+        )
 
     @property
     def focal_factor(self) -> float:
@@ -109,11 +112,11 @@ class Calibration:
         """`estimate_readout_time`, a time that is tried a step."""
         if self.readout_time is not None:
             return
-        self.rolled |= self.graph.readout_time > 0.0
+        self.rolled |= self.graph.readout_time != 0.0
         estimating = estimating_readout_time(self.graph, members, self.threads)
         self.graph.readout_time = yield from timed(self.stats, "rolling shutter", estimating)
         self.stats.values["readout_time"] = self.graph.readout_time
-        self.stats.values["rolling shutter"] = f"{1e3 * self.graph.readout_time:.1f} ms"
+        self.stats.values["rolling shutter"] = told_readout_time(self.graph.readout_time)
 
     def _sensible(self) -> bool:
         return self.config.bounds[0] < self.focal_factor < self.config.bounds[1]

@@ -16,7 +16,7 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from mvsgs_core.camera import MAX_READOUT_TIME
+from mvsgs_core.camera import MAX_READOUT_TIME, is_readout_time
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
@@ -31,7 +31,8 @@ MIN_GAIN = 0.02  # of the robust cost: what a global shutter gains by chance is 
 def estimate_readout_time(graph: KeyframeGraph, indices: Iterable[int], threads: int) -> float:
     """Seconds, 0 for a global shutter or where the matches hardly tell. Leaves the graph as it is.
 
-    The graph's own readout time where nothing can be said: an adjustment failed, or the cost has no least.
+    Below 0 the last row is read first, which is tried where no time above 0 is any better. The graph's own readout time
+    where nothing can be said: an adjustment failed, or the cost has no least.
     """
     return whole(estimating_readout_time(graph, indices, threads))
 
@@ -39,23 +40,44 @@ def estimate_readout_time(graph: KeyframeGraph, indices: Iterable[int], threads:
 def estimating_readout_time(graph: KeyframeGraph, indices: Iterable[int], threads: int) -> Steps[float]:
     """`estimate_readout_time`, a time that is tried a step; the graph is as it was between them, too."""
     order = sorted(indices)
-    tried = np.linspace(0.0, MAX_ESTIMATED, 4)
-    before, costs = graph.readout_time, []
-    for readout_time in tried:
-        graph.readout_time = float(readout_time)
-        try:
-            problem = graph.problem(order, set(order[1:]), set(order))
-        finally:
-            graph.readout_time = before
-        solution = adjust(problem, Solver(steps=3, robust_scale=1.0, tolerance=0.0, threads=threads))
-        if solution.failure:
-            return before
-        costs.append(solution.cost)
-        yield
+    costs: dict[float, float] = {}  # by the time that was tried
+    found: float | None = None
+    for last in (MAX_ESTIMATED, -MAX_ESTIMATED):
+        tried = [float(seconds) for seconds in np.linspace(0.0, last, 4)]
+        for seconds in tried:
+            if seconds not in costs:
+                cost = _cost(graph, order, seconds, threads)
+                if cost is None:
+                    return graph.readout_time
+                costs[seconds] = cost
+                yield
+        best = _cheapest(tried, [costs[seconds] for seconds in tried])
+        if best:
+            return best
+        found = best if found is None else found
+    return graph.readout_time if found is None else found
+
+
+def _cost(graph: KeyframeGraph, order: list[int], readout_time: float, threads: int) -> float | None:
+    """What bundle adjustment of these keyframes leaves with such a readout time; None where it fails."""
+    before, graph.readout_time = graph.readout_time, readout_time
+    try:
+        problem = graph.problem(order, set(order[1:]), set(order))
+    finally:
+        graph.readout_time = before
+    solution = adjust(problem, Solver(steps=3, robust_scale=1.0, tolerance=0.0, threads=threads))
+    return None if solution.failure else solution.cost
+
+
+def _cheapest(tried: list[float], costs: list[float]) -> float | None:
+    """The time between 0, the first that was tried, and the last whose cost is least, by a parabola.
+
+    0 where it is hardly less than without a shutter; None where the parabola has no least.
+    """
     bend, slope, level = np.polyfit(tried, costs, 2)
     if bend <= 0.0:
-        return before
-    best = float(np.clip(-0.5 * slope / bend, 0.0, MAX_ESTIMATED))
+        return None
+    best = float(np.clip(-0.5 * slope / bend, *sorted((0.0, tried[-1]))))
     gain = level - float(np.polyval([bend, slope, level], best))
     return best if gain > MIN_GAIN * costs[0] else 0.0
 
@@ -120,10 +142,11 @@ def _seen_at(frame: TrackingImage, size: tuple[int, ...], readout_time: float) -
 
 def check_readout_time(readout_time: float | None) -> None:
     """Raises ValueError for what can't be a readout time; None is to be estimated."""
-    if readout_time is not None and not 0.0 <= readout_time <= MAX_READOUT_TIME:
+    if readout_time is not None and not is_readout_time(readout_time):
         raise ValueError(
-            f"tracker.readout_time={readout_time:g}: it is the seconds from the first row to the last, "
-            f"0 to {MAX_READOUT_TIME:g} (25 milliseconds are 0.025), 0 for a global shutter"
+            f"tracker.readout_time={readout_time:g}: it is the seconds from the first row to the last, at most "
+            f"{MAX_READOUT_TIME:g} (25 milliseconds are 0.025), 0 for a global shutter, below 0 where the last row is "
+            "read first"
         )
 
 

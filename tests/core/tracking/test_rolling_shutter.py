@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core import geometry
+from mvsgs_core.camera import is_readout_time, told_readout_time
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
 from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, estimate_readout_time
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
@@ -51,12 +52,18 @@ def graph_of(readout_time: float, count: int = 7, noise: float = 0.1) -> tuple[K
     return graph, poses
 
 
-@pytest.mark.parametrize("readout_time", [0.0, 0.01, 0.025])
+@pytest.mark.parametrize("readout_time", [0.0, 0.01, 0.025, -0.01, -0.025])
 def test_readout_is_found(readout_time: float) -> None:
     graph, _ = graph_of(readout_time)
     assert len(graph.edges) > 20
     assert estimate_readout_time(graph, graph.keyframes, threads=1) == pytest.approx(readout_time, abs=0.002)
     assert graph.readout_time == 0.0, "only the caller changes the graph"
+
+
+def test_a_camera_upside_down_reads_its_last_row_first_and_is_told_so() -> None:
+    assert told_readout_time(0.02) == "20.0 ms"
+    assert told_readout_time(-0.0239, " a frame") == "23.9 ms a frame, the last row first"
+    assert [is_readout_time(s) for s in (-0.2, 0.0, 0.2, -0.21, 25.0, float("nan"))] == [True] * 3 + [False] * 3
 
 
 def test_poses_are_right_once_it_is_taken_out() -> None:
