@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..scene import town
 from ..scene.difficulties import Difficulties, DifficultPath, Sensor
 from ..scene.renderer import Rendering
 from ..scene.stage import SCENES, stage
@@ -33,6 +34,7 @@ class Film:
     seed: int = 0  # of textures, relief and noise
     loop: bool = False  # the last frame leads on to the first
     threads: int = 0  # of the renderer; 0: what OpenMP gives
+    streets: int = town.STREETS  # of the town in either direction, an even number; building takes their square
 
 
 @dataset
@@ -56,6 +58,8 @@ class Synthetic:
             raise ValueError(
                 "synthetic: frames and stride at least 1, start at least 0, size two numbers of at least 8"
             )
+        if film.streets < 2 or film.streets % 2:
+            raise ValueError("synthetic: streets must be an even number, so that the outer ones make a ring")
         self.difficulties = Difficulties(**{k: v for k, v in options.items() if k in known and v is not None})
         self.warnings: list[str] = []
         self.size = (int(film.size[0]), int(film.size[1]))
@@ -66,7 +70,8 @@ class Synthetic:
         )
         d = self.difficulties
         moving = frames - min(d.rest, frames) - min(d.pure_rotation, frames) + d.jump
-        self.stage = stage(scene, seed, d.textureless, max(1, moving) if loop else None, d.moving_object)
+        lap = max(1, moving) if loop else None
+        self.stage = stage(scene, seed, d.textureless, lap, d.moving_object, film.streets)
         if loop and moving < 240:
             self.warnings.append(f"synthetic: a loop of {moving} frames is fast; take at least 240")
         self.path = DifficultPath(self.stage.path, d)

@@ -9,7 +9,7 @@ from collections import Counter
 import numpy as np
 
 from .path import Shake, look_at
-from .town import Plan
+from .town import STREETS, Plan
 
 Node = tuple[int, int]  # a crossing
 
@@ -72,10 +72,10 @@ class TownPath:
     SWING = np.radians(14.0)
     HABIT = 1.6  # how readily a street is driven again that has been: higher, and loops come sooner
 
-    def __init__(self, seed: int, loop_frames: int | None = None) -> None:
+    def __init__(self, seed: int, loop_frames: int | None = None, streets: int = STREETS) -> None:
         """loop_frames: round some blocks and back to the first pose after so many frames; None: on and on."""
         rng = np.random.default_rng([seed, 10])
-        self.plan = Plan.of(seed)
+        self.plan = Plan.of(seed, streets)
         self.shake = Shake(rng, 0.015, np.radians(0.25), loop_frames)
         self.loop_frames = loop_frames
         self.phases = rng.uniform(0.0, 2.0 * np.pi, 2)

@@ -47,12 +47,12 @@ class Stage:
 
 
 @functools.lru_cache(maxsize=4)
-def renderer_of(scene: str, seed: int, textureless: int) -> SceneRenderer:
-    """The scene built and lit; the same object for the same arguments."""
+def renderer_of(scene: str, seed: int, textureless: int, streets: int = town.STREETS) -> SceneRenderer:
+    """The scene built and lit; the same object for the same arguments. streets: of a town."""
     if scene == "aerial":
         return SceneRenderer(aerial.build(seed, textureless), aerial.LIGHTING, seed)
     if scene == "town":
-        return SceneRenderer(town.build(seed, textureless), town.LIGHTING, seed)
+        return SceneRenderer(town.build(seed, textureless, streets), town.LIGHTING, seed)
     return SceneRenderer(room.build(seed, textureless), room.LIGHTING, seed)
 
 
@@ -67,15 +67,23 @@ def ball_of(radius: float, seed: int) -> SceneRenderer:
     return SceneRenderer([ball], light, seed)
 
 
-def stage(scene: str, seed: int, textureless: int, loop_frames: int | None, moving_object: float) -> Stage:
-    """Raises ValueError for an unknown scene."""
+def stage(
+    scene: str,
+    seed: int,
+    textureless: int,
+    loop_frames: int | None,
+    moving_object: float,
+    streets: int = town.STREETS,
+) -> Stage:
+    """streets: of a town. Raises ValueError for an unknown scene."""
     if scene not in SCENES:
         raise ValueError(f"no scene {scene!r}; there are: {', '.join(SCENES)}")
     size = max(moving_object, 0.01)
-    renderer = renderer_of(scene, seed, textureless)
+    renderer = renderer_of(scene, seed, textureless, streets)
     if scene == "aerial":
         path: CameraPath = FlightPath(seed, loop_frames)
         return Stage(scene, renderer, path, ball_of(5.0 * size, seed), np.array([0.0, 30.0, 15.0]))
     if scene == "town":
-        return Stage(scene, renderer, TownPath(seed, loop_frames), ball_of(0.5 * size, seed), np.array([0.0, 0.0, 0.8]))
+        path = TownPath(seed, loop_frames, streets)
+        return Stage(scene, renderer, path, ball_of(0.5 * size, seed), np.array([0.0, 0.0, 0.8]))
     return Stage(scene, renderer, RoomPath(seed, loop_frames), ball_of(0.13 * size, seed), np.array([2.6, 2.2, 1.1]))

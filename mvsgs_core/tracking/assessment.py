@@ -28,7 +28,7 @@ def warn_of_few_matches(stats: Stats, graph: KeyframeGraph, enough: int) -> None
     """Few points hold the poses: their errors do not average out, and the whole map bends without any residual."""
     if not graph.edges:
         return
-    found = float(np.median([np.count_nonzero(edge.weight) for edge in graph.edges.values()]))
+    found = float(np.median([edge.matches for edge in graph.edges.values()]))
     stats.counts["matches of a pair of keyframes, median"] = found
     if found < enough:
         stats.warn(

@@ -9,6 +9,7 @@ import numpy as np
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.image import RecentImages
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.steps import Steps, whole
 
@@ -68,9 +69,12 @@ class BackEnd:
         members = self.local_map.members(segment)
         if len(members) < 3:
             return
+        images = RecentImages()
         for index in members:
             stats.count("edges matched again", self.rematch_edges(index))
             stats.count("edges by proximity", self.extend_edges(index, segment))
+            for near in sorted(self.graph.edges.reached([index])):
+                images.use(self.graph.keyframes[near].image)
         for solution in self.adjust(segment):
             if solution.failure:
                 stats.warn(f"global bundle adjustment failed: {solution.failure}")

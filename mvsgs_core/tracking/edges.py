@@ -6,21 +6,54 @@ What is asked of a large graph is nearly always about few keyframes, so that it 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping
-from dataclasses import dataclass
 
 import numpy as np
 
 Pair = tuple[int, int]  # of frame indices: source, target
 
 
-@dataclass
 class Edge:
-    """Where the points of one keyframe were found in another."""
+    """Where the points of one keyframe were found in another. A lost point takes a bit: about half of them are.
 
-    target: np.ndarray  # (2, M) float32, 0 where lost
-    weight: np.ndarray  # (M,) float16, 0 to 1
-    shift: np.ndarray  # (2, M) float16 pixels by which a second of readout time moves the target
-    fraction: float  # of the textured points that were found
+    An edge is replaced by another one, never changed.
+    """
+
+    __slots__ = ("_found", "_points", "_shift", "_target", "_weight", "fraction")
+
+    def __init__(self, target: np.ndarray, weight: np.ndarray, shift: np.ndarray, fraction: float) -> None:
+        """target (2, M) pixels; weight (M,) 0 to 1, 0: lost; shift (2, M) pixels by which a second of readout time
+        moves the target; fraction: of the textured points that were found."""
+        weight = weight.astype(np.float16)
+        found = weight > 0
+        self._points, self._found = len(weight), np.packbits(found)
+        self._target, self._shift = target[:, found].astype(np.float32), shift[:, found].astype(np.float16)
+        self._weight, self.fraction = weight[found], fraction
+
+    @property
+    def target(self) -> np.ndarray:
+        """(2, M) float32, 0 where lost."""
+        return self._whole(self._target)
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(M,) float16, 0 to 1."""
+        return self._whole(self._weight)
+
+    @property
+    def shift(self) -> np.ndarray:
+        """(2, M) float16, 0 where lost."""
+        return self._whole(self._shift)
+
+    @property
+    def matches(self) -> int:
+        """Points that were found."""
+        return len(self._weight)
+
+    def _whole(self, values: np.ndarray) -> np.ndarray:
+        """(..., M) of values (..., N) of the points that were found."""
+        whole = np.zeros((*values.shape[:-1], self._points), values.dtype)
+        whole[..., np.unpackbits(self._found, count=self._points).view(bool)] = values
+        return whole
 
 
 class Edges(MutableMapping[Pair, Edge]):

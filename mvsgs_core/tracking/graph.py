@@ -44,9 +44,9 @@ class KeyframeGraph:
         fraction = float(matches.alive[textured].sum() / max(1, textured.sum()))
         if fraction < min_fraction or matches.alive.sum() < 30:
             return False
-        target = np.nan_to_num(matches.target.T).astype(np.float32)
-        shift = np.zeros(target.shape, np.float16) if matches.shift is None else matches.shift.T.astype(np.float16)
-        self.edges[source, to] = Edge(target, matches.weight.astype(np.float16), shift, fraction)
+        target = np.nan_to_num(matches.target.T)
+        shift = np.zeros(target.shape) if matches.shift is None else matches.shift.T
+        self.edges[source, to] = Edge(target, matches.weight, shift, fraction)
         return True
 
     def neighbors(self, index: int) -> set[int]:
@@ -141,12 +141,12 @@ class KeyframeGraph:
         if not solution.failure:
             self.intrinsics = self.intrinsics * [solution.focal_factor, solution.focal_factor, 1.0, 1.0]
             for n, index in enumerate(order):
-                keyframe = self.keyframes[index]
+                keyframe = self.keyframes[index]  # given copies: a view of its row would keep the whole solution
                 if index in free_poses:
-                    keyframe.cam_from_world = solution.cam_from_world[n]
+                    keyframe.cam_from_world = solution.cam_from_world[n].copy()
                 if index in free_depths:
-                    keyframe.inverse_depth = solution.inverse_depth[n]
-                    keyframe.information = solution.information[n]
+                    keyframe.inverse_depth = solution.inverse_depth[n].copy()
+                    keyframe.information = solution.information[n].copy()
         return solution
 
     def rescale(self, indices: Iterable[int], factor: float) -> None:

@@ -140,6 +140,23 @@ class TrackingImage:
             self.__dict__.pop(name, None)
 
 
+class RecentImages:
+    """Images of which something is computed in a walk over a whole map: those that it came by long ago release it."""
+
+    LIMIT = 64  # images: about a megabyte each
+
+    def __init__(self) -> None:
+        self._images: dict[int, TrackingImage] = {}  # by index, the one used last at the end
+
+    def use(self, image: TrackingImage) -> TrackingImage:
+        """The image, which keeps what is computed of it until `LIMIT` others have been used."""
+        self._images.pop(image.index, None)
+        self._images[image.index] = image
+        if len(self._images) > self.LIMIT:
+            self._images.pop(next(iter(self._images))).release()
+        return image
+
+
 def tracking_size(height: int, width: int, area: int) -> tuple[int, int]:
     """(height, width) at which images of a size are tracked: about `area` pixels, multiples of 8, at most doubled.
 
@@ -187,4 +204,4 @@ def find_cells(gray: np.ndarray, noise: float = 20.0, mask: np.ndarray | None = 
     return Cells(points, information, textured if mask is None else textured & mask[v, u])
 
 
-__all__ = ["BORDER", "CELL", "LEVELS", "Cells", "TrackingImage", "find_cells", "tracking_size"]
+__all__ = ["BORDER", "CELL", "LEVELS", "Cells", "RecentImages", "TrackingImage", "find_cells", "tracking_size"]

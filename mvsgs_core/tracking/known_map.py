@@ -177,7 +177,7 @@ def _edges(arrays: Arrays, keyframes: set[int], points: int) -> dict[tuple[int, 
     if not set(pairs.ravel().tolist()) <= keyframes or (pairs[:, 0] == pairs[:, 1]).any() or (weight < 0).any():
         raise ValueError("matches are of keyframes that are not there, or weigh less than nothing")
     return {
-        (int(a), int(b)): Edge(target[n].copy(), weight[n].copy(), shift[n].copy(), float(fraction[n]))
+        (int(a), int(b)): Edge(target[n], weight[n], shift[n], float(fraction[n]))
         for n, (a, b) in enumerate(pairs.tolist())
     }
 

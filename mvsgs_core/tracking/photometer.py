@@ -19,7 +19,7 @@ from mvsgs_core.tracking.estimation.gray_levels import MIN_SAMPLES, TERMS, backw
 from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration, PhotometricEdges, solve_photometry
 from mvsgs_core.tracking.estimation.response import radial_terms, vignetting_polynomial
 from mvsgs_core.tracking.graph import Edge, KeyframeGraph
-from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.image import RecentImages, TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.steps import Steps, timed, whole
 
@@ -122,12 +122,13 @@ class Photometer:
     def _looking_at_edges(self) -> Steps[None]:
         graph = self.graph
         changed, self._looked_at = graph.edges.changes(self._looked_at)
+        images = RecentImages()
         for a, b in tuple(changed):
             edge, known = graph.edges.get((a, b)), self._moments.get((a, b))
             if edge is None:
                 self._moments.pop((a, b), None)
             elif known is None or known[0] is not edge:
-                image = graph.keyframes[b].image
+                _, image = (images.use(graph.keyframes[index].image) for index in (a, b))
                 self._moments[a, b] = edge, _compared(graph, a, image, edge.target.T, edge.weight > 0)
                 yield
 

@@ -83,7 +83,7 @@ class _Published:
     known: np.ndarray
     segment: int
     exposure: np.ndarray | None  # (3, 4) color affine; None: the identity
-    looked_at: tuple[object, ...] = ()  # what the keyframe was made of when nothing had moved; empty: not looked at
+    looked_at: tuple[object, ...] = ()  # what the keyframe was made of when it was looked at; empty: it was not
 
 
 class Light(Protocol):
@@ -189,8 +189,7 @@ class Publisher:
                 last.world_from_cam, last.scale, last.segment, last.exposure = pose, scale, segment, exposure
                 self._lit |= exposure is not None
                 moved.append(index)
-            else:
-                last.looked_at = parts
+            last.looked_at = parts
         if not moved:
             return None
         last_of = [self._published[index] for index in moved]

@@ -119,7 +119,7 @@ def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads:
     keyframes, each alone, disagree.
     """
     rise = observability(graph, members, probe, threads, factor)
-    matches = sum(int(np.count_nonzero(graph.edges[a, b].weight)) for a, b in graph.edges if {a, b} <= set(members))
+    matches = sum(graph.edges[a, b].matches for a, b in graph.edges if {a, b} <= set(members))
     if rise <= 0.0 or matches == 0:
         return float("inf")
     curvature = TOGETHER**0.5 * probe / float(np.sqrt(matches * rise))

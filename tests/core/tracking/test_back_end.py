@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
+from mvsgs_core.tracking.edges import Edge
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from tests.support.true_maps import exact_matches, matcher, pose_error, true_graph, true_pose
@@ -62,7 +61,7 @@ def median_inverse_depth(graph: KeyframeGraph) -> float:
 def test_only_edges_that_the_map_contradicts_are_matched_again() -> None:
     graph = connected()
     good, bad = graph.edges[6, 0], graph.edges[6, 12]
-    graph.edges[6, 12] = replace(bad, target=bad.target + 8.0)
+    graph.edges[6, 12] = Edge(bad.target + 8.0, bad.weight, bad.shift, bad.fraction)
     assert back_end(graph).rematch_edges(6) == 1
     assert graph.edges[6, 0] is good
     again, (expected, _) = graph.edges[6, 12], graph.predict(6, 12)
@@ -73,7 +72,8 @@ def test_only_edges_that_the_map_contradicts_are_matched_again() -> None:
 
 def test_an_edge_that_nothing_holds_is_matched_again() -> None:
     graph = connected()
-    graph.edges[6, 12] = replace(graph.edges[6, 12], weight=np.zeros_like(graph.edges[6, 12].weight))
+    held = graph.edges[6, 12]
+    graph.edges[6, 12] = Edge(held.target, np.zeros_like(held.weight), held.shift, held.fraction)
     assert back_end(graph).rematch_edges(6) == 1
     assert (graph.edges[6, 12].weight > 0).sum() > 100
 
@@ -128,7 +128,7 @@ def test_the_end_matches_again_adds_edges_and_adjusts() -> None:
     for pair in [pair for pair in graph.edges if abs(pair[0] - pair[1]) > 6]:
         del graph.edges[pair]
     wrong = graph.edges[6, 0]
-    graph.edges[6, 0] = replace(wrong, target=wrong.target + 30.0)
+    graph.edges[6, 0] = Edge(wrong.target + 30.0, wrong.weight, wrong.shift, wrong.fraction)
     before, stats = worst_pose(graph), Stats()
     back_end(graph).put_right(0, stats)
     assert stats.counts["edges matched again"] >= 1
