@@ -1,4 +1,4 @@
-"""A town of streets between rows of houses; meters, x east, y north, z up. 4 kilometers of one-way streets.
+"""A town of streets between rows of houses; meters, x east, y north, z up. By default 4 kilometers of one-way streets.
 
 Streets run along a grid that is not quite regular. Each is driven in one direction, in turns east and west, north and
 south; the outer ones make a ring. So whoever comes a second time sees the same: a loop.

@@ -69,9 +69,7 @@ class KeyframeWork:
         if self.config.loops:
             yield from self._close_loops(index)
         yield from self.photometer.updating()
-        members = self.local_map.members(self.graph.keyframes[index].segment)
-        for old in members[: -self.config.local_map.window]:
-            self.graph.keyframes[old].image.release()
+        self.local_map.release_images(self.graph.keyframes[index].segment)
 
     def first(self, keyframes: list[int]) -> Steps[None]:
         """The same of a segment's first keyframes, once they are solved."""

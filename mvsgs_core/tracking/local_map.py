@@ -78,6 +78,17 @@ class LocalMap:
     def members(self, segment: int) -> list[int]:
         return self.graph.keyframes.members(segment)
 
+    def release_images(self, segment: int) -> None:
+        """Forgets what was computed of the keyframes that were matched since the last time and are not in the window.
+
+        Of thousands these are few.
+        """
+        used, window = self.matcher.used, set(self.members(segment)[-self.config.window :])
+        for index in used - window:
+            if index in self.graph.keyframes:
+                self.graph.keyframes[index].image.release()
+        self.matcher.used = used & window
+
     def match_edge(self, source: int, to: int) -> bool:
         """Matches an edge from where the map says the points should be; not one that too few can be seen along.
 

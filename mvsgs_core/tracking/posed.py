@@ -130,8 +130,7 @@ class PosedTracker:
         if solution.failure:
             self.stats.warn(f"triangulation failed: {solution.failure}")
         self.photometer.update()
-        for old in members[: -self.config.local_map.window]:
-            self.graph.keyframes[old].image.release()
+        self.local_map.release_images(0)
         self.front_end.refer_to(frame)
         self.stats.count("keyframes")
         complete, self._complete, self._tail = self._complete, [frame.index], {}

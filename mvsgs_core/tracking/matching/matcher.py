@@ -16,6 +16,7 @@ class Matcher:
         self.features = FeatureFlow()
         self.calls = 0
         self.feature_calls = 0  # how often features had to help
+        self.used: set[int] = set()  # indices of images that were matched: what is computed of them is kept
 
     def match(self, a: TrackingImage, b: TrackingImage, guess: np.ndarray, enough: float) -> tuple[Matches, float]:
         """Points of a's cells (M) in b. guess: (M, 2), NaN where there is none.
@@ -24,6 +25,7 @@ class Matcher:
         Returns the matches and the fraction of the textured points that were found.
         """
         self.calls += 1
+        self.used |= {a.index, b.index}
         matches, fraction = self._flow(a, b, guess)
         if fraction < enough:
             self.feature_calls += 1
