@@ -69,6 +69,15 @@ class Trainer:
                 render.color = render.color.clamp(0.0, 1.0)
             return render
 
+    def weights(self, view: TrainingView, median_depth: float) -> Tensor:
+        """(N,) the most of a pixel's light that each splat has in a training image."""
+        with torch.no_grad():
+            found = self._rasterize(
+                self.state.detached(), view, view.intrinsics, view.size, median_depth, None, None, weights=True
+            ).weight_max
+        assert found is not None
+        return found
+
     def step(self, view: TrainingView, median_depth: float, *, refining: bool = False) -> None:
         """One iteration on a keyframe. median_depth: of the scene; refining: no splat is added or removed."""
         training = self.config.training

@@ -38,6 +38,7 @@ from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.stats import Stats
 from mvsgs_core.warned import Warnings
 
+GRAY_LEVEL = 1.0 / 255.0  # of a pixel's light: what has less everywhere is not seen
 NO_IMAGE = np.zeros((0, 0, 3), np.uint8)
 NOBODY = -(2**63)  # anchor of a splat that another block owns
 LEARNED = (  # what a keyframe's home says of it
@@ -71,7 +72,18 @@ def parting_of(mapper: OnlineMapper, blocks: int) -> Parting:
     means, log_scales = splats.means.cpu().numpy(), splats.log_scales.cpu().numpy()
     opacity = torch.sigmoid(splats.opacity_logits).cpu().numpy()
     overlap = mapper.config.refine.overlap
-    return part(mapper.views, means, log_scales, opacity, mapper.median_depth, blocks, overlap)
+    views = mapper.views
+    images = {view.index: [view] if view.has_image else [] for view in views}
+    for frame in mapper.keyframes.between:
+        images.setdefault(frame.keyframe, []).append(mapper.chosen(frame))
+
+    def shown(k: int) -> np.ndarray:
+        found = np.zeros(len(mapper.state), bool)
+        for view in images[views[k].index]:
+            found |= (mapper.trainer.weights(view, mapper.median_depth) >= GRAY_LEVEL).cpu().numpy()
+        return found
+
+    return part(views, means, log_scales, opacity, mapper.median_depth, blocks, overlap, shown)
 
 
 def iterations_of(mapper: OnlineMapper, parting: Parting, total: int) -> list[int]:

@@ -4,13 +4,13 @@ Keyframes are parted by where the middle of what they see is: halves of equal nu
 points are spread most, and so on (Bentley's k-d tree, 1975). The planes between them part the splats, too, each of
 which is owned by one block. A keyframe is at home in one and a guest in every other of which it sees enough.
 
-What a camera sees is asked of clumps, the splats of one block in a cube, and not of each splat. Nothing hides anything
-here: that would take a render.
+Whether it sees enough is asked of clumps, the splats of one block in a cube, of which nothing hides another. Which
+splats a block needs is asked of the keyframes' renders: a street's far end is mostly hidden.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,6 @@ import numpy as np
 from mvsgs_core.mapping.keyframes import TrainingView
 
 CLUMP = 0.25  # side of the cubes, scene's median depths
-SIGMAS = 3.0  # standard deviations from a splat's center to where it ends
 FAR = 3.0  # median depths: what lies beyond makes nobody a guest, as something hides most of it
 
 
@@ -29,7 +28,7 @@ class Parting:
     home: np.ndarray  # (K,) int64 block of each keyframe
     owner: np.ndarray  # (N,) int64 block of each splat
     trained: np.ndarray  # (B, K) bool, keyframes that a block trains on: those at home, and guests
-    needed: tuple[np.ndarray, ...]  # B times (N,) bool, splats that these may see, and all that the block owns
+    needed: tuple[np.ndarray, ...]  # B times (N,) bool, splats that these show, and all that the block owns
 
     def __len__(self) -> int:
         return len(self.trained)
@@ -38,18 +37,17 @@ class Parting:
 @dataclass(frozen=True)
 class _Clumps:
     centers: np.ndarray  # (C, 3)
-    radii: np.ndarray  # (C,) of a ball that has all of it
     area: np.ndarray  # (C,) of its splats, as far as they are opaque
     owner: np.ndarray  # (C,) int64 block
-    of_splat: np.ndarray  # (N,) int64 clump of each splat
 
 
 def part(
     views: Sequence[TrainingView], means: np.ndarray, log_scales: np.ndarray, opacity: np.ndarray, median_depth: float,
-    blocks: int, overlap: float,
+    blocks: int, overlap: float, shown: Callable[[int], np.ndarray],
 ) -> Parting:  # fmt: skip
     """Of keyframes (K) and splats: means (N, 3), log_scales (N, 3), opacity (N,) 0 to 1, in the mapper's frame.
 
+    shown: (N,) bool, splats that a keyframe's image shows, by its place among the views; each is asked once.
     median_depth: of the scene; overlap: fraction of what a keyframe sees from which on it is a guest. A block that no
     keyframe is at home in is left out: its splats go to the first one.
     """
@@ -64,15 +62,15 @@ def part(
     if count == 1:
         return Parting(home, owner, trained, (np.ones(len(means), bool),))
     clumps = _clumps(means, log_scales, opacity, owner, CLUMP * median_depth)
-    reached = np.zeros((len(views), len(clumps.owner)), bool)
+    needed = owner == np.arange(count)[:, None]
     for k, view in enumerate(views):
-        depth, inside, reached[k] = _seen(view, clumps)
+        depth, inside = _seen(view, clumps.centers)
         near = inside & (depth < FAR * (view.median_depth or median_depth))
         weight = np.where(near, clumps.area / np.maximum(depth, 1e-3 * median_depth) ** 2, 0.0)
         fraction = np.bincount(clumps.owner, weight, count) / max(float(weight.sum()), 1e-30)
         trained[:, k] |= fraction > overlap
-    needed = tuple((reached[trained[b]].any(axis=0) | (clumps.owner == b))[clumps.of_splat] for b in range(count))
-    return Parting(home, owner, trained, needed)
+        needed[trained[:, k]] |= shown(k)
+    return Parting(home, owner, trained, tuple(needed))
 
 
 def _middle(view: TrainingView, median_depth: float) -> np.ndarray:
@@ -123,24 +121,22 @@ def _clumps(
     number = np.bincount(of_splat, minlength=count)
     centers = np.column_stack([np.bincount(of_splat, means[:, i], count) for i in range(3)]) / number[:, None]
     scales = np.sort(np.exp(log_scales.astype(np.float64)), axis=1)
-    reach = np.linalg.norm(means - centers[of_splat], axis=1) + SIGMAS * scales[:, 2]
-    radii, owners = np.zeros(count), np.zeros(count, dtype=np.int64)
-    np.maximum.at(radii, of_splat, reach)
+    owners = np.zeros(count, dtype=np.int64)
     owners[of_splat] = owner
     area = np.bincount(of_splat, opacity * scales[:, 1] * scales[:, 2], count)
-    return _Clumps(centers, radii, area, owners, of_splat)
+    return _Clumps(centers, area, owners)
 
 
-def _seen(view: TrainingView, clumps: _Clumps) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each clump (C,): depth, whether its center is in the image, and whether any of it can be."""
+def _seen(view: TrainingView, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of points (C, 3): depth (C,), and whether they are in the image (C,)."""
     (height, width), (fx, fy, cx, cy) = view.image_size, view.image_intrinsics  # there where the image was let go
     left, right, top, bottom = cx + 0.5, width - 0.5 - cx, cy + 0.5, height - 0.5 - cy
     planes = np.array([[-fx, 0, -left], [fx, 0, -right], [0, -fy, -top], [0, fy, -bottom]])
     pose = view.refined_from_cam
-    points = (clumps.centers - pose[:3, 3]) @ pose[:3, :3]
+    points = (centers - pose[:3, 3]) @ pose[:3, :3]
     outside = (points @ (planes / np.linalg.norm(planes, axis=1, keepdims=True)).T).max(axis=1)
     depth = points[:, 2]
-    return depth, (outside < 0) & (depth > 0), (outside < clumps.radii) & (depth > -clumps.radii)
+    return depth, (outside < 0) & (depth > 0)
 
 
 __all__ = ["Parting", "part"]

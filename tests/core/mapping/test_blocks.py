@@ -146,3 +146,19 @@ def test_keyframes_that_all_see_the_same_are_refined_whole_unless_blocks_are_ask
 def test_wrong_settings_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError):
         RefineConfig(**wrong)
+
+
+def test_a_block_is_not_given_what_none_of_its_images_shows() -> None:
+    mapper = corridor(2, overlap=0.0)
+    before = parting_of(mapper, 2)
+    foreign = np.flatnonzero(before.needed[0] & (before.owner == 1))
+    assert len(foreign) > 10
+    mapper.state.splats.opacity_logits.data[torch.from_numpy(foreign)] = -8.0
+    after = parting_of(mapper, 2)
+    assert not after.needed[0][foreign].any()
+    assert after.needed[1][foreign].all()  # its own
+    shown = np.zeros(len(mapper.state), bool)
+    for view, trained in zip(mapper.views, after.trained[0]):
+        if trained:
+            shown |= (mapper.trainer.weights(view, mapper.median_depth) >= 1 / 255).numpy()
+    assert np.array_equal(after.needed[0], shown | (after.owner == 0))
