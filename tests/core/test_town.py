@@ -77,3 +77,12 @@ def test_is_a_data_set_like_the_other_scenes(block: SceneRenderer, monkeypatch: 
     items = list(Synthetic(scene="town", size=SIZE, frames=3, moving_object=1.0, threads=1))
     assert [item.image.shape for item in items] == [(*SIZE, 3)] * 3
     assert not np.array_equal(items[0].image, items[2].image)
+
+
+def test_a_larger_town_has_more_streets_and_a_ring() -> None:
+    path = drive.TownPath(0, streets=8)
+    path.pose(60_000)
+    driven = {frozenset(street) for street in zip(path.route.nodes, path.route.nodes[1:])}
+    assert 2 * town.STREETS * (town.STREETS - 1) < len(driven) <= 2 * 8 * 7
+    with pytest.raises(ValueError, match="even"):
+        Synthetic(scene="town", streets=7)
