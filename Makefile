@@ -16,6 +16,7 @@ DOCS := build/site/venv
 KERNELS := $(shell find mvsgs_core/csrc -type f 2>/dev/null)
 
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(JOBS)
+unexport PYTHONDONTWRITEBYTECODE  # a container may set it: each of a run's processes would compile all sources anew
 
 .PHONY: setup wheel demo test test-quick suite lint style types bench bench-quick docs clean check-system
 
@@ -59,12 +60,15 @@ demo: setup
 	@echo "report: file://$(abspath $(DEMO_OUTPUT))/report.html"
 
 # Types are checked beside the tests. Three of these at once keep two cores busy, as many wait for processes; one thread
-# each, or they wait for each other.
+# each, or they wait for each other. The tests are collected once before, so that not each of the three compiles them
+# all; what is wrong there is said when they run. In the order of their names: in xdist's own, by the number of tests,
+# files of one long test come last.
 test: style
 	@$(MAKE) --no-print-directory -j2 types suite
 
 suite test-quick: setup
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile $(if $(filter test-quick,$@),-m "not slow")
+	$(if $(filter suite,$@),@$(BIN)/python -m pytest -p no:xdist --collect-only -q > /dev/null 2>&1 || true)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(if $(filter test-quick,$@),-m "not slow")
 
 lint: style types
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from mvsgs_core import image_metrics
 from mvsgs_core.bad_file import BadFileError
@@ -27,6 +26,9 @@ def _batch(image: np.ndarray) -> torch.Tensor:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_agrees_with_torchmetrics(seed: int) -> None:
+    # here: it takes a second, and every worker collects this file
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
     a, b = _pair(seed)
     expected = structural_similarity_index_measure(_batch(a), _batch(b), data_range=1.0)
     assert image_metrics.ssim(a, b) == pytest.approx(float(expected), abs=1e-5)  # type: ignore[arg-type]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from mvsgs_core.rasterizer import ssim
 
@@ -32,6 +31,9 @@ def test_value_and_gradient_match_the_twin(size: tuple[int, int]) -> None:
 
 def test_twin_against_torchmetrics() -> None:
     """torchmetrics mirrors the border: compared inside a frame of zeros, which it sees as the window's zeros."""
+    # here: it takes a second, and every worker collects this file
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     image, target = pair(48, 64)
     framed = [torch.nn.functional.pad(x.permute(2, 0, 1)[None], (10, 10, 10, 10)) for x in (image, target)]
     _, full = structural_similarity_index_measure(
