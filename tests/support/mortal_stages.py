@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,14 @@ from nodes.mvs import Mvs
 from nodes.tracker import Tracker
 
 
+FLUSHED = 0.2  # s after which what was sent has left the process: what ZeroMQ still has dies with it
+
+
 def die_once(came: int, after: int, grave: str) -> None:
     """grave: the file that says that it has happened."""
     if came == after and not Path(grave).exists():
         Path(grave).touch()
+        time.sleep(FLUSHED)
         os.kill(os.getpid(), signal.SIGKILL)
 
 
