@@ -76,16 +76,21 @@ def test_stages_of_another_host_that_are_killed_and_started_again_lose_no_keyfra
 ) -> None:
     here, there = hosts
     create_keys(tmp_path / "keys")
+    (tmp_path / "graves").mkdir()
     mortal = "tests.support.mortal_stages"
     run = Launch(
         tmp_path, "dataset.options.frames=80", "dataset.size=[120,160]", "device=cpu", "mapper.iterations=2",
         "mapper.refinement=2", "evaluator.lpips=off", "evaluator.fitted=false", "screen=plain",
         "transport=tcp", f"host={here.address}", f"port={PORT}", f"keys={tmp_path / 'keys'}",
-        "mvs=external", f"mvs.host={there.address}", f"mvs._target_={mortal}.MortalStereo", "mvs.after=4",
-        f"mvs.grave={tmp_path / 'mvs'}", "depth_fusion=external", f"depth_fusion.host={there.address}",
-        f"depth_fusion._target_={mortal}.MortalFusion", "depth_fusion.after=6",
-        f"depth_fusion.grave={tmp_path / 'fusion'}", "tracker=external", f"tracker.host={there.address}",
-        f"tracker._target_={mortal}.MortalTracker", "tracker.after=40", f"tracker.grave={tmp_path / 'tracker'}",
+        *(word for stage, kind, after in (
+            ("mvs", "Stereo", ""), ("depth_fusion", "Fusion", "mvs"), ("tracker", "Tracker", "depth_fusion")
+        ) for word in (
+            f"{stage}=external", f"{stage}.host={there.address}", f"{stage}._target_={mortal}.Mortal{kind}",
+            f"{stage}.death.grave={tmp_path / 'graves' / stage}",
+            f"{stage}.death.after={tmp_path / 'graves' / after if after else ''}",
+        )),
+        f"dataset._target_={mortal}.PatientReader", "dataset.name=synthetic",
+        f"dataset.returned={tmp_path / 'graves' / 'depth_fusion'}",
         conf=ROOT / "launch" / "conf", prefix=here.inside,
     )  # fmt: skip
     stages: dict[str, subprocess.Popen[bytes]] = {}
@@ -110,7 +115,7 @@ def test_stages_of_another_host_that_are_killed_and_started_again_lose_no_keyfra
             stage.kill()
             stage.wait()
         run.kill()
-    assert sorted(deaths) == ["depth_fusion", "mvs", "tracker"]
+    assert deaths == ["mvs", "depth_fusion", "tracker"]
     report = run.report()
     skipped = report["skipped"]
     assert report["counts"]["mapper"]["views"] > 8

@@ -1,4 +1,8 @@
-"""Stages whose process is killed once, after some keyframes, as by a power cut; started again, they live."""
+"""Stages whose process is killed once, as by a power cut; started again, they live.
+
+They die one after the other, from stereo on, and the tracker last, for whom the stream waits: what a stage still holds
+for another that is away dies with it, and what an earlier tracker sent no later one has.
+"""
 
 from __future__ import annotations
 
@@ -9,41 +13,62 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from msgs import CameraPose, Depth, Frame, FusedKeyframe, Keyframe, Poses, TrackedFrame, TrackerPhase
+from msgs import CameraPose, Depth, Frame, FusedKeyframe, GroundTruth, Keyframe, Poses, TrackedFrame, TrackerPhase
 from nodes.depth_fusion import DepthFusion
 from nodes.mvs import Mvs
+from nodes.reader import Reader
 from nodes.tracker import Tracker
-
+from tests.support.patience import LONG
 
 FLUSHED = 0.2  # s after which what was sent has left the process: what ZeroMQ still has dies with it
 
 
-def die_once(came: int, after: int, grave: str) -> None:
-    """grave: the file that says that it has happened."""
-    if came == after and not Path(grave).exists():
-        Path(grave).touch()
-        time.sleep(FLUSHED)
-        os.kill(os.getpid(), signal.SIGKILL)
+@dataclass(frozen=True)
+class Death:
+    grave: str = ""  # the file that says that it has happened
+    after: str = ""  # the grave of a stage that must have come back before
+
+    def come(self, now: bool) -> None:
+        """To be called when a message was worked off. now: it is time, as far as this stage knows."""
+        if not self.grave:
+            return
+        if Path(self.grave).exists():
+            back(self.grave).touch()
+        elif now and (not self.after or back(self.after).exists()):
+            time.sleep(FLUSHED)
+            Path(self.grave).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
-class MortalStereo(Mvs):
-    @dataclass(frozen=True)
-    class Config(Mvs.Config):
-        after: int = 4  # keyframes
-        grave: str = ""
+def back(grave: str) -> Path:
+    """The file that says that who was killed works again."""
+    return Path(f"{grave}.back")
+
+
+class PatientReader(Reader):
+    """Waits before a frame, as a camera does that is paused."""
+
+    @dataclass
+    class Config(Reader.Config):
+        before: int = 40  # frame
+        returned: str = ""  # the grave of a stage that must have come back
 
     config: Config
 
-    def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
-        yield from super().on_keyframe(keyframe)
-        die_once(len(self._once.keyframes), self.config.after, self.config.grave)
+    def run(self) -> Iterator[Frame | GroundTruth]:
+        until = time.monotonic() + LONG
+        for message in super().run():
+            while message.index == self.config.before and not back(self.config.returned).exists():
+                assert time.monotonic() < until, f"{self.config.returned} is not back"
+                time.sleep(0.01)
+            yield message
 
 
 class MortalTracker(Tracker):
     @dataclass(frozen=True)
     class Config(Tracker.Config):
-        after: int = 40  # frames
-        grave: str = ""
+        frames: int = 40  # that come before it may be killed
+        death: Death = Death()
 
     config: Config
 
@@ -51,17 +76,30 @@ class MortalTracker(Tracker):
         yield from super().on_frame(frame)
         if self._returning is not None:
             self._returning._due = 0.0  # saved with every keyframe, however slow the machine is
-        die_once(frame.index, self.config.after, self.config.grave)
+        self.config.death.come(frame.index >= self.config.frames)
+
+
+class MortalStereo(Mvs):
+    @dataclass(frozen=True)
+    class Config(Mvs.Config):
+        keyframes: int = 4  # that come before it may be killed
+        death: Death = Death()
+
+    config: Config
+
+    def on_keyframe(self, keyframe: Keyframe) -> Iterator[Depth]:
+        yield from super().on_keyframe(keyframe)
+        self.config.death.come(len(self._once.keyframes) >= self.config.keyframes)
 
 
 class MortalFusion(DepthFusion):
     @dataclass(frozen=True)
     class Config(DepthFusion.Config):
-        after: int = 6  # keyframes
-        grave: str = ""
+        keyframes: int = 6  # that come before it may be killed
+        death: Death = Death()
 
     config: Config
 
     def on_depth(self, depth: Depth) -> Iterator[FusedKeyframe]:
         yield from super().on_depth(depth)
-        die_once(len(self._once.keyframes), self.config.after, self.config.grave)
+        self.config.death.come(len(self._once.keyframes) >= self.config.keyframes)
