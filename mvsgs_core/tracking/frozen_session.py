@@ -16,7 +16,7 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.front_end import Step
-from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.image import RecentImages, TrackingImage
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
 from mvsgs_core.tracking.session import Session
@@ -75,6 +75,8 @@ class FrozenSession(Session):
         limit = self.covisible_keyframes.limit(step.reference, self.config.keyframe_choice.max_flow)
         if self.choice.moved(step, frame.size[1], limit):
             self._reuse_keyframe(frame, step)
+        if len(self.matcher.used) > RecentImages.LIMIT and self.front_end.reference is not None:
+            self.local_map.release_images_but({self.front_end.reference.index})
         return Update(record.state)
 
     def _relocalize(self, frame: TrackingImage, record: FrameRecord) -> Update:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,15 +80,15 @@ class LocalMap:
         return self.graph.keyframes.members(segment)
 
     def release_images(self, segment: int) -> None:
-        """Forgets what was computed of the keyframes that were matched since the last time and are not in the window.
+        """Forgets what was computed of keyframes that were matched since the last time and are not in the window."""
+        self.release_images_but(set(self.members(segment)[-self.config.window :]))
 
-        Of thousands these are few.
-        """
-        used, window = self.matcher.used, set(self.members(segment)[-self.config.window :])
-        for index in used - window:
+    def release_images_but(self, kept: Set[int]) -> None:
+        """Forgets what was computed of all other keyframes that were matched since the last time: of thousands few."""
+        for index in set(self.matcher.used) - kept:
             if index in self.graph.keyframes:
                 self.graph.keyframes[index].image.release()
-        self.matcher.used = used & window
+                del self.matcher.used[index]
 
     def match_edge(self, source: int, to: int) -> bool:
         """Matches an edge from where the map says the points should be; not one that too few can be seen along.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakValueDictionary
+
 import numpy as np
 
 from mvsgs_core.tracking.image import TrackingImage
@@ -16,7 +18,8 @@ class Matcher:
         self.features = FeatureFlow()
         self.calls = 0
         self.feature_calls = 0  # how often features had to help
-        self.used: set[int] = set()  # indices of images that were matched: what is computed of them is kept
+        # images that were matched, by index, as long as anybody has them: what is computed of them is kept
+        self.used: WeakValueDictionary[int, TrackingImage] = WeakValueDictionary()
 
     def match(self, a: TrackingImage, b: TrackingImage, guess: np.ndarray, enough: float) -> tuple[Matches, float]:
         """Points of a's cells (M) in b. guess: (M, 2), NaN where there is none.
@@ -25,7 +28,7 @@ class Matcher:
         Returns the matches and the fraction of the textured points that were found.
         """
         self.calls += 1
-        self.used |= {a.index, b.index}
+        self.used[a.index], self.used[b.index] = a, b
         matches, fraction = self._flow(a, b, guess)
         if fraction < enough:
             self.feature_calls += 1

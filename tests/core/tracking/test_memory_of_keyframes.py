@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -73,6 +75,20 @@ def test_keyframes_outside_the_window_forget_what_was_computed_of_them() -> None
     assert maps.match_edge(18, 0)  # an old one is seen again
     maps.release_images(0)
     assert [index for index in FRAMES if computed(graph.keyframes[index])] == [12, 18]
+
+
+def test_of_frames_that_are_gone_nothing_is_kept() -> None:
+    graph, match = true_graph(*FRAMES), matcher()
+    keyframe = graph.keyframes[FRAMES[0]].image
+    for index in range(100, 110):
+        match.match(keyframe, replace(keyframe, index=index), keyframe.cells.points, 0.0)
+    assert list(match.used) == [keyframe.index]
+    maps = LocalMap(graph, match, LocalMapConfig(), 1)
+    maps.release_images_but({keyframe.index})
+    assert "pyramid" in keyframe.__dict__
+    maps.release_images_but(set())
+    assert "pyramid" not in keyframe.__dict__
+    assert len(match.used) == 0
 
 
 def test_the_end_of_a_stream_computes_of_few_images_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
