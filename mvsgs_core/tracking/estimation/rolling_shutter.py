@@ -77,7 +77,7 @@ def _cheapest(tried: list[float], costs: list[float]) -> float | None:
     bend, slope, level = np.polyfit(tried, costs, 2)
     if bend <= 0.0:
         return None
-    best = float(np.clip(-0.5 * slope / bend, *sorted((0.0, tried[-1]))))
+    best = float(np.clip(-0.5 * slope / bend, min(tried), max(tried)))
     gain = level - float(np.polyval([bend, slope, level], best))
     return best if gain > MIN_GAIN * costs[0] else 0.0
 
