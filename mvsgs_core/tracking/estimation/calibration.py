@@ -38,9 +38,7 @@ class Calibration:
             self.stats.values["readout_time"] = self.readout_time
         self.given = self.graph.intrinsics  # (4,) that came with the frames, at the tracker's size
         self.guessed = not self.settled
-        self.rolled = (
-            False  # a readout time that is not 0 was used before the one that is now, by a map gone on with, too
-        )
+        self.rolled = False  # a readout time that is not 0 was used before the one now, also by a map gone on with
 
     @property
     def focal_factor(self) -> float:
