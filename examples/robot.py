@@ -17,6 +17,7 @@ PUB socket: msgs/WIRE.md has them. Beyond this machine (--address tcp://0.0.0.0:
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -133,6 +134,7 @@ def main() -> None:
             publisher = LivePublisher(arguments.address, keys=keys)
     except (TransportError, ValueError) as error:
         sys.exit(f"error: {error}")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `kill` and systemd end it as Ctrl-C does
     sent = 0
     try:
         print(f"publishing at {arguments.ros2 or arguments.address}, waiting for a reader; Ctrl-C ends", flush=True)
