@@ -109,7 +109,7 @@ def trajectory_of(track: dict[str, Any], report: dict[str, Any], frames: dict[in
     rest = {
         "timestamp": np.array([frames[i].timestamp for i in track["index"]]),
         "state": np.where(posed, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8),
-        "readout_time": _told_readout(report),
+        **_told_readout(report),
     }
     return Trajectory(**{**rest, **known})
 
@@ -140,7 +140,10 @@ def _array(values: list[Any]) -> np.ndarray | None:
     return np.array([unknown if value is None else value for value in values])
 
 
-def _told_readout(report: dict[str, Any]) -> float:
-    """Seconds of the rolling shutter, as the protocol in the report says it; 0 where it says nothing of one."""
-    found = re.search(r"\(([\d.]+) ms a frame(, the last row first)?\)", report.get("protocol", ""))
-    return 0.0 if found is None else (-1e-3 if found.group(2) else 1e-3) * float(found.group(1))
+def _told_readout(report: dict[str, Any]) -> dict[str, Any]:
+    """The rolling shutter, as the protocol in the report says it; none where it says nothing of one."""
+    found = re.search(r"\(([\d.]+) ms a frame(?:, the (first|last) (row|column) first)?\)", report.get("protocol", ""))
+    if found is None:
+        return {}
+    seconds, end, line = found.groups()
+    return {"readout_time": (-1e-3 if end == "last" else 1e-3) * float(seconds), "reads_columns": line == "column"}

@@ -155,7 +155,7 @@ def enlarge(tracker: Tracker, total: int) -> None:
         for (a, b), edge in edges:
             if number[a] in graph.keyframes and number[b] in graph.keyframes:
                 graph.edges[number[a], number[b]] = Edge(
-                    edge.target.copy(), edge.weight.copy(), edge.shift.copy(), edge.fraction
+                    edge.target.copy(), edge.weight.copy(), edge.velocity.copy(), edge.fraction
                 )
         session.photometer.update()
         for index in number.values():

@@ -62,6 +62,7 @@ class _PhotographedImage(_Image):
 
     velocity: Annotated[np.ndarray, "float64 6"] | None = field(default=None, kw_only=True)
     readout_time: float = field(default=0.0, kw_only=True)  # seconds from the photograph's first row to its last
+    reads_columns: bool = field(default=False, kw_only=True)  # from its first column to its last, that is
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,7 @@ class Poses:
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None  # of all images now; None: as it was
     velocity: Annotated[np.ndarray, "float64 K 6"] | None = None  # of those keyframes now, NaN or None: as it was
     readout_time: float = 0.0  # seconds of the rolling shutter that go with the velocities
+    reads_columns: bool = False  # it reads columns, not rows
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,7 @@ class Trajectory:
     places: Annotated[np.ndarray, "float64 N 3"] | None = None  # Frame.place, NaN where there is none; None: nowhere
     # k1, k2 as OpenCV's of the frames, by the focal lengths as found; keyframes are without; None: frames have none
     distortion: Annotated[np.ndarray, "float64 2"] | None = None
+    reads_columns: bool = False  # the rolling shutter reads columns, not rows
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,11 @@ def is_readout_time(seconds: float) -> bool:
     return abs(seconds) <= MAX_READOUT_TIME
 
 
-def told_readout_time(seconds: float, each: str = "") -> str:
+def told_readout_time(seconds: float, each: str = "", reads_columns: bool = False) -> str:
     """As people read it. each: of what, such as " a frame"."""
-    return f"{1e3 * abs(seconds):.1f} ms{each}" + (", the last row first" if seconds < 0.0 else "")
+    end, line = "last" if seconds < 0.0 else "first", "column" if reads_columns else "row"
+    usual = seconds == 0.0 or (end, line) == ("first", "row")
+    return f"{1e3 * abs(seconds):.1f} ms{each}" + ("" if usual else f", the {end} {line} first")
 
 
 def check_intrinsics(intrinsics: np.ndarray, size: tuple[int, int]) -> None:

@@ -38,6 +38,7 @@ class Trajectory:
     velocity: np.ndarray | None = None  # (N, 6) of the camera, see `velocities`; None: that between the poses
     places: np.ndarray | None = None  # (N, 3) latitude, longitude, altitude by GPS, NaN where not known; None: nowhere
     distortion: np.ndarray | None = None  # (2,) k1, k2 of the frames that the keyframes are without; None: none
+    reads_columns: bool = False  # the rolling shutter reads columns, not rows
 
     @classmethod
     def empty(cls) -> Trajectory:

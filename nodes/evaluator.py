@@ -205,9 +205,8 @@ def _fitted(report: dict[str, Any]) -> str:
 def _shutter(found: trajectory.Trajectory | None) -> str:
     if found is None or found.readout_time == 0.0:
         return ""
-    return (
-        f"Renders are as the camera's rolling shutter saw them ({told_readout_time(found.readout_time, ' a frame')}). "
-    )
+    told = told_readout_time(found.readout_time, " a frame", found.reads_columns)
+    return f"Renders are as the camera's rolling shutter saw them ({told}). "
 
 
 def _exposure(found: dict[str, Any] | None) -> str:

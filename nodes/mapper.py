@@ -140,7 +140,8 @@ class Mapper(Node):
                 FrameBetween(
                     index=frame.index, timestamp=frame.timestamp, image=frame.image, intrinsics=frame.intrinsics,
                     keyframe=frame.keyframe, keyframe_from_cam=frame.keyframe_from_cam, scale=frame.scale,
-                    exposure=frame.exposure, velocity=frame.velocity, readout_time=frame.readout_time, mask=frame.mask,
+                    exposure=frame.exposure, velocity=frame.velocity, readout_time=frame.readout_time,
+                    reads_columns=frame.reads_columns, mask=frame.mask,
                 )
             )  # fmt: skip
         yield from ()
@@ -169,7 +170,7 @@ class Mapper(Node):
         self.atlas.revision = max(self.atlas.revision, poses.revision)
         self.atlas.correct(
             poses.index, poses.world_from_cam, poses.scale, poses.segment, poses.exposure, poses.vignetting,
-            poses.velocity, poses.readout_time,
+            poses.velocity, poses.readout_time, poses.reads_columns,
         )  # fmt: skip
         yield from ()
 
@@ -241,7 +242,7 @@ class Mapper(Node):
                 depth=fused.depth, scale=fused.scale, confidence=fused.confidence, normals=fused.normals,
                 unfiltered=fused.unfiltered, timestamp=fused.timestamp, exposure=fused.exposure,
                 vignetting=fused.vignetting, photograph=fused.photograph, velocity=fused.velocity,
-                readout_time=fused.readout_time, mask=fused.mask,
+                readout_time=fused.readout_time, reads_columns=fused.reads_columns, mask=fused.mask,
             ),
             fused.segment,
             halvings,

@@ -90,6 +90,7 @@ def depth_message(keyframe: Keyframe, depth: np.ndarray, confidence: np.ndarray)
         photograph=keyframe.photograph,
         velocity=keyframe.velocity,
         readout_time=keyframe.readout_time,
+        reads_columns=keyframe.reads_columns,
         captured=keyframe.captured,
         mask=keyframe.mask,
     )

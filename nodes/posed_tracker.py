@@ -86,6 +86,7 @@ class PosedTracker(Node):
             state=np.where(known, TrackingState.TRACKED, TrackingState.LOST).astype(np.uint8),
             segment=np.where(known, 0, -1).astype(np.int32),
             readout_time=self.config.readout_time,
+            reads_columns=self.config.reads_columns,
             exposure=np.stack([exposures.get(i, unknown) for i in order]) if exposures else None,
             vignetting=None if self._core is None else self._core.photometer.vignetting,
             places=places_of(np.array(order, np.int64), self._places),
@@ -113,12 +114,12 @@ class PosedTracker(Node):
         light = core.photometer
         self._keyframes[index] = light.exposure(index)
         inverse_depth, weight = coarse_map(keyframe)
-        readout_time = self.config.readout_time
+        readout_time, reads_columns = self.config.readout_time, self.config.reads_columns
         velocity = camera_velocity(keyframe, core.graph.intrinsics) if readout_time else None
         return Keyframe(
             index=index,
             timestamp=frame.timestamp,
-            image=rectified(frame.image, keyframe.image, readout_time),
+            image=rectified(frame.image, keyframe.image, readout_time, reads_columns),
             intrinsics=frame.intrinsics,
             world_from_cam=self._joined[index][1],
             scale=1.0,
@@ -130,8 +131,9 @@ class PosedTracker(Node):
             photograph=None if velocity is None else frame.image,
             velocity=velocity,
             readout_time=0.0 if velocity is None else readout_time,
+            reads_columns=reads_columns,
             captured=frame.captured,
-            mask=rectified_mask(frame.mask, keyframe.image, readout_time),
+            mask=rectified_mask(frame.mask, keyframe.image, readout_time, reads_columns),
         )
 
     def _exposed(self, core: CoreTracker) -> Iterator[Poses]:

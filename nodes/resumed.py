@@ -45,6 +45,7 @@ class Resumed(Node):
                 continue
             self.stats.count("frames")
             yield GroundTruth(keyframe.index, keyframe.timestamp, image, keyframe.intrinsics, None, None, mask=mask)
+        slowest = max(keyframes, key=lambda keyframe: abs(keyframe.readout_time), default=None)
         yield Trajectory(
             index=np.array([keyframe.index for keyframe in keyframes], dtype=np.int64),
             timestamp=np.array([keyframe.timestamp for keyframe in keyframes], dtype=np.float64),
@@ -54,5 +55,6 @@ class Resumed(Node):
             segment=np.array([keyframe.segment for keyframe in keyframes], dtype=np.int32),
             exposure=np.array([keyframe.exposure for keyframe in keyframes], dtype=np.float32).reshape(-1, 3, 4),
             velocity=np.array([keyframe.velocity for keyframe in keyframes], dtype=np.float64).reshape(-1, 6),
-            readout_time=max((keyframe.readout_time for keyframe in keyframes), key=abs, default=0.0),
+            readout_time=0.0 if slowest is None else slowest.readout_time,
+            reads_columns=slowest is not None and slowest.reads_columns,
         )

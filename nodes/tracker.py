@@ -191,6 +191,10 @@ class Tracker(TrackerNode):
     def _readout_time(self) -> float:
         return self.core.readout_time if self.config.rectify_rolling_shutter else 0.0
 
+    @property
+    def _reads_columns(self) -> bool:
+        return self.core.reads_columns
+
     def _send(self, update: Update) -> Iterator[Keyframe | Poses | TrackedFrame]:
         if update.correction is not None:
             update = replace(update, correction=self._with_shutter(update.correction))
@@ -212,7 +216,7 @@ class Tracker(TrackerNode):
             velocity = self._velocity(index) if index in late else None
             if velocity is not None:
                 found[k] = velocity
-        return replace(correction, velocity=found, readout_time=self._readout_time)
+        return replace(correction, velocity=found, readout_time=self._readout_time, reads_columns=self._reads_columns)
 
     def _velocity(self, index: int) -> np.ndarray | None:
         """(6,) of the camera at a keyframe, in the unit of its depths now; None: not known."""
@@ -225,7 +229,7 @@ class Tracker(TrackerNode):
         if not self._readout_time:
             self._without_shutter.add(index)
         with self.stats.time("rectification"):
-            image = rectified(frame.image, keyframe.image, self._readout_time)
+            image = rectified(frame.image, keyframe.image, self._readout_time, self._reads_columns)
         self._readout_times.append(0.0 if keyframe.image.velocity is None else self._readout_time)
         if any(self._readout_times):
             self.stats.values["rolling shutter taken out of keyframes"] = in_milliseconds(self._readout_times)
@@ -246,8 +250,9 @@ class Tracker(TrackerNode):
             photograph=None if velocity is None else frame.image,
             velocity=velocity,
             readout_time=0.0 if velocity is None else self._readout_time,
+            reads_columns=self._reads_columns,
             captured=frame.captured,
-            mask=rectified_mask(frame.mask, keyframe.image, self._readout_time),
+            mask=rectified_mask(frame.mask, keyframe.image, self._readout_time, self._reads_columns),
         )
 
     def _camera_pose(self, frame: Frame) -> CameraPose | None:
@@ -267,6 +272,7 @@ class Tracker(TrackerNode):
             exposure=found.exposure,
             velocity=velocity,
             readout_time=0.0 if velocity is None else self._readout_time,
+            reads_columns=self._reads_columns,
             mask=frame.mask,
         )
 

@@ -107,6 +107,11 @@ class TrackerNode(Node, ABC):
         """Seconds of the rolling shutter that was taken out of the keyframes' images."""
         return 0.0
 
+    @property
+    def _reads_columns(self) -> bool:
+        """Whether that is the time of its columns, not of its rows."""
+        return False
+
     def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame | CameraPose | TrackerPhase]:
         self._frames[frame.index] = frame
         keep_place(self._places, frame)
@@ -143,7 +148,8 @@ class TrackerNode(Node, ABC):
         if self.core.nothing:
             self.stats.nothing(self.core.nothing)
         trajectory = self.core.trajectory()
-        found = {"focal_factor": self._focal_factor, "readout_time": self._readout_time}
+        found: dict[str, Any] = {"focal_factor": self._focal_factor, "readout_time": self._readout_time}
+        found["reads_columns"] = self._reads_columns
         known = {"places": places_of(trajectory.index, self._places), "distortion": self._distortion}
         yield Trajectory(**vars(trajectory) | found | known)
 

@@ -59,7 +59,8 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
         self._exposures: dict[int, np.ndarray] = {}  # (3, 4), the same
         self._vignetting: np.ndarray | None = None  # (3,) the newest
-        self._velocities: dict[int, tuple[np.ndarray, float, float]] = {}  # newest, with their scale and readout time
+        # newest, each with its scale, and time and axis of the readout
+        self._velocities: dict[int, tuple[np.ndarray, float, float, bool]] = {}
 
     @abstractmethod
     def _make_core(self) -> Core: ...
@@ -97,7 +98,7 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         if poses.velocity is not None:
             for i, velocity, scale in zip(poses.index, poses.velocity, poses.scale, strict=True):
                 if np.isfinite(velocity).all():
-                    self._velocities[int(i)] = (velocity, float(scale), poses.readout_time)
+                    self._velocities[int(i)] = (velocity, float(scale), poses.readout_time, poses.reads_columns)
         self._core.move(self._poses)
         yield poses
 
@@ -130,8 +131,8 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
 
         One that was sent before the rolling shutter was known is its own photograph.
         """
-        velocity, scale, readout_time = message.velocity, message.scale, message.readout_time
-        velocity, scale, readout_time = self._velocities.get(message.index, (velocity, scale, readout_time))
+        as_sent = message.velocity, message.scale, message.readout_time, message.reads_columns
+        velocity, scale, readout_time, reads_columns = self._velocities.get(message.index, as_sent)
         photograph = message.photograph
         if velocity is not None:
             velocity = velocity * np.repeat([now.scale / scale, 1.0], 3)
@@ -139,6 +140,7 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         return {
             "world_from_cam": now.world_from_cam, "scale": now.scale,
             "photograph": photograph, "velocity": velocity, "readout_time": readout_time,
+            "reads_columns": reads_columns,
         }  # fmt: skip
 
     def _corrected(self, keyframe: K) -> K:

@@ -14,6 +14,7 @@ from mvsgs_core import geometry
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.tracking.estimation import calibration
+from mvsgs_core.tracking.estimation.rolling_shutter import Readout
 from mvsgs_core.trajectory import Trajectory as CameraTrajectory
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker, in_milliseconds
@@ -23,8 +24,8 @@ def of_type(sent: list[msgs.Message], kind: type) -> list:  # type: ignore[type-
     return [message for message in sent if isinstance(message, kind)]
 
 
-def rolling_messages(count: int) -> tuple[list[Frame], list[GroundTruth]]:
-    rolling = Synthetic(threads=1, rolling_shutter=0.5)
+def rolling_messages(count: int, kind: str = "rolling_shutter") -> tuple[list[Frame], list[GroundTruth]]:
+    rolling = Synthetic(threads=1, **{kind: 0.5})
     items = [rolling[n] for n in range(count)]
     frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in items]
     return frames, [GroundTruth(i.index, i.timestamp, i.image, i.intrinsics, i.world_from_cam, None) for i in items]
@@ -96,6 +97,31 @@ def test_keyframes_are_as_a_global_shutter_would_have_taken_them(rectify_rolling
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", [Tracker, PosedTracker])
+def test_so_are_those_of_a_camera_that_reads_columns(kind: type[Tracker] | type[PosedTracker]) -> None:
+    frames, truths = rolling_messages(30, "rolling_columns")
+    node = kind(kind.Config(readout_time=0.5 / FPS, reads_columns=True))  # type: ignore[arg-type]
+    sent: list[msgs.Message] = []
+    for frame, truth in zip(frames, truths, strict=True):
+        sent += node.on_frame(frame)
+        sent += node.on_ground_truth(truth) if isinstance(node, PosedTracker) else []
+    sent += node.on_end()
+    keyframes = of_type(sent, Keyframe)
+    check_global_shutter(keyframes, frames)
+    check_photographs(keyframes, frames)
+    assert all(k.reads_columns for k in keyframes)
+    assert all(b.reads_columns for b in of_type(sent, TrackedFrame))
+    assert all(t.reads_columns and t.readout_time == 0.5 / FPS for t in of_type(sent, Trajectory))
+    if kind is Tracker:
+        assert of_type(sent, Poses)[-1].reads_columns
+
+
+def test_columns_are_read_within_a_time_that_is_given() -> None:
+    with pytest.raises(ValueError, match=r"tracker\.reads_columns=true: give tracker\.readout_time"):
+        Tracker(Tracker.Config(reads_columns=True))
+
+
+@pytest.mark.slow
 def test_keyframes_sent_before_the_readout_time_was_known_get_it_with_their_next_correction() -> None:
     """As the tracker finds it: 0 where the first keyframes do not tell it, and later what they do."""
     frames, _ = rolling_messages(40)
@@ -130,11 +156,11 @@ def test_a_readout_time_that_falls_to_zero_is_told(monkeypatch: pytest.MonkeyPat
     """Poses are then those of a camera without a rolling shutter, and the map has to render like that."""
     found = [0.5 / FPS]
 
-    def estimating(graph: object, indices: object, threads: int) -> Generator[None, None, float]:
+    def estimating(graph: object, indices: object, threads: int) -> Generator[None, None, Readout]:
         yield
-        return found[-1]
+        return Readout(found[-1], False)
 
-    monkeypatch.setattr(calibration, "estimating_readout_time", estimating)
+    monkeypatch.setattr(calibration, "estimating_readout", estimating)
     frames, _ = rolling_messages(24)
     node = Tracker()
     early: list[msgs.Message] = [m for frame in frames for m in node.on_frame(frame)]

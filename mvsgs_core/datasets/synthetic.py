@@ -102,7 +102,7 @@ class Synthetic:
             # The exposure is centered on the frame's time, where pose and depth are exact.
             offsets = d.motion_blur * ((np.arange(SUB_FRAMES) + 0.5) / SUB_FRAMES - 0.5)
             light = np.asarray(np.mean([self._light(n + o) for o in offsets], axis=0, dtype=np.float32))
-        elif d.rolling_shutter > 0:
+        elif d.rolling_shutter > 0 or d.rolling_columns > 0:
             light = self._light(n)
         covered = d.covered > 0 and d.covered_start <= n < d.covered_start + d.covered
         return Item(
@@ -128,17 +128,19 @@ class Synthetic:
         return Sensor(Difficulties(), self.seed).image(view.color, 0), view.depth * np.float32(d.scale)
 
     def _light(self, s: float) -> np.ndarray:
-        """(H, W, 3) float32 of an instant; of a rolling shutter, whose middle row is read at frame s."""
-        readout_time, (height, width) = self.difficulties.rolling_shutter, self.size
+        """(H, W, 3) float32 of an instant; of a rolling shutter, whose middle row or column is read at frame s."""
+        d = self.difficulties
+        readout_time, axis = d.rolling_shutter or d.rolling_columns, 1 if d.rolling_columns else 0
         if readout_time == 0:
             return self._view(self.path.pose(s), self.intrinsics, self.size, s).color
-        strips = []
-        for top in range(0, height, STRIP):
-            rows = min(STRIP, height - top)
-            at = s + readout_time * ((top + (rows - 1) / 2) / height - 0.5)
-            lens = self.intrinsics - [0.0, 0.0, 0.0, top]
-            strips.append(self._view(self.path.pose(at), lens, (rows, width), at).color)
-        return np.concatenate(strips)
+        strips, lines = [], self.size[axis]
+        for first in range(0, lines, STRIP):
+            count = min(STRIP, lines - first)
+            at = s + readout_time * ((first + (count - 1) / 2) / lines - 0.5)
+            lens, size = self.intrinsics.copy(), (self.size[0], count) if axis else (count, self.size[1])
+            lens[3 - axis] -= first
+            strips.append(self._view(self.path.pose(at), lens, size, at).color)
+        return np.concatenate(strips, axis)
 
     def _view(self, pose: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], s: float) -> Rendering:
         d = self.difficulties

@@ -148,6 +148,7 @@ class Evaluation:
                     finished.vignetting,
                     finished.antialiased,
                     photograph.mask,
+                    tracked.reads_columns,
                 )
             )
         return frames

@@ -36,6 +36,7 @@ class ScoredFrame:
     vignetting: np.ndarray | None = None  # (3,) of the sensor; None: none
     antialiased: bool = False  # as its map is rendered, see `rasterize`
     mask: Callable[[], np.ndarray | None] = lambda: None  # (H, W) bool, the pixels that count, read when needed
+    reads_columns: bool = False  # while it was read, not rows, see `rasterize`
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def render_frame(splats: Splats, kernel: str, frame: ScoredFrame, size: tuple[in
     with torch.inference_mode():
         render = rasterize(
             splats, frame.world_from_cam, frame.intrinsics, size, exposure=exposure, kernel=kernel, near=frame.near,
-            readout=frame.readout, antialiased=frame.antialiased,
+            readout=frame.readout, reads_columns=frame.reads_columns, antialiased=frame.antialiased,
         )  # fmt: skip
     color = render.color.cpu().numpy()
     if frame.vignetting is not None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mvsgs_core.camera import check_intrinsics, told_readout_time
+from mvsgs_core.camera import check_intrinsics, is_readout_time, told_readout_time
 from mvsgs_core.datasets.lens import Lens
 
 GIVEN, ESTIMATED, GUESSED = "given", "estimated", "guessed"  # by the user or the data set; by the tracker; by nobody
@@ -31,13 +31,15 @@ class SourceCamera:
     doubt: str = ""  # why the focal length is not to be relied on; empty: nothing speaks against it
     readout_time: float | None = None  # seconds of the rolling shutter, first row to last; 0: none; None: not known
     radial: tuple[float, float] | None = None  # k1 that was found and left in, its deviation; None: not looked for
+    reads_columns: bool = False  # the rolling shutter reads columns, not rows
 
     def __post_init__(self) -> None:
         if self.origin not in (GIVEN, ESTIMATED, GUESSED):
             raise ValueError(f"`origin` is given, estimated or guessed, not {self.origin!r}")
-        for name, value in (("focal_sigma", self.focal_sigma), ("readout_time", self.readout_time)):
-            if value is not None and not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"`{name}` is {value}")
+        if self.focal_sigma is not None and not (np.isfinite(self.focal_sigma) and self.focal_sigma >= 0):
+            raise ValueError(f"`focal_sigma` is {self.focal_sigma}")
+        if self.readout_time is not None and not is_readout_time(self.readout_time):
+            raise ValueError(f"`readout_time` is {self.readout_time}")
         if self.radial is not None and not (np.isfinite(self.radial).all() and self.radial[1] >= 0):
             raise ValueError(f"`radial` is {self.radial}")
 
@@ -52,7 +54,7 @@ class SourceCamera:
         if self.radial is not None:
             parts.append(f"radial distortion {self.radial[0]:.3f}, give or take {self.radial[1]:.3f}, left in")
         if self.readout_time:
-            parts.append(f"rolling shutter of {told_readout_time(self.readout_time)}")
+            parts.append(f"rolling shutter of {told_readout_time(self.readout_time, reads_columns=self.reads_columns)}")
         if self.doubt:
             parts.append(f"doubtful: {self.doubt}")
         return "; ".join(parts)
@@ -90,6 +92,7 @@ def source_camera(statistics: Mapping[str, Any]) -> SourceCamera | None:
             replace(lens, intrinsics=(factor * fx, factor * fy, cx, cy), guessed=lens.guessed and not found),
             ESTIMATED if found else GUESSED if lens.guessed else GIVEN,
             error, doubt, None if readout is None else float(readout), radial,
+            bool(values.get("reads_columns", False)),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
@@ -103,6 +106,7 @@ def camera_values(camera: SourceCamera) -> dict[str, Any]:
         "focal_sigma": camera.focal_sigma,
         "doubt": camera.doubt,
         "readout_time": camera.readout_time,
+        "reads_columns": camera.reads_columns,
         "radial": None if camera.radial is None else list(camera.radial),
     }
 
@@ -117,6 +121,7 @@ def camera_of(values: Mapping[str, Any]) -> SourceCamera:
             _lens(values), str(values["origin"]), None if sigma is None else float(sigma), str(values["doubt"]),
             None if readout is None else float(readout),
             None if radial is None else (float(radial[0]), float(radial[1])),
+            bool(values.get("reads_columns", False)),
         )  # fmt: skip
     except (KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{error!r}") from error

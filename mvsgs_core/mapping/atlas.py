@@ -133,13 +133,13 @@ class Atlas:
     def correct(
         self, index: np.ndarray, world_from_cam: np.ndarray, scale: np.ndarray, segment: np.ndarray | None = None,
         exposure: np.ndarray | None = None, vignetting: np.ndarray | None = None, velocity: np.ndarray | None = None,
-        readout_time: float = 0.0,
+        readout_time: float = 0.0, reads_columns: bool = False,
     ) -> None:  # fmt: skip
         """Corrected poses as in `OnlineMapper.correct`, for each part's keyframes; what is no pose is counted once.
 
         segment (K,): to which their keyframes belong now; maps of segments that became one are joined. exposure
-        (K, 3, 4), vignetting (3,): as in `ImageFormation.take`. velocity (K, 6), readout_time: as in
-        `OnlineMapper.move`.
+        (K, 3, 4), vignetting (3,): as in `ImageFormation.take`. velocity (K, 6), readout_time,
+        reads_columns: as in `OnlineMapper.move`.
         """
         usable = np.array([is_pose(pose, s) for pose, s in zip(world_from_cam, scale.tolist())], bool)
         if not usable.all():
@@ -152,7 +152,7 @@ class Atlas:
         for part in self.parts.values() or [self.current]:
             part.correct(index[usable], world_from_cam[usable], scale[usable])
             if velocity is not None:
-                part.move(index[usable], velocity[usable], readout_time)
+                part.move(index[usable], velocity[usable], readout_time, reads_columns)
         if self.current.config.training.exposure and not (exposure is None and vignetting is None):
             self.current.photometry.take(index.tolist(), exposure, vignetting, self.current.log)
             for part in self.parts.values() or [self.current]:

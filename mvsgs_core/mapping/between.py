@@ -34,6 +34,7 @@ class FrameBetween:
     exposure: np.ndarray | None = None  # (3, 4) from the keyframe's colors; None: no difference
     velocity: np.ndarray | None = None  # (6,) of the camera, as in `msgs`; None: not known
     readout_time: float = 0.0  # seconds from the image's first row to its last
+    reads_columns: bool = False  # from its first column to its last, that is
     mask: np.ndarray | None = None  # (H, W) bool, False where a pixel is no part of the scene; None: all are
 
 
@@ -115,6 +116,7 @@ def between_view(
     if given.velocity is not None:
         if is_read_out(given.velocity, given.readout_time):
             view.twist, view.readout_time = given.velocity, given.readout_time
+            view.reads_columns = given.reads_columns
         else:
             log.refuse("photographs", 1, NO_SHUTTER)
     if given.exposure is not None:

@@ -33,6 +33,7 @@ class RGBDKeyframe:
     photograph: np.ndarray | None = None  # (H, W, 3) uint8 as a rolling shutter took it, of which `image` is free
     velocity: np.ndarray | None = None  # (6,) of the camera, as in `msgs`; with a photograph only
     readout_time: float = 0.0  # seconds from the first row of the photograph to the last
+    reads_columns: bool = False  # from its first column to the last, that is
     mask: np.ndarray | None = None  # (H, W) bool, False where a pixel is no part of the scene; None: all are
 
 
@@ -68,6 +69,7 @@ class TrainingView:
     fixed: bool = False  # its pose is not refined: it holds the frame of reference
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))  # of the camera, twist a second, mapper's unit
     readout_time: float = 0.0  # seconds from the image's first row to its last; 0: all rows at once, or not known
+    reads_columns: bool = False  # from its first column to its last, that is
     image_on_disk: bool = False  # see resting_images.py
     as_taken: bool = True  # no shutter is taken out of the image: renders are as that saw it, as soon as it is known
     median_depth: float = 0.0  # of its depth map, in the mapper's unit; 0: it has none
@@ -144,13 +146,16 @@ class TrainingView:
         self.pose_moments[0, :3] /= factor
         self.pose_moments[1, :3] /= factor**2
 
-    def take_photograph(self, photograph: np.ndarray, velocity: np.ndarray, readout_time: float) -> None:
+    def take_photograph(
+        self, photograph: np.ndarray, velocity: np.ndarray, readout_time: float, reads_columns: bool = False
+    ) -> None:
         """From here on the image is the photograph (H, W, 3) uint8 as a rolling shutter took it, and renders are, too.
 
         velocity: (6,) of the camera, a twist a second in its own axes, in the mapper's unit.
         """
         resized = torch.from_numpy(np.array(camera.resize_image(photograph, self.size)))
-        self.image, self.velocity, self.readout_time = resized.to(self.exposure.device), velocity, readout_time
+        self.image, self.velocity = resized.to(self.exposure.device), velocity
+        self.readout_time, self.reads_columns = readout_time, reads_columns
         self.as_taken, self.image_on_disk = True, False
 
     def place(self, world_from_cam: np.ndarray, local_from_cam: np.ndarray, scale: float) -> Similarity:

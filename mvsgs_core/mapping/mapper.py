@@ -138,7 +138,7 @@ class OnlineMapper:
         if checked.photograph is not None and checked.velocity is not None and view.has_image:
             per_unit = scale / (checked.scale * self.frame.length)
             velocity = checked.velocity * ([per_unit] * 3 + [1.0] * 3)
-            view.take_photograph(checked.photograph, velocity, checked.readout_time)
+            view.take_photograph(checked.photograph, velocity, checked.readout_time, checked.reads_columns)
         self.schedule.add_budget(self.config.iterations)
         self.log.count("inserted", inserted)
         self.log.count("views")
@@ -276,7 +276,7 @@ class OnlineMapper:
         self.log.count("corrected_keyframes", len(moved))
         return count
 
-    def move(self, index: np.ndarray, velocity: np.ndarray, readout_time: float) -> None:
+    def move(self, index: np.ndarray, velocity: np.ndarray, readout_time: float, reads_columns: bool = False) -> None:
         """Takes velocities (K, 6) of the camera at the keyframes `index` (K,), world units a second, NaN: as it was.
 
         And the time, seconds, in which their photographs were read; for those that are trained on as they were taken,
@@ -287,12 +287,12 @@ class OnlineMapper:
         for view in self.views:
             found = known.get(view.index)
             if view.as_taken and found is not None and np.isfinite(found).all():
-                view.velocity, view.readout_time = found, readout_time
+                view.velocity, view.readout_time, view.reads_columns = found, readout_time, reads_columns
             elif readout_time == 0.0:
                 view.readout_time = 0.0
         for between in self.keyframes.between:
             if between.twist.any():
-                between.readout_time = readout_time
+                between.readout_time, between.reads_columns = readout_time, reads_columns
 
     def expose(self) -> int:
         """Brings keyframes and colors to what `photometry` says now; returns the number of splats that changed.

@@ -137,8 +137,8 @@ class Trainer:
         render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
             exposure=exposure if formed else None, pose_delta=twist, readout=view.readout,
-            near=training.near * median_depth, antialiased=training.antialiased, weights=weights,
-            threads=self.config.threads, step=step,
+            reads_columns=view.reads_columns, near=training.near * median_depth, antialiased=training.antialiased,
+            weights=weights, threads=self.config.threads, step=step,
         )  # fmt: skip
         factor = self._vignetting(intrinsics, size) if formed else None
         if factor is not None:

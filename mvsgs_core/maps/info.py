@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mvsgs_core.camera import told_readout_time
 from mvsgs_core.kept_map import FOLDER, TRACKER, check_kept_map, tracker_file
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.tracking import known_map
@@ -39,7 +40,7 @@ def info(output: Path) -> list[str]:
         f"splats      {splats.splats}, trained on {len(splats.keyframes)} keyframes ({splats.file.name})",
         f"keyframes   {len(known.keyframes)} of the tracker, {len(known.edges)} matched pairs ({TRACKER})",
         f"camera      {width}x{height} pixels as tracked, intrinsics [{fx:.1f}, {fy:.1f}, {cx:.1f}, {cy:.1f}], "
-        f"rolling shutter {1e3 * known.readout_time:.1f} ms",
+        f"rolling shutter {told_readout_time(known.readout_time, reads_columns=known.reads_columns)}",
         f"light       {_light(known)}",
         f"extent      {_lengths(np.ptp(positions, axis=0))} between keyframes, {depth:.3g} to what they see (median)",
     ]

@@ -9,7 +9,8 @@ The mathematics, the same in each: EWA splatting (Zwicker et al. 2001) as in 3D 
   mean (u, v) moves by p = du/dt, with dX/dt = -translation - rotation x X, to the row at which it is read: with
   g = 1 / (1 - p_y / H) and s = g (v / H - 1/2) to (u, v) + s p. Its axes follow by the Jacobian of that, p held, to
   (x + p_x g y / H, g y). So Seiskari et al. 2024 (2403.13327), with the row solved. p is that of the clamped x/z and
-  y/z, and at most half the image.
+  y/z, and at most half the image. One that reads columns reads the rows of an image whose axes are exchanged, and so
+  it is rendered.
 - alpha = min(0.99, opacity * kernel(m)); below 1/255 it is skipped. Splats are blended front to back in the order of
   float32 depth, equal depths in the order of their index; a pixel ends once its transmittance is below 1e-4 (the splat
   that brings it below is blended still).
@@ -61,6 +62,7 @@ def rasterize(
     exposure: Tensor | None = None,
     pose_delta: Tensor | None = None,
     readout: np.ndarray | None = None,
+    reads_columns: bool = False,
     near: float = 1e-3,
     antialiased: bool = False,
     degree: int | None = None,
@@ -77,6 +79,7 @@ def rasterize(
     pose_delta: (6,) twist (translation, rotation) in the camera's frame: renders from world_from_cam @ exp(pose_delta).
     readout: (6,) twist (translation, rotation) in the camera's frame by which it moves while the image is read from the
     first row to the last; world_from_cam is its pose in the middle. None: all rows at once. Carries no gradient.
+    reads_columns: from the first column to the last, that is; both coordinates of `Render.means2d` are exchanged then.
     near: splats with z <= near are left out, map units: relate it to the scene's depth.
     degree: highest degree of the spherical harmonics used; None = all that `splats.sh` has.
     weights: fill `Render.weight_sum` and `weight_max` (adds about a quarter to the forward pass).
@@ -112,7 +115,11 @@ def rasterize(
     )
     if step is not None and kernel == "ges_scale":
         raise ValueError('kernel "ges_scale" cannot step the splats in the backward pass: it renders others')
-    render = _render(backend, splats, settings, step)
+    columns = reads_columns and any(settings.readout)
+    render = _render(backend, splats, _exchanged(settings) if columns else settings, step)
+    if columns:
+        render.color = render.color.transpose(0, 1).contiguous()
+        render.depth, render.opacity = render.depth.T.contiguous(), render.opacity.T.contiguous()
     if exposure is not None:
         if tuple(exposure.shape) != (3, 4):
             raise ValueError(f"exposure is {tuple(exposure.shape)}: expected (3, 4)")
@@ -154,6 +161,17 @@ def chosen_backend(backend: str, device: torch.device) -> str:
     if backend != "auto":
         return backend
     return "cpu" if device.type == "cpu" else "triton"
+
+
+def _exchanged(settings: RenderSettings) -> RenderSettings:
+    """The same camera with the axes of its image exchanged. Its own axes are then left-handed, which nothing asks for;
+    a rotation turns the other way round."""
+    fx, fy, cx, cy = settings.intrinsics
+    v_x, v_y, v_z, w_x, w_y, w_z = settings.readout
+    return replace(
+        settings, pose=settings.pose[:, [1, 0, 2, 3]], intrinsics=(fy, fx, cy, cx), size=settings.size[::-1],
+        readout=(v_y, v_x, v_z, -w_y, -w_x, -w_z),
+    )  # fmt: skip
 
 
 def _pose(world_from_cam: Tensor | np.ndarray, delta: Tensor | None) -> Tensor:

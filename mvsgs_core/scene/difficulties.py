@@ -27,6 +27,7 @@ class Difficulties:
     drop: float = 0.0  # fraction of frames lost at random, 0 to 1; their time stamps are missing
     motion_blur: float = 0.0  # exposure time as a fraction of the time between two frames, 0 to 1
     rolling_shutter: float = 0.0  # readout time as a fraction of the time between two frames, 0 to 1
+    rolling_columns: float = 0.0  # the same of a camera that is held upright, which reads columns
     exposure: float = 0.0  # brightness drifts by up to so many stops up and down
     white_balance: float = 0.0  # red against blue drifts by up to so many stops either way
     vignetting: float = 0.0  # part of the light that is missing in the corners, 0 to 1
@@ -46,8 +47,10 @@ class Difficulties:
                 raise ValueError(f"{f.name}: {value} is negative; 0 is off")
         if self.scale <= 0:
             raise ValueError(f"scale: {self.scale} must be positive")
-        limits = {"drop": 0.95, "motion_blur": 1.0, "rolling_shutter": 1.0, "textureless": 4, "vignetting": 0.95}
-        for name, limit in (limits | {"response": 1.0}).items():
+        if self.rolling_shutter and self.rolling_columns:
+            raise ValueError("rolling_columns: a camera that has a rolling_shutter reads rows")
+        limits = {"drop": 0.95, "motion_blur": 1.0, "rolling_shutter": 1.0, "rolling_columns": 1.0, "textureless": 4}
+        for name, limit in (limits | {"vignetting": 0.95, "response": 1.0}).items():
             if getattr(self, name) > limit:
                 raise ValueError(f"{name}: {getattr(self, name)} is more than {limit}")
 

@@ -69,7 +69,7 @@ class BothSides:
     def _match(self, index: int, image: TrackingImage, pose: np.ndarray) -> Matches:
         """A keyframe's points, looked for where a camera at this pose (4, 4) should see them."""
         guess, _ = self.graph.predict_pose(index, pose)
-        guess = guess + self.graph.readout_time * image.shutter(guess)
+        guess = self.graph.as_read(guess, image)
         matches, _ = self.matcher.match(self.graph.keyframes[index].image, image, guess, 0.0)
         return matches
 

@@ -33,9 +33,10 @@ class PosedConfig(KeyframeTrackingConfig):
     """Raises ValueError for what can't be a readout time."""
 
     readout_time: float = 0.0  # seconds of the camera's rolling shutter, 0 for a global one: true poses don't tell it
+    reads_columns: bool = False  # of a phone that is held upright: it reads columns within that time, not rows
 
     def __post_init__(self) -> None:
-        check_readout_time(self.readout_time)
+        check_readout_time(self.readout_time, self.reads_columns)
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class TrackerConfig(KeyframeTrackingConfig):
     """Raises ValueError for what can't be a readout time or a number of frames."""
 
     readout_time: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
+    reads_columns: bool = False  # where that is given, of a phone that is held upright: it reads columns, not rows
     loops: bool = True  # old keyframes are looked for by appearance
     realtime: bool = False  # keyframes are worked on as there is time, not before the next frame
     frames_between: int = 8  # frames between two keyframes, at most, that the map is trained on, too; 0: none
@@ -60,7 +62,7 @@ class TrackerConfig(KeyframeTrackingConfig):
     focal: FocalConfig = field(default_factory=FocalConfig)
 
     def __post_init__(self) -> None:
-        check_readout_time(self.readout_time)
+        check_readout_time(self.readout_time, self.reads_columns)
         if self.frames_between < 0:
             raise ValueError(f"tracker.frames_between={self.frames_between}: a number of frames, 0 for none")
 

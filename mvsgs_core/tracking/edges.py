@@ -18,15 +18,15 @@ class Edge:
     An edge is replaced by another one, never changed.
     """
 
-    __slots__ = ("_found", "_points", "_shift", "_target", "_weight", "fraction")
+    __slots__ = ("_found", "_points", "_target", "_velocity", "_weight", "fraction")
 
-    def __init__(self, target: np.ndarray, weight: np.ndarray, shift: np.ndarray, fraction: float) -> None:
-        """target (2, M) pixels; weight (M,) 0 to 1, 0: lost; shift (2, M) pixels by which a second of readout time
-        moves the target; fraction: of the textured points that were found."""
+    def __init__(self, target: np.ndarray, weight: np.ndarray, velocity: np.ndarray, fraction: float) -> None:
+        """target (2, M) pixels; weight (M,) 0 to 1, 0: lost; velocity (2, M) of the image at the target, pixels a
+        second; fraction: of the textured points that were found."""
         weight = weight.astype(np.float16)
         found = weight > 0
         self._points, self._found = len(weight), np.packbits(found)
-        self._target, self._shift = target[:, found].astype(np.float32), shift[:, found].astype(np.float16)
+        self._target, self._velocity = target[:, found].astype(np.float32), velocity[:, found].astype(np.float16)
         self._weight, self.fraction = weight[found], fraction
 
     @property
@@ -40,9 +40,9 @@ class Edge:
         return self._whole(self._weight)
 
     @property
-    def shift(self) -> np.ndarray:
+    def velocity(self) -> np.ndarray:
         """(2, M) float16, 0 where lost."""
-        return self._whole(self._shift)
+        return self._whole(self._velocity)
 
     @property
     def matches(self) -> int:

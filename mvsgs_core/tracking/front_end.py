@@ -14,6 +14,8 @@ from mvsgs_core.tracking.matching.flow import DenseInverseSearch, Matches, propa
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.places.localization import Localization, localize
 
+FASTEST = 65504.0  # pixels a second: faster, of a timestamp that is wrong, is no number of an edge
+
 
 @dataclass(frozen=True)
 class FrontEndConfig:
@@ -130,11 +132,11 @@ class FrontEnd:
             return
         height, width = image.size
         cells = cv2.resize(field, (width // CELL, height // CELL), interpolation=cv2.INTER_AREA)
-        velocity = np.asarray(cells / seconds, dtype=np.float32)
+        velocity = np.clip(cells / seconds, -FASTEST, FASTEST).astype(np.float32)
         for frame in (image, self.last):
             if frame.velocity is None:
                 frame.velocity = velocity
-                frame.__dict__.pop("cell_shutter", None)
+                frame.__dict__.pop("cell_velocity", None)
 
     def _same(self, image: TrackingImage) -> bool:
         """Whether the last image shows the same: a covered lens does not move either."""

@@ -28,7 +28,7 @@ def go_on(session: Session, known: KnownMap) -> None:
     graph = session.graph
     graph.intrinsics, graph.vignetting = known.intrinsics.copy(), known.vignetting.copy()
     if session.calibration.readout_time is None:
-        graph.readout_time = known.readout_time
+        graph.readout_time, graph.reads_columns = known.readout_time, known.reads_columns
     session.calibration.settled = True
     session.calibration.guessed = False
     for keyframe in known.keyframes:

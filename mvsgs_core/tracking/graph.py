@@ -10,6 +10,7 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.tracking.edges import Edge, Edges
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
+from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.keyframes import Keyframe, KeyframeTable
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.steps import Steps, whole
@@ -26,6 +27,7 @@ class KeyframeGraph:
         self.intrinsics = np.asarray(intrinsics, dtype=np.float64)  # (4,) at the tracker's size
         self.device = device  # of the bundle adjustments of several keyframes, see Solver
         self.readout_time = 0.0  # seconds that the camera needs for an image, from the first row to the last
+        self.reads_columns = False  # the same from the first column to the last
         self.vignetting = np.zeros(3)  # of log V = l1 r² + l2 r⁴ + l3 r⁶, as far as it is known
         self.keyframes = KeyframeTable()  # by frame index
         self.edges = Edges()  # by frame indices
@@ -45,8 +47,8 @@ class KeyframeGraph:
         if fraction < min_fraction or matches.alive.sum() < 30:
             return False
         target = np.nan_to_num(matches.target.T)
-        shift = np.zeros(target.shape) if matches.shift is None else matches.shift.T
-        self.edges[source, to] = Edge(target, matches.weight, shift, fraction)
+        velocity = np.zeros(target.shape) if matches.velocity is None else matches.velocity.T
+        self.edges[source, to] = Edge(target, matches.weight, velocity, fraction)
         return True
 
     def neighbors(self, index: int) -> set[int]:
@@ -55,7 +57,7 @@ class KeyframeGraph:
     def predict(self, source: int, to: int) -> tuple[np.ndarray, np.ndarray]:
         """Where the points of `source` should be seen in `to`: (M, 2), NaN behind it; and inside the image (M,)."""
         at, inside = self.predict_pose(source, self.keyframes[to].cam_from_world)
-        return at + self.readout_time * self.keyframes[to].image.shutter(at), inside
+        return self.as_read(at, self.keyframes[to].image), inside
 
     def predict_pose(
         self, source: int, cam_from_world: np.ndarray, at_infinity: bool = False
@@ -76,10 +78,23 @@ class KeyframeGraph:
             inside = np.all((at >= 0) & (at <= [width - 1, height - 1]), axis=1)
         return at, inside
 
+    def as_read(self, points: np.ndarray, image: TrackingImage) -> np.ndarray:
+        """Where the rolling shutter sees what a global one would see at points (N, 2) of an image."""
+        return points + self._moved(points, image.velocity_at(points), image.size)
+
+    def rectified(self, points: np.ndarray, velocity: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Where a global shutter would have seen what the rolling one saw at points (N, 2), which move at `velocity`
+        (N, 2) pixels a second, of an image of `size` (height, width)."""
+        return points - self._moved(points, velocity, size)
+
+    def _moved(self, points: np.ndarray, velocity: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        axis = 0 if self.reads_columns else 1
+        return np.asarray(self.readout_time * (velocity * (points[:, axis : axis + 1] / size[1 - axis] - 0.5)))
+
     def pixels(self, index: int) -> np.ndarray:
         """Where a global shutter would have seen the points of a keyframe: (2, M) float64."""
         image = self.keyframes[index].image
-        return np.asarray((image.cells.points - self.readout_time * image.cell_shutter).T)
+        return self.rectified(image.cells.points, image.cell_velocity, image.size).T
 
     def problem(self, indices: Iterable[int], free_poses: set[int], free_depths: set[int]) -> Graph:
         """The bundle adjustment of these keyframes and every edge among them that has something free at an end."""
@@ -96,7 +111,7 @@ class KeyframeGraph:
         target = np.empty((len(pairs), 2, cells))
         for n, (a, b) in enumerate(pairs):
             edge = self.edges[a, b]
-            target[n] = edge.target - self.readout_time * edge.shift
+            target[n] = self.rectified(edge.target.T, edge.velocity.T, frames[0].image.size).T
             information[n] = self.keyframes[a].image.cells.information.T * edge.weight
         inverse_depth = np.stack([k.inverse_depth for k in frames])
         return Graph(

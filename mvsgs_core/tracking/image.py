@@ -98,15 +98,15 @@ class TrackingImage:
         places = self.levels.flattest(CELL)
         return places, self.levels.at(places)
 
-    def shutter(self, points: np.ndarray) -> np.ndarray:
-        """(N, 2) pixels by which a second of readout time moves what is seen at points (N, 2)."""
+    def velocity_at(self, points: np.ndarray) -> np.ndarray:
+        """(N, 2) pixels a second by which what is seen at points (N, 2) moves; 0 where it is not known."""
         if self.velocity is None:
             return np.zeros(points.shape)
         at = np.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0)
         rows, columns = self.velocity.shape[:2]
         v = np.clip(at[:, 1] / CELL, 0, rows - 1).astype(int)
         u = np.clip(at[:, 0] / CELL, 0, columns - 1).astype(int)
-        return np.asarray(self.velocity[v, u] * (at[:, 1:] / self.size[0] - 0.5))
+        return np.asarray(self.velocity[v, u])
 
     def masked(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool: which points (N, 2) lie where nothing is to be seen; points outside, or NaN, do not."""
@@ -118,9 +118,9 @@ class TrackingImage:
         return np.asarray(inside & ~self.mask[v, u])
 
     @cached_property
-    def cell_shutter(self) -> np.ndarray:
-        """`shutter` of the cells' points (M, 2)."""
-        return self.shutter(self.cells.points)
+    def cell_velocity(self) -> np.ndarray:
+        """`velocity_at` the cells' points (M, 2)."""
+        return self.velocity_at(self.cells.points)
 
     def features(self, count: int = 800) -> tuple[np.ndarray, np.ndarray]:
         """ORB keypoints (N, 2) float32 and descriptors (N, 32) uint8."""

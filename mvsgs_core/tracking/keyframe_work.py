@@ -62,7 +62,7 @@ class KeyframeWork:
         """What an inserted keyframe tells of the camera, of the whole map and of the light."""
         segment = self.graph.keyframes[index].segment
         if len(self.graph.keyframes) in REESTIMATED_AT:
-            yield from self.calibration.estimating_readout_time(self.local_map.members(segment)[-12:])
+            yield from self.calibration.estimating_readout(self.local_map.members(segment)[-12:])
             yield
         self.calibration.refine(self.local_map.members(segment))
         yield
@@ -73,7 +73,7 @@ class KeyframeWork:
 
     def first(self, keyframes: list[int]) -> Steps[None]:
         """The same of a segment's first keyframes, once they are solved."""
-        yield from self.calibration.estimating_readout_time(keyframes)
+        yield from self.calibration.estimating_readout(keyframes)
         yield
         self.local_map.adjust_window(keyframes[-1])
         yield

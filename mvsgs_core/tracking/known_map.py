@@ -30,6 +30,7 @@ class KnownMap:
     size: tuple[int, int]  # height, width of the tracker's images
     intrinsics: np.ndarray  # (4,) at that size
     readout_time: float  # seconds of the camera's rolling shutter
+    reads_columns: bool  # it reads columns, not rows
     vignetting: np.ndarray  # (3,) as the graph has it, of log V
     published_vignetting: np.ndarray  # (3,) as readers have it, see `msgs`; zeros: none
     keyframes: list[Keyframe]  # in the order of the stream
@@ -48,8 +49,8 @@ class KnownMap:
         exposures = {index - frames: exposure for index, exposure in self.exposures.items()}
         edges = {(a - frames, b - frames): edge for (a, b), edge in self.edges.items()}
         return KnownMap(
-            self.size, self.intrinsics, self.readout_time, self.vignetting, self.published_vignetting, keyframes,
-            exposures, edges,
+            self.size, self.intrinsics, self.readout_time, self.reads_columns, self.vignetting,
+            self.published_vignetting, keyframes, exposures, edges,
         )  # fmt: skip
 
 
@@ -87,13 +88,12 @@ def save(file: Path, graph: KeyframeGraph, publisher: Publisher, vignetting: np.
         "edges": np.array(pairs, np.int64).reshape(-1, 2),
         "target": np.array([edge.target for edge in edges], np.float32).reshape(-1, 2, points),
         "weight": np.array([edge.weight for edge in edges], np.float16).reshape(-1, points),
-        "shift": np.array([edge.shift for edge in edges], np.float16).reshape(-1, 2, points),
         "fraction": np.array([edge.fraction for edge in edges], np.float64),
     }
     if any(image.mask is not None for image in images):
         whole = np.ones((height, width), bool)
         arrays["mask"] = np.stack([whole if image.mask is None else image.mask for image in images])
-    meta = {"size": [height, width], "readout_time": graph.readout_time}
+    meta = {"size": [height, width], "readout_time": graph.readout_time, "reads_columns": graph.reads_columns}
     file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(file) as aside:
         write_arrays(aside, FORMAT, VERSION, meta, {name: np.ascontiguousarray(a) for name, a in arrays.items()})
@@ -116,6 +116,9 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
         raise ValueError(f"{size!r} is no size of the tracker's images")
     if type(readout_time) is not float or not is_readout_time(readout_time):
         raise ValueError(f"{readout_time!r} is no readout time")
+    reads_columns = meta.get("reads_columns", False)  # which an earlier version knew nothing of
+    if type(reads_columns) is not bool:
+        raise ValueError(f"{reads_columns!r} does not say whether columns are read")
     height, width = size
     index = arrays.take("index", np.int64, (None,))
     count, points = len(index), (height // CELL) * (width // CELL)
@@ -157,27 +160,24 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
         )
         for k in range(count)
     ]  # fmt: skip
-    edges = _edges(arrays, set(index.tolist()), points)
+    edges = _edges(arrays, {keyframe.index: keyframe.image for keyframe in keyframes}, points)
     vignetting = arrays.take("vignetting", np.float64, (3,)).copy()
     return KnownMap(
-        (height, width), intrinsics.copy(), readout_time, vignetting, published_vignetting, keyframes, exposures, edges,
-        dict(zip(index.tolist(), scale.tolist())),
+        (height, width), intrinsics.copy(), readout_time, reads_columns, vignetting, published_vignetting, keyframes,
+        exposures, edges, dict(zip(index.tolist(), scale.tolist())),
     )  # fmt: skip
 
 
-def _edges(arrays: Arrays, keyframes: set[int], points: int) -> dict[tuple[int, int], Edge]:
+def _edges(arrays: Arrays, images: dict[int, TrackingImage], points: int) -> dict[tuple[int, int], Edge]:
     pairs = arrays.take("edges", np.int64, (None, 2))
     count = len(pairs)
     target = arrays.take("target", np.float32, (count, 2, points))
-    weight, shift = (
-        arrays.take("weight", np.float16, (count, points)),
-        arrays.take("shift", np.float16, (count, 2, points)),
-    )
+    weight = arrays.take("weight", np.float16, (count, points))
     fraction = arrays.take("fraction", np.float64, (count,))
-    if not set(pairs.ravel().tolist()) <= keyframes or (pairs[:, 0] == pairs[:, 1]).any() or (weight < 0).any():
+    if not set(pairs.ravel().tolist()) <= images.keys() or (pairs[:, 0] == pairs[:, 1]).any() or (weight < 0).any():
         raise ValueError("matches are of keyframes that are not there, or weigh less than nothing")
     return {
-        (int(a), int(b)): Edge(target[n], weight[n], shift[n], float(fraction[n]))
+        (int(a), int(b)): Edge(target[n], weight[n], images[b].velocity_at(target[n].T).T, float(fraction[n]))
         for n, (a, b) in enumerate(pairs.tolist())
     }
 

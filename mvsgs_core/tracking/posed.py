@@ -37,7 +37,7 @@ class PosedTracker:
         self.stats = Stats()
         self.size = tracking_size(*size, config.area)
         self.graph = KeyframeGraph(scale_intrinsics(intrinsics, size, self.size))
-        self.graph.readout_time = config.readout_time
+        self.graph.readout_time, self.graph.reads_columns = config.readout_time, config.reads_columns
         self.threads = config.threads or 1
         self.flow = make_flow(config.flow)
         matcher = Matcher(self.flow)

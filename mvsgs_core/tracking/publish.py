@@ -51,6 +51,7 @@ class Correction:
     vignetting: np.ndarray | None = None  # (3,) float32 of all images; None: as it was
     velocity: np.ndarray | None = None  # (K, 6) of the camera, see `msgs`, NaN where not known; None: as they were
     readout_time: float = 0.0  # seconds of the rolling shutter that go with them
+    reads_columns: bool = False  # it reads columns, not rows
 
 
 @dataclass(frozen=True)

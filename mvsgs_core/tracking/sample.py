@@ -17,7 +17,7 @@ from mvsgs_core.tracking.places.localization import localize, located
 
 GRID = (6, 8)  # rows and columns of the image: one point each
 
-_POINT = np.dtype([("cell", "<u4"), ("target", "<f4", 2), ("shift", "<f2", 2)])
+_POINT = np.dtype([("cell", "<u4"), ("target", "<f4", 2), ("velocity", "<f2", 2)])
 
 
 def sample(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: np.ndarray) -> bytes:
@@ -29,7 +29,7 @@ def sample(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: n
     chosen = _thinned(matches.target, np.flatnonzero(use), keyframe.image.size)
     few = np.zeros(len(use))
     few[chosen] = 1.0
-    alone = localize(graph, index, Matches(matches.target, few, matches.shift), cam_from_world, Solver(steps=4))
+    alone = localize(graph, index, Matches(matches.target, few, matches.velocity), cam_from_world, Solver(steps=4))
     points = np.zeros(len(chosen), _POINT)
     points["cell"] = chosen
     points["target"] = matches.target[chosen]
@@ -38,17 +38,17 @@ def sample(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: n
             graph.predict_pose(index, pose)[0][chosen] for pose in (cam_from_world, alone.cam_from_world)
         )
         points["target"] += np.nan_to_num(all_say - few_say)
-    if matches.shift is not None:
-        points["shift"] = matches.shift[chosen]
+    if matches.velocity is not None:
+        points["velocity"] = matches.velocity[chosen]
     return points.tobytes()
 
 
 def restored(points: bytes, cells: int) -> Matches:
     """The matches that were kept, among all `cells` of the keyframe."""
     kept = np.frombuffer(points, _POINT)
-    target, weight, shift = np.full((cells, 2), np.nan), np.zeros(cells), np.zeros((cells, 2))
-    target[kept["cell"]], weight[kept["cell"]], shift[kept["cell"]] = kept["target"], 1.0, kept["shift"]
-    return Matches(target, weight, shift)
+    target, weight, velocity = np.full((cells, 2), np.nan), np.zeros(cells), np.zeros((cells, 2))
+    target[kept["cell"]], weight[kept["cell"]], velocity[kept["cell"]] = kept["target"], 1.0, kept["velocity"]
+    return Matches(target, weight, velocity)
 
 
 def _thinned(target: np.ndarray, candidates: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -62,7 +62,14 @@ class Session:
         self.intrinsics = scale_intrinsics(intrinsics, size, self.size)
         self.graph = KeyframeGraph(self.intrinsics, config.device)
         self.calibration = Calibration(
-            self.graph, config.focal, stats, float(intrinsics[0]), not guessed, config.readout_time, threads
+            self.graph,
+            config.focal,
+            stats,
+            float(intrinsics[0]),
+            not guessed,
+            config.readout_time,
+            config.reads_columns,
+            threads,
         )
         self.matcher = Matcher(make_flow(config.flow))
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, threads)
@@ -120,7 +127,7 @@ class Session:
         else:
             yield from self._end_with_a_keyframe()
         if self.phase is not Phase.INITIALIZING:
-            self.calibration.estimate_readout_time(self.members[-40:])
+            self.calibration.estimate_readout(self.members[-40:])
         if self.publisher.held:
             yield Update(TrackingState.TRACKED, self._settle())
 

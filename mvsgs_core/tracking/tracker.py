@@ -115,6 +115,11 @@ class Tracker:
         """Seconds that the camera's rolling shutter needs for an image, as far as it is known; 0: global."""
         return 0.0 if self._session is None else self._session.graph.readout_time
 
+    @property
+    def reads_columns(self) -> bool:
+        """Whether that is the time of its columns, not of its rows."""
+        return self._session is not None and self._session.graph.reads_columns
+
     def keyframe(self, index: int) -> Keyframe:
         return self.session.graph.keyframes[index]
 
@@ -270,7 +275,9 @@ class Tracker:
         correction = None if self._frozen else session.publisher.corrections(everything=True)
         if correction is not None and (graph.readout_time != 0.0 or session.calibration.rolled):
             velocity = self._trajectory.velocities_of(correction.index)
-            correction = replace(correction, velocity=velocity, readout_time=graph.readout_time)
+            correction = replace(
+                correction, velocity=velocity, readout_time=graph.readout_time, reads_columns=graph.reads_columns
+            )
         yield Update(state, correction=correction)
 
 

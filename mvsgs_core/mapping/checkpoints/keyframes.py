@@ -26,6 +26,7 @@ class KeptKeyframe:
     exposure: np.ndarray  # (3, 4) float32, the tracker's; NaN: none is known
     velocity: np.ndarray  # (6,) of the camera, as in `msgs`
     readout_time: float  # seconds of its rolling shutter
+    reads_columns: bool  # that it reads columns, not rows
     folder: Path  # of the images
     name: str  # of its image's file; empty where that was let go
 
@@ -51,7 +52,7 @@ def kept_keyframes(output: Path | str) -> list[KeptKeyframe]:
             KeptKeyframe(
                 row["index"], row["timestamp"], row["intrinsics"], row["world_from_cam"], int(part["segment"]),
                 row["measured"], row["velocity"] * ([float(part["unit"] or 1.0)] * 3 + [1.0] * 3),
-                row["readout_time"], file.parent / KEYFRAMES, row["file"],
+                row["readout_time"], row["reads_columns"], file.parent / KEYFRAMES, row["file"],
             )
             for k, part in enumerate(meta["mappers"])
             for row in keyframe_rows(Arrays(raw).of(f"map{k}").of("views"), part["images"])

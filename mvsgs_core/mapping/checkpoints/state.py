@@ -34,7 +34,8 @@ VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in Trainin
     "image_size": (np.int64, (2,)), "exposure": (np.float32, (3, 4)), "exposure_moments": (np.float32, (2, 3, 4)),
     "measured": (np.float32, (3, 4)),
     "pose_delta": (np.float64, (4, 4)), "pose_moments": (np.float64, (2, 6)), "pose_steps": (np.int64, ()),
-    "velocity": (np.float64, (6,)), "readout_time": (np.float64, ()), "as_taken": (np.bool_, ()),
+    "velocity": (np.float64, (6,)), "readout_time": (np.float64, ()), "reads_columns": (np.bool_, ()),
+    "as_taken": (np.bool_, ()),
     "fixed": (np.bool_, ()),
     "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_here": (np.int64, ()),
     "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "loss_before": (np.float64, ()),
@@ -45,6 +46,7 @@ BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
     "twist": (np.float64, (6,)),
 }  # fmt: skip
 NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth")
+LATER = ("reads_columns",)  # which earlier versions knew nothing of: 0
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
 
 
@@ -185,7 +187,10 @@ def keyframe_rows(
     """The values of each keyframe's TrainingView, and the `file` of its image. Raises ValueError for damage."""
     count = len(arrays.take("index", np.int64, (None,)))
     columns = {
-        name: arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN) for name, (dtype, shape) in kept.items()
+        name: np.zeros((count, *shape), dtype)
+        if name in LATER and name not in arrays
+        else arrays.take(name, dtype, (count, *shape), nan=name in MAY_BE_NAN)
+        for name, (dtype, shape) in kept.items()
     }
     sensible = all((columns[n] >= 0).all() for n in NEVER_BELOW_0)
     if not (sensible and (columns["image_size"] > 0).all() and (columns["scale"] > 0).all()):

@@ -11,7 +11,7 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.estimation.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
 from mvsgs_core.tracking.estimation.radial import Radial, estimate_radial, lens_problem
-from mvsgs_core.tracking.estimation.rolling_shutter import estimating_readout_time
+from mvsgs_core.tracking.estimation.rolling_shutter import estimating_readout
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.steps import Steps, timed, whole
 
@@ -30,12 +30,14 @@ class Calibration:
     pixels: float  # the focal length that came with the frames, at their own size
     settled: bool  # from the start on, where the intrinsics are no guess
     readout_time: float | None  # seconds; None: to be estimated
+    reads_columns: bool  # where it is given
     threads: int
 
     def __post_init__(self) -> None:
-        self.graph.readout_time = self.readout_time or 0.0
+        self.graph.readout_time, self.graph.reads_columns = self.readout_time or 0.0, self.reads_columns
         if self.readout_time is not None:
             self.stats.values["readout_time"] = self.readout_time
+            self.stats.values["reads_columns"] = self.reads_columns
         self.given = self.graph.intrinsics  # (4,) that came with the frames, at the tracker's size
         self.guessed = not self.settled
         self.rolled = False  # a readout time that is not 0 was used before the one now, also by a map gone on with
@@ -102,19 +104,20 @@ class Calibration:
                 f"%, and {used:.0f} px was used: run again with dataset.intrinsics=[fx,fy,cx,cy] set to it"
             )
 
-    def estimate_readout_time(self, members: list[int]) -> None:
+    def estimate_readout(self, members: list[int]) -> None:
         """Of a rolling shutter, from these keyframes."""
-        whole(self.estimating_readout_time(members))
+        whole(self.estimating_readout(members))
 
-    def estimating_readout_time(self, members: list[int]) -> Steps[None]:
-        """`estimate_readout_time`, a time that is tried a step."""
+    def estimating_readout(self, members: list[int]) -> Steps[None]:
+        """`estimate_readout`, a time that is tried a step."""
         if self.readout_time is not None:
             return
         self.rolled |= self.graph.readout_time != 0.0
-        estimating = estimating_readout_time(self.graph, members, self.threads)
-        self.graph.readout_time = yield from timed(self.stats, "rolling shutter", estimating)
-        self.stats.values["readout_time"] = self.graph.readout_time
-        self.stats.values["rolling shutter"] = told_readout_time(self.graph.readout_time)
+        estimating = estimating_readout(self.graph, members, self.threads)
+        found = yield from timed(self.stats, "rolling shutter", estimating)
+        self.graph.readout_time, self.graph.reads_columns = found
+        self.stats.values["readout_time"], self.stats.values["reads_columns"] = found
+        self.stats.values["rolling shutter"] = told_readout_time(found[0], reads_columns=found[1])
 
     def _sensible(self) -> bool:
         return self.config.bounds[0] < self.focal_factor < self.config.bounds[1]

@@ -27,7 +27,7 @@ class Matches:
 
     target: np.ndarray  # (N, 2) float64 pixels; NaN where lost
     weight: np.ndarray  # (N,) float64, 0 (lost) to 1
-    shift: np.ndarray | None = None  # (N, 2) pixels by which a second of readout time moves the target; None: not known
+    velocity: np.ndarray | None = None  # (N, 2) of the image at the target, pixels a second; None: not known
 
     @property
     def alive(self) -> np.ndarray:

@@ -52,7 +52,7 @@ class Matcher:
             hidden = b.masked(target)
             target[hidden], weight[hidden] = np.nan, 0.0
         fraction = float((weight > 0).sum() / max(1, cells.textured.sum()))
-        return Matches(target, weight, b.shutter(target)), fraction
+        return Matches(target, weight, b.velocity_at(target)), fraction
 
 
 __all__ = ["Matcher"]

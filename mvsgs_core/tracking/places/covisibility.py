@@ -78,9 +78,7 @@ class CovisibleKeyframes:
         seen = matches.alive & keyframe.triangulated
         if fraction < self.config.min_fraction or not seen.any():
             return None
-        apart = np.linalg.norm(expected + self.graph.readout_time * frame.shutter(expected) - matches.target, axis=1)[
-            seen
-        ]
+        apart = np.linalg.norm(self.graph.as_read(expected, frame) - matches.target, axis=1)[seen]
         if not np.median(apart) < self.config.max_error:
             return None
         found = localize(self.graph, index, matches, pose, self.solver)

@@ -40,7 +40,7 @@ def localize_by(
     weight = np.stack([np.where(k.triangulated, m.weight, 0.0) for k, m in zip(keyframes, matches.values())])
     if (weight > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
         weight = np.stack([m.weight for m in matches.values()])
-    target = np.stack([np.nan_to_num(_rectified(m, graph.readout_time).T) for m in matches.values()])
+    target = np.stack([np.nan_to_num(_rectified(graph, k, m).T) for k, m in matches.items()])
     cells = weight.shape[1]
     problem = Graph(
         cam_from_world=np.stack([*(k.cam_from_world for k in keyframes), start]),
@@ -73,7 +73,7 @@ def located(
     """
     expected, _ = graph.predict_pose(index, cam_from_world, at_infinity)
     with np.errstate(invalid="ignore"):
-        apart = np.linalg.norm(expected - _rectified(matches, graph.readout_time), axis=1)
+        apart = np.linalg.norm(expected - _rectified(graph, index, matches), axis=1)
     return np.asarray(matches.alive & (apart < INLIER))
 
 
@@ -87,9 +87,11 @@ def confirmed(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world
     return float(found.sum() / max(1, expected.sum()))
 
 
-def _rectified(matches: Matches, readout_time: float) -> np.ndarray:
-    """Targets (M, 2) as a global shutter would have seen them."""
-    return matches.target if matches.shift is None else matches.target - readout_time * matches.shift
+def _rectified(graph: KeyframeGraph, index: int, matches: Matches) -> np.ndarray:
+    """Targets (M, 2), of the points of keyframe `index`, as a global shutter would have seen them."""
+    if matches.velocity is None:
+        return matches.target
+    return graph.rectified(matches.target, matches.velocity, graph.keyframes[index].image.size)
 
 
 __all__ = ["INLIER", "Localization", "confirmed", "localize", "localize_by", "located"]

@@ -1,4 +1,4 @@
-"""Renders as a rolling shutter sees them: against one render a row, between back ends, and by finite differences."""
+"""Renders as a rolling shutter sees them: against one render a line, between back ends, and by finite differences."""
 
 from __future__ import annotations
 
@@ -21,26 +21,29 @@ READOUT = np.array([0.06, -0.04, 0.05, 0.03, -0.05, 0.04])  # 2 to 4 pixels at a
 BACKENDS = ("reference", "cpu", "triton")
 
 
-def row_by_row(splats: Splats, size: tuple[int, int], readout: np.ndarray) -> Tensor:
-    """(H, W, 3) each row from the pose at which it is read."""
-    rows = []
-    for row in range(size[0]):
-        pose = POSE @ geometry.se3_exp(readout * (row / size[0] - 0.5))
-        rows.append(rasterize(splats, pose, intrinsics(size), size).color[row])
-    return torch.stack(rows)
+def line_by_line(splats: Splats, lens: np.ndarray, size: tuple[int, int], readout: np.ndarray, axis: int) -> Tensor:
+    """(H, W, 3) each row, or for axis 1 each column, from the pose at which it is read."""
+    lines = []
+    for line in range(size[axis]):
+        pose = POSE @ geometry.se3_exp(readout * (line / size[axis] - 0.5))
+        lines.append(rasterize(splats, pose, lens, size).color.select(axis, line))
+    return torch.stack(lines, dim=axis)
 
 
 @pytest.mark.parametrize(
     ("readout", "left"), [(READOUT, 0.1), (-READOUT, 0.1), *zip(np.eye(6) * 0.08, [0.1, 0.1, 0.45, 0.1, 0.1, 0.1])],
     ids=["all", "back", "x", "y", "z", "turn x", "turn y", "turn z"],
 )  # fmt: skip
-def test_as_if_every_row_had_a_pose_of_its_own(readout: np.ndarray, left: float) -> None:
+@pytest.mark.parametrize("reads_columns", [False, True])
+def test_as_if_every_line_had_a_pose_of_its_own(reads_columns: bool, readout: np.ndarray, left: float) -> None:
     """left: of what the shutter changes, for it is of first order; ahead, what comes nearer grows as well, by 2 %."""
-    splats, size = random_splats(300, log_scale=-2.3), (48, 64)
+    splats, size, lens = random_splats(300, log_scale=-2.3), (48, 64), intrinsics((48, 64))
+    if reads_columns:  # the same camera, held upright
+        size, lens = (64, 48), lens[[1, 0, 3, 2]]
     splats.opacity_logits += 1.0
-    expected = row_by_row(splats, size, readout)
-    found = rasterize(splats, POSE, intrinsics(size), size, readout=readout).color
-    without = rasterize(splats, POSE, intrinsics(size), size).color
+    expected = line_by_line(splats, lens, size, readout, int(reads_columns))
+    found = rasterize(splats, POSE, lens, size, readout=readout, reads_columns=reads_columns).color
+    without = rasterize(splats, POSE, lens, size).color
     assert float((found - expected).square().mean()) < left**2 * float((without - expected).square().mean())
 
 
@@ -53,9 +56,11 @@ def test_back_ends_agree_with_the_reference(backend: str, kernel: str) -> None:
     splats = random_splats(count)
     assert_agree(splats, size, backend, kernel=kernel, antialiased=True, readout=READOUT)
     assert_agree(splats, size, backend, kernel=kernel, readout=20 * READOUT)  # beyond MAX_MOTION, most of them
+    assert_agree(splats, size, backend, kernel=kernel, antialiased=True, readout=READOUT, reads_columns=True)
 
 
-def test_gradients_of_the_reference() -> None:
+@pytest.mark.parametrize("reads_columns", [False, True])
+def test_gradients_of_the_reference(reads_columns: bool) -> None:
     """Every element of the Jacobian in float64, that of the pose included."""
     scene = random_splats(4, 4, seed=7, log_scale=0.3)
     delta = torch.full((6,), 0.02, dtype=torch.float64, requires_grad=True)
@@ -65,21 +70,23 @@ def test_gradients_of_the_reference() -> None:
     def images(*values: Tensor) -> tuple[Tensor, ...]:
         *fields, twist = values
         render = rasterize(
-            Splats(*fields), POSE, intrinsics(size), size, backend="reference", pose_delta=twist, readout=2 * READOUT
-        )
+            Splats(*fields), POSE, intrinsics(size), size, backend="reference", pose_delta=twist, readout=2 * READOUT,
+            reads_columns=reads_columns,
+        )  # fmt: skip
         return render.color, render.depth, render.opacity
 
     assert torch.autograd.gradcheck(images, (*inputs, delta), eps=1e-6, atol=1e-6, rtol=1e-4)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_no_motion_is_no_shutter(backend: str) -> None:
+@pytest.mark.parametrize("reads_columns", [False, True])
+def test_no_motion_is_no_shutter(backend: str, reads_columns: bool) -> None:
     if backend == "triton":
         pytest.importorskip("triton", reason="triton is not installed: pip install triton to run its interpreter")
     size, splats = (20, 24), random_splats(30)
     runs = [
-        gradients(copy(splats, device=device_of(backend)), size, backend=backend, readout=readout)
-        for readout in (None, np.zeros(6))
+        gradients(copy(splats, device=device_of(backend)), size, backend=backend, readout=readout, reads_columns=given)
+        for readout, given in ((None, False), (np.zeros(6), reads_columns))
     ]
     assert torch.equal(runs[0][0].color, runs[1][0].color)
     assert all(torch.equal(value, runs[1][1][name]) for name, value in runs[0][1].items())

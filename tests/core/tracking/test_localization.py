@@ -63,12 +63,16 @@ def test_without_matches_there_is_no_pose() -> None:
     np.testing.assert_array_equal(found.cam_from_world, start)
 
 
-def test_the_rolling_shutter_is_taken_out_of_the_matches() -> None:
+@pytest.mark.parametrize("reads_columns", [False, True])
+def test_the_rolling_shutter_is_taken_out_of_the_matches(reads_columns: bool) -> None:
     graph, true = true_graph(REFERENCE), true_pose(FRAME)
     exact = exact_matches(graph, REFERENCE, true)
-    shift = np.random.default_rng(0).normal(0.0, 100.0, exact.target.shape)  # pixels a second of readout
-    graph.readout_time = 0.02
-    matches = Matches(exact.target + 0.02 * shift, exact.weight, shift)
+    seen = exact.target + np.random.default_rng(0).normal(0.0, 2.0, exact.target.shape)
+    height, width = graph.keyframes[REFERENCE].image.size
+    late = (seen[:, 0] / width if reads_columns else seen[:, 1] / height) - 0.5  # readouts
+    velocity = (seen - exact.target) / (0.02 * late[:, None])
+    graph.readout_time, graph.reads_columns = 0.02, reads_columns
+    matches = Matches(seen, exact.weight, velocity)
     found = localize(graph, REFERENCE, matches, AWAY @ true, SOLVER)
     assert max(pose_error(found.cam_from_world, true)) < 1e-6
     assert located(graph, REFERENCE, matches, true).sum() == exact.alive.sum()

@@ -44,7 +44,11 @@ def adjustments(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def state(graph: KeyframeGraph) -> list[np.ndarray]:
     """What frames are followed by."""
     keyframes = [array for k in graph.keyframes.values() for array in (k.cam_from_world, k.inverse_depth)]
-    return [graph.intrinsics.copy(), np.array(graph.readout_time), *(array.copy() for array in keyframes)]
+    return [
+        graph.intrinsics.copy(),
+        np.array([graph.readout_time, graph.reads_columns]),
+        *(array.copy() for array in keyframes),
+    ]
 
 
 def stepwise(steps: Steps[Any], graph: KeyframeGraph, adjustments: list[int]) -> Iterator[int]:
@@ -74,8 +78,8 @@ def connected() -> KeyframeGraph:
 def test_the_readout_time_is_tried_one_by_one(adjustments: list[int]) -> None:
     graph = connected()
     graph.readout_time = 0.004
-    work = list(stepwise(rolling_shutter.estimating_readout_time(graph, FRAMES, 1), graph, adjustments))
-    assert sum(work) == 7, "0, three times above it, and three below, as a global shutter is no worse than the former"
+    work = list(stepwise(rolling_shutter.estimating_readout(graph, FRAMES, 1), graph, adjustments))
+    assert sum(work) == 7, "0, one in each of four directions, and two more in that of which it leaves the least cost"
     assert max(work) == 1
 
 
