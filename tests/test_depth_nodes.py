@@ -198,7 +198,8 @@ def test_a_photograph_passes_through_and_its_velocity_follows_the_maps_scale() -
     velocity = np.arange(1.0, 7.0)
     mvs, depth_fusion = stereo(), fusion()
     sent = [keyframe(i) for i in range(6)]
-    sent = [replace(k, photograph=k.image[::-1].copy(), velocity=velocity, readout_time=0.02) for k in sent]
+    shutter = {"velocity": velocity, "readout_time": 0.02, "reads_columns": True}
+    sent = [replace(k, photograph=k.image[::-1].copy(), **shutter) for k in sent]
     depths = [d for k in sent for d in mvs.on_keyframe(k)]
     assert all(np.array_equal(d.velocity, velocity) for d in depths)
     poses = np.stack([k.world_from_cam for k in sent])
@@ -213,6 +214,7 @@ def test_a_photograph_passes_through_and_its_velocity_follows_the_maps_scale() -
         np.testing.assert_allclose(view.velocity, velocity * [2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
         np.testing.assert_array_equal(view.photograph, sent[view.index].image[::-1])
         assert view.readout_time == 0.02
+        assert view.reads_columns
 
 
 def test_a_velocity_that_is_known_better_reaches_keyframes_on_their_way() -> None:
@@ -223,12 +225,13 @@ def test_a_velocity_that_is_known_better_reaches_keyframes_on_their_way() -> Non
     poses = np.stack([k.world_from_cam for k in sent])
     better = np.full((4, 6), 5.0)
     better[1] = np.nan  # not known better
-    correction = Poses(1, np.arange(4), poses, np.ones(4), velocity=better, readout_time=0.03)
+    correction = Poses(1, np.arange(4), poses, np.ones(4), velocity=better, readout_time=0.03, reads_columns=True)
     for node in (mvs, depth_fusion):
         list(node.on_poses(correction))
     views = [v for d in [*depths, *mvs.on_end()] for v in depth_fusion.on_depth(d)] + list(depth_fusion.on_end())
     found = [(None if v.velocity is None else v.velocity.tolist(), v.readout_time) for v in views]
     assert found == [([5.0] * 6, 0.03), ([1.0] * 6, 0.02), ([5.0] * 6, 0.03), ([5.0] * 6, 0.03)]
+    assert [v.reads_columns for v in views] == [True, False, True, True]
     np.testing.assert_array_equal(views[3].photograph, sent[3].image)
 
 

@@ -54,6 +54,9 @@ def test_renders_are_as_the_rolling_shutter_saw_them(evaluator: Evaluator) -> No
     color = render_frame(finished.splats, finished.kernel, view, (H, W)).color
     still = render_frame(finished.splats, finished.kernel, replace(view, readout=None), (H, W)).color
     assert np.abs(color - still).max() > 1e-3
+    list(evaluator.on_trajectory(replace(track, reads_columns=True)))
+    upright = render_frame(finished.splats, finished.kernel, evaluator.evaluation.scored_frames()[5], (H, W)).color
+    assert min(np.abs(upright - color).max(), np.abs(upright - still).max()) > 1e-3
     given = np.arange(6.0) * np.ones((N, 1))
     list(evaluator.on_trajectory(replace(track, velocity=given)))  # the tracker knows better
     np.testing.assert_allclose(evaluator.evaluation.scored_frames()[5].readout, 0.02 * given[5])

@@ -111,7 +111,12 @@ def test_a_kept_map_keeps_the_masks_of_its_keyframes(tmp_path: Path) -> None:
         points = len(image.cells.points)
         keyframes[item.index] = Keyframe(image, np.eye(4), np.ones(points), np.ones(points), 0)
     graph = SimpleNamespace(
-        keyframes=keyframes, edges={}, intrinsics=np.ones(4), vignetting=np.zeros(3), readout_time=0.0
+        keyframes=keyframes,
+        edges={},
+        intrinsics=np.ones(4),
+        vignetting=np.zeros(3),
+        readout_time=0.0,
+        reads_columns=False,
     )
     publisher = SimpleNamespace(published=set(keyframes), exposure=lambda index: None, scale=lambda index: 1.0)
     save(tmp_path / "tracker.npz", graph, publisher, None)  # type: ignore[arg-type]

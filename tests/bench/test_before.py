@@ -208,6 +208,9 @@ def test_what_an_earlier_checkout_left_out_of_its_trajectory_is_had_otherwise() 
     assert found.posed.tolist() == [True, False]
     turned = {"protocol": told["protocol"].replace("a frame", "a frame, the last row first")}
     assert finished.trajectory_of(track, turned, frames).readout_time == pytest.approx(-0.0253)
+    upright = {"protocol": told["protocol"].replace("a frame", "a frame, the first column first")}
+    found = finished.trajectory_of(track, upright, frames)
+    assert (found.readout_time, found.reads_columns) == (pytest.approx(0.0253), True)
     assert finished.trajectory_of(track, {"protocol": "no shutter"}, frames).readout_time == 0.0
 
 

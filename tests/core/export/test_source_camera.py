@@ -10,7 +10,15 @@ import pytest
 
 from mvsgs_core.datasets.lens import Lens, guess_lens
 from mvsgs_core.export.cameras import read_cameras, read_source_camera, write_cameras
-from mvsgs_core.export.source_camera import FACTOR, LENS, SourceCamera, lens_values, source_camera
+from mvsgs_core.export.source_camera import (
+    FACTOR,
+    LENS,
+    SourceCamera,
+    camera_of,
+    camera_values,
+    lens_values,
+    source_camera,
+)
 from tests.support.tiny_map import cameras_around, save_cameras
 
 PHONE = Lens((1400.0, 1410.0, 959.5, 539.5), (1080, 1920), (0.1, -0.05, 0.0, 0.001))
@@ -66,6 +74,16 @@ def test_a_guess_that_stays_one_is_doubted() -> None:
 )  # fmt: skip
 def test_what_is_no_camera_is_none(statistics: dict[str, Any]) -> None:
     assert source_camera(statistics) is None
+
+
+@pytest.mark.parametrize(("reads_columns", "line"), [(False, "row"), (True, "column")])
+def test_a_camera_may_be_held_in_any_way(reads_columns: bool, line: str) -> None:
+    camera = source_camera(said(PHONE, readout_time=-0.018, reads_columns=reads_columns))
+    assert camera == SourceCamera(PHONE, "given", None, "", -0.018, reads_columns=reads_columns)
+    assert camera.text().endswith(f"rolling shutter of 18.0 ms, the last {line} first")
+    assert camera_of(camera_values(camera)) == camera
+    earlier = {name: value for name, value in camera_values(camera).items() if name != "reads_columns"}
+    assert not camera_of(earlier).reads_columns
 
 
 def test_it_comes_back_from_cameras_json_and_is_no_keyframe(tmp_path: Path) -> None:

@@ -317,6 +317,21 @@ def test_another_version_is_refused_by_its_number(tmp_path: Path, monkeypatch: p
         load(tmp_path, PLAIN, Stats())
 
 
+def test_an_earlier_one_says_nothing_of_columns_and_its_cameras_read_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    atlas = begun(PLAIN)
+    for k in atlas.current.views:
+        k.reads_columns = True
+    meta, arrays = read_state(state_files(written(atlas, tmp_path))[0])
+    del meta["format"], meta["version"]
+    assert any(k.reads_columns for k in kept_keyframes(tmp_path))
+    earlier = meta, {name: value for name, value in arrays.items() if not name.endswith("/reads_columns")}
+    monkeypatch.setattr("mvsgs_core.mapping.checkpoints.files.read_arrays", lambda *_: earlier)
+    found, _ = load(tmp_path, PLAIN, Stats())
+    assert {k.reads_columns for k in found.current.views} == {False}
+
+
 def test_numpy_reads_it_without_pickle(tmp_path: Path) -> None:
     file = state_files(written(begun(PLAIN), tmp_path))[0]
     shutil.copy(file, tmp_path / "copy.npz")

@@ -19,27 +19,32 @@ READOUT_TIME = 0.02
 TIMES = (0.0, 0.33, 0.66, 1.0)
 
 
-def photographed(index: int, t: float, velocity: np.ndarray, unit: float = 1.0) -> RGBDKeyframe:
-    """A keyframe whose photograph's rows were each seen from where the camera was then."""
+def photographed(
+    index: int, t: float, velocity: np.ndarray, unit: float = 1.0, reads_columns: bool = False
+) -> RGBDKeyframe:
+    """A keyframe whose photograph's rows, or columns, were each seen from where the camera was then."""
     still = rgbd_keyframe(index, pose_on_arc(t), unit=unit)
-    photograph = still.image.copy()
-    for row in range(len(photograph)):
-        moved = geometry.se3_exp(velocity * READOUT_TIME * (row / len(photograph) - 0.5))
-        photograph[row] = rgbd_keyframe(index, pose_on_arc(t) @ moved).image[row]
+    photograph, axis = still.image.copy(), int(reads_columns)
+    for line in range(photograph.shape[axis]):
+        moved = geometry.se3_exp(velocity * READOUT_TIME * (line / photograph.shape[axis] - 0.5))
+        at = (slice(None), line) if reads_columns else line
+        photograph[at] = rgbd_keyframe(index, pose_on_arc(t) @ moved).image[at]
     scaled = velocity * ([unit] * 3 + [1.0] * 3)
-    return replace(still, photograph=photograph, velocity=scaled, readout_time=READOUT_TIME)
+    return replace(
+        still, photograph=photograph, velocity=scaled, readout_time=READOUT_TIME, reads_columns=reads_columns
+    )
 
 
-def shaking(unit: float = 1.0) -> list[RGBDKeyframe]:
+def shaking(unit: float = 1.0, reads_columns: bool = False) -> list[RGBDKeyframe]:
     """Views of a camera that moves by 3 to 5 pixels within each."""
     speed = np.random.default_rng(0).choice([-1.0, 1.0], (len(TIMES), 6)) * [4.0, 4.0, 2.0, 2.0, 2.0, 2.0]
-    return [photographed(5 * k, t, speed[k], unit) for k, t in enumerate(TIMES)]
+    return [photographed(5 * k, t, speed[k], unit, reads_columns) for k, t in enumerate(TIMES)]
 
 
-@pytest.mark.parametrize("unit", [1.0, 50.0])
-def test_photographs_with_their_shutter_give_the_map_of_still_ones(unit: float) -> None:
+@pytest.mark.parametrize(("unit", "reads_columns"), [(1.0, False), (50.0, False), (1.0, True)])
+def test_photographs_with_their_shutter_give_the_map_of_still_ones(unit: float, reads_columns: bool) -> None:
     """Nearly as good, for the shutter is rendered to first order; photographs without it in the render are far off."""
-    views = shaking(unit)
+    views = shaking(unit, reads_columns)
     between = rgbd_keyframe(99, pose_on_arc(0.5), unit=unit)
     by_shutter = score(mapped(views), between)
     still = score(mapped([replace(v, photograph=None) for v in views]), between)
@@ -77,8 +82,9 @@ def test_a_velocity_that_is_known_better_replaces_the_first() -> None:
     views = shaking()[:2]
     mapper = mapped([replace(views[0], photograph=None), views[1]])
     better = np.stack([np.full(6, 2.0), np.arange(1.0, 7.0)])
-    mapper.move(np.array([0, 5]), better, 0.03)
+    mapper.move(np.array([0, 5]), better, 0.03, reads_columns=True)
     assert mapper.views[0].readout is None  # its image has no shutter in it
+    assert mapper.views[1].reads_columns
     in_unit = better[1] / np.repeat([mapper.frame.length, 1.0], 3)
     np.testing.assert_allclose(mapper.views[1].readout, 0.03 * in_unit)
     mapper.move(np.array([5]), np.full((1, 6), np.nan), 0.01)
@@ -152,8 +158,9 @@ def test_a_frame_between_keyframes_is_rendered_as_its_shutter_saw_it() -> None:
     expected = READOUT_TIME * keyframe.velocity / np.repeat([mapper.frame.length, 1.0], 3)
     np.testing.assert_allclose(view.readout, expected)
     mapper.correct(np.array([0]), keyframe.world_from_cam[None], np.array([3.0]))
-    mapper.move(np.array([7]), np.ones((1, 6)), 0.03)
+    mapper.move(np.array([7]), np.ones((1, 6)), 0.03, reads_columns=True)
     mapper.chosen(view)
+    assert view.reads_columns
     np.testing.assert_allclose(view.readout, 1.5 * expected * np.repeat([3.0, 1.0], 3))
 
 

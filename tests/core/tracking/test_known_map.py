@@ -56,6 +56,23 @@ def test_a_map_comes_back_as_it_was(file: Path) -> None:
     for pair, edge in known.edges.items():
         assert np.array_equal(edge.target, graph.edges[pair].target)
         assert np.array_equal(edge.weight, graph.edges[pair].weight)
+        if pair[1]:  # the flow to the first frame came after its matches
+            np.testing.assert_allclose(edge.velocity, graph.edges[pair].velocity, rtol=1e-3)
+
+
+def test_a_map_knows_whether_its_camera_reads_columns(file: Path, tmp_path: Path) -> None:
+    """One that was kept before there was anything but rows reads rows."""
+    meta, arrays = read_arrays(file, FORMAT, VERSION, WHAT)
+    meta = {name: value for name, value in meta.items() if name not in ("format", "version", "reads_columns")}
+    meta["readout_time"] = 0.02
+    for said, expected in (({"reads_columns": True}, True), ({}, False)):
+        write_arrays(tmp_path / "map.npz", FORMAT, VERSION, meta | said, arrays)
+        known = load(tmp_path / "map.npz")
+        assert (known.readout_time, known.reads_columns) == (0.02, expected)
+        assert returning(known, back()[:1]).reads_columns == expected
+    write_arrays(tmp_path / "map.npz", FORMAT, VERSION, meta | {"reads_columns": 1}, arrays)
+    with pytest.raises(ValueError, match="1 does not say whether columns are read"):
+        load(tmp_path / "map.npz")
 
 
 def test_the_camera_is_found_and_tracked_in_the_frame_of_the_map(file: Path) -> None:
