@@ -61,7 +61,7 @@ def median_inverse_depth(graph: KeyframeGraph) -> float:
 def test_only_edges_that_the_map_contradicts_are_matched_again() -> None:
     graph = connected()
     good, bad = graph.edges[6, 0], graph.edges[6, 12]
-    graph.edges[6, 12] = Edge(bad.target + 8.0, bad.weight, bad.shift, bad.fraction)
+    graph.edges[6, 12] = Edge(bad.target + 8.0, bad.weight, bad.velocity, bad.fraction)
     assert back_end(graph).rematch_edges(6) == 1
     assert graph.edges[6, 0] is good
     again, (expected, _) = graph.edges[6, 12], graph.predict(6, 12)
@@ -73,7 +73,7 @@ def test_only_edges_that_the_map_contradicts_are_matched_again() -> None:
 def test_an_edge_that_nothing_holds_is_matched_again() -> None:
     graph = connected()
     held = graph.edges[6, 12]
-    graph.edges[6, 12] = Edge(held.target, np.zeros_like(held.weight), held.shift, held.fraction)
+    graph.edges[6, 12] = Edge(held.target, np.zeros_like(held.weight), held.velocity, held.fraction)
     assert back_end(graph).rematch_edges(6) == 1
     assert (graph.edges[6, 12].weight > 0).sum() > 100
 
@@ -128,7 +128,7 @@ def test_the_end_matches_again_adds_edges_and_adjusts() -> None:
     for pair in [pair for pair in graph.edges if abs(pair[0] - pair[1]) > 6]:
         del graph.edges[pair]
     wrong = graph.edges[6, 0]
-    graph.edges[6, 0] = Edge(wrong.target + 30.0, wrong.weight, wrong.shift, wrong.fraction)
+    graph.edges[6, 0] = Edge(wrong.target + 30.0, wrong.weight, wrong.velocity, wrong.fraction)
     before, stats = worst_pose(graph), Stats()
     back_end(graph).put_right(0, stats)
     assert stats.counts["edges matched again"] >= 1

@@ -21,21 +21,21 @@ FRAMES = tuple(range(0, 24, 6))
 
 
 def random_edge(points: int = 99) -> tuple[np.ndarray, np.ndarray, np.ndarray, Edge]:
-    """Target, weight and shift as an edge keeps them, and the edge; a third of the points is found."""
+    """Target, weight and velocity as an edge keeps them, and the edge; a third of the points is found."""
     random = np.random.default_rng(0)
     weight = np.where(random.random(points) < 1 / 3, random.uniform(0.1, 1.0, points), 0.0).astype(np.float16)
     target = np.where(weight > 0, random.uniform(0.0, 320.0, (2, points)), 0.0).astype(np.float32)
-    shift = np.where(weight > 0, random.normal(0.0, 5.0, (2, points)), 0.0).astype(np.float16)
-    return target, weight, shift, Edge(target, weight, shift, 0.4)
+    velocity = np.where(weight > 0, random.normal(0.0, 5.0, (2, points)), 0.0).astype(np.float16)
+    return target, weight, velocity, Edge(target, weight, velocity, 0.4)
 
 
 def test_an_edge_gives_back_to_the_bit_what_was_found_and_keeps_no_more() -> None:
-    target, weight, shift, edge = random_edge()
-    for given, kept in ((target, edge.target), (weight, edge.weight), (shift, edge.shift)):
+    target, weight, velocity, edge = random_edge()
+    for given, kept in ((target, edge.target), (weight, edge.weight), (velocity, edge.velocity)):
         assert kept.dtype == given.dtype
         np.testing.assert_array_equal(kept, given)
     assert edge.matches == np.count_nonzero(weight)
-    kept = [edge._found, edge._target, edge._weight, edge._shift]
+    kept = [edge._found, edge._target, edge._weight, edge._velocity]
     assert all(values.base is None for values in kept)
     assert sum(values.nbytes for values in kept) == -(-len(weight) // 8) + 14 * edge.matches
 
