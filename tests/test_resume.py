@@ -14,12 +14,15 @@ import pytest
 import nodes
 from launch.compose import compose
 from launch.inline import run_inline
-from msgs import FusedKeyframe, Poses, Preview, SplatMap
+from msgs import FusedKeyframe, Poses, Preview, SplatMap, Trajectory
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from nodes.mapper import Mapper
 from nodes.resumed import Resumed
 from tests.support.mapper_messages import settings, view_message
+from tests.support.patience import LONG
+from tests.support.small_atlas import PLAIN, begun
 from tests.support.tiny_scene import pose_on_arc
 
 SMALL = [
@@ -236,3 +239,14 @@ def test_what_cannot_be_resumed_is_said_before_anything_runs(tmp_path: Path) -> 
             check()
     with pytest.raises(ValueError, match=r"dataset\.path is missing"):
         Resumed.check(Resumed.Config())
+
+
+def test_what_the_shutter_of_a_map_reads_is_said_with_its_time(tmp_path: Path) -> None:
+    atlas = begun(PLAIN)
+    for k in atlas.current.views:
+        k.readout_time, k.reads_columns = -0.02, True
+    writer = CheckpointWriter(tmp_path, atlas.current.config)
+    writer.submit(atlas.frozen(), sync=True)
+    assert writer.wait(LONG)
+    (found,) = (m for m in Resumed(Resumed.Config(path=str(tmp_path))).run() if isinstance(m, Trajectory))
+    assert (found.readout_time, found.reads_columns) == (-0.02, True)
