@@ -8,6 +8,7 @@ import numpy as np
 
 TABLES = 4
 BITS = 14  # a word; descriptors of the same corner share the word of some table
+MOST_POSTINGS = 300_000  # that a query looks at: those of its rarest words, so that it costs no more in a large map
 
 
 class Retrieval:
@@ -37,6 +38,10 @@ class Retrieval:
         if not found:
             return []
         lengths = np.array([len(postings) for postings in found])
+        if lengths.sum() > MOST_POSTINGS:
+            rarest = np.argsort(lengths, kind="stable")
+            rarest = np.sort(rarest[np.cumsum(lengths[rarest]) <= MOST_POSTINGS])
+            found, lengths = [found[n] for n in rarest], lengths[rarest]
         rarity = np.log(1.0 + len(self._indices) / lengths)
         places = np.concatenate([np.frombuffer(postings, np.int32) for postings in found])
         scores = np.bincount(places, np.repeat(rarity, lengths), len(self._indices))

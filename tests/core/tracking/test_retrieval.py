@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mvsgs_core.tracking.places.retrieval import Retrieval
 from tests.support.true_maps import image
@@ -52,6 +53,20 @@ def test_what_looks_less_than_half_as_much_alike_as_usual_is_no_match() -> None:
     assert retrieval.query(again, 20, {40}, usual={40}) == []
     assert retrieval.query(again, 20, set(), usual={40}) == [40]
     assert len(retrieval.query(again, 20, {40}, usual={50})) == 9
+
+
+def test_a_query_of_a_large_map_looks_at_its_rarest_words_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And finds the same: what all keyframes show says nothing of the place."""
+    retrieval, places, random = made()
+    again = [noisy(place, random) for place in places]
+    whole = [retrieval.query(image, 10, set()) for image in again]
+    counted: list[int] = []
+    bincount = np.bincount
+    monkeypatch.setattr(np, "bincount", lambda places, *rest: counted.append(len(places)) or bincount(places, *rest))
+    monkeypatch.setattr("mvsgs_core.tracking.places.retrieval.MOST_POSTINGS", 400)
+    few = [retrieval.query(image, 10, set()) for image in again]
+    assert max(counted) <= 400
+    assert [found[0] for found in few] == [found[0] for found in whole]
 
 
 def test_nothing_is_found_by_an_image_without_features_or_in_an_empty_map() -> None:
