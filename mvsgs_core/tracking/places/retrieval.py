@@ -8,7 +8,7 @@ import numpy as np
 
 TABLES = 4
 BITS = 14  # a word; descriptors of the same corner share the word of some table
-MOST_POSTINGS = 300_000  # that a query looks at: those of its rarest words, so that it costs no more in a large map
+MOST_POSTINGS = 600_000  # that a query looks at: those of its rarest words, so that it costs no more in a large map
 
 
 class Retrieval:
