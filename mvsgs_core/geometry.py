@@ -39,6 +39,15 @@ def so3_exp(omega: np.ndarray) -> np.ndarray:
     return np.eye(3) + a * k + b * (k @ k)
 
 
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) next to matrices (..., 3, 3), scaled or rounded, whose determinants are positive.
+
+    `inverse` takes the transpose: a rotation that is none by 1e-3 has no inverse, and what is chained with it is bent.
+    """
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ vt)
+
+
 def so3_log(rotation: np.ndarray) -> np.ndarray:
     """Rotation vectors (..., 3) of rotation matrices (..., 3, 3), stable up to and at pi (by quaternion)."""
     q = quaternion_from_rotation(rotation)

@@ -142,8 +142,7 @@ class LoopCloser:
         solution = solve_thinned(poses, edges)
         if solution.failure or not np.isfinite(solution.similarities).all():
             return solution.failure or "the pose graph's solution is not finite"
-        for k, similarity in zip(order, solution.similarities):
-            self._apply(k, similarity)
+        self._apply(order, solution.similarities)
         return ""
 
     def _join(self, found: PlaceMatch, index: int, scale: float) -> None:
@@ -151,19 +150,26 @@ class LoopCloser:
         target = self.graph.keyframes[found.index].segment
         wanted = self._measured(found, index, scale) @ self.graph.keyframes[found.index].cam_from_world
         other_from_target = self.graph.world_from_cam(index) @ wanted
-        for k in self.local_map.members(self.graph.keyframes[index].segment):
-            self._apply(k, self.graph.keyframes[k].cam_from_world @ other_from_target)
+        members = self.local_map.members(self.graph.keyframes[index].segment)
+        self._apply(members, self.graph.keyframes.poses(members) @ other_from_target)
+        for k in members:
             self.graph.keyframes[k].segment = target
 
-    def _apply(self, index: int, similarity: np.ndarray) -> None:
-        """Makes a similarity a pose: the keyframe's unit becomes the world's."""
-        keyframe = self.graph.keyframes[index]
-        scale = float(scale_of(similarity))
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = similarity[:3, :3] / scale, similarity[:3, 3] / scale
-        keyframe.cam_from_world = pose
-        keyframe.inverse_depth = keyframe.inverse_depth * scale
-        keyframe.information = keyframe.information / scale**2
+    def _apply(self, indices: list[int], similarities: np.ndarray) -> None:
+        """Makes similarities (K, 4, 4) poses: the keyframes' units become the world's.
+
+        Each loop is made of the poses that the one before left, which doubles what rounding took from their rotations:
+        after some forty it would be 1e-3, and scale drifts where the camera turns.
+        """
+        scales = scale_of(similarities)
+        poses = np.tile(np.eye(4), (len(indices), 1, 1))
+        poses[:, :3, :3] = geometry.nearest_rotation(similarities[:, :3, :3])
+        poses[:, :3, 3] = similarities[:, :3, 3] / scales[:, None]
+        for index, pose, scale in zip(indices, poses, scales.tolist()):
+            keyframe = self.graph.keyframes[index]
+            keyframe.cam_from_world = pose.copy()  # a view would keep all of them
+            keyframe.inverse_depth = keyframe.inverse_depth * scale
+            keyframe.information = keyframe.information / scale**2
 
 
 __all__ = ["Closure", "LoopCloser", "LoopConfig"]

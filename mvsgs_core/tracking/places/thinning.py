@@ -69,7 +69,6 @@ def follow(poses: np.ndarray, nodes: np.ndarray, solved: np.ndarray) -> np.ndarr
 
     One between two nodes keeps its place beside either, the more the nearer it is.
     """
-    result = np.empty_like(poses)
     after = np.clip(np.searchsorted(nodes, np.arange(len(poses)), side="right"), 1, len(nodes) - 1)
     first, last = nodes[after - 1], nodes[after]
     beside_first = poses @ geometry.inverse(poses[first]) @ solved[after - 1]
@@ -77,12 +76,11 @@ def follow(poses: np.ndarray, nodes: np.ndarray, solved: np.ndarray) -> np.ndarr
     part = (np.arange(len(poses)) - first) / (last - first)
     apart = beside_last @ inverse_similarity(beside_first)
     scale = scale_of(apart)
-    for k, s in enumerate(part):
-        step = np.eye(4)
-        step[:3, :3] = scale[k] ** s * geometry.so3_exp(s * geometry.so3_log(apart[k, :3, :3] / scale[k]))
-        step[:3, 3] = s * apart[k, :3, 3]
-        result[k] = step @ beside_first[k]
-    return result
+    turn = geometry.so3_exp(part[:, None] * geometry.so3_log(apart[:, :3, :3] / scale[:, None, None]))
+    step = np.tile(np.eye(4), (len(poses), 1, 1))
+    step[:, :3, :3] = (scale**part)[:, None, None] * turn
+    step[:, :3, 3] = part[:, None] * apart[:, :3, 3]
+    return np.asarray(step @ beside_first)
 
 
 __all__ = ["follow", "solve_thinned", "thinned"]

@@ -13,7 +13,7 @@ from mvsgs_core.tracking.estimation.pose_graph import PoseGraphSolution
 from mvsgs_core.tracking.graph import Edge, Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
-from mvsgs_core.tracking.places import loop_closure
+from mvsgs_core.tracking.places import loop_closure, thinning
 from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, RelativeScale
 from mvsgs_core.tracking.places.localization import Localization
 from mvsgs_core.tracking.places.loop_closure import LoopCloser, LoopConfig
@@ -285,6 +285,19 @@ def test_a_place_of_doubtful_depths_hardly_bends_a_map() -> None:
         assert closure.moved
         bent.append(errors(true, graph)[1] - 1.0)
     assert bent[1] < 0.1 * bent[0]
+
+
+def test_rotations_stay_rotations_over_many_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a large map, which is solved by some of its keyframes, and whose loops say now more, now less."""
+    monkeypatch.setattr(thinning, "MAX_NODES", COUNT // 2)
+    monkeypatch.setattr(thinning, "THINNED", COUNT // 3)
+    true, graph = ring(), ring()
+    closing = closer(graph)
+    for n in range(60):
+        found, index, scale = between(true, graph, 0, COUNT - 1)
+        assert closing.close(found, index, replace(scale, value=scale.value * (1.1 if n % 2 else 1.0 / 1.1))).moved
+    rotations = np.stack([k.cam_from_world[:3, :3] for k in graph.keyframes.values()])
+    np.testing.assert_allclose(rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (COUNT, 1, 1)), atol=1e-14)
 
 
 def test_what_is_near_in_time_is_no_loop() -> None:
