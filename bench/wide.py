@@ -17,7 +17,8 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -133,16 +134,38 @@ def beside(name: str, items: Sequence[Item], ours: Solved, theirs: ColmapModel |
     return rows
 
 
-def scene(name: str) -> list[Row]:
-    """Ours in the order of the names and shuffled, and COLMAP's."""
+def scene(name: str, both_orders: bool) -> list[Row]:
+    """Ours in the order of the names and shuffled, and COLMAP's, which is shuffled too if it is to have both orders."""
     items = photographs(name)
     ours = solve(items)
     order = np.random.default_rng(0).permutation(len(items))
     rows = rows_of(name, items, ours, solve([items[n] for n in order]), order)
+    theirs, why = solve_with_colmap(items, np.arange(len(items)))
+    rows += beside(name, items, ours, theirs, why)
+    if both_orders and theirs is not None:
+        again, why = solve_with_colmap(items, order)
+        rows += apart(name, theirs, again) if again is not None else [Row(f"{name}: COLMAP, shuffled", why)]
+    return rows
+
+
+def solve_with_colmap(items: Sequence[Item], order: np.ndarray) -> tuple[ColmapModel | None, str]:
+    """Of the photographs in this order (P,); the model has their places in `items`. Or why there is none."""
     with tempfile.TemporaryDirectory() as place:
-        frames = {n: item.image for n, item in enumerate(items)}
-        theirs, why = reconstruct(frames, items[0].intrinsics, Path(place), 1, photographs=True)
-    return rows + beside(name, items, ours, theirs, why)
+        frames = {n: items[k].image for n, k in enumerate(order)}
+        model, why = reconstruct(frames, items[0].intrinsics, Path(place), 1, photographs=True)
+    return model and replace(model, index=order[model.index]), why
+
+
+def apart(name: str, theirs: ColmapModel, again: ColmapModel) -> list[Row]:
+    """What COLMAP's own results differ by."""
+    _, first, second = np.intersect1d(theirs.index, again.index, return_indices=True)
+    if len(first) < 3:
+        return []
+    off = position_error(again.world_from_cam[second, :3, 3], theirs.world_from_cam[first, :3, 3])
+    return [
+        Row(f"{name}: COLMAP's orders differ by", off, "%"),
+        Row(f"{name}: focal length, COLMAP's orders", 100.0 * (again.focal / theirs.focal - 1.0), "%"),
+    ]
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
@@ -150,7 +173,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
     unknown = set(scenes) - set(NAMES)
     if unknown:
         raise SystemExit(f"--scenes {','.join(sorted(unknown))}: there are {','.join(NAMES)}")
-    return in_pieces(scenes, folder(options, "wide"), options.resume, options.minutes, scene)
+    measured = partial(scene, both_orders=options.colmap_in_both_orders)
+    return in_pieces(scenes, folder(options, "wide"), options.resume, options.minutes, measured)
 
 
 def in_pieces(
@@ -185,6 +209,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", type=Path, help="folder of what was measured; default: in runs")
     parser.add_argument("--resume", action="store_true", help="keep the scenes that an earlier call measured")
     parser.add_argument("--minutes", type=float, help="begin no scene after; --resume goes on")
+    parser.add_argument(
+        "--colmap-in-both-orders", action="store_true", help="COLMAP shuffled as well: what its results differ by"
+    )
 
 
 if __name__ == "__main__":
