@@ -22,8 +22,6 @@ from mvsgs_core.tracking.places.localization import Localization, localize
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 from mvsgs_core.tracking.steps import Steps, whole
 
-MAX_DOUBT = 0.2  # of a place's depths, for errors of a pixel: beyond, as where a camera turned, they tell no scale
-
 
 @dataclass(frozen=True)
 class PlaceMatch:
@@ -80,24 +78,12 @@ def verifying_place(
     return PlaceMatch(index, matches, localization)
 
 
-@dataclass(frozen=True)
-class RelativeScale:
-    """Unit of a keyframe's own depths over the unit of a place's keyframe.
-
-    The sigmas are of a point, not of many: points of a keyframe share its baseline, so they err together.
-    """
-
-    value: float
-    sigma: float  # of its logarithm, for errors of a pixel
-    place_sigma: float  # what the place's depths have in that: of what is found by them, as a fraction
-
-
-def relative_scale(graph: KeyframeGraph, place: PlaceMatch, index: int) -> RelativeScale | None:
-    """That of keyframe `index`, which sees the place; None where too few points compare, or depths say too little."""
+def relative_scale(graph: KeyframeGraph, place: PlaceMatch, index: int) -> float | None:
+    """Unit of keyframe `index`'s own depths over the unit of the place's keyframe; None where too few compare."""
     here, seen = graph.keyframes[index], graph.keyframes[place.index]
-    usable = np.flatnonzero(place.matches.alive & seen.triangulated)
+    usable = place.matches.alive & seen.triangulated
     own = np.flatnonzero(here.triangulated)
-    if len(usable) < 20 or len(own) < 20:
+    if usable.sum() < 20 or len(own) < 20:
         return None
     relative = place.localization.cam_from_world @ graph.world_from_cam(place.index)
     fx, fy, cx, cy = graph.intrinsics
@@ -110,13 +96,8 @@ def relative_scale(graph: KeyframeGraph, place: PlaceMatch, index: int) -> Relat
     near = (distance[np.arange(len(at)), nearest] < 8.0) & (z > 0)
     if near.sum() < 20:
         return None
-    there, beside = usable[near], own[nearest[near]]
-    variance_there = 1.0 / (seen.information * seen.inverse_depth**2)[there]
-    variance = variance_there + 1.0 / (here.information * here.inverse_depth**2)[beside]
-    sigma, place_sigma = (float(np.sqrt(np.median(v))) for v in (variance, variance_there))
-    if place_sigma > MAX_DOUBT:
-        return None
-    return RelativeScale(float(np.median(1.0 / here.inverse_depth[beside] / z[near])), sigma, place_sigma)
+    ratio = (1.0 / here.inverse_depth[own][nearest] / z)[near]
+    return float(np.median(ratio))
 
 
-__all__ = ["PlaceMatch", "RelativeScale", "relative_scale", "verify_place", "verifying_place"]
+__all__ = ["PlaceMatch", "relative_scale", "verify_place", "verifying_place"]

@@ -11,12 +11,7 @@ from mvsgs_core import geometry
 from mvsgs_core.tracking.estimation.pose_graph import SimilarityEdges, scale_of
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap
-from mvsgs_core.tracking.places.geometric_verification import (
-    PlaceMatch,
-    RelativeScale,
-    relative_scale,
-    verifying_place,
-)
+from mvsgs_core.tracking.places.geometric_verification import PlaceMatch, relative_scale, verifying_place
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 from mvsgs_core.tracking.places.retrieval import Retrieval
 from mvsgs_core.tracking.places.thinning import solve_thinned
@@ -84,16 +79,16 @@ class LoopCloser:
                 return self.close(found, index, scale)
         return None
 
-    def close(self, found: PlaceMatch, index: int, scale: RelativeScale) -> Closure:
+    def close(self, found: PlaceMatch, index: int, scale: float) -> Closure:
         """Moves the map so that the place match holds.
 
         scale: unit of keyframe `index` over that of the keyframe found.
         """
         old, new = self.graph.keyframes[found.index], self.graph.keyframes[index]
         joined = new.segment if old.segment != new.segment else None
-        moved = joined is not None or not self._disagreement(found, index, scale.value) < self.config.max_disagreement
+        moved = joined is not None or not self._disagreement(found, index, scale) < self.config.max_disagreement
         if joined is not None:
-            self._join(found, index, scale.value)
+            self._join(found, index, scale)
         elif moved:
             failure = self._spread_correction(found, index, scale)
             if failure:
@@ -115,12 +110,8 @@ class LoopCloser:
         result[:3, :3], result[:3, 3] = scale * relative[:3, :3], scale * relative[:3, 3]
         return result
 
-    def _spread_correction(self, found: PlaceMatch, index: int, scale: RelativeScale) -> str:
-        """The loop's error is spread over its segment by a pose graph; returns why that failed, or nothing.
-
-        What is known of the loop is as doubtful as the depths that tell it: a place where the camera only turned says
-        little of scale, and would bend a large map that others hold.
-        """
+    def _spread_correction(self, found: PlaceMatch, index: int, scale: float) -> str:
+        """The loop's error is spread over its segment by a pose graph; returns why that failed, or nothing."""
         order = self.local_map.members(self.graph.keyframes[index].segment)
         number = {k: n for n, k in enumerate(order)}
         poses = np.stack([self.graph.keyframes[k].cam_from_world for k in order])
@@ -129,15 +120,13 @@ class LoopCloser:
         pairs = {(min(a, b), max(a, b)) for a, b in tied if a in number and b in number}
         pairs |= set(pairwise(order))
         source, to = np.array([(number[a], number[b]) for a, b in sorted(pairs)]).T
-        loop = self._measured(found, index, scale.value)
-        step = [0.01 * unit, 0.005, 0.01]
-        away = float(np.linalg.norm(loop[:3, 3])) / scale.value  # from the keyframe found, by its depths
-        doubt = [scale.place_sigma * away, 0.0, scale.sigma]
         edges = SimilarityEdges(
             source=np.append(source, number[found.index]),
             to=np.append(to, number[index]),
-            relative=np.concatenate([poses[to] @ geometry.inverse(poses[source]), [loop]]),
-            sigma=np.concatenate([np.tile(step, (len(source), 1)), [np.hypot(step, doubt)]]),
+            relative=np.concatenate(
+                [poses[to] @ geometry.inverse(poses[source]), [self._measured(found, index, scale)]]
+            ),
+            sigma=np.tile([0.01 * unit, 0.005, 0.01], (len(source) + 1, 1)),
         )
         solution = solve_thinned(poses, edges)
         if solution.failure or not np.isfinite(solution.similarities).all():
