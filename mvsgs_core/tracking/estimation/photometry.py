@@ -16,6 +16,7 @@ The gauge: the mean over the images is zero.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -63,7 +64,7 @@ class PhotometricCalibration:
         edge = (EDGE_SIGMA, EDGE_SIGMA)
         return PhotometricCalibration(zero, zero, np.zeros((count, 3)), zero, np.zeros(_GLOBAL), 0.0, 0.0, False, edge)
 
-    @property
+    @cached_property
     def varies(self) -> bool:
         return bool(np.any(self.gains) or np.any(self.white))
 
