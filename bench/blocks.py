@@ -8,7 +8,6 @@ two blocks meet. Times mean something on an idle machine of two cores or more on
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,6 +28,7 @@ from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.blocks import job
 from mvsgs_core.mapping.blocks.config import RefineConfig
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.named_modules import is_installed
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes import Node
 from nodes.mapper import Mapper
@@ -173,7 +173,7 @@ def timed_rows(name: str, begun: Atlas, total: int, rounds: int) -> list[Row]:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     names = ["town"] if options.quick else options.maps.split(",")
-    rows, rounds = [], 0 if importlib.util.find_spec("ray") is None else options.rounds
+    rows, rounds = [], options.rounds if is_installed("ray") else 0
     for name in names:
         begun, photographs = made([*MAPS[name], *(["dataset.stop=60"] if options.quick else [])])
         total = 60 if options.quick else options.iterations

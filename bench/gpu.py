@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import importlib.util
 import statistics
 import time
 from collections.abc import Callable
@@ -33,6 +32,7 @@ from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, training_view
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.trainer import Trainer
+from mvsgs_core.named_modules import is_installed
 from mvsgs_core.rasterizer import ssim
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
@@ -140,7 +140,7 @@ def rasterizer_rows(size: tuple[int, int], count: int, device: torch.device, pea
         splats = on_device(host, device)
         label = f"{size[1]}x{size[0]} {count / 1000:g}k {kernel}"
         actions = [*triton_case(splats, size, kernel)]
-        beside = kernel == "gaussian" and importlib.util.find_spec("gsplat") is not None
+        beside = kernel == "gaussian" and is_installed("gsplat")
         if beside:
             actions += gsplat_case(splats, size)
         taken = milliseconds(actions, device, rounds)

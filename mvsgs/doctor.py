@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
-import importlib.util
 import json
 import platform
 import shutil
@@ -20,6 +19,7 @@ import torch
 
 from mvsgs import WORKSPACE
 from mvsgs_core import machine, native, weights
+from mvsgs_core.named_modules import is_installed
 
 KERNELS = ("rasterizer", "mapping", "tracking", "mvs", "fusion", "scene")
 NEEDED = ("torch", "numpy", "pyzmq", "opencv-contrib-python-headless", "open3d", "viser", "av")
@@ -48,7 +48,7 @@ def checks() -> Iterator[tuple[str, str, bool]]:
         version = _version(name)
         yield name, version or "missing: make setup", version is not None
     for module, purpose in OPTIONAL.items():
-        there = importlib.util.find_spec(module) is not None
+        there = is_installed(module)
         yield module, _version(module) or "there" if there else f"not there; only for {purpose}", True
     for entry in weights.REGISTRY.values():
         try:

@@ -1,4 +1,5 @@
-"""Modules that a user names in a setting, such as `tracker._target_=my_tracker.Strided`: found where the user works."""
+"""Modules that a user names in a setting, such as `tracker._target_=my_tracker.Strided`: found where the user works;
+and optional ones that are installed or not."""
 
 from __future__ import annotations
 
@@ -25,8 +26,14 @@ def import_named(name: str) -> ModuleType:
     return importlib.import_module(name)
 
 
+def is_installed(module: str) -> bool:
+    """Whether an optional module is there: a folder of its name, as a clone beside this checkout, is not it."""
+    spec = importlib.util.find_spec(module)
+    return spec is not None and spec.origin is not None
+
+
 def _found(top: str) -> bool:
     return top in sys.modules or importlib.util.find_spec(top) is not None
 
 
-__all__ = ["import_named"]
+__all__ = ["import_named", "is_installed"]

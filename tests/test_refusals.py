@@ -109,7 +109,7 @@ def test_a_few_images_of_another_shape_are_left_out_and_no_reason_to_refuse(tmp_
 
 
 def test_a_refinement_on_ray_needs_ray(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvsgs_core.mapping.blocks.config.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     graph = compose(["refine=ray", "refine.address=10.0.0.1:6379"])
     config = graph.slots["mapper"].parameters
     assert (config.refine.by, config.refine.address) == ("ray", "10.0.0.1:6379")

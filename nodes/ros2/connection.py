@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import ipaddress
 import os
 import re
 from dataclasses import dataclass
+
+from mvsgs_core.named_modules import is_installed
 
 LOOPBACK, ANY = "lo", "auto"
 LAST_DOMAIN = 232  # beyond it there are no ports
@@ -97,7 +98,7 @@ TF = Quality(reliable=True, depth=100)
 
 def check_installed() -> None:
     """Raises ValueError, saying what to do, where there is no DDS."""
-    if importlib.util.find_spec("cyclonedds") is None:
+    if not is_installed("cyclonedds"):
         raise ValueError("ROS 2 is reached by cyclonedds, which is optional: pip install cyclonedds")
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass
 from typing import Literal
+
+from mvsgs_core.named_modules import is_installed
 
 MISSING = "refine=ray needs Ray: pip install 'mvsgs[ray]', here and on the cluster's machines"
 
@@ -29,7 +30,7 @@ class RefineConfig:
 
     def check(self) -> None:
         """Raises ValueError where what it asks for is not installed."""
-        if self.by == "ray" and importlib.util.find_spec("ray") is None:
+        if self.by == "ray" and not is_installed("ray"):
             raise ValueError(MISSING)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import replace
 
 import pytest
@@ -11,10 +10,11 @@ import torch
 from mvsgs_core.mapping.blocks.config import RefineConfig
 from mvsgs_core.mapping.blocks.refinement import refined_in_blocks
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.named_modules import is_installed
 from tests.support.small_maps import CONFIG, mapped
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
-needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
+needs_ray = pytest.mark.skipif(not is_installed("ray"), reason="Ray is not installed")
 
 
 def refined(refine: RefineConfig) -> OnlineMapper:
