@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import numpy as np
 from bench.exports.made import MESHES, SPLATS, Made, Opened, load, rendered
 from mvsgs_core.export.render_path import resampled
 from mvsgs_core.image_metrics import psnr
+from mvsgs_core.named_modules import is_installed
 from mvsgs_core.open3d_loader import open3d
 from mvsgs_core.trajectory_file import read_trajectory
 
@@ -96,7 +96,7 @@ def _by_trimesh(made: Made) -> list[Opened]:
 
 def _by_pycolmap(made: Made) -> Opened:
     def read() -> Opened:
-        if importlib.util.find_spec("pycolmap") is None:
+        if not is_installed("pycolmap"):
             raise ImportError("not installed: pip install pycolmap")
         folder = next(path.parent for path in (made.folder / "colmap").rglob("cameras.*"))
         found = json.loads(_output(sys.executable, "-c", _READ_MODEL, str(folder)))

@@ -1,11 +1,16 @@
-"""Scenes of bench.wide that are measured at several times."""
+"""Scenes of bench.wide that are measured at several times; what two results of COLMAP differ by."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from bench.baselines.colmap_poses import Model
 from bench.table import Row
-from bench.wide import in_pieces
+from bench.wide import apart, in_pieces
 
 
 def test_what_was_measured_is_kept_and_what_is_missing_named(tmp_path: Path) -> None:
@@ -23,3 +28,21 @@ def test_what_was_measured_is_kept_and_what_is_missing_named(tmp_path: Path) -> 
     anew = in_pieces(["a"], tmp_path, resume=False, minutes=None, measured=measured)
     assert anew == [Row("a: parts", 3)]
     assert asked == ["a", "b", "a"]
+
+
+def test_results_of_two_orders_are_compared_photograph_by_photograph() -> None:
+    """In frames and units of their own, where either lacks some."""
+    random = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, :3, 3] = random.normal(size=(8, 3))
+    none = np.zeros((0, 3))
+    first = Model(np.arange(7), poses[:7], none, none, {}, 1.0, 500.0)
+    order = random.permutation(np.arange(1, 8))
+    other = poses[order]
+    other[:, :3, 3] = 3.0 * other[:, :3, 3] + [1.0, 2.0, 3.0]
+    same, focal = apart("a", first, Model(order, other, none, none, {}, 1.0, 510.0))
+    assert float(same.value) == pytest.approx(0.0, abs=1e-9)
+    assert float(focal.value) == pytest.approx(2.0)
+    moved, _ = apart("a", first, Model(np.roll(order, 1), other, none, none, {}, 1.0, 510.0))
+    assert float(moved.value) > 1.0
+    assert apart("a", first, replace(first, index=np.arange(5, 12))) == []

@@ -147,8 +147,8 @@ class LoopCloser:
     def _apply(self, indices: list[int], similarities: np.ndarray) -> None:
         """Makes similarities (K, 4, 4) poses: the keyframes' units become the world's.
 
-        Each loop is made of the poses that the one before left, which doubles what rounding took from their rotations:
-        after some forty it would be 1e-3, and scale drifts where the camera turns.
+        Each loop is made of the poses that the one before left, which triples what rounding took from their rotations:
+        after 26 it would be 1e-3, and scale drifts where the camera turns.
         """
         scales = scale_of(similarities)
         poses = np.tile(np.eye(4), (len(indices), 1, 1))

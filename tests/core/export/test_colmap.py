@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from mvsgs_core.export import __main__ as export
 from mvsgs_core.export.cameras import write_cameras
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.export.ply import read_ply, write_ply
+from mvsgs_core.named_modules import is_installed
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.tiny_map import (
     INTRINSICS,
@@ -60,7 +60,7 @@ print(json.dumps(found))
 
 
 def opened_by_colmap(folder: Path) -> dict[str, Any]:
-    if importlib.util.find_spec("pycolmap") is None:
+    if not is_installed("pycolmap"):
         pytest.skip("pycolmap is not installed: pip install pycolmap")
     done = subprocess.run([sys.executable, "-c", OPENED_BY_COLMAP, folder / "sparse" / "0"], capture_output=True)
     assert done.returncode == 0, done.stderr.decode()
