@@ -116,7 +116,7 @@ def _carried(view: StereoKeyframe, truth: np.ndarray, neighbors: list[_Neighbor]
     maps = [_with_depth(neighbor, depth) for neighbor, depth in neighbors if depth is not None]
     if not maps:
         return np.ones(0)
-    all_of_it = FuseOptions(sigma=0.01, violation=1.0, min_neighbor_confidence=0.0)
+    all_of_it = FuseOptions(violation=1.0, min_neighbor_confidence=0.0)
     splatted = NativeFusionBackend(1).splat(depth_maps(_with_depth(view, truth), maps), all_of_it)
     reached = (truth > 0) & (splatted > 0).any(axis=0)
     ratios = np.where(splatted > 0, splatted / np.where(truth > 0, truth, 1.0), np.inf)[:, reached]

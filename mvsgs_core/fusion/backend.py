@@ -18,10 +18,13 @@ class NativeFusionBackend:
         self._kernels = native.load("fusion")
         self._threads = threads or 0
 
-    def consistent_views(self, maps: DepthMaps, relative: float, pixels: float, round_trip: bool) -> np.ndarray:
-        options = self._kernels.ConsistencyOptions(relative, pixels, round_trip, self._threads)
+    def parallax(self, maps: DepthMaps) -> np.ndarray:
+        return np.asarray(self._kernels.parallax(maps.depth, maps.neighbor_depths, maps.there, self._threads))
+
+    def consistent_views(self, maps: DepthMaps, relative: np.ndarray, pixels: float, round_trip: bool) -> np.ndarray:
+        options = self._kernels.ConsistencyOptions(pixels, round_trip, self._threads)
         return np.asarray(
-            self._kernels.consistent_views(maps.depth, maps.neighbor_depths, maps.there, maps.back, options)
+            self._kernels.consistent_views(maps.depth, maps.neighbor_depths, maps.there, maps.back, relative, options)
         )
 
     def splat(self, maps: DepthMaps, options: FuseOptions) -> np.ndarray:
@@ -31,11 +34,11 @@ class NativeFusionBackend:
             )
         )
 
-    def fuse(self, maps: DepthMaps, splatted: np.ndarray, options: FuseOptions) -> Fused:
+    def fuse(self, maps: DepthMaps, splatted: np.ndarray, sigma: np.ndarray, options: FuseOptions) -> Fused:
         return Fused(
             *self._kernels.fuse_depth(
                 maps.depth, maps.confidence, maps.neighbor_depths, maps.neighbor_confidences, splatted, maps.there,
-                self._options(options),
+                sigma, self._options(options),
             )
         )  # fmt: skip
 

@@ -8,15 +8,26 @@ import numpy as np
 from mvsgs_core.fusion.interface import Fused
 
 # Logistic regression on `features_of`, by `python -m bench.depth.calibration`.
-WEIGHTS = np.array([-1.802, 0.956, 1.655, -0.617, -0.337, -0.346, 1.449, 0.637, -0.609, -0.504, 1.107, 0.834])
+WEIGHTS = np.array([-1.054, 0.811, 1.839, -0.76, -0.443, -0.475, 1.205, 0.044, -0.789, -0.387, 0.981, 0.953, -0.6])
+
+_LOCATED = 1.0  # pixels to which the neighbors together locate a point
+_DOUBTS = (0.005, 0.2)  # relative depth: a doubt below the first and above the second is told from no other
 
 
-def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, seeing: np.ndarray) -> np.ndarray:
+def uncertainty_of(parallax: np.ndarray) -> np.ndarray:
+    """Relative uncertainty of depth (H, W) float32 from a back end's `parallax`, huge where that is 0."""
+    return np.asarray(_LOCATED / np.maximum(parallax, 1e-6), dtype=np.float32)
+
+
+def features_of(
+    fused: Fused, confidence: np.ndarray, consistent: np.ndarray, seeing: np.ndarray, doubt: np.ndarray
+) -> np.ndarray:
     """(F, H, W) float32, the first all ones.
 
     From stereo's confidence, the number of neighbors that agree, and of those that have a depth there at all, each
     (H, W): that few agree where few look, at the image's border or behind an edge, doesn't speak against a depth.
     The mean of the whole map speaks for its pose and its range: where these are wrong, little matches anywhere.
+    From `uncertainty_of` (H, W) too: where parallax is small, what agrees says less.
     """
     around = cv2.blur(confidence, (9, 9))  # errors come in patches
     agreeing = cv2.blur((consistent >= 2).astype(np.float32), (5, 5))
@@ -39,6 +50,7 @@ def features_of(fused: Fused, confidence: np.ndarray, consistent: np.ndarray, se
             4.0 * behind,
             np.full_like(confidence, confidence.mean()),
             cv2.erode(confidence, np.ones((5, 5), np.uint8)),
+            np.log(np.clip(doubt, *_DOUBTS) / 0.02),
         ]
     ).astype(np.float32)
 

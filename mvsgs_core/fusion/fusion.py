@@ -9,7 +9,7 @@ import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.fusion.backend import make_fusion_backend
-from mvsgs_core.fusion.confidence import features_of, probability_of_inlier
+from mvsgs_core.fusion.confidence import features_of, probability_of_inlier, uncertainty_of
 from mvsgs_core.fusion.filters import discontinuity_mask, speckle_mask
 from mvsgs_core.fusion.interface import FuseOptions, FusionBackend
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
@@ -17,7 +17,7 @@ from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.keyframe_window import KeyframeWindow
 from mvsgs_core.pace import Effort, Pace
 
-ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
+ANY_DEPTH = np.float32(1.0)  # relative difference that no two positive depths reach
 EFFORTS = (Effort("full", 1.0), Effort("two neighbors", 0.4), Effort("no neighbor", 0.15))
 
 
@@ -29,11 +29,12 @@ class FusionConfig:
     window: int = 4  # keyframes before the reference that may be neighbors
     neighbors: int = 6  # depth maps that a reference is checked with
     refine: bool = True  # depth and confidence from the neighbors' maps (counterpart of V-FUSE)
-    sigma: float = 0.01  # relative depth: width of the support
+    sigma: float = 0.01  # relative depth: width of the support, at least
+    sigma_most: float = 0.1  # and at most, where the neighbors have little parallax: see `uncertainty_of`
     violation: float = 1.0  # weight of free-space violations against support
     min_neighbor_confidence: float = 0.1  # a neighbor's pixel below takes no part in the refinement
     check: bool = True  # geometric consistency
-    relative: float = 0.02  # relative depth difference that still agrees
+    relative: float = 0.02  # relative depth difference that still agrees; refined, the support's width if that is more
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
     min_views: int = 2  # views that must agree, the reference counted
@@ -158,15 +159,22 @@ def fuse(
     counts: dict[str, float] = {"pixels": float(depth.size), "known": float(known.sum())}
     if neighbors:
         maps = depth_maps(reference, neighbors)
+        within = np.full(reference.size, config.relative, dtype=np.float32)
         if config.refine:
-            options = FuseOptions(config.sigma, config.violation, config.min_neighbor_confidence)
-            fused = backend.fuse(maps, backend.splat(maps, options), options)
+            options = FuseOptions(config.violation, config.min_neighbor_confidence)
+            splatted = backend.splat(maps, options)
+            first = np.where(known, depth, np.where(splatted > 0, splatted, np.inf).min(axis=0)).astype(np.float32)
+            first[np.isinf(first)] = 0.0
+            doubt = uncertainty_of(backend.parallax(replace(maps, depth=first)))
+            fused = backend.fuse(maps, splatted, np.clip(doubt, config.sigma, config.sigma_most), options)
             depth = fused.depth
             maps = replace(maps, depth=depth)
-        consistent = backend.consistent_views(maps, config.relative, config.pixels, config.round_trip)
+            doubt = uncertainty_of(backend.parallax(maps))
+            within = np.clip(doubt, within, np.maximum(within, np.float32(config.sigma_most)))
+        consistent = backend.consistent_views(maps, within, config.pixels, config.round_trip)
         if config.refine:
-            seeing = backend.consistent_views(maps, ANY_DEPTH, config.pixels, False)
-            evidence = features_of(fused, confidence, consistent, seeing)
+            seeing = backend.consistent_views(maps, np.full_like(depth, ANY_DEPTH), config.pixels, False)
+            evidence = features_of(fused, confidence, consistent, seeing, doubt)
             confidence = np.where(depth > 0, probability_of_inlier(evidence), 0.0).astype(np.float32)
     if reference.mask is not None:  # the neighbors may well see what is behind there
         depth = np.where(reference.mask, depth, np.float32(0))

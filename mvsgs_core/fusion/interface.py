@@ -22,7 +22,6 @@ class Fused:
 class FuseOptions:
     """How depths support and contradict each other."""
 
-    sigma: float  # relative depth: width of the support
     violation: float  # weight of free-space violations against support
     min_neighbor_confidence: float  # a neighbor's pixel below takes no part
 
@@ -42,16 +41,25 @@ class DepthMaps:
 class FusionBackend(Protocol):
     """The steps of fusion over depth maps."""
 
-    def consistent_views(self, maps: DepthMaps, relative: float, pixels: float, round_trip: bool) -> np.ndarray:
+    def parallax(self, maps: DepthMaps) -> np.ndarray:
+        """(H, W) float32: pixels that the neighbors together move a point for a relative change of its inverse depth.
+
+        The root of the sum of squares over the neighbors in whose image the point falls; 0 where depth is unknown.
+        """
+
+    def consistent_views(self, maps: DepthMaps, relative: np.ndarray, pixels: float, round_trip: bool) -> np.ndarray:
         """(H, W) uint8: neighbors that agree with the reference's depth.
 
         MVS-GS, geometric consistency: the reference's point, projected into the neighbor, against the depth there,
-        `relative` to the larger of both. With `round_trip` (MVSFormer): that depth, projected back, must come within
-        `pixels` of where it started, and its depth within `relative`.
+        within `relative` (H, W) float32 of the larger of both. With `round_trip` (MVSFormer): that depth, projected
+        back, must come within `pixels` of where it started, and its depth within `relative`.
         """
 
     def splat(self, maps: DepthMaps, options: FuseOptions) -> np.ndarray:
         """(N, H, W): the neighbors' pixels as depths in the reference, the nearest where several fall."""
 
-    def fuse(self, maps: DepthMaps, splatted: np.ndarray, options: FuseOptions) -> Fused:
-        """The best of the reference's depth and the splatted ones by support - violation, refined by its supporters."""
+    def fuse(self, maps: DepthMaps, splatted: np.ndarray, sigma: np.ndarray, options: FuseOptions) -> Fused:
+        """The best of the reference's depth and the splatted ones by support - violation, refined by its supporters.
+
+        sigma: (H, W) float32, the width of the support, relative to depth.
+        """

@@ -14,8 +14,21 @@ class TorchFusionBackend(TorchTwin):
     """Runs on `device`, a torch device such as "cuda" or "cpu"; arrays in and out are numpy."""
 
     @torch.no_grad()
-    def consistent_views(self, maps: DepthMaps, relative: float, pixels: float, round_trip: bool) -> np.ndarray:
+    def parallax(self, maps: DepthMaps) -> np.ndarray:
         z = self._on(maps.depth)
+        u, v = _pixels(z.shape, self.device)
+        squares = torch.zeros_like(z)
+        size = torch.Size(maps.neighbor_depths.shape[1:])
+        for there in self._on(maps.there):
+            x, y, depth, front = _project(there, u, v, z)
+            use = (z > 0) & front & _nearest(x, y, size)[1]
+            moved = torch.stack([there[9] - x * there[11], there[10] - y * there[11]]) / torch.where(use, depth, 1.0)
+            squares += torch.where(use, moved.square().sum(0), 0.0)
+        return squares.sqrt().cpu().numpy()
+
+    @torch.no_grad()
+    def consistent_views(self, maps: DepthMaps, relative: np.ndarray, pixels: float, round_trip: bool) -> np.ndarray:
+        z, within = self._on(maps.depth), self._on(relative)
         u, v = _pixels(z.shape, self.device)
         count = torch.zeros(z.shape, dtype=torch.uint8, device=self.device)
         for map_, there, home in zip(self._on(maps.neighbor_depths), self._on(maps.there), self._on(maps.back)):
@@ -27,9 +40,9 @@ class TorchFusionBackend(TorchTwin):
                 width = map_.shape[1]
                 here_x, here_y, here_depth, ahead = _project(home, (at % width).float(), (at // width).float(), found)
                 near = (here_x - u) ** 2 + (here_y - v) ** 2 < pixels**2
-                agree &= ahead & near & ((here_depth - z).abs() < relative * torch.maximum(here_depth, z))
+                agree &= ahead & near & ((here_depth - z).abs() < within * torch.maximum(here_depth, z))
             else:
-                agree &= (found - seen_depth).abs() < relative * torch.maximum(found, seen_depth)
+                agree &= (found - seen_depth).abs() < within * torch.maximum(found, seen_depth)
             count += agree.to(torch.uint8)
         return count.cpu().numpy()
 
@@ -48,20 +61,20 @@ class TorchFusionBackend(TorchTwin):
         return result.reshape(-1, *size).cpu().numpy()
 
     @torch.no_grad()
-    def fuse(self, maps: DepthMaps, splatted: np.ndarray, options: FuseOptions) -> Fused:
-        own_depth, sigma = self._on(maps.depth), options.sigma
+    def fuse(self, maps: DepthMaps, splatted: np.ndarray, sigma: np.ndarray, options: FuseOptions) -> Fused:
+        own_depth, width = self._on(maps.depth), self._on(sigma)
         known = own_depth > 0
         own_confidence = torch.where(known, self._on(maps.confidence), torch.zeros_like(own_depth))
         depths, sure = self._on(maps.neighbor_depths), self._on(maps.neighbor_confidences)
         there = self._on(maps.there)
         u, v = _pixels(own_depth.shape, self.device)
-        tolerance, zero = 3.0 * sigma, torch.zeros_like(own_depth)
+        tolerance, zero = 3.0 * width, torch.zeros_like(own_depth)
         best = {"score": torch.full_like(own_depth, -1e9), "depth": zero, "for": zero, "against": zero, "own": zero}
         for z in [own_depth, *self._on(splatted)]:
             valid = z > 0
             safe = torch.where(valid, z, torch.ones_like(z))
             difference = (own_depth - safe) / safe
-            agree = torch.exp(-0.5 * (difference / sigma) ** 2)
+            agree = torch.exp(-0.5 * (difference / width) ** 2)
             from_own = torch.where(known, own_confidence * agree, zero)
             against = torch.where(known & (difference.abs() > tolerance), own_confidence, zero)
             weights = from_own.clone()
@@ -73,7 +86,7 @@ class TorchFusionBackend(TorchTwin):
                 found, c = map_.reshape(-1)[at], c_map.reshape(-1)[at]
                 use = valid & front & inside & (found > 0) & (c >= options.min_neighbor_confidence)
                 off = torch.where(use, (found - expected) / torch.where(use, expected, safe), zero)
-                weight = torch.where(use, c * torch.exp(-0.5 * (off / sigma) ** 2), zero)
+                weight = torch.where(use, c * torch.exp(-0.5 * (off / width) ** 2), zero)
                 support += weight
                 weights += weight
                 inverse += torch.where(use, weight / (safe * (1.0 + off)), zero)

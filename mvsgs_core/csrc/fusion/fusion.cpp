@@ -37,7 +37,28 @@ inline int nearest(float x, float y, int height, int width) {
 
 }  // namespace
 
-void consistent_views(const DepthMaps& maps, const Warp* back, const ConsistencyOptions& o, std::uint8_t* count) {
+void parallax(const DepthMaps& maps, int threads, float* moved) {
+    const int height = maps.height, width = maps.width;
+#pragma omp parallel for schedule(static) num_threads(threads)
+    for (int y = 0; y < height; ++y) {
+        for (int x = 0; x < width; ++x) {
+            const std::size_t i = static_cast<std::size_t>(y) * width + x;
+            const float z = maps.depth[i], u = static_cast<float>(x), v = static_cast<float>(y);
+            float squares = 0.0f;
+            for (int n = 0; z > 0.0f && n < maps.views; ++n) {
+                const Projected p = project(maps.warps[n], u, v, z);
+                if (!p.front || nearest(p.x, p.y, maps.neighbor_height, maps.neighbor_width) < 0) continue;
+                const float* b = maps.warps[n].b;
+                const float dx = (b[0] - p.x * b[2]) / p.depth, dy = (b[1] - p.y * b[2]) / p.depth;
+                squares += dx * dx + dy * dy;
+            }
+            moved[i] = std::sqrt(squares);
+        }
+    }
+}
+
+void consistent_views(const DepthMaps& maps, const Warp* back, const float* relative, const ConsistencyOptions& o,
+                      std::uint8_t* count) {
     const int height = maps.height, width = maps.width, views = maps.views;
     const int nh = maps.neighbor_height, nw = maps.neighbor_width;
     const float *depth = maps.depth, *neighbor_depths = maps.neighbors;
@@ -58,13 +79,13 @@ void consistent_views(const DepthMaps& maps, const Warp* back, const Consistency
                     const float found = neighbor_depths[n * stride + at];
                     if (!(found > 0.0f)) continue;
                     if (!o.round_trip) {
-                        agreeing += std::fabs(found - p.depth) < o.relative * std::max(found, p.depth);
+                        agreeing += std::fabs(found - p.depth) < relative[i] * std::max(found, p.depth);
                         continue;
                     }
                     const Projected q = project(back[n], static_cast<float>(at % nw), static_cast<float>(at / nw), found);
                     const float dx = q.x - u, dy = q.y - v;
                     agreeing += q.front && dx * dx + dy * dy < limit &&
-                                std::fabs(q.depth - z) < o.relative * std::max(q.depth, z);
+                                std::fabs(q.depth - z) < relative[i] * std::max(q.depth, z);
                 }
             }
             count[i] = static_cast<std::uint8_t>(agreeing);
@@ -89,20 +110,20 @@ void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, 
 }
 
 void fuse_depth(const DepthMaps& maps, const float* confidence, const float* neighbor_confidences,
-                const float* splatted, const FuseOptions& o, float* fused, float* support, float* violation,
-                float* own) {
+                const float* splatted, const float* sigma, const FuseOptions& o, float* fused, float* support,
+                float* violation, float* own) {
     const int height = maps.height, width = maps.width, views = maps.views;
     const int nh = maps.neighbor_height, nw = maps.neighbor_width;
     const float *depth = maps.depth, *neighbor_depths = maps.neighbors;
     const Warp* warps = maps.warps;
     const std::size_t stride = static_cast<std::size_t>(nh) * nw, pixels = static_cast<std::size_t>(height) * width;
-    const float tolerance = 3.0f * o.sigma, sharpness = -0.5f / (o.sigma * o.sigma);
 #pragma omp parallel for schedule(dynamic, 8) num_threads(o.threads)
     for (int y = 0; y < height; ++y) {
         for (int x = 0; x < width; ++x) {
             const std::size_t i = static_cast<std::size_t>(y) * width + x;
             const float z_own = depth[i], c_own = z_own > 0.0f ? confidence[i] : 0.0f;
             const float u = static_cast<float>(x), v = static_cast<float>(y);
+            const float tolerance = 3.0f * sigma[i], sharpness = -0.5f / (sigma[i] * sigma[i]);
             float best_score = -1e9f, best_depth = 0.0f, best_support = 0.0f, best_violation = 0.0f, best_own = 0.0f;
             for (int candidate = -1; candidate < views; ++candidate) {
                 const float z = candidate < 0 ? z_own : splatted[candidate * pixels + i];

@@ -19,15 +19,19 @@ struct DepthMaps {
 };
 
 struct ConsistencyOptions {
-    float relative;   // largest difference of depth, relative to the larger one
     float pixels;     // round trip: largest distance to where it started
     bool round_trip;
     int threads;
 };
 
-// views (H, W): the number of neighbors whose depth agrees with the reference's.
+// moved (H, W): pixels that the neighbors together, by the root of the sum of squares, move a point for a relative
+// change of its inverse depth; only those in whose image it falls count; 0 where depth is unknown.
+void parallax(const DepthMaps& maps, int threads, float* moved);
+
+// views (H, W): the number of neighbors whose depth agrees with the reference's, within `relative` (H, W) of the larger.
 // One way: the reference's point, projected, against the depth found there. Round trip: that depth, projected back.
-void consistent_views(const DepthMaps& maps, const Warp* back, const ConsistencyOptions& options, std::uint8_t* count);
+void consistent_views(const DepthMaps& maps, const Warp* back, const float* relative,
+                      const ConsistencyOptions& options, std::uint8_t* count);
 
 // splatted (H, W): depth in the reference of a neighbor's pixels, the nearest one where several fall; 0 where none.
 void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, int neighbor_height,
@@ -35,16 +39,16 @@ void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, 
                  float* splatted);
 
 struct FuseOptions {
-    float sigma;                    // relative depth: width of the support
     float violation;                // weight of free-space violations against support
     float min_neighbor_confidence;  // a neighbor's pixel below takes no part
     int threads;
 };
 
 // Per pixel, of the reference's own depth and those splatted (N, H, W) from neighbors the one with the best score
-// support - violation, refined to the weighted mean of what supports it; with confidences (H, W) and (N, h, w).
+// support - violation, refined to the weighted mean of what supports it; with confidences (H, W) and (N, h, w), and
+// the width of the support `sigma` (H, W), relative to depth.
 void fuse_depth(const DepthMaps& maps, const float* confidence, const float* neighbor_confidences,
-                const float* splatted, const FuseOptions& options, float* fused, float* support, float* violation,
-                float* own);
+                const float* splatted, const float* sigma, const FuseOptions& options, float* fused, float* support,
+                float* violation, float* own);
 
 }  // namespace fusion

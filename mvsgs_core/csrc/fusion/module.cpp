@@ -12,14 +12,23 @@ fusion::DepthMaps maps_of(const Image& depth, const Stack& neighbors, const Warp
             extent(neighbors, 0), extent(neighbors, 1), extent(neighbors, 2)};
 }
 
-Result<std::uint8_t> consistent_views(Image depth, Stack neighbor_depths, Warps warps, Warps back,
+Result<float> parallax(Image depth, Stack neighbor_depths, Warps warps, int threads) {
+    const fusion::DepthMaps maps = maps_of(depth, neighbor_depths, warps);
+    auto moved = allocate<float>({depth.shape(0), depth.shape(1)});
+    nb::gil_scoped_release release;
+    fusion::parallax(maps, thread_count(threads), moved.data());
+    return moved;
+}
+
+Result<std::uint8_t> consistent_views(Image depth, Stack neighbor_depths, Warps warps, Warps back, Image relative,
                                       const fusion::ConsistencyOptions& options) {
     one_warp_each(neighbor_depths, back);
+    same_size(depth, relative);
     const fusion::DepthMaps maps = maps_of(depth, neighbor_depths, warps);
     auto count = allocate<std::uint8_t>({depth.shape(0), depth.shape(1)});
     const fusion::ConsistencyOptions o = with_threads(options);
     nb::gil_scoped_release release;
-    fusion::consistent_views(maps, data_of(back), o, count.data());
+    fusion::consistent_views(maps, data_of(back), relative.data(), o, count.data());
     return count;
 }
 
@@ -44,8 +53,9 @@ Result<float> splat_depths(Stack neighbor_depths, Stack neighbor_confidences, Wa
 }
 
 nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack neighbor_confidences, Stack splatted,
-                     Warps warps, const fusion::FuseOptions& options) {
+                     Warps warps, Image sigma, const fusion::FuseOptions& options) {
     same_size(depth, confidence);
+    same_size(depth, sigma);
     one_warp_each(splatted, warps);
     require(neighbor_confidences.size() == neighbor_depths.size(), "one confidence per depth");
     const std::size_t h = depth.shape(0), w = depth.shape(1);
@@ -56,8 +66,8 @@ nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack
     {
         const fusion::FuseOptions o = with_threads(options);
         nb::gil_scoped_release release;
-        fusion::fuse_depth(maps, confidence.data(), neighbor_confidences.data(), splatted.data(), o, fused.data(),
-                           support.data(), violation.data(), own.data());
+        fusion::fuse_depth(maps, confidence.data(), neighbor_confidences.data(), splatted.data(), sigma.data(), o,
+                           fused.data(), support.data(), violation.data(), own.data());
     }
     return nb::make_tuple(fused, support, violation, own);
 }
@@ -67,12 +77,14 @@ nb::tuple fuse_depth(Image depth, Image confidence, Stack neighbor_depths, Stack
 MVSGS_EXPAND(MVSGS_MODULE, m) {
     using namespace nb::literals;
     nb::class_<fusion::ConsistencyOptions>(m, "ConsistencyOptions")
-        .def(nb::init<float, float, bool, int>(), "relative"_a, "pixels"_a, "round_trip"_a, "threads"_a);
+        .def(nb::init<float, bool, int>(), "pixels"_a, "round_trip"_a, "threads"_a);
     nb::class_<fusion::FuseOptions>(m, "FuseOptions")
-        .def(nb::init<float, float, float, int>(), "sigma"_a, "violation"_a, "min_neighbor_confidence"_a, "threads"_a);
-    m.def("consistent_views", &consistent_views, "depth"_a, "neighbor_depths"_a, "warps"_a, "back"_a, "options"_a);
+        .def(nb::init<float, float, int>(), "violation"_a, "min_neighbor_confidence"_a, "threads"_a);
+    m.def("parallax", &parallax, "depth"_a, "neighbor_depths"_a, "warps"_a, "threads"_a);
+    m.def("consistent_views", &consistent_views, "depth"_a, "neighbor_depths"_a, "warps"_a, "back"_a, "relative"_a,
+          "options"_a);
     m.def("splat_depths", &splat_depths, "neighbor_depths"_a, "neighbor_confidences"_a, "back"_a, "height"_a,
           "width"_a, "options"_a);
     m.def("fuse_depth", &fuse_depth, "depth"_a, "confidence"_a, "neighbor_depths"_a, "neighbor_confidences"_a,
-          "splatted"_a, "warps"_a, "options"_a);
+          "splatted"_a, "warps"_a, "sigma"_a, "options"_a);
 }

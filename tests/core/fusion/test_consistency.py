@@ -9,16 +9,17 @@ import pytest
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.fusion.backend import NativeFusionBackend
-from mvsgs_core.fusion.fusion import FusionConfig, OnlineFusion, fuse
+from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig, OnlineFusion, fuse
 from mvsgs_core.fusion.interface import FuseOptions
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.torch_backend import TorchFusionBackend
+from mvsgs_core.warp import apply_warp, relative_warp
 from tests.support.depth_views import SIZE, view
 from tests.support.plane_scene import intrinsics_of, look, true_depth
 
-CONFIG = FusionConfig(  # of a small map: filters of few pixels
-    device="cpu", threads=1, relative=0.01, confidence=0.77, discontinuity_radius=2, speckle=200
+CONFIG = FusionConfig(  # of a small map: filters of few pixels, and little parallax
+    device="cpu", threads=1, relative=0.01, confidence=0.5, discontinuity_radius=2, speckle=200
 )
 
 
@@ -60,21 +61,62 @@ def test_consistency_equals_brute_force(round_trip: bool) -> None:
     maps = depth_maps(reference, neighbors)
     expected = sum(brute_force(reference, n, 0.02, 0.7, round_trip).astype(int) for n in neighbors)
     for backend in (NativeFusionBackend(1), TorchFusionBackend("cpu")):
-        found = backend.consistent_views(maps, 0.02, 0.7, round_trip)
+        found = backend.consistent_views(maps, np.full(SIZE, 0.02, np.float32), 0.7, round_trip)
         assert np.mean(found != expected) < 0.003  # rounding at half a pixel
     assert 0.2 < np.mean(np.asarray(expected) > 0) < 1.0
 
 
+def test_parallax_is_what_a_change_of_depth_moves_in_the_neighbors() -> None:
+    reference, neighbors = view(0, 0.0, 0.01), [view(1, 0.6, 0.0, 0.05), view(2, 0.9)]
+    reference.depth[5:9, 5:9] = 0
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float64)
+    inverse = 1.0 / np.where(reference.depth > 0, reference.depth, 1.0).astype(np.float64)
+    squares = np.zeros(SIZE)
+    for n in neighbors:
+        warp = relative_warp(reference.intrinsics, reference.world_from_cam, n.intrinsics, n.world_from_cam)
+        x, y, z = apply_warp(warp, u, v, inverse)
+        ahead, behind = (np.stack(apply_warp(warp, u, v, f * inverse)[:2]) for f in (1 + 1e-5, 1 - 1e-5))
+        inside = (z > 0) & (x > -0.5) & (y > -0.5) & (x < SIZE[1] - 0.5) & (y < SIZE[0] - 0.5)
+        squares += np.where(inside, ((ahead - behind) ** 2).sum(axis=0) / 2e-5**2, 0.0)
+    expected = np.where(reference.depth > 0, np.sqrt(squares), 0.0)
+    assert 1.0 < np.median(expected) < 30.0
+    assert (expected[reference.depth > 0] == 0).any()  # what no neighbor sees
+    for backend in (NativeFusionBackend(1), TorchFusionBackend("cpu")):
+        found = backend.parallax(depth_maps(reference, neighbors))
+        assert found.dtype == np.float32
+        wrong = np.abs(found - expected) > 1e-3 * (1 + expected)
+        assert wrong.mean() < 0.003  # rounding at half a pixel
+
+
 def test_fusion_of_both_backends_agrees() -> None:
     reference, neighbors = view(0, 0.0, 0.03), [view(1, 0.2, 0.01), view(2, -0.3, 0.01), view(3, 0.1, 0.01)]
-    maps, options = depth_maps(reference, neighbors), FuseOptions(0.01, 1.0, 0.4)
+    maps, options = depth_maps(reference, neighbors), FuseOptions(1.0, 0.4)
     native, twin = NativeFusionBackend(1), TorchFusionBackend("cpu")
     splats = [b.splat(maps, options) for b in (native, twin)]
     assert np.mean(np.abs(splats[0] - splats[1]) > 1e-3) < 0.003
-    results = [b.fuse(maps, splats[0], replace(options, min_neighbor_confidence=0.1)) for b in (native, twin)]
+    sigma = np.random.default_rng(0).uniform(0.005, 0.05, SIZE).astype(np.float32)
+    results = [b.fuse(maps, splats[0], sigma, replace(options, min_neighbor_confidence=0.1)) for b in (native, twin)]
     for name in ("depth", "support", "violation", "own"):
         difference = np.abs(getattr(results[0], name) - getattr(results[1], name))
         assert np.mean(difference > 1e-3) < 0.005, name
+
+
+def test_noise_that_parallax_cannot_tell_apart_supports_and_agrees() -> None:
+    """Depths 3 % off, at a baseline where that is a fraction of a pixel; the same at a wide one is a disagreement."""
+    truth = true_depth(look(0.0), SIZE)
+    narrow = replace(CONFIG, sigma_most=CONFIG.sigma)
+
+    def fused(step: float, config: FusionConfig) -> FusedDepth:
+        neighbors = [view(k, step * x, 0.03) for k, x in enumerate((1, -1, 2), 1)]
+        return fuse(view(0, 0.0, 0.03), neighbors, config, NativeFusionBackend(1))
+
+    def error(found: FusedDepth) -> float:
+        return float(np.abs(np.log(found.unfiltered[8:24, 8:48] / truth[8:24, 8:48])).mean())
+
+    near, fixed = fused(0.02, CONFIG), fused(0.02, narrow)
+    assert error(near) < 0.8 * error(fixed)
+    assert near.consistent.mean() > 1.5 * fixed.consistent.mean()
+    assert fused(1.0, CONFIG).consistent[8:24, 16:40].mean() < 0.7 * near.consistent[8:24, 16:40].mean()
 
 
 def test_fusion_replaces_an_outlier_and_fills_a_hole() -> None:
@@ -98,7 +140,7 @@ def test_a_point_that_others_see_through_is_rejected() -> None:
 
 
 def test_the_wrong_pose_of_one_neighbor_does_not_get_through() -> None:
-    reference, good = view(0, 0.0), [view(1, 0.05), view(2, -0.05), view(3, 0.1)]
+    reference, good = view(0, 0.0), [view(1, 0.15), view(2, -0.15), view(3, 0.2)]
     wrong = view(4, 0.3)
     shifted = KeyframeDepth(4, wrong.depth, wrong.confidence, wrong.intrinsics, look(0.5, 0.1), 1.0)
     result = fuse(reference, [*good, shifted], CONFIG, NativeFusionBackend(1))

@@ -9,6 +9,7 @@ from mvsgs_core.fusion.interface import Fused
 from mvsgs_core.mvs.confidence import Evidence, probability_of_inlier
 
 SIZE = (24, 32)
+DOUBT = np.full(SIZE, 0.02, np.float32)
 
 
 def evidence(gray: np.ndarray) -> Evidence:
@@ -36,7 +37,7 @@ def test_a_map_that_matched_badly_elsewhere_is_doubted_everywhere() -> None:
     elsewhere = flat.copy()
     elsewhere[:, 16:] = 0.0  # far from what is looked at
     sure, doubted = (
-        fused_confidence.probability_of_inlier(fused_confidence.features_of(fused, own, agree, agree))
+        fused_confidence.probability_of_inlier(fused_confidence.features_of(fused, own, agree, agree, DOUBT))
         for own in (flat, elsewhere)
     )
     assert np.all(sure[:, :10] > doubted[:, :10] + 0.01)
@@ -48,15 +49,31 @@ def test_next_to_a_doubtful_pixel_all_are_doubted() -> None:
     spot = flat.copy()
     spot[12, 16] = 0.0
     fused = Fused(depth=2.0 * flat, support=2.0 * flat, violation=0.0 * flat, own=flat)
-    features = fused_confidence.features_of(fused, spot, agree, agree)
-    lowest = features[-1]
+    features = fused_confidence.features_of(fused, spot, agree, agree, DOUBT)
+    lowest = features[-2]
     assert np.all(lowest[10:15, 14:19] == 0.0)
     assert lowest[9, 16] == flat[9, 16]
+
+
+def test_agreement_says_less_where_parallax_is_small() -> None:
+    flat, agree = np.full(SIZE, 0.9, np.float32), np.full(SIZE, 4, np.uint8)
+    fused = Fused(depth=2.0 * flat, support=2.0 * flat, violation=0.0 * flat, own=flat)
+    sure, unsure, blind = (
+        fused_confidence.probability_of_inlier(
+            fused_confidence.features_of(
+                fused, flat, agree, agree, fused_confidence.uncertainty_of(np.full(SIZE, pixels, np.float32))
+            )
+        )
+        for pixels in (100.0, 10.0, 0.0)
+    )
+    assert np.all(sure > unsure)
+    assert np.all(unsure > blind)
+    assert np.isfinite(blind).all()
 
 
 def test_every_feature_has_a_weight() -> None:
     zero = np.zeros(SIZE, np.float32)
     fused = Fused(depth=zero + 1.0, support=zero, violation=zero, own=zero)
     count = np.zeros(SIZE, np.uint8)
-    assert len(fused_confidence.features_of(fused, zero, count, count)) == len(fused_confidence.WEIGHTS)
+    assert len(fused_confidence.features_of(fused, zero, count, count, DOUBT)) == len(fused_confidence.WEIGHTS)
     assert np.isfinite(probability_of_inlier(evidence(np.full(SIZE, -128.0)))).all()
