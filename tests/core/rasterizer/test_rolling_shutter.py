@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 import torch
@@ -13,9 +11,6 @@ from mvsgs_core import geometry
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.rasterizer_scenes import POSE, assert_agree, copy, device_of, gradients, intrinsics, random_splats
-
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when triton is first imported
 
 READOUT = np.array([0.06, -0.04, 0.05, 0.03, -0.05, 0.04])  # 2 to 4 pixels at a depth of 2 to 5
 BACKENDS = ("reference", "cpu", "triton")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import pytest
@@ -26,8 +25,6 @@ from tests.support.rasterizer_scenes import (
 
 pytestmark = pytest.mark.slow
 
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when triton is first imported
 pytest.importorskip("triton", reason="triton is not installed: pip install triton to run its interpreter")
 
 SIZE = (20, 35)
