@@ -166,11 +166,12 @@ def fuse(
             first = np.where(known, depth, np.where(splatted > 0, splatted, np.inf).min(axis=0)).astype(np.float32)
             first[np.isinf(first)] = 0.0
             doubt = uncertainty_of(backend.parallax(replace(maps, depth=first)))
-            fused = backend.fuse(maps, splatted, np.clip(doubt, config.sigma, config.sigma_most), options)
+            width = np.clip(doubt, config.sigma, max(config.sigma, config.sigma_most))
+            fused = backend.fuse(maps, splatted, width, options)
             depth = fused.depth
             maps = replace(maps, depth=depth)
             doubt = uncertainty_of(backend.parallax(maps))
-            within = np.clip(doubt, within, np.maximum(within, np.float32(config.sigma_most)))
+            within = np.clip(doubt, config.relative, max(config.relative, config.sigma_most))
         consistent = backend.consistent_views(maps, within, config.pixels, config.round_trip)
         if config.refine:
             seeing = backend.consistent_views(maps, np.full_like(depth, ANY_DEPTH), config.pixels, False)

@@ -119,6 +119,14 @@ def test_noise_that_parallax_cannot_tell_apart_supports_and_agrees() -> None:
     assert fused(1.0, CONFIG).consistent[8:24, 16:40].mean() < 0.7 * near.consistent[8:24, 16:40].mean()
 
 
+def test_a_width_above_the_most_is_a_fixed_one() -> None:
+    views = [view(k, 0.02 * x, 0.03) for k, x in enumerate((0, 1, -1, 2))]
+    backend = NativeFusionBackend(1)
+    fixed, other = (fuse(views[0], views[1:], replace(CONFIG, sigma=0.3, sigma_most=m), backend) for m in (0.01, 0.3))
+    np.testing.assert_array_equal(fixed.unfiltered, other.unfiltered)
+    assert (fixed.unfiltered > 0).any()
+
+
 def test_fusion_replaces_an_outlier_and_fills_a_hole() -> None:
     reference = view(0, 0.0)
     reference.depth[10:14, 10:14] *= 0.6
