@@ -17,7 +17,7 @@ from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.keyframe_window import KeyframeWindow
 from mvsgs_core.pace import Effort, Pace
 
-ANY_DEPTH = np.float32(1.0)  # relative difference that no two positive depths reach
+ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
 EFFORTS = (Effort("full", 1.0), Effort("two neighbors", 0.4), Effort("no neighbor", 0.15))
 
 

@@ -18,8 +18,9 @@ from mvsgs_core.warp import apply_warp, relative_warp
 from tests.support.depth_views import SIZE, view
 from tests.support.plane_scene import intrinsics_of, look, true_depth
 
-CONFIG = FusionConfig(  # of a small map: filters of few pixels, and little parallax
-    device="cpu", threads=1, relative=0.01, confidence=0.5, discontinuity_radius=2, speckle=200
+FINE = (160, 224)  # where parallax is enough for a depth to be sure
+CONFIG = FusionConfig(  # of a small map: filters of few pixels
+    device="cpu", threads=1, relative=0.01, confidence=0.77, discontinuity_radius=2, speckle=200
 )
 
 
@@ -147,12 +148,16 @@ def test_a_point_that_others_see_through_is_rejected() -> None:
     assert np.all((kept == 0) | (np.abs(kept - truth) < 0.02 * truth))
 
 
+def _fine(index: int, x: float) -> KeyframeDepth:
+    return view(index, x, size=FINE)
+
+
 def test_the_wrong_pose_of_one_neighbor_does_not_get_through() -> None:
-    reference, good = view(0, 0.0), [view(1, 0.15), view(2, -0.15), view(3, 0.2)]
-    wrong = view(4, 0.3)
+    reference, good = _fine(0, 0.0), [_fine(1, 0.3), _fine(2, -0.3), _fine(3, 0.5)]
+    wrong = _fine(4, 0.3)
     shifted = KeyframeDepth(4, wrong.depth, wrong.confidence, wrong.intrinsics, look(0.5, 0.1), 1.0)
     result = fuse(reference, [*good, shifted], CONFIG, NativeFusionBackend(1))
-    truth = true_depth(look(0.0), SIZE)
+    truth = true_depth(look(0.0), FINE)
     kept = result.depth > 0
     assert kept.mean() > 0.7
     assert np.mean(np.abs(result.depth - truth)[kept] > 0.05 * truth[kept]) < 0.02
@@ -160,17 +165,17 @@ def test_the_wrong_pose_of_one_neighbor_does_not_get_through() -> None:
 
 def test_few_agreeing_neighbors_count_against_a_depth_only_where_others_see_another() -> None:
     """One neighbor agrees and nobody else looks; or one agrees and two see another depth there."""
-    reference, agreeing = view(0, 0.0), view(1, 0.05)
-    others = [view(2, -0.05), view(3, 0.1)]
+    reference, agreeing = _fine(0, 0.0), _fine(1, 0.3)
+    others = [_fine(2, -0.3), _fine(3, 0.5)]
     for other in others:
-        other.depth[:, :28] = 0.0
-        other.depth[:, 28:] *= 0.8
+        other.depth[:, :112] = 0.0
+        other.depth[:, 112:] *= 0.8
     found = fuse(reference, [agreeing, *others], CONFIG, NativeFusionBackend(1))
-    truth = true_depth(look(0.0), SIZE)
+    truth = true_depth(look(0.0), FINE)
     right = np.abs(found.unfiltered - truth) < 0.02 * truth
-    unseen, contested = found.confidence[8:32, 8:22], found.confidence[8:32, 34:48][right[8:32, 34:48]]
+    unseen, contested = found.confidence[32:128, 32:88], found.confidence[32:128, 136:192][right[32:128, 136:192]]
     assert np.median(unseen) > np.median(contested) + 0.1
-    assert (found.depth[8:32, 8:22] > 0).mean() > 0.6
+    assert (found.depth[32:128, 32:88] > 0).mean() > 0.6
 
 
 def test_fewer_neighbors_than_asked_for_is_said() -> None:
