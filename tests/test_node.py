@@ -121,6 +121,8 @@ def test_sigint_ends_a_source_and_the_graph_finishes_with_what_it_has() -> None:
         time.sleep(random.uniform(0.0, 1.0))  # from before the imports are done to the middle of the stream
         for process in g.processes.values():
             process.popen.send_signal(signal.SIGINT)
+        for process in g.processes.values():  # the promise counts from here: a busy machine takes long to start four
+            process.wait_for(lambda status: status.get("state") not in (None, "starting"))
         assert set(g.wait(DOWN).values()) == {0}
         received = g.joined["received"]
         assert received["Keyframe"] == received["GroundTruth"] == list(range(len(received["Keyframe"])))

@@ -79,7 +79,8 @@ def test_messages_know_neither_torch_nor_nodes() -> None:
 
 def test_importing_messages_and_the_transport_loads_no_torch() -> None:
     heavy = {"torch", "cv2", "open3d", "hydra"}
-    code = f"import sys, nodes.runtime.process, msgs.codec; print(sorted({heavy} & set(sys.modules)))"
+    modules = "nodes.runtime.process, msgs.codec, tests.support.sample_nodes"  # the tests start the last by the dozen
+    code = f"import sys, {modules}; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 
