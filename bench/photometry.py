@@ -29,11 +29,13 @@ ALL: Mapping[str, float] = {
     "exposure": 1.0, "white_balance": 0.3, "vignetting": 0.5, "response": 0.15, "noise": 1.5,
 }  # fmt: skip
 VARYING: Mapping[str, Mapping[str, float]] = {"exposure by a stop": {"exposure": 1.0}, "all that a camera does": ALL}
+DRIVE: Mapping[str, Any] = {"scene": "town", "frames": 800, "stride": 2, "streets": 12}
 STEADY: Mapping[str, Mapping[str, Any]] = {
     "room, steady": {},
     "room, noise and motion blur": {"noise": 3.0, "motion_blur": 0.5},
     "room, loop of 300 frames": {"frames": 300, "loop": True},
     "aerial, steady": {"scene": "aerial"},
+    "town, drive of 400 frames": DRIVE,  # what is far comes near
 }
 VIDEOS = {
     "tum_fr1_xyz": CASES["tum_fr1_xyz"],

@@ -15,11 +15,18 @@ from typing import Protocol
 import numpy as np
 
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.estimation.gray_levels import MIN_SAMPLES, TERMS, backward, log_ratio_moments
+from mvsgs_core.tracking.estimation.gray_levels import (
+    BESIDE,
+    MIN_SAMPLES,
+    TERMS,
+    backward,
+    log_ratio_moments,
+    surrounded,
+)
 from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration, PhotometricEdges, solve_photometry
 from mvsgs_core.tracking.estimation.response import radial_terms, vignetting_polynomial
 from mvsgs_core.tracking.graph import Edge, KeyframeGraph
-from mvsgs_core.tracking.image import RecentImages, TrackingImage
+from mvsgs_core.tracking.image import CELL, RecentImages, TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.steps import Steps, timed, whole
 
@@ -215,16 +222,20 @@ def _compared(
 ) -> np.ndarray | None:
     """Moments (3, 6, 6) of the log ratios of a keyframe's cells and an image, where its points were found, (M, 2).
 
-    The flattest place of a cell is looked up as far beside the match as it is beside the cell's point.
+    The flattest place of a cell is looked up as far beside the match as it is beside the cell's point. Of one that does
+    not lie among points which were found less is believed.
     """
     keyframe = graph.keyframes[reference].image
     if keyframe.levels is None or image.levels is None or alive.sum() < MIN_SAMPLES:
         return None
     places, samples = keyframe.flat_places
+    points = keyframe.cells.points
+    inside = surrounded(places, points, alive, (image.size[0] // CELL, image.size[1] // CELL))[alive]
     places = places[alive]
-    there = target[alive] + places - keyframe.cells.points[alive]
-    here, across = (radial_terms(points, graph.intrinsics, image.size) for points in (places, there))
-    return log_ratio_moments(samples[alive], image.levels.at(there), (here, across), graph.vignetting)
+    there = target[alive] + places - points[alive]
+    here, across = (radial_terms(at, graph.intrinsics, image.size) for at in (places, there))
+    doubt = np.where(inside, 0.0, BESIDE)
+    return log_ratio_moments(samples[alive], image.levels.at(there), (here, across), graph.vignetting, doubt)
 
 
 __all__ = ["FrameLight", "Photometer", "observed"]

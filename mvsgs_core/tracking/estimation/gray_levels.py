@@ -16,7 +16,10 @@ import numpy as np
 from mvsgs_core.tracking.estimation.response import BRIGHTEST, DARKEST, offset_term
 
 NOISE = 1.0 / 255.0  # of a window's mean, gray levels 0 to 1: quantization and what is left of the sensor's noise
+FLOOR = 0.02  # of a level that a place may be off, however flat it is: by what shines, or lies behind the point beside
 SHARE = 1.0  # of a window's spread that counts as its error: a match beside may be off by a window
+INSIDE = 2.0  # pixels at least that a place lies inside of the points around it
+BESIDE = 0.1  # of a level that one may be off that does not
 MIN_SAMPLES = 30
 TERMS = 9  # 1, what an offset adds, three of the radius, what an offset adds to these, the log ratio
 _STEPS = 4  # of reweighting
@@ -71,11 +74,29 @@ class Samples:
     @property
     def variance(self) -> np.ndarray:
         """(N, 3) of the logarithm of the levels."""
-        return np.asarray((NOISE**2 + (SHARE * self.spread[:, None]) ** 2) / self.level**2)
+        return np.asarray((NOISE**2 + (SHARE * self.spread[:, None]) ** 2) / self.level**2 + 0.5 * FLOOR**2)
+
+
+def surrounded(places: np.ndarray, points: np.ndarray, found: np.ndarray, cells: tuple[int, int]) -> np.ndarray:
+    """(M,) bool: the places (M, 2) that lie among points (M, 2) which were `found` (M,), those of the 3x3 cells around;
+    of what was not found itself, none. By rows of `cells` = (rows, columns).
+
+    A smooth place beside a contour may be of what is behind it: it moves otherwise than the points, and a sky, of which
+    nothing is matched, would be compared with a sky that is higher up, step by step as the camera drives on.
+    """
+    around = np.full((cells[0] + 2, cells[1] + 2, 2), np.nan)
+    around[1:-1, 1:-1] = np.where(found[:, None], points, np.nan).reshape(*cells, 2)
+    angles = np.arange(8) * np.pi / 4
+    directions = np.stack([np.cos(angles), np.sin(angles)])
+    reach = np.full((len(places), 8), -np.inf)  # of the points, seen from the place
+    for row, column in np.ndindex(3, 3):
+        near = around[row : row + cells[0], column : column + cells[1]].reshape(-1, 2)
+        reach = np.fmax(reach, (near - places) @ directions)
+    return np.asarray(found & (reach > INSIDE).all(axis=1))
 
 
 def log_ratio_moments(
-    a: Samples, b: Samples, radial: tuple[np.ndarray, np.ndarray], dark: np.ndarray
+    a: Samples, b: Samples, radial: tuple[np.ndarray, np.ndarray], dark: np.ndarray, doubt: np.ndarray | None = None
 ) -> np.ndarray | None:
     """Weighted moments (3, 9, 9), a channel each, of z = (1, offset term, radial terms' change, that of their products
     with the offset term, log b / a).
@@ -89,8 +110,9 @@ def log_ratio_moments(
     if known.sum() < MIN_SAMPLES:
         return None
     a, b = a[known], b[known]
+    also = 0.0 if doubt is None else doubt[known, None] ** 2
     log_a, log_b = np.log(a.level), np.log(b.level)
-    ratio, variance = log_b - log_a, a.variance + b.variance
+    ratio, variance = log_b - log_a, a.variance + b.variance + also
     mean_ratio, sigma = ratio.mean(axis=1), np.sqrt(variance.mean(axis=1))
     at_a, at_b = (r[known] for r in radial)
     even = 0.5 * (log_a + log_b - ((at_a + at_b) @ dark)[:, None])  # noise of the ratio is not in it
@@ -129,4 +151,4 @@ def backward(moments: np.ndarray) -> np.ndarray:
     return np.asarray(moments * sign * sign[:, None])
 
 
-__all__ = ["MIN_SAMPLES", "TERMS", "Levels", "Samples", "backward", "log_ratio_moments", "of_response"]
+__all__ = ["MIN_SAMPLES", "TERMS", "Levels", "Samples", "backward", "log_ratio_moments", "of_response", "surrounded"]

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pytest
 
-from mvsgs_core.tracking.estimation.gray_levels import Levels, Samples, backward, log_ratio_moments
+from mvsgs_core.tracking.estimation.gray_levels import (
+    BESIDE,
+    Levels,
+    Samples,
+    backward,
+    log_ratio_moments,
+    surrounded,
+)
 from mvsgs_core.tracking.estimation.photometry import PhotometricCalibration, PhotometricEdges, solve_photometry
 from mvsgs_core.tracking.estimation.response import MIDDLE, affine, vignetting_polynomial
+from mvsgs_core.tracking.image import CELL, TrackingImage
 
 POINTS = 400
 
@@ -206,3 +215,38 @@ def test_levels_leave_out_what_the_sensor_cannot_show_and_know_flat_places() -> 
     assert places.shape == (4 * 6, 2)
     cell = np.floor((places + 0.5) / 8).astype(int)
     np.testing.assert_array_equal(cell, [(u, v) for v in range(4) for u in range(6)])
+
+
+def test_a_sky_behind_roofs_that_come_nearer_says_nothing() -> None:
+    random, (height, width) = np.random.default_rng(4), (240, 320)
+    v, u = np.mgrid[: height + 8, :width]
+    fronts = cv2.GaussianBlur(random.uniform(0.0, 255.0, v.shape), (0, 0), 1.5)
+    fronts = np.clip(115.0 + 3.0 * (fronts - fronts.mean()), 20.0, 220.0)
+    fronts[v < 100 + 12 * np.sin(0.1 * u)] = 0.0
+    sky = 150.0 + 0.5 * v
+
+    def image(rise: int) -> TrackingImage:
+        near = fronts[rise : rise + height]
+        gray = np.where(near > 0.0, near, sky[:height]).astype(np.uint8)
+        return TrackingImage.of(rise, 0.0, np.dstack([gray] * 3), (height, width), color=False)
+
+    before, after = image(0), image(8)
+    points, (places, samples) = before.cells.points, before.flat_places
+    assert before.levels is not None
+    assert after.levels is not None
+    found = before.cells.textured & (points[:, 1] > 85.0)
+    chosen = surrounded(places, points, found, (height // CELL, width // CELL))
+    behind = places[:, 1] < 100 + 12 * np.sin(0.1 * places[:, 0]) - 2.0
+    assert (found & behind).sum() > 20
+    assert (chosen & behind).sum() < 0.2 * (found & behind).sum()
+    assert (chosen & ~behind).sum() > 0.5 * (found & ~behind).sum()
+    assert not (chosen & ~found).any()
+    gains = []
+    nowhere = np.zeros((int(found.sum()), 3))
+    there = after.levels.at(places[found] - [0.0, 8.0])
+    for doubt in (None, np.where(chosen[found], 0.0, BESIDE)):
+        moments = log_ratio_moments(samples[found], there, (nowhere, nowhere), np.zeros(3), doubt)
+        assert moments is not None
+        gains.append(float(moments[0, 0, 8] / moments[0, 0, 0]))
+    assert gains[0] < -0.005
+    assert abs(gains[1]) < 0.001
