@@ -73,6 +73,7 @@ GONE: Mapping[str, str] = {
         (f"mapper.insertion.{name}" for name in ("fill_below", "fill_opacity", "fill_scale")),
         "splats of doubtful depth begin as all others: min_opacity, initial_opacity, initial_scale",
     ),
+    "mapper.density_control.prune_scale": "no splat grows beyond mapper.optimizer.max_scale",
     "mvs.skip_certain": "it cost precision and saved no time",
     "mvs.skip_explained": "it passed over no keyframe of a camera's stream",
     "mvs.tolerance": "it was of mvs=skipping",

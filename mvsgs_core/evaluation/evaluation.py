@@ -285,7 +285,10 @@ def _places(finished: Snapshot) -> dict[int, int]:
 
 
 def _typical_depth(finished: Snapshot) -> float:
-    """Median distance of the splats from the middle of the keyframes, map units; the world's scale is arbitrary."""
+    """Of what a keyframe sees, map units; else the splats' distance from the middle of the keyframes."""
+    depth = finished.typical_depth()
+    if depth is not None:
+        return depth
     if not len(finished.keyframes) or not len(finished.splats.means):
         return 1.0
     center = np.median(finished.world_from_cam[:, :3, 3] - finished.origin, axis=0)

@@ -9,7 +9,7 @@ from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.rasterize import Render
 
-NEAR = 0.01  # of the splats' median distance: what is nearer to the camera is not drawn
+NEAR = 0.01  # of the typical depth: what is nearer to the camera is not drawn
 
 
 def rendered_keyframe(final: Snapshot, cameras: Cameras, k: int) -> tuple[torch.Tensor, Render]:
@@ -22,5 +22,8 @@ def rendered_keyframe(final: Snapshot, cameras: Cameras, k: int) -> tuple[torch.
 
 def near_plane(final: Snapshot, world_from_cam: np.ndarray) -> float:
     """In the map's unit, for a pose in the world (4, 4)."""
+    depth = final.typical_depth()
+    if depth is not None:
+        return NEAR * depth
     distances = np.linalg.norm(final.splats.means.numpy() - final.relative_pose(world_from_cam)[:3, 3], axis=1)
     return NEAR * float(np.median(distances)) if len(distances) else NEAR

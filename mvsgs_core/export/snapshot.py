@@ -35,6 +35,19 @@ class Snapshot:
         local[:3, 3] -= self.origin
         return local
 
+    def typical_depth(self) -> float | None:
+        """Median distance of the splats from the keyframes that they were made from, world units: that of what a camera
+        sees, however far the map reaches. None where no keyframe of theirs is known."""
+        if not len(self.keyframes) or not len(self.anchors):
+            return None
+        order = np.argsort(self.keyframes)
+        place = order[np.searchsorted(self.keyframes, self.anchors, sorter=order).clip(max=len(order) - 1)]
+        known = self.keyframes[place] == self.anchors
+        if not known.any():
+            return None
+        cameras = self.world_from_cam[place[known], :3, 3] - self.origin
+        return float(np.median(np.linalg.norm(self.splats.means.numpy()[known] - cameras, axis=1)))
+
     @torch.no_grad()
     def render(
         self, world_from_cam: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], **options: Any

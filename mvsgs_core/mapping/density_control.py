@@ -27,7 +27,6 @@ class DensityControlConfig:
     gradient: float = 6.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
     prune_opacity: float = 0.02  # 0 to 1; below: removed
-    prune_scale: float = 0.5  # maximum standard deviation in median depths; above: removed
     needless: float = 0.02  # of the keyframes' squared error that splats taken out at the end may add; 0: none are
     max_splats: int = 1_000_000  # no growth beyond
 
@@ -55,18 +54,16 @@ def control(
     return change
 
 
-def removable(state: MapState, config: DensityControlConfig, median_depth: float) -> Tensor:
-    """(N,) bool: transparent, or too large for the scene."""
-    transparent = state.splats.opacity_logits < math.log(config.prune_opacity / (1.0 - config.prune_opacity))
-    largest = state.splats.log_scales.max(dim=1).values
-    return transparent | (largest > math.log(config.prune_scale * median_depth))
+def removable(state: MapState, config: DensityControlConfig) -> Tensor:
+    """(N,) bool: transparent."""
+    return state.splats.opacity_logits < math.log(config.prune_opacity / (1.0 - config.prune_opacity))
 
 
 def _adapt(
     state: MapState, config: DensityControlConfig, median_depth: float, generator: torch.Generator
 ) -> DensityChange:
     mean_gradient = state.means2d_gradient / state.means2d_views.clamp(min=1.0)
-    prune = removable(state, config, median_depth)
+    prune = removable(state, config)
     dense = (mean_gradient > config.gradient) & ~prune
     room = max(0, config.max_splats - len(state))
     if int(dense.sum()) > room:  # the worst first

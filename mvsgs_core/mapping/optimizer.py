@@ -23,6 +23,7 @@ class OptimizerConfig:
     means_final: float = 0.05  # fraction of `means` that an old splat keeps
     decay_steps: int = 600  # steps of a splat until then, log-linear
     log_scales: float = 0.1  # natural logarithm a step
+    max_scale: float = 0.2  # median depths: the widest standard deviation; wider, it is fog to a camera that comes near
     quaternions: float = 0.015  # a step, of a unit quaternion
     opacity_logits: float = 0.05  # logit a step
     sh: float = 0.03  # color a step, degree 0; higher degrees a twentieth
@@ -45,11 +46,12 @@ class Group:
 def groups(rates: OptimizerConfig, median_depth: float, factor: float, train_betas: bool, kernel: str) -> list[Group]:
     """The steps of all parameters for a scene of this median depth; `factor` scales all rates (the global decay)."""
     log_depth = math.log(median_depth)
+    largest = log_depth + math.log(rates.max_scale)
     means = rates.means * median_depth * factor
     beta_range = (-60.0, 60.0) if kernel == "ges_scale" else (0.1, 20.0)
     result = [
         Group("means", means, means * rates.means_final, -1e6 * median_depth, 1e6 * median_depth),
-        Group("log_scales", rates.log_scales * factor, rates.log_scales * factor, log_depth - 14.0, log_depth + 3.0),
+        Group("log_scales", rates.log_scales * factor, rates.log_scales * factor, log_depth - 14.0, largest),
         Group("quaternions", rates.quaternions * factor, rates.quaternions * factor, -1e3, 1e3),
         Group("opacity_logits", rates.opacity_logits * factor, rates.opacity_logits * factor, -12.0, 12.0),
         Group("sh", rates.sh * factor, rates.sh * factor, -100.0, 100.0, lead=3, tail=0.05),

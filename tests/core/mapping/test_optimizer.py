@@ -134,6 +134,17 @@ def test_wild_rates_stay_inside_the_bounds() -> None:
         assert values.max() <= group.high
 
 
+@pytest.mark.parametrize("run", [step, step_reference])
+def test_no_splat_grows_beyond_the_widest(run: Any) -> None:
+    state = random_state(30)
+    rates = OptimizerConfig(max_scale=0.3)
+    for _ in range(80):
+        for name in PARAMETERS:
+            getattr(state.splats, name).grad = torch.full_like(getattr(state.splats, name), -1e-4)
+        run(state, torch.ones(30, dtype=torch.bool), groups(rates, 2.0, 1.0, True, "exact"), 100)
+    torch.testing.assert_close(state.splats.log_scales.exp(), torch.full((30, 3), 0.3 * 2.0))
+
+
 def test_threads_do_not_change_the_result() -> None:
     one, two = random_state(2000), random_state(2000)
     for state, threads in ((one, 1), (two, 2)):
