@@ -26,7 +26,7 @@ SCENES = ("room", "tum_fr1_xyz", "redkitchen", "room_exposure")
 TABLE_III = ("A", "B", "C", "D")
 SKIPS = (  # what is left out, switched off or over; keyframe reuse needs more keyframes than these scenes have
     "no_skips", "no_skip_converged", "no_selective", "no_unexplored",
-    "no_price", "whole_error", "only_empty", "no_doubtful", "no_free_space", "realtime", "no_skip_cells", "every_frame",
+    "no_price", "whole_error", "only_empty", "no_doubtful", "realtime", "no_skip_cells", "every_frame",
 )  # fmt: skip
 OTHERS = (
     "no_density_control", "exact", "ges_scale", "ges_loss", "harmonics", "no_exposure", "no_frames_between",

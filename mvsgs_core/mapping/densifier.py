@@ -8,12 +8,10 @@ import cv2
 import numpy as np
 import torch
 
-from mvsgs_core import geometry
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.filling import continued_depth
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
-from mvsgs_core.mapping.free_space import in_free_space
 from mvsgs_core.mapping.insertion import Points, depth_colors, points_of_rectangles, splats_from_points
 from mvsgs_core.mapping.keyframe_store import KeyframeStore
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
@@ -31,13 +29,11 @@ class Densifier:
 
     def __init__(
         self, config: MapperConfig, state: MapState, frame: FrameOfReference, keyframes: KeyframeStore,
-        render: Callable[[TrainingView], Render], light: Callable[[TrainingView, torch.Tensor], torch.Tensor],
-        photometry: ImageFormation, log: Stats,
+        render: Callable[[TrainingView], Render], photometry: ImageFormation, log: Stats,
     ) -> None:  # fmt: skip
-        """render: of `state` as a keyframe's camera photographs it; light: of its splats, as `Trainer.light`. What is
-        given here changes by itself."""
+        """render: of `state` as a keyframe's camera photographs it. What is given here changes by itself."""
         self.config, self.state, self.frame, self.keyframes = config.insertion, state, frame, keyframes
-        self.render, self.light, self.photometry, self.log = render, light, photometry, log
+        self.render, self.photometry, self.log = render, photometry, log
         self._kernel = config.training.kernel
         self._max_splats = config.density_control.max_splats
 
@@ -46,9 +42,8 @@ class Densifier:
         size = view.size
         image = view.target.cpu().numpy()
         valid = np.ones(size, dtype=bool) if view.valid is None else view.valid.cpu().numpy()
-        depth = _nearest(self._near(depth / np.float32(self.frame.length)), size)
-        self._clear_free_space(view, depth)
         residual, shown = self._residual(view, image)
+        depth = _nearest(self._near(depth / np.float32(self.frame.length)), size)
         known = wanted = (depth > 0) & valid
         confidence = np.ones(size, dtype=np.float32)
         if self.config.doubtful and keyframe.unfiltered is not None and self.frame.unit is not None:
@@ -65,20 +60,6 @@ class Densifier:
         colors = self.photometry.colors_of_map(depth_colors(view.image.cpu().numpy(), size), view)
         points = points_of_rectangles(parts, depth, known, confidence, view.intrinsics, colors, normals)
         return self._append(points, view)
-
-    def _clear_free_space(self, view: TrainingView, depth: np.ndarray) -> None:
-        """Removes the splats that hang before the surfaces that a view knows, by its depth (H, W), 0: unknown."""
-        state, nearer = self.state, self.config.free_space
-        if not len(state) or not nearer > 0 or not (depth > 0).any():
-            return
-        known = (depth > 0).astype(np.float32)
-        images = np.stack([np.ones_like(known), known, known / np.where(depth > 0, depth, np.float32(1))], axis=-1)
-        light = self.light(view, torch.from_numpy(images).to(state.device))
-        cam_from_map = torch.from_numpy(geometry.inverse(view.refined_from_cam)).to(state.splats.means)
-        z = state.splats.means.detach() @ cam_from_map[2, :3] + cam_from_map[2, 3]
-        gone = in_free_space(light, z, nearer)
-        self.log.count("in_free_space", int(gone.sum()))
-        state.keep(~gone)
 
     def _residual(self, view: TrainingView, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Squared error (H, W), mean over RGB, of what the map shows of an image, and its depth there, 0: nothing.

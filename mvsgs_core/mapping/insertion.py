@@ -29,7 +29,6 @@ class InsertionConfig:
     price: float = 0.25  # dissimilarity, as SSIM's, that a splat must mend (.11: 40 dB of a pixel amid gray ones)
     median_errors: float = 3.0  # times a view's median error that a pixel of the map may have: blur, noise, pose
     min_opacity: float = 0.7  # rendered opacity below: the map shows nothing there, whatever the color
-    free_space: float = 0.75  # of a keyframe's known depth: splats that are nearer than that are removed; 0: none are
     doubtful: bool = True  # where it shows nothing, splats of doubtful or continued depth, too; false: it stays empty
     initial_scale: float = 0.6  # standard deviation over the side of the rectangle
     flatten: float = 0.3  # thickness along the normal over the smaller width; 1: as thick as that

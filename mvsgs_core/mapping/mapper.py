@@ -73,11 +73,8 @@ class OnlineMapper:
         def render(view: TrainingView, size: tuple[int, int] | None = None) -> Render:
             return trainer.render(view, keyframes.median_depth, size)
 
-        def light(view: TrainingView, images: torch.Tensor) -> torch.Tensor:
-            return trainer.light(view, keyframes.median_depth, images)
-
         # no part refers to its mapper: copies of it, for checkpoints, are then freed as soon as they are written
-        self.densifier = Densifier(config, self.state, self.frame, keyframes, render, light, self.photometry, self.log)
+        self.densifier = Densifier(config, self.state, self.frame, keyframes, render, self.photometry, self.log)
 
     @property
     def views(self) -> list[TrainingView]:

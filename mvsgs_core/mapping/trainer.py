@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -29,7 +27,6 @@ from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.interface import SplatStep
 from mvsgs_core.rasterizer.photograph_loss import Formation, photograph_loss
 from mvsgs_core.rasterizer.rasterize import Render, chosen_backend, rasterize
-from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 
@@ -80,16 +77,6 @@ class Trainer:
             ).weight_max
         assert found is not None
         return found
-
-    def light(self, view: TrainingView, median_depth: float, images: Tensor) -> Tensor:
-        """(N, 3) the splats' blending weights in a training image times `images` (h, w, 3), summed over the pixels."""
-        splats = self.state.detached()
-        sh = torch.zeros_like(splats.sh, requires_grad=True)  # colors are linear in them, by the weights
-        render = self._rasterize(
-            replace(splats, sh=sh), view, view.intrinsics, view.size, median_depth, None, None, formed=False
-        )
-        (slope,) = torch.autograd.grad((render.color * images).sum(), [sh])
-        return slope[:, 0] / C0
 
     def step(self, view: TrainingView, median_depth: float, *, refining: bool = False) -> None:
         """One iteration on a keyframe. median_depth: of the scene; refining: no splat is added or removed."""
