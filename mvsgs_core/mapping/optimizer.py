@@ -17,7 +17,10 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Rates of a splat's parameters. Lengths are in units of the scene's median depth."""
+    """Rates of a splat's parameters. Lengths are in units of the scene's median depth.
+
+    Raises ValueError for a `max_scale` that no splat has.
+    """
 
     means: float = 1.0e-3  # median depths a step, for a new splat
     means_final: float = 0.05  # fraction of `means` that an old splat keeps
@@ -28,6 +31,10 @@ class OptimizerConfig:
     opacity_logits: float = 0.05  # logit a step
     sh: float = 0.03  # color a step, degree 0; higher degrees a twentieth
     betas: float = 1.0e-3  # shape exponent a step
+
+    def __post_init__(self) -> None:
+        if not 1e-5 <= self.max_scale <= 1e5:
+            raise ValueError(f"mapper.optimizer.max_scale={self.max_scale}: median depths, from 1e-5 to 1e5")
 
 
 @dataclass(frozen=True)

@@ -101,10 +101,10 @@ def log_ratio_moments(
     """Weighted moments (3, 9, 9), a channel each, of z = (1, offset term, radial terms' change, that of their products
     with the offset term, log b / a).
 
-    radial: terms (N, 3) in a and b. dark (3,): the vignetting as far as it is known, log V = dark · radial; without it
-    the mean levels of the offset term are, and half of it those of the products. Weights are those of independent
-    samples, outliers from what light changes down-weighted (Cauchy), so that the moments are information. None where
-    there are too few samples.
+    radial: terms (N, 3) in a and b. doubt (N,): parts of a level that a sample may be off besides; None: nothing.
+    dark (3,): the vignetting as far as it is known, log V = dark · radial; without it the mean levels of the offset
+    term are, and half of it those of the products. Weights are those of independent samples, outliers from what light
+    changes down-weighted (Cauchy), so that the moments are information. None where there are too few samples.
     """
     known = np.isfinite(a.level).all(axis=1) & np.isfinite(b.level).all(axis=1)
     if known.sum() < MIN_SAMPLES:

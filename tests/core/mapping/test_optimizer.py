@@ -134,6 +134,12 @@ def test_wild_rates_stay_inside_the_bounds() -> None:
         assert values.max() <= group.high
 
 
+@pytest.mark.parametrize("wrong", [0.0, -1.0, math.inf, math.nan])
+def test_a_widest_splat_that_cannot_be_is_refused(wrong: float) -> None:
+    with pytest.raises(ValueError, match=r"mapper.optimizer.max_scale=.*median depths"):
+        OptimizerConfig(max_scale=wrong)
+
+
 @pytest.mark.parametrize("run", [step, step_reference])
 def test_no_splat_grows_beyond_the_widest(run: Any) -> None:
     state = random_state(30)
