@@ -17,10 +17,10 @@ from mvsgs_core.evaluation.fitted_camera import fit_camera
 from mvsgs_core.evaluation.frames import Frames, Photograph
 from mvsgs_core.evaluation.straight import undistortion
 from mvsgs_core.evaluation.trajectory_metrics import AlignedPath, known_poses
+from mvsgs_core.export.keyframe_render import NEAR, near_plane
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.trajectory import Trajectory, velocities
 
-NEAR = 0.01  # of the typical depth: splats nearer to a camera are not drawn
 ENOUGH = 3  # held-out frames whose mean and worst say something
 
 
@@ -124,7 +124,7 @@ class Evaluation:
         tracked = self.trajectory.following(finished.keyframes, finished.world_from_cam)
         frames = []
         main = tracked.main()
-        near = NEAR * _typical_depth(finished)
+        near = near_plane(finished, finished.world_from_cam[0]) if len(finished.keyframes) else NEAR
         moving = tracked.velocity
         if moving is None:
             moving = velocities(tracked.timestamp, tracked.world_from_cam, main)
@@ -282,14 +282,3 @@ class Evaluation:
 def _places(finished: Snapshot) -> dict[int, int]:
     """Keyframe -> its row in the map's arrays."""
     return {int(index): row for row, index in enumerate(finished.keyframes)}
-
-
-def _typical_depth(finished: Snapshot) -> float:
-    """Of what a keyframe sees, map units; else the splats' distance from the middle of the keyframes."""
-    depth = finished.typical_depth()
-    if depth is not None:
-        return depth
-    if not len(finished.keyframes) or not len(finished.splats.means):
-        return 1.0
-    center = np.median(finished.world_from_cam[:, :3, 3] - finished.origin, axis=0)
-    return float(np.median(np.linalg.norm(finished.splats.means.numpy() - center, axis=1)))

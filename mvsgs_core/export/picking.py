@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from mvsgs_core.export.keyframe_render import NEAR
+from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -30,10 +30,9 @@ def hit(final: Snapshot, start: np.ndarray, direction: np.ndarray) -> np.ndarray
     pose = np.eye(4)
     pose[:3, :3] = np.stack([side, np.cross(ahead, side), ahead], axis=1)
     pose[:3, 3] = start + final.origin
-    near = NEAR * float(np.median(np.linalg.norm(final.splats.means.numpy() - start, axis=1)))
     middle = (_SIDE - 1) / 2
     intrinsics = np.array([_PIXELS_A_RADIAN, _PIXELS_A_RADIAN, middle, middle])
-    render = final.render(pose, intrinsics, (_SIDE, _SIDE), near=near)
+    render = final.render(pose, intrinsics, (_SIDE, _SIDE), near=near_plane(final, pose))
     place = int(middle), int(middle)
     if not render.opacity[place] > 0.5:
         return None

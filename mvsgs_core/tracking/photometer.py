@@ -230,7 +230,7 @@ def _compared(
         return None
     places, samples = keyframe.flat_places
     points = keyframe.cells.points
-    inside = surrounded(places, points, alive, (image.size[0] // CELL, image.size[1] // CELL))[alive]
+    inside = surrounded(places, points, alive, (keyframe.size[0] // CELL, keyframe.size[1] // CELL))[alive]
     places = places[alive]
     there = target[alive] + places - points[alive]
     here, across = (radial_terms(at, graph.intrinsics, image.size) for at in (places, there))

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from mvsgs_core.export.keyframe_render import NEAR, near_plane
+from mvsgs_core.export.picking import hit
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -40,6 +41,14 @@ def test_the_typical_depth_is_that_of_a_keyframe_however_long_the_street(step: f
         assert near_plane(final, pose) == pytest.approx(NEAR * 10.0)
     moved = replace(final, origin=np.array([5.0, 0.0, 0.0]), world_from_cam=final.world_from_cam + _along_x(5.0))
     assert moved.typical_depth() == pytest.approx(10.0)
+
+
+def test_a_ray_meets_what_is_near_however_long_the_street() -> None:
+    final = street(100.0)
+    opaque = replace(final.splats, opacity_logits=torch.full_like(final.splats.opacity_logits, 5.0))
+    found = hit(replace(final, splats=opaque), np.array([0.0, 0.0, 8.0]), np.array([0.0, 0.0, 1.0]))
+    assert found is not None
+    assert found[2] == pytest.approx(10.0, abs=0.1)
 
 
 def test_without_keyframes_of_its_splats_none_is_known() -> None:
