@@ -235,6 +235,7 @@ class SplatMap:
     exposures: Annotated[np.ndarray, "float32 K 3 4"]  # color affine [A | b] of each keyframe
     vignetting: Annotated[np.ndarray, "float32 3"] | None = None  # that renders need beside them
     antialiased: bool = False  # renders scale a splat's opacity by what the pixels' blur makes of its area
+    background: Annotated[np.ndarray, "float32 3"] | None = None  # color where there is no splat; None: black
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,11 @@ import math
 import resource
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from msgs import FusedKeyframe, GroundTruth, SplatMap, Trajectory
 from mvsgs_core import machine, trajectory, weights
@@ -22,13 +21,12 @@ from mvsgs_core.evaluation import html, pictures, statistics
 from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.origin import origin
-from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.georeference import FILE as GEOREFERENCE
 from mvsgs_core.georeference import Georeference, NoReferenceError, georeference, values_of, write_georeference
 from mvsgs_core.held_out import HELD_OUT_EVERY
-from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.trajectory_file import write_trajectory
 from nodes import Node
+from nodes.splat_map import snapshot_of
 
 
 class Evaluator(Node):
@@ -85,7 +83,7 @@ class Evaluator(Node):
         yield from ()
 
     def on_splat_map(self, splat_map: SplatMap) -> Iterator[None]:
-        self.evaluation.add_map(_snapshot(splat_map), splat_map.refined)
+        self.evaluation.add_map(snapshot_of(splat_map), splat_map.refined)
         yield from ()
 
     def on_end(self) -> Iterator[None]:
@@ -182,15 +180,6 @@ class Evaluator(Node):
             with replacing(folder / "comparison.png") as aside:
                 pictures.write_sheet(aside, comparisons)
         replace_text(folder / "report.html", document)
-
-
-def _snapshot(message: SplatMap) -> Snapshot:
-    """Copies: what is kept of a message would keep all of it."""
-    arrays = {name: value.copy() for name, value in vars(message).items() if isinstance(value, np.ndarray)}
-    splats = Splats(**{f.name: torch.from_numpy(arrays.pop(f.name)) for f in fields(Splats)})
-    return Snapshot(
-        splats, kernel=message.kernel, iterations=message.iterations, antialiased=message.antialiased, **arrays
-    )
 
 
 def _fitted(report: dict[str, Any]) -> str:

@@ -20,7 +20,7 @@ from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays, seen
 from mvsgs_core.stats import Stats
 from nodes import Node
-from nodes.mapper import splat_map
+from nodes.splat_map import splat_map
 
 NEWEST = 8  # frames that wait for their poses, to be shown
 NO_DEPTH = np.zeros((1, 1), dtype=np.float32)

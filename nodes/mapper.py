@@ -14,7 +14,6 @@ import numpy as np
 from msgs import Asked, FusedKeyframe, Keyframe, Poses, Preview, Reply, Request, SplatMap, TrackedFrame
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
-from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.source_camera import source_camera
 from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.atlas import Atlas
@@ -37,6 +36,7 @@ from nodes import Node
 from nodes.once import Once
 from nodes.runtime.freed_memory import return_large_blocks
 from nodes.runtime.status import rss
+from nodes.splat_map import splat_map
 
 _SLICE = 0.05  # seconds of optimization in one on_idle
 PREVIEWS = 0.1  # of the time that previews may take in real time
@@ -388,13 +388,3 @@ class Mapper(Node):
         for index in self._unseen.keys() & shown:
             self.stats.arrived("keyframe to preview", self._unseen.pop(index))
             self._shown = max(self._shown, index)
-
-
-def splat_map(final: Snapshot, refined: bool) -> SplatMap:
-    """The message of a map."""
-    arrays = {name: value.numpy() for name, value in final.splats.tensors().items()}
-    return SplatMap(
-        refined=refined, iterations=final.iterations, kernel=final.kernel, origin=final.origin, **arrays,
-        anchors=final.anchors, keyframes=final.keyframes, world_from_cam=final.world_from_cam, scale=final.scale,
-        exposures=final.exposures, vignetting=final.vignetting, antialiased=final.antialiased,
-    )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,8 +14,8 @@ from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.keyframe_render import rendered_keyframe
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.preview import as_bytes
-from mvsgs_core.rasterizer.splats import Splats
 from nodes.keyframe_pictures import difference, thumbnail
+from nodes.splat_map import snapshot_of
 
 _GOOD, _BAD = 0.02, 0.1  # mean errors at the ends of the colors, of the range of brightness
 Shown = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # photograph, render, depth
@@ -84,14 +84,7 @@ class SeenKeyframes:
 
     def finish(self, message: SplatMap) -> Snapshot:
         """The refined map, from which keyframes are rendered from now on."""
-        splats = Splats(**{f.name: torch.from_numpy(getattr(message, f.name).copy()) for f in fields(Splats)})
-        self.final = Snapshot(
-            splats=splats, anchors=message.anchors.copy(), origin=message.origin.copy(), kernel=message.kernel,
-            iterations=message.iterations, keyframes=message.keyframes.copy(), scale=message.scale.copy(),
-            world_from_cam=message.world_from_cam.copy(), exposures=message.exposures.copy(),
-            vignetting=None if message.vignetting is None else message.vignetting.copy(),
-            antialiased=message.antialiased,
-        )  # fmt: skip
+        self.final = snapshot_of(message)
         anchors, counts = np.unique(self.final.anchors, return_counts=True)
         self.splats = dict(zip(anchors.tolist(), counts.tolist()))
         return self.final

@@ -329,7 +329,7 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
         render = rasterize(
             Splats(**{name: torch.from_numpy(getattr(after, name)) for name in PARAMETERS}),
             message.world_from_cam - np.pad(after.origin[:, None], ((0, 1), (3, 0))), message.intrinsics,
-            (24, 32), kernel=after.kernel,
+            (24, 32), kernel=after.kernel, background=after.background,
         )  # fmt: skip
     assert psnr(render.color.clamp(0, 1).numpy(), message.image / np.float32(255)) > 25.0
     assert not node.stats.warnings

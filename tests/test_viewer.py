@@ -22,7 +22,7 @@ import pytest
 from msgs import Preview, SplatMap, TrackerPhase
 from mvsgs_core.mapping.preview import as_bytes
 from nodes import handlers, outputs
-from nodes.mapper import splat_map
+from nodes.splat_map import splat_map
 from nodes.viewer import Viewer
 from tests.support.shared_data import ROOT
 from tests.support.tiny_map import INTRINSICS, SIZE, final_map, poses_around

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from mvsgs_core.evaluation.exposure import frame_exposures
+from mvsgs_core.mapping.background import background_of
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
@@ -76,6 +77,7 @@ class SparseMap:
         self._random = np.random.default_rng(config.mapper.seed)
         self._given = views
         self._views = [self._training(view) for view in views]
+        self._trainer.background = background_of(self._views)
         start = _splats((points - self.origin) / self.unit, colors, config.initial_opacity)
         self.state.append(start, torch.zeros(len(start), dtype=torch.int64))
 
@@ -101,7 +103,8 @@ class SparseMap:
         with torch.no_grad():
             color = rasterize(
                 self.state.detached(), self._local(view.world_from_cam), view.intrinsics, view.image.shape[:2],
-                exposure=exposure, kernel=self.config.mapper.training.kernel, threads=self.config.mapper.threads,
+                background=self._trainer.background, exposure=exposure, kernel=self.config.mapper.training.kernel,
+                threads=self.config.mapper.threads,
                 antialiased=self.config.mapper.training.antialiased,
             ).color  # fmt: skip
         image = color.numpy()

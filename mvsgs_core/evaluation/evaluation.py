@@ -147,6 +147,7 @@ class Evaluation:
                     None if exposures is None else exposures.affines[k],
                     finished.vignetting,
                     finished.antialiased,
+                    finished.background,
                     photograph.mask,
                     tracked.reads_columns,
                 )

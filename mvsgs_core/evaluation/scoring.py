@@ -35,6 +35,7 @@ class ScoredFrame:
     exposure: np.ndarray | None = None  # (3, 4) color affine of the photograph; None: none
     vignetting: np.ndarray | None = None  # (3,) of the sensor; None: none
     antialiased: bool = False  # as its map is rendered, see `rasterize`
+    background: np.ndarray | None = None  # (3,) of its map; None: black
     mask: Callable[[], np.ndarray | None] = lambda: None  # (H, W) bool, the pixels that count, read when needed
     reads_columns: bool = False  # while it was read, not rows, see `rasterize`
 
@@ -94,6 +95,7 @@ def render_frame(splats: Splats, kernel: str, frame: ScoredFrame, size: tuple[in
         render = rasterize(
             splats, frame.world_from_cam, frame.intrinsics, size, exposure=exposure, kernel=kernel, near=frame.near,
             readout=frame.readout, reads_columns=frame.reads_columns, antialiased=frame.antialiased,
+            background=frame.background,
         )  # fmt: skip
     color = render.color.cpu().numpy()
     if frame.vignetting is not None:

@@ -26,7 +26,8 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     that float32 would not hold them are they relative to it. A comment `origin x y z` tells what must be added.
     fold: for viewers that know only Gaussians; the scales are those of the closest Gaussian, and there is no beta. The
     scale is a logarithm: what multiplies the standard deviation is added to it. Of an antialiased map a comment
-    `antialiased` says so to who knows it; other programs must be told, or show it too bright.
+    `antialiased` says so to who knows it; other programs must be told, or show it too bright. A comment `background r g
+    b`, 0 to 1, is the color where there is no splat, for who knows it, too.
     """
     origin, kernel = relative_origin(final), "gaussian" if fold else final.kernel
 
@@ -38,7 +39,7 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
     header = [
         "ply", "format binary_little_endian 1.0", f"comment density {kernel}",
         "comment origin " + " ".join(repr(float(value)) for value in origin),
-        *(["comment antialiased"] if final.antialiased else []), f"element vertex {count}",
+        *(["comment antialiased"] if final.antialiased else []), *_background_line(final), f"element vertex {count}",
         *(f"property float {name}" for name in names), "end_header\n",
     ]  # fmt: skip
     with path.open("wb") as file:
@@ -68,6 +69,12 @@ def _properties(splats: Splats, shift: np.ndarray, kernel: str) -> dict[str, np.
     if kernel != "gaussian":
         columns["beta"] = splats.betas.numpy()
     return columns
+
+
+def _background_line(final: Snapshot) -> list[str]:
+    if final.background is None:
+        return []
+    return ["comment background " + " ".join(repr(float(value)) for value in final.background)]
 
 
 def relative_origin(final: Snapshot) -> np.ndarray:
@@ -102,7 +109,7 @@ def _parse(data: bytes) -> Snapshot:
     header = data[:end].decode("ascii", errors="replace").splitlines()
     if "format binary_little_endian 1.0" not in header:
         raise ValueError("only binary_little_endian PLY files are read")
-    count, names, origin, kernel = _parse_header(header)
+    count, names, origin, kernel, background = _parse_header(header)
     antialiased = "comment antialiased" in header
     available = {name for name, _ in names}
     needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{k}" for k in range(3)),
@@ -136,14 +143,16 @@ def _parse(data: bytes) -> Snapshot:
     return Snapshot(
         splats=splats, anchors=np.full(count, -1, dtype=np.int64), origin=origin, kernel=kernel, iterations=0,
         keyframes=np.zeros(0, dtype=np.int64), world_from_cam=np.zeros((0, 4, 4)), scale=np.zeros(0),
-        exposures=np.zeros((0, 3, 4), dtype=np.float32), antialiased=antialiased,
+        exposures=np.zeros((0, 3, 4), dtype=np.float32), antialiased=antialiased, background=background,
     )  # fmt: skip
 
 
-def _parse_header(header: list[str]) -> tuple[int, list[tuple[str, str]], np.ndarray, str | None]:
+def _parse_header(
+    header: list[str],
+) -> tuple[int, list[tuple[str, str]], np.ndarray, str | None, np.ndarray | None]:
     kinds = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "uchar": "u1", "uint8": "u1",
              "int": "<i4", "int32": "<i4"}  # fmt: skip
-    count, names, origin, kernel = -1, [], np.zeros(3), None
+    count, names, origin, kernel, background = -1, [], np.zeros(3), None, None
     for line in header:
         words = line.split()
         match words:
@@ -159,11 +168,15 @@ def _parse_header(header: list[str]) -> tuple[int, list[tuple[str, str]], np.nda
                 origin = np.array([float(x), float(y), float(z)])
                 if not np.all(np.isfinite(origin)):
                     raise ValueError(f"its origin is not finite, {origin}")
+            case ["comment", "background", r, g, b]:
+                background = np.array([float(r), float(g), float(b)], dtype=np.float32)
+                if not np.all(np.isfinite(background)):
+                    raise ValueError(f"its background is not finite, {background}")
             case ["comment", "density", name] if name in KERNELS:
                 kernel = name
     if count < 0:
         raise ValueError("it has no vertices")
-    return count, names, origin, kernel
+    return count, names, origin, kernel, background
 
 
 def _columns(rows: np.ndarray, names: list[str]) -> np.ndarray:

@@ -28,6 +28,7 @@ class Snapshot:
     exposures: np.ndarray  # (K, 3, 4) float32
     vignetting: np.ndarray | None = None  # (3,) float32 of the camera, see `photometry`; None: none
     antialiased: bool = False  # rendered, and so trained, as `rasterize` does with antialiased=True
+    background: np.ndarray | None = None  # (3,) float32 color where there is no splat; None: black
 
     def relative_pose(self, world_from_cam: np.ndarray) -> np.ndarray:
         """(4, 4) of a pose in the world (4, 4): relative to `origin`, as the splats are."""
@@ -56,8 +57,9 @@ class Snapshot:
         other options may be given."""
         pose = self.relative_pose(world_from_cam)
         return rasterize(
-            self.splats, pose, intrinsics, size, kernel=self.kernel, antialiased=self.antialiased, **options
-        )
+            self.splats, pose, intrinsics, size, kernel=self.kernel, antialiased=self.antialiased,
+            background=self.background, **options,
+        )  # fmt: skip
 
     def scaled(self, factor: float) -> Snapshot:
         """The same map in another unit."""

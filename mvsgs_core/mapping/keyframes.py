@@ -73,6 +73,7 @@ class TrainingView:
     image_on_disk: bool = False  # see resting_images.py
     as_taken: bool = True  # no shutter is taken out of the image: renders are as that saw it, as soon as it is known
     median_depth: float = 0.0  # of its depth map, in the mapper's unit; 0: it has none
+    mean_color: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) of its image, 0 to 1; 0: not known
     valid: Tensor | None = None  # (H, W) bool; None: every pixel is
     visits: int = 0  # training iterations so far
     visits_here: int = 0  # of these since its pose was last corrected
@@ -220,9 +221,10 @@ def training_view(
         valid = keyframe.mask if valid is None else valid & keyframe.mask
     valid = camera.mask_at(valid, size)
     identity = torch.eye(3, 4, device=device)
+    resized = np.array(camera.resize_image(image, size))
     return TrainingView(
         index=keyframe.index,
-        image=torch.from_numpy(np.array(camera.resize_image(image, size))).to(device),
+        image=torch.from_numpy(resized).to(device),
         intrinsics=camera.scale_intrinsics(keyframe.intrinsics, (height, width), size),
         image_intrinsics=np.asarray(keyframe.intrinsics, dtype=np.float64),
         image_size=(height, width),
@@ -233,7 +235,14 @@ def training_view(
         exposure=identity.clone(),
         exposure_moments=(torch.zeros_like(identity), torch.zeros_like(identity)),
         valid=None if valid is None else torch.from_numpy(valid.copy()).to(device),  # messages are read-only
+        mean_color=mean_color(resized, valid),
     )
+
+
+def mean_color(image: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
+    """(3,) float64, 0 to 1, of an image (H, W, 3) uint8 at the pixels that are valid, (H, W) bool; 0 where none is."""
+    pixels = image.reshape(-1, 3) if valid is None else image[valid]
+    return np.asarray(pixels.mean(axis=0) / 255.0) if len(pixels) else np.zeros(3)
 
 
 def checked_image(image: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

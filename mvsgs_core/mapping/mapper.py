@@ -11,6 +11,7 @@ import torch
 
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.mapping.background import background_of
 from mvsgs_core.mapping.between import BetweenView, FrameBetween, between_view
 from mvsgs_core.mapping.coarse import LATER, CoarseKeyframes
 from mvsgs_core.mapping.config import MapperConfig
@@ -66,6 +67,7 @@ class OnlineMapper:
         )
         self.schedule = Schedule(config.window, config.seed)
         self.trainer = Trainer(config, self.state, self.log, self.photometry)
+        self.trainer.background = background_of(self.views)
         self.coarse = CoarseKeyframes(self.log)
         self._late = 0  # of these, how many got their splats after the stream
         trainer, keyframes = self.trainer, self.keyframes
@@ -129,6 +131,7 @@ class OnlineMapper:
             return 0
         if self.keyframes.add(view):
             self.schedule.reset()
+        self.trainer.background = background_of(self.views)
         with self.log.time("insertion"):
             later = halvings >= NONE_NOW and len(self.state) > 0
             inserted = 0 if later else self.densifier.add(checked, view.smaller(min(halvings, NONE_NOW - 1)), depth)
@@ -305,6 +308,8 @@ class OnlineMapper:
             same = now is before if now is None or before is None else np.array_equal(now, before)
             if not same:
                 changes[view.index] = view.expose(now)
+        if changes:
+            self.trainer.background = background_of(self.views)
         with self.log.time("correction"):
             count = recolor_with_anchors(self.state, changes)
         self.log.count("corrected_exposures", len(changes))
@@ -327,6 +332,7 @@ class OnlineMapper:
             self.state.take_over(other.state)
         other.keyframes.place_anew(self.frame.local)
         self.keyframes.take_over(other.keyframes, change.scale)
+        self.trainer.background = background_of(self.views)
         self.schedule.reset()
         self.schedule.add_budget(other.schedule.drop())
         self.schedule.spared += other.schedule.spared
@@ -355,7 +361,7 @@ class OnlineMapper:
         training = self.config.training
         return snapshot(
             self.state, self.views, self.frame, training.kernel, self.iterations, self.photometry.vignetting,
-            training.antialiased,
+            training.antialiased, self.trainer.background,
         )  # fmt: skip
 
     def chosen(self, view: TrainingView) -> TrainingView:

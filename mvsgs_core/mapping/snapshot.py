@@ -24,6 +24,7 @@ def snapshot(
     iterations: int,
     vignetting: np.ndarray | None = None,
     antialiased: bool = False,
+    background: np.ndarray | None = None,
 ) -> Snapshot:
     """The state in world units."""
     local = state.detached()
@@ -34,6 +35,9 @@ def snapshot(
     count = len(views)
     exposures = np.array([v.exposure.detach().cpu().numpy() for v in views], dtype=np.float32).reshape(-1, 3, 4)
     if count and not np.array_equal(exposures, np.broadcast_to(IDENTITY, exposures.shape)):
+        if background is not None:
+            mean = exposures.mean(axis=0)
+            background = mean[:, :3] @ background + mean[:, 3]
         splats.sh, exposures = relative_to_mean(splats, exposures)
     return Snapshot(
         splats=splats,
@@ -47,6 +51,7 @@ def snapshot(
         exposures=exposures,
         vignetting=None if vignetting is None else vignetting.astype(np.float32),
         antialiased=antialiased,
+        background=background,
     )
 
 

@@ -30,6 +30,7 @@ from mvsgs_core.rasterizer.rasterize import Render, chosen_backend, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 
+UNSURE = 0.02  # standard deviation of the background in training: no splat can leave its own color to it
 FACTORS = 8  # images of vignetting that are kept, one for each size and intrinsics
 
 
@@ -50,6 +51,7 @@ class Trainer:
         self.exposure_rate = exposure_rate
         self.iterations = 0
         self.rate = 1.0  # factor on all learning rates: falls during the final refinement
+        self.background: np.ndarray | None = None  # (3,) behind the splats, in the map's colors; None: black
         self.generator = torch.Generator().manual_seed(config.seed)  # of density control
         self._factors: dict[tuple[float, ...], Tensor] = {}
         self._weights = weights_of(config.training.loss, config.training.loss_weights)
@@ -88,7 +90,7 @@ class Trainer:
         at_once = self._own_loss is None and only_photometric(self._weights)
         render = self._rasterize(
             self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist, step=step,
-            formed=not at_once,
+            formed=not at_once, background=self._unsure_background(),
         )  # fmt: skip
         if at_once:
             loss = self._photograph_loss(view, render, exposure)
@@ -130,12 +132,14 @@ class Trainer:
     def _rasterize(
         self, splats: Splats, view: TrainingView, intrinsics: np.ndarray, size: tuple[int, int], median_depth: float,
         exposure: Tensor | None, twist: Tensor | None, *, weights: bool = False, step: SplatStep | None = None,
-        formed: bool = True,
+        formed: bool = True, background: np.ndarray | None = None,
     ) -> Render:  # fmt: skip
-        """formed: as the camera photographs it, exposure and vignetting done; else the map's own colors."""
+        """formed: as the camera photographs it, exposure and vignetting done; else the map's own colors. background: in
+        the place of the map's."""
         training = self.config.training
         render = rasterize(
             splats, view.refined_from_cam, intrinsics, size, kernel=training.kernel, backend=training.backend,
+            background=self.background if background is None else background,
             exposure=exposure if formed else None, pose_delta=twist, readout=view.readout,
             reads_columns=view.reads_columns, near=training.near * median_depth, antialiased=training.antialiased,
             weights=weights, threads=self.config.threads, step=step,
@@ -144,6 +148,12 @@ class Trainer:
         if factor is not None:
             render.color = render.color * factor
         return render
+
+    def _unsure_background(self) -> np.ndarray | None:
+        """Another one each time: over one that is always the same, splats of about its color stay half transparent."""
+        if self.background is None:
+            return None
+        return self.background + UNSURE * torch.randn(3, generator=self.generator).numpy()
 
     def _photographed(self, view: TrainingView) -> bool:
         """Whether exposure or vignetting is known: then the image ends at black and white where the color does not."""

@@ -37,7 +37,8 @@ VIEWS: dict[str, tuple[type, tuple[int, ...]]] = {  # K keyframes: as in Trainin
     "velocity": (np.float64, (6,)), "readout_time": (np.float64, ()), "reads_columns": (np.bool_, ()),
     "as_taken": (np.bool_, ()),
     "fixed": (np.bool_, ()),
-    "median_depth": (np.float64, ()), "visits": (np.int64, ()), "visits_here": (np.int64, ()),
+    "median_depth": (np.float64, ()), "mean_color": (np.float64, (3,)), "visits": (np.int64, ()),
+    "visits_here": (np.int64, ()),
     "loss_fast": (np.float64, ()), "loss_slow": (np.float64, ()), "loss_before": (np.float64, ()),
     "intrinsics": (np.float64, (4,)),
 }  # fmt: skip
@@ -45,8 +46,8 @@ BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
     "keyframe": (np.int64, ()), "keyframe_from_cam": (np.float64, (4, 4)), "from_keyframe": (np.float32, (3, 4)),
     "twist": (np.float64, (6,)),
 }  # fmt: skip
-NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth")
-LATER = ("reads_columns",)  # which earlier versions knew nothing of: 0
+NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "mean_color")
+LATER = ("reads_columns", "mean_color")  # which earlier versions knew nothing of: 0
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
 
 

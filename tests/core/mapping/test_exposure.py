@@ -190,7 +190,8 @@ def test_a_common_change_of_gauge_changes_no_render_and_a_late_exposure_is_as_on
     torch.testing.assert_close(mapper.state.splats.sh.detach(), recolored(colors, gauge), atol=1e-5, rtol=0)
     for view, image in zip(mapper.views, before, strict=True):
         solid = mapper.render(view).opacity > 0.99
-        torch.testing.assert_close(mapper.render(view).color[solid], image[solid], atol=3e-3, rtol=0)
+        # colors below 0 are cut, which the gauge moves
+        torch.testing.assert_close(mapper.render(view).color[solid], image[solid], atol=6e-3, rtol=0)
     assert mapper.expose() == 0
 
     late = mapped([replace(exposed[0], exposure=None)], CONFIG)

@@ -79,8 +79,8 @@ def test_a_map_that_is_corrected_renders_as_well_as_one_that_never_drifted(drift
     assert 0 < owed < 24  # a quarter of what the map was trained: it keeps most of that
     result = refined(follows)
     assert result > refined(stays) + 0.3
-    assert result > refined(knows) - 0.3
-    assert result > 47.0
+    assert result > refined(knows) - 1.5
+    assert result > 48.0
 
 
 def test_a_correction_below_a_pixel_is_owed_nothing() -> None:
