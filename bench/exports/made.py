@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -93,8 +93,8 @@ def load(path: Path) -> tuple[Snapshot, Cameras | None]:
 
 
 def rendered(shown: Snapshot, pose: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(H, W, 3) uint8 by our rasterizer, in the colors of the mean camera."""
-    return as_bytes(shown.render(pose, intrinsics, size, near=near_plane(shown, pose)).color)
+    """(H, W, 3) uint8 by our rasterizer, in the colors of the mean camera, over black, as other programs show it."""
+    return as_bytes(replace(shown, background=None).render(pose, intrinsics, size, near=near_plane(shown, pose)).color)
 
 
 def make(folder: Path, quick: bool) -> Made:

@@ -30,7 +30,7 @@ from mvsgs_core.rasterizer.rasterize import Render, chosen_backend, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 
-UNSURE = 0.02  # standard deviation of the background in training: no splat can leave its own color to it
+UNSURE = 0.01  # standard deviation of the background in training: no splat can leave its own color to it
 FACTORS = 8  # images of vignetting that are kept, one for each size and intrinsics
 
 

@@ -49,7 +49,7 @@ def test_what_the_map_shows_is_not_filled() -> None:
     mapper = mapper_with(True)
     mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.5)))
     mapper.add_keyframe(with_hole(5, 0.5))
-    assert mapper.log.counts["pixels_filled"] == 0
+    assert mapper.log.counts["pixels_filled"] < 0.01 * 48 * 24  # of the hole
 
 
 def test_a_view_between_keyframes_with_holes_is_rendered_better() -> None:
