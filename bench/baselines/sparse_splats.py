@@ -104,8 +104,7 @@ class SparseMap:
             color = rasterize(
                 self.state.detached(), self._local(view.world_from_cam), view.intrinsics, view.image.shape[:2],
                 background=self._trainer.background, exposure=exposure, kernel=self.config.mapper.training.kernel,
-                threads=self.config.mapper.threads,
-                antialiased=self.config.mapper.training.antialiased,
+                threads=self.config.mapper.threads, antialiased=self.config.mapper.training.antialiased,
             ).color  # fmt: skip
         image = color.numpy()
         if self._photometry.vignetting is not None:

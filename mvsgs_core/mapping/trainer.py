@@ -52,7 +52,7 @@ class Trainer:
         self.iterations = 0
         self.rate = 1.0  # factor on all learning rates: falls during the final refinement
         self.background: np.ndarray | None = None  # (3,) behind the splats, in the map's colors; None: black
-        self.generator = torch.Generator().manual_seed(config.seed)  # of density control
+        self.generator = torch.Generator().manual_seed(config.seed)  # of density control and backgrounds
         self._factors: dict[tuple[float, ...], Tensor] = {}
         self._weights = weights_of(config.training.loss, config.training.loss_weights)
         own = config.training.loss_function
