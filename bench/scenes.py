@@ -97,15 +97,11 @@ def measure(options: argparse.Namespace) -> list[Row]:
     overrides = list(options.overrides)
     if options.quick:
         overrides += QUICK
-    matrix = Matrix(
-        options.scenes.split(",") if options.scenes else ["room"] if options.quick else available_scenes(),
-        options.variants.split(","),
-        [int(s) for s in options.seeds.split(",")],
-        overrides,
-        options.jobs,
-    )
+    scenes = options.scenes.split(",") if options.scenes else ["room"] if options.quick else available_scenes()
+    parts = {scene: [scene] for scene in scenes} if options.jobs == 1 else {"runs": scenes}  # one piece: at once
+    variants, seeds = options.variants.split(","), [int(s) for s in options.seeds.split(",")]
     made = pieces.Pieces.of(options, folder(options, "scenes"))
-    runs = made.runs({"runs": matrix})
+    runs = made.runs({name: Matrix(some, variants, seeds, overrides, options.jobs) for name, some in parts.items()})
     plots.write(made.output / "time_against_error.svg", time_against_error(runs))
     return rows(runs) + made.rows()
 
