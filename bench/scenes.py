@@ -98,7 +98,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     if options.quick:
         overrides += QUICK
     scenes = options.scenes.split(",") if options.scenes else ["room"] if options.quick else available_scenes()
-    parts = {scene: [scene] for scene in scenes} if options.jobs == 1 else {"runs": scenes}  # one piece: at once
+    parts = {scene: [scene] for scene in scenes} if options.jobs == 1 else {"runs": scenes}  # those at once are one
     variants, seeds = options.variants.split(","), [int(s) for s in options.seeds.split(",")]
     made = pieces.Pieces.of(options, folder(options, "scenes"))
     runs = made.runs({name: Matrix(some, variants, seeds, overrides, options.jobs) for name, some in parts.items()})

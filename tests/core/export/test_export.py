@@ -117,6 +117,7 @@ def test_folding_adds_the_logarithm_and_drops_beta(tmp_path: Path) -> None:
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n1234", "lacks y"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n1234", "cut short"),
         (b"ply\nformat binary_little_endian 1.0\nelement face 9\nend_header\n", "vertices only"),
+        (b"ply\nformat binary_little_endian 1.0\ncomment background 0 nan 0\nend_header\n", "background is not finite"),
     ],
 )
 def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, content: bytes, message: str) -> None:

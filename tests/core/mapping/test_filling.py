@@ -20,16 +20,16 @@ from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 HOLE = slice(20, 44)  # columns of the 64 in which a filter left nothing
 
 
-def with_hole(index: int, t: float) -> RGBDKeyframe:
+def with_hole(index: int, t: float, hole: slice = HOLE) -> RGBDKeyframe:
     view = rgbd_keyframe(index, pose_on_arc(t))
     depth, normals = view.depth.copy(), np.array(view.normals)
-    depth[:, HOLE], normals[:, HOLE] = 0.0, 0.0
+    depth[:, hole], normals[:, hole] = 0.0, 0.0
     confidence = np.where(depth > 0, 0.9, 0.2).astype(np.float32)
     return replace(view, depth=depth, normals=normals, confidence=confidence, unfiltered=view.depth)
 
 
-def mapper_with(doubtful: bool) -> OnlineMapper:
-    config = MapperConfig(threads=1, insertion=InsertionConfig(doubtful=doubtful))
+def mapper_with(doubtful: bool, iterations: int = 30) -> OnlineMapper:
+    config = MapperConfig(iterations=iterations, threads=1, insertion=InsertionConfig(doubtful=doubtful))
     return OnlineMapper(config)
 
 
@@ -46,18 +46,18 @@ def test_a_hole_of_the_filters_is_covered_sparsely() -> None:
 
 
 def test_what_the_map_shows_is_not_filled() -> None:
-    mapper = mapper_with(True)
+    mapper = mapper_with(True, iterations=60)
     mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.5)))
     mapper.add_keyframe(with_hole(5, 0.5))
-    assert mapper.log.counts["pixels_filled"] < 0.01 * 48 * 24  # of the hole
+    assert mapper.log.counts["pixels_filled"] == 0
 
 
 def test_a_view_between_keyframes_with_holes_is_rendered_better() -> None:
-    views = [with_hole(5 * k, t) for k, t in enumerate((0.4, 0.5, 0.6))]
+    views = [with_hole(5 * k, t, slice(14, 50)) for k, t in enumerate((0.4, 0.5, 0.6))]
     between = rgbd_keyframe(99, pose_on_arc(0.45))
     without = mapped(views, replace(CONFIG, insertion=replace(FINE, doubtful=False)))
     filled = score(mapped(views), between)
-    assert filled > score(without, between) + 1.0
+    assert filled > score(without, between) + 5.0
     assert filled > 39.5
 
 
