@@ -146,6 +146,34 @@ def test_a_foreign_frame_is_named_and_the_next_one_is_read(ipc: str, opened: Cal
         assert reader.receive(LONG).index == 3
 
 
+def test_a_wake_for_what_was_taken_already_ends_no_wait(
+    ipc: str, opened: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The owner may find a frame before the thread that put it there says so."""
+    reader = opened(NewestReader(ipc, Frame))
+    with zmq.Context() as context, context.socket(zmq.XPUB) as xpub:
+        xpub.bind(ipc)
+        xpub.recv()
+        xpub.send(encode(frame(0), delivery=NEWEST))
+        until(lambda: reader.pollable.poll(0))
+        assert reader._frames.popleft()
+        take, looked = reader.take, []
+
+        def late() -> Frame | None:
+            looked.append(True)
+            if len(looked) == 1:
+                return None  # before the wake came
+            if len(looked) == 2:
+                found = take()
+                xpub.send(encode(frame(1), 1, delivery=NEWEST))
+                return found
+            return take()
+
+        monkeypatch.setattr(reader, "take", late)
+        assert reader.receive(LONG).index == 1
+        assert reader.receive(0.05) is None
+
+
 def test_a_frame_above_the_limit_never_reaches_memory(ipc: str, opened: Callable) -> None:
     reader = opened(NewestReader(ipc, Frame, max_bytes=10_000))
     with zmq.Context() as context, context.socket(zmq.XPUB) as xpub:

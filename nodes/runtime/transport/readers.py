@@ -284,9 +284,13 @@ class NewestReader(_Reader):
         Raises CodecError for a frame that is no message; the next call goes on. Raises TransportError for wrong keys.
         """
         self.watch()
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
         message = self.take()
-        if message is None and self.pollable.poll(None if timeout_s is None else round(timeout_s * 1000)):
+        # woken, there may be nothing: what it was for was taken before the thread said so
+        while message is None and self.pollable.poll(_milliseconds_until(deadline)):
             message = self.take()
+            if self.ended:
+                break
         return message
 
     def close(self) -> None:
@@ -331,6 +335,11 @@ class NewestReader(_Reader):
         """In the thread that reads: who waits in `receive` looks again."""
         if self._wake.poll(0, zmq.POLLOUT):
             self._wake.send(b"")
+
+
+def _milliseconds_until(deadline: float | None) -> int | None:
+    """As `poll` takes it, of the monotonic clock; None: for ever."""
+    return None if deadline is None else max(0, round(1000 * (deadline - time.monotonic())))
 
 
 def _is_end(frame: zmq.Frame) -> bool:
