@@ -129,11 +129,12 @@ def run(scene: Scene, config: MapperConfig, checkpoints: int = 10, period: float
     clock = time.perf_counter() - start
     online = held_out_psnr(mapper, scene)
     seconds, values = [clock], [online]
-    every = max(1, config.refinement // checkpoints)
+    refinement = mapper.refinement
+    every = max(1, refinement // checkpoints)
     start = time.perf_counter()
-    for done in range(config.refinement):
-        mapper.refine(done, config.refinement)
-        if (done + 1) % every == 0 or done + 1 == config.refinement:
+    for done in range(refinement):
+        mapper.refine(done, refinement)
+        if (done + 1) % every == 0 or done + 1 == refinement:
             clock += time.perf_counter() - start
             seconds.append(clock)
             values.append(held_out_psnr(mapper, scene))
@@ -174,7 +175,7 @@ def variants(config: MapperConfig) -> dict[str, MapperConfig]:
 
 def singly(scene: Scene, config: MapperConfig) -> list[Row]:
     """Splats, seconds and PSNR of the default and of every variant of it; half the refinement."""
-    config = replace(config, refinement=config.refinement // 2)
+    config = replace(config, refinement=config.refinement_of(len(scene.views)) // 2)
     default = run(scene, config, checkpoints=1)
     rows = rows_of(scene, "default", default)
     for name, variant in variants(config).items():

@@ -86,7 +86,7 @@ class Atlas:
     def finish(self) -> None:
         """The stream has ended: of parts that stayed apart, the largest is gone on with.
 
-        What its corrected keyframes are still owed may take as many iterations as the final refinement does, by `step`.
+        What its corrected keyframes are still owed may take as many iterations as a short refinement does, by `step`.
         """
         self.stream_ended = True
         self.take_between()
@@ -108,17 +108,18 @@ class Atlas:
     def make_up(self, splats: bool = True, rate: float | None = None) -> bool:
         """A piece of what a live stream left no time for, as in `OnlineMapper`; False when nothing is left.
 
-        After the stream as many iterations as the refinement has at most: one that was long would be waited for as
+        After the stream as many iterations as a short refinement has at most: one that was long would be waited for as
         long again.
         """
-        return self.current.make_up(self.current.config.refinement if self.stream_ended else None, splats, rate)
+        limit = self.current.config.refinement_of(0) if self.stream_ended else None
+        return self.current.make_up(limit, splats, rate)
 
     def refine(self) -> bool:
         """A piece of the final refinement, an iteration or a wait for one elsewhere; False when it is done.
 
         In blocks the map stays as it is until all are done: who goes on from it begins the refinement anew.
         """
-        total = self.current.config.refinement
+        total = self.current.refinement
         if self.refined >= total:
             return False
         if self.refined == 0 and self._in_blocks is None:

@@ -12,6 +12,10 @@ from mvsgs_core.mapping.keyframes import ConvergenceConfig
 from mvsgs_core.mapping.losses import Loss, LossWeights
 from mvsgs_core.mapping.optimizer import OptimizerConfig
 
+ITERATIONS, LIVE = 15, 30  # of a keyframe while the stream runs; in real time, where nothing waits for them
+FEWEST = 16  # keyframes that a refinement is long enough for: a map of fewer has as much to settle
+LONGEST = 1000  # iterations of a refinement in real time: somebody waits for the map
+
 
 @dataclass(frozen=True)
 class TrainingConfig:
@@ -37,8 +41,11 @@ class TrainingConfig:
 class MapperConfig:
     """All of them; lengths are relative to the scene's median depth."""
 
-    iterations: int = 30  # optimization budget of each keyframe, half on the newest, half on all (the paper: 1000)
-    refinement: int = 300  # iterations over all keyframes at the end
+    # of each keyframe in the stream, half on the newest, half on all (the paper: 1000); null: 15, in real time 30
+    iterations: int | None = None
+    # at the end, over all images; null: 25 a keyframe or 5/3 of `iterations`, of 16 keyframes at least, in real time at
+    # most 1000
+    refinement: int | None = None
     refine: RefineConfig = field(default_factory=RefineConfig)  # on which machines, in which parts
     window: int = 6  # newest keyframes, on which the local half of the budget goes
     realtime: bool = False  # a new keyframe waits for no iteration: it cancels the pending ones of older keyframes
@@ -56,3 +63,18 @@ class MapperConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     insertion: InsertionConfig = field(default_factory=InsertionConfig)
     density_control: DensityControlConfig = field(default_factory=DensityControlConfig)
+
+    @property
+    def budget(self) -> int:
+        """Iterations that a new keyframe brings."""
+        if self.iterations is not None:
+            return self.iterations
+        return LIVE if self.realtime else ITERATIONS
+
+    def refinement_of(self, keyframes: int) -> int:
+        """Iterations of the final refinement of a map of so many."""
+        if self.refinement is not None:
+            return self.refinement
+        each = ITERATIONS if self.iterations is None else self.iterations
+        total = 5 * each * max(keyframes, FEWEST) // 3
+        return min(total, LONGEST) if self.realtime else total

@@ -23,7 +23,7 @@ class DensityControlConfig:
     """When and how splats are added and removed during optimization."""
 
     mode: Literal["adaptive", "none"] = "adaptive"  # adaptive: clone, split and prune
-    every: int = 100  # iterations between two rounds
+    every: int = 50  # iterations between two rounds
     gradient: float = 6.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
     prune_opacity: float = 0.02  # 0 to 1; below: removed

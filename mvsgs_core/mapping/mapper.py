@@ -92,6 +92,11 @@ class OnlineMapper:
         return self.keyframes.median_depth
 
     @property
+    def refinement(self) -> int:
+        """Iterations of the final refinement."""
+        return self.config.refinement_of(len(self.keyframes.with_image))
+
+    @property
     def figures(self) -> dict[str, int]:
         """For the live display and the report."""
         owed = min(len(self.keyframes.owed), self.schedule.beside)  # at least
@@ -142,7 +147,7 @@ class OnlineMapper:
             per_unit = scale / (checked.scale * self.frame.length)
             velocity = checked.velocity * ([per_unit] * 3 + [1.0] * 3)
             view.take_photograph(checked.photograph, velocity, checked.readout_time, checked.reads_columns)
-        self.schedule.add_budget(self.config.iterations)
+        self.schedule.add_budget(self.config.budget)
         self.log.count("inserted", inserted)
         self.log.count("views")
         self.log.count("views_without_depth", float(not (depth > 0).any()))
@@ -169,7 +174,7 @@ class OnlineMapper:
         What is owed takes at most a keyframe's budget beside what is pending; the rest waits for the next keyframe, or
         for the `end`.
         """
-        owed = self.keyframes.owed.first(self.config.iterations)
+        owed = self.keyframes.owed.first(self.config.budget)
         if not self.schedule.due(owed is not None) or not self.views or len(self.state) == 0:
             self.schedule.drop()
             return False
@@ -186,8 +191,8 @@ class OnlineMapper:
         return True
 
     def end(self) -> None:
-        """The stream has ended: no keyframe waits for what is owed, it may take as many iterations as `refine` does."""
-        self.schedule.beside = self.config.refinement
+        """The stream has ended: nothing waits for what is owed, which may take as long as a short refinement."""
+        self.schedule.beside = self.config.refinement_of(0)
 
     def make_up(self, limit: int | None = None, splats: bool = True, rate: float | None = None) -> bool:
         """A piece of what a live stream left no time for: the splats that a keyframe lacks, and when none does a
@@ -206,7 +211,7 @@ class OnlineMapper:
             self._complete()
             return True
         if limit is not None:
-            schedule.spared = min(schedule.spared, limit + self._late * (self.config.refinement // LATE))
+            schedule.spared = min(schedule.spared, limit + self._late * (self.config.refinement_of(0) // LATE))
         if not schedule.spared:
             return False
         schedule.spared -= 1
@@ -244,7 +249,7 @@ class OnlineMapper:
             self.trainer.prune(self.keyframes.with_image, self.median_depth)
         with self.log.time("refinement"):
             self.trainer.rate = FINAL_RATE ** (done / max(total, 1))
-            view = self.keyframes.owed.first(self.config.iterations) if done % 2 else None
+            view = self.keyframes.owed.first(self.config.budget) if done % 2 else None
             if view is None:
                 images = self.keyframes.trained
                 view = self.chosen(images[self.schedule.next_of_all(len(images))])

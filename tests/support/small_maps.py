@@ -7,13 +7,15 @@ import torch
 
 from mvsgs_core.image_metrics import psnr
 from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.rasterizer.splats import Splats
 
 FINE = InsertionConfig(price=0.02)  # of images so small that a rectangle of 8 pixels is a tenth of them
-CONFIG = MapperConfig(iterations=16, refinement=20, threads=1, insertion=FINE)
+RARE = DensityControlConfig(every=100)  # maps of some 60 iterations have no round: it would leave them unsettled
+CONFIG = MapperConfig(iterations=16, refinement=20, threads=1, insertion=FINE, density_control=RARE)
 
 
 def empty_map() -> Splats:

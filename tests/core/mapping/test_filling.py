@@ -14,7 +14,7 @@ from mvsgs_core.mapping.filling import continued_depth
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
-from tests.support.small_maps import CONFIG, FINE, mapped, score
+from tests.support.small_maps import CONFIG, FINE, RARE, mapped, score
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 HOLE = slice(20, 44)  # columns of the 64 in which a filter left nothing
@@ -29,8 +29,8 @@ def with_hole(index: int, t: float, hole: slice = HOLE) -> RGBDKeyframe:
 
 
 def mapper_with(doubtful: bool, iterations: int = 30) -> OnlineMapper:
-    config = MapperConfig(iterations=iterations, threads=1, insertion=InsertionConfig(doubtful=doubtful))
-    return OnlineMapper(config)
+    insertion = InsertionConfig(doubtful=doubtful)
+    return OnlineMapper(MapperConfig(iterations=iterations, threads=1, insertion=insertion, density_control=RARE))
 
 
 def test_a_hole_of_the_filters_is_covered_sparsely() -> None:

@@ -10,7 +10,8 @@ import torch
 
 from mvsgs_core import geometry
 from mvsgs_core.mapping import keyframe_store, losses
-from mvsgs_core.mapping.config import TrainingConfig
+from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import ConvergenceConfig, RGBDKeyframe
@@ -259,3 +260,26 @@ def test_gradients_that_are_not_finite_are_counted_and_the_map_stays_finite(monk
     assert any("gradients" in text for text in mapper.log.warnings)
     for name in PARAMETERS:
         assert torch.isfinite(getattr(mapper.state.splats, name)).all()
+
+
+def test_the_refinement_is_as_long_as_the_map_is_large() -> None:
+    assert MapperConfig().budget == 15
+    assert [MapperConfig().refinement_of(count) for count in (0, 16, 17, 5000)] == [400, 400, 425, 125_000]
+    assert MapperConfig(iterations=300).refinement_of(20) == 10_000
+    assert MapperConfig(refinement=7).refinement_of(5000) == 7
+    live = MapperConfig(realtime=True)
+    assert live.budget == 30  # nothing waits for them
+    assert [live.refinement_of(count) for count in (0, 30, 5000)] == [400, 750, 1000]  # for which somebody waits
+    assert MapperConfig(realtime=True, iterations=7).budget == 7
+    assert MapperConfig(realtime=True, refinement=3000).refinement_of(5000) == 3000
+
+
+def test_the_atlas_refines_for_as_long_as_its_map_asks_for() -> None:
+    atlas = Atlas(OnlineMapper(replace(CONFIG, iterations=3, refinement=None)))
+    atlas.add(rgbd_keyframe(0, pose_on_arc(0.5)), 0)
+    while atlas.step():
+        pass
+    before = atlas.current.iterations
+    while atlas.refine():
+        pass
+    assert atlas.current.iterations == before + 5 * 16

@@ -13,7 +13,7 @@ from mvsgs_core.mapping.insertion import InsertionConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.mapping.owed import Owed
-from tests.support.small_maps import mapped
+from tests.support.small_maps import RARE, mapped
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 pytestmark = pytest.mark.slow
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 DRIFT = 0.25  # share by which lengths have shrunk at the end
 REFINEMENT = 240
 DENSE = InsertionConfig(price=3e-4)  # so many splats that what is left of the drift is what limits the map
-CONFIG = MapperConfig(iterations=12, refinement=0, threads=1, insertion=DENSE)
+CONFIG = MapperConfig(iterations=12, refinement=0, threads=1, insertion=DENSE, density_control=RARE)
 
 
 def arc() -> list[RGBDKeyframe]:
