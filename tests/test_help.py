@@ -76,7 +76,7 @@ def test_help_has_every_parameter_with_its_type_default_and_comment() -> None:
         assert word in shown
     lines = shown.splitlines()
     for slot, parameter, words in (
-        ("mapper", "iterations=1000", ("int; ", "(default: 30)")),
+        ("mapper", "iterations=1000", ("int or null; ", "null: 15, in real time 30", "(default: null)")),
         ("tracker", "area=76800", ("int; pixels of the tracker's own image",)),
         ("dataset", "size=[240, 320]", ("[height, width]",)),
         ("slot", "cpu=null", ("[int] or null; cores to pin to",)),

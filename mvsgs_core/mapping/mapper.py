@@ -39,15 +39,11 @@ class OnlineMapper:
     """Builds the map: `add_keyframe`, then `step` while any is pending, `correct` at any time, `refine` last."""
 
     def __init__(
-        self,
-        config: MapperConfig | None = None,
-        log: Stats | None = None,
-        corrections: dict[int, tuple[np.ndarray, float]] | None = None,
-        state: MapState | None = None,
-        views: list[TrainingView] | None = None,
-        between: list[BetweenView] | None = None,
+        self, config: MapperConfig | None = None, log: Stats | None = None,
+        corrections: dict[int, tuple[np.ndarray, float]] | None = None, state: MapState | None = None,
+        views: list[TrainingView] | None = None, between: list[BetweenView] | None = None,
         photometry: ImageFormation | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """log, corrections (world_from_cam (4, 4), scale; by keyframe), photometry: what mappers of one stream share.
 
         state, views, between: of a mapper that is gone on with.
@@ -56,11 +52,9 @@ class OnlineMapper:
         self.log = log or Stats()
         self.corrections = {} if corrections is None else corrections  # newest pose and scale of each keyframe
         self.photometry = ImageFormation() if photometry is None else photometry
-        self.state = (
-            MapState((config.sh_degree + 1) ** 2, torch.device(resolve_device(config.device)))
-            if state is None
-            else state
-        )
+        if state is None:
+            state = MapState((config.sh_degree + 1) ** 2, torch.device(resolve_device(config.device)))
+        self.state = state
         self.frame = FrameOfReference()
         self.keyframes = KeyframeStore(
             config.max_keyframes, config.window, self.log, views or (), between or (), config.images_in_memory

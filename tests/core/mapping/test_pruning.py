@@ -9,14 +9,13 @@ import pytest
 import torch
 
 from mvsgs_core.mapping import pruning
-from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.mapping.pruning import HIDDEN, OPAQUE, prune, removal_cost
 from mvsgs_core.rasterizer.rasterize import Render, rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.rasterizer_scenes import intrinsics, random_splats
-from tests.support.small_maps import CONFIG, mapped, score
+from tests.support.small_maps import CONFIG, RARE, mapped, score
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (40, 56)
@@ -175,7 +174,7 @@ def test_the_refinement_thins_the_map_and_does_not_harm_it() -> None:
     views = [rgbd_keyframe(5 * k, pose_on_arc(t)) for k, t in enumerate((0.0, 0.33, 0.66, 1.0))]
     unseen = rgbd_keyframe(99, pose_on_arc(0.5))
     thinned = mapped(views)
-    all_there = mapped(views, replace(CONFIG, density_control=DensityControlConfig(needless=0.0)))
+    all_there = mapped(views, replace(CONFIG, density_control=replace(RARE, needless=0.0)))
     assert thinned.log.counts["needless"] > 0.01 * len(all_there.state)
     assert len(thinned.state) == len(all_there.state) - thinned.log.counts["needless"]
     assert score(thinned, unseen) > score(all_there, unseen) - 0.1
