@@ -42,9 +42,8 @@ _SLICE = 0.05  # seconds of optimization in one on_idle
 PREVIEWS = 0.1  # of the time that previews may take in real time
 EFFORTS = (  # one by the number of halvings of the image
     Effort("full", 1.0),
-    Effort("new splats as of half the image's size", 0.35),
-    Effort("new splats as of a quarter of the image's size", 0.2),
-    Effort("no new splats for now", 0.02, telling=False),
+    Effort("new splats as of half the image's size", 0.5),
+    Effort("no new splats for now", 0.1, telling=False),
 )
 LAST_SECONDS = 2.0  # after the last keyframe of a live stream the map is handed out, before its refinement
 

@@ -31,13 +31,17 @@ def _falls_at(inverse: np.ndarray, rows: np.ndarray, columns: np.ndarray, radius
     """(K,) bool: whether an inverse depth (H, W), huge where unknown, falls by `jump` around pixels, slope aside."""
     unknown = np.finfo(np.float32).max
     here, padded = inverse[rows, columns], np.pad(inverse, radius, constant_values=unknown)
+    width, side = padded.shape[1], 2 * radius + 1
+    middle = (rows + radius) * width + columns + radius
+    around = padded.ravel()
+    limit = here - jump * here
     falls = np.zeros(len(rows), dtype=bool)
-    for dv in range(-radius, radius + 1):
-        for du in range(-radius, radius + 1):
-            there = padded[rows + radius + dv, columns + radius + du]
-            opposite = padded[rows + radius - dv, columns + radius - du]
+    for k in range(side * side // 2):  # a place around the pixel and the one opposite to it
+        step = (k // side - radius) * width + k % side - radius
+        one, other = around[middle + step], around[middle - step]
+        for there, opposite in ((one, other), (other, one)):
             slope = np.where(opposite < unknown, np.maximum(opposite - here, 0), 0)
-            falls |= there <= here - slope - jump * here
+            falls |= there <= limit - slope
     return falls
 
 

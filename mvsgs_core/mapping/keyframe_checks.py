@@ -31,8 +31,8 @@ def checked_keyframe(view: RGBDKeyframe, log: Stats) -> RGBDKeyframe | None:
     normals, confidence = view.normals, view.confidence
     if normals is not None:
         with np.errstate(over="ignore", invalid="ignore"):
-            length = np.linalg.norm(normals, axis=-1)
-            bad = ~np.isfinite(length) | (length > 1.5)
+            squared = np.einsum("...i,...i", normals, normals)
+            bad = ~(squared <= 1.5**2)  # NaN is none either
         if bad.any():
             log.refuse("normals", int(bad.sum()), "normals that are not finite or no unit vectors were left out")
             normals = np.where(bad[..., None], np.float32(0), normals)

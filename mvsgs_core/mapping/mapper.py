@@ -32,7 +32,7 @@ from mvsgs_core.stats import Stats
 
 LATE = 30  # part of the refinement's iterations that a keyframe's late splats bring: 1 / LATE
 FINAL_RATE = 0.1  # of the learning rates, with which a map is handed out
-NONE_NOW = 3  # halvings of an image of which nothing worth a splat is left
+NONE_NOW = 2  # halvings of an image of which nothing worth a splat is left
 
 
 class OnlineMapper:
@@ -103,8 +103,8 @@ class OnlineMapper:
     def add_keyframe(self, keyframe: RGBDKeyframe, halvings: int = 0) -> int:
         """Takes in a keyframe and adds splats where the map does not show it; returns their number.
 
-        halvings: splats as its image needs them at half the size, a quarter and so on, which takes a fraction of the
-        time; from `NONE_NOW` on none, but in an empty map. `make_up` adds the rest.
+        halvings: splats as its image needs them at half the size, for half the time; from `NONE_NOW` on none, but in an
+        empty map. `make_up` adds the rest.
         Without `realtime`, the pending iterations of earlier keyframes are done first, so that the result does not
         depend on how fast keyframes come. One that no camera gives is refused and counted, see `keyframe_checks`.
         """
@@ -135,7 +135,7 @@ class OnlineMapper:
             later = halvings >= NONE_NOW and len(self.state) > 0
             inserted = 0 if later else self.densifier.add(checked, view.smaller(min(halvings, NONE_NOW - 1)), depth)
         if halvings:
-            self.coarse.wait(checked)
+            self.coarse.wait(checked, later)
         view.as_taken = keyframe.photograph is None and keyframe.velocity is None
         if checked.photograph is not None and checked.velocity is not None and view.has_image:
             per_unit = scale / (checked.scale * self.frame.length)
@@ -193,16 +193,18 @@ class OnlineMapper:
         canceled iteration, on any image. False when nothing is left.
 
         limit: iterations at most that are left, None: all, beside those that keyframes bring that get their splats so
-        late: a thirtieth of the refinement each; splats: whether they may get them; rate: factor on all learning rates
-        of an iteration that is still the stream's own, None: it is made up.
+        late: a thirtieth of the refinement each; splats: whether they may get them, False: only those that have none
+        do, of half the size; rate: factor on all learning rates of an iteration that is still the stream's own, None:
+        it is made up.
         """
         schedule, images = self.schedule, self.keyframes.trained
         schedule.spare()
         if not images or len(self.state) == 0:
             return False
-        if splats and len(self.coarse):
-            self._late += limit is not None
-            self._complete()
+        found = self.coarse.next() if splats else self.coarse.without()
+        if found is not None:
+            self._late += splats and limit is not None
+            self._complete(*found, 0 if splats else NONE_NOW - 1)
             return True
         if limit is not None:
             schedule.spared = min(schedule.spared, limit + self._late * (self.config.refinement_of(0) // LATE))
@@ -216,19 +218,17 @@ class OnlineMapper:
             self.trainer.rate = 1.0
         return True
 
-    def _complete(self) -> None:
-        """Adds the splats that the keyframe lacks which has waited longest."""
-        found = self.coarse.next()
-        assert found is not None
-        keyframe, image = found
+    def _complete(self, keyframe: RGBDKeyframe, image: np.ndarray | None, halvings: int) -> None:
+        """Adds the splats that a keyframe lacks that has waited."""
         view = self.keyframes.of(keyframe.index)
         if view is None or not view.has_image:
             return
         with self.log.time("insertion"):
             at_once = view if image is None else view.rectified(image)
             depth = keyframe.depth * np.float32(view.scale / keyframe.scale)
-            self.log.count("inserted", self.densifier.add(keyframe, at_once, depth))
-        self.log.count(LATER)
+            self.log.count("inserted", self.densifier.add(keyframe, at_once.smaller(halvings), depth))
+        if not halvings:
+            self.log.count(LATER)
 
     def refine(self, done: int, total: int) -> None:
         """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates; half of

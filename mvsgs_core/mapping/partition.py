@@ -14,14 +14,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 
+from mvsgs_core import native
 from mvsgs_core.rasterizer.ssim_window import C2, RADIUS, SIGMA
 
 LEVELS = 3  # halvings of the largest rectangle along an axis: of 8 pixels
+MEAN = np.full((1, 3), 1.0 / 3.0, np.float32)  # of the colors: NumPy's over an axis of three is slow
 EMPTY = 1e3  # error of a pixel that the map does not show: more than any splat costs
-NOTHING, LEAF, ROWS, COLUMNS = range(4)  # what becomes of a rectangle
-
-Key = tuple[int, int]  # a rectangle of 2^key[0] rows and 2^key[1] columns
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,20 @@ class Partition:
 
     def __len__(self) -> int:
         return len(self.sides)
+
+
+@dataclass(frozen=True)
+class Split:
+    """What the kernel splits: an image of whole rectangles of 8x8 pixels."""
+
+    colors: np.ndarray  # (H, W, 3) float32
+    weight: np.ndarray  # (H, W) float32 factor from squared error to dissimilarity, 0 of a pixel that does not count
+    left: np.ndarray  # (H, W) float32 dissimilarity that stays without a splat
+    taken: np.ndarray  # (H, W) bool, the pixels that can get one
+    sure: np.ndarray  # (H, W) bool, whose depth is known
+    logarithm: np.ndarray  # (H, W) float64 of that depth, 0 of others
+    angle: float  # of a pixel, radians
+    price: float
 
 
 def partition(
@@ -51,40 +65,22 @@ def partition(
     size = wanted.shape
     side = 1 << LEVELS
     beyond = ((0, -size[0] % side), (0, -size[1] % side))
-    colors = np.pad(image.astype(np.float32), (*beyond, (0, 0)), mode="edge")
     taken = np.pad(wanted, beyond)
     sure = np.pad(known & wanted, beyond)
-    logarithm = np.log(np.where(sure, np.pad(depth, beyond), 1.0), dtype=np.float64)
     scale = _per_contrast(image)
-    weight = np.where(taken, np.pad(scale, beyond), np.float32(0))
     left = np.where(residual >= EMPTY, EMPTY, residual * scale).astype(np.float32)
-    left = np.where(taken, np.pad(left, beyond), np.float32(0))
-    sums: dict[Key, tuple[np.ndarray, ...]] = {
-        (0, 0): (taken.astype(np.float32), left, sure.astype(np.float64), logarithm, logarithm**2)
-    }
-    cost: dict[Key, np.ndarray] = {}
-    choice: dict[Key, np.ndarray] = {}
-    for key in np.ndindex(LEVELS + 1, LEVELS + 1):
-        rows, columns = key
-        if rows:  # of which nothing else is made any more
-            sums[key] = tuple(_by_two_rows(value) for value in sums.pop((rows - 1, columns)))
-        elif columns:
-            sums[key] = tuple(_by_two_columns(value) for value in sums[0, columns - 1])
-        count, nothing, number, first, second = sums[key]
-        leaf = _distortion(colors, weight, key) + np.float32(price)
-        variance = second / np.maximum(number, 1) - (first / np.maximum(number, 1)) ** 2
-        leaf[variance > angle**2 * (1 << (rows + columns))] = np.inf
-        impossible = np.full_like(leaf, np.inf)
-        options = np.stack([
-            nothing,
-            leaf,
-            _by_two_rows(cost[rows - 1, columns]) if rows else impossible,
-            _by_two_columns(cost[rows, columns - 1]) if columns else impossible,
-        ])  # fmt: skip
-        best = np.argmin(options, axis=0).astype(np.int8)
-        choice[key] = np.where(count > 0, best, NOTHING)
-        cost[key] = np.where(count > 0, np.take_along_axis(options, best[None], axis=0)[0], 0.0)
-    return _chosen(choice, taken, size)
+    given = Split(
+        colors=np.pad(image.astype(np.float32), (*beyond, (0, 0)), mode="edge"),
+        weight=np.where(taken, np.pad(scale, beyond), np.float32(0)),
+        left=np.where(taken, np.pad(left, beyond), np.float32(0)),
+        taken=taken,
+        sure=sure,
+        logarithm=np.log(np.where(sure, np.pad(depth, beyond), 1.0), dtype=np.float64),
+        angle=angle,
+        price=price,
+    )
+    labels, sides = native.load("mapping").partition(*vars(given).values(), torch.get_num_threads())
+    return Partition(labels[: size[0], : size[1]], sides)
 
 
 def _per_contrast(image: np.ndarray) -> np.ndarray:
@@ -92,58 +88,5 @@ def _per_contrast(image: np.ndarray) -> np.ndarray:
     colors = image.astype(np.float32)
     window = (2 * RADIUS + 1, 2 * RADIUS + 1)
     mean = cv2.GaussianBlur(colors, window, SIGMA)
-    variance = np.maximum(cv2.GaussianBlur(colors**2, window, SIGMA) - mean**2, 0).mean(axis=-1)
+    variance = cv2.transform(np.maximum(cv2.GaussianBlur(colors * colors, window, SIGMA) - mean * mean, 0), MEAN)
     return np.asarray(1 / (2 * variance + np.float32(C2)), dtype=np.float32)
-
-
-def _distortion(colors: np.ndarray, weight: np.ndarray, key: Key) -> np.ndarray:
-    """Weighted squared error, mean over RGB, of each rectangle: of the means, blended, against the colors.
-
-    weight: (H, W) of a pixel, 0 of one that does not count. A single pixel has no error.
-    """
-    height, width = weight.shape
-    shape = (width >> key[1], height >> key[0])
-    if key == (0, 0):
-        return np.zeros_like(weight)
-    means = cv2.resize(colors, shape, interpolation=cv2.INTER_AREA)
-    difference = colors - cv2.resize(means, (width, height), interpolation=cv2.INTER_LINEAR)
-    squared = np.einsum("ijk,ijk->ij", difference, difference) * weight / np.float32(3)
-    area = np.float32(1 << (key[0] + key[1]))
-    return np.asarray(cv2.resize(squared, shape, interpolation=cv2.INTER_AREA) * area)
-
-
-def _chosen(choice: dict[Key, np.ndarray], taken: np.ndarray, size: tuple[int, ...]) -> Partition:
-    """The rectangles that the choices lead to from the largest down; of whole images, cut to `size`."""
-    labels = np.full(taken.shape, -1, dtype=np.int64)
-    reached = {key: np.zeros(value.shape, dtype=bool) for key, value in choice.items()}
-    reached[LEVELS, LEVELS][:] = True
-    sides: list[np.ndarray] = []
-    total = 0
-    for key in sorted(choice, key=sum, reverse=True):
-        rows, columns = key
-        leaves = reached[key] & (choice[key] == LEAF)
-        number = int(leaves.sum())
-        named = np.full(leaves.shape, -1)
-        named[leaves] = total + np.arange(number)
-        whole = _by_halves(_by_halves(named, rows, 0), columns, 1)
-        labels = np.where((whole >= 0) & taken, whole, labels)
-        sides.append(np.tile([[1 << rows, 1 << columns]], (number, 1)))
-        total += number
-        if rows:
-            reached[rows - 1, columns] |= _by_halves(reached[key] & (choice[key] == ROWS), 1, 0)
-        if columns:
-            reached[rows, columns - 1] |= _by_halves(reached[key] & (choice[key] == COLUMNS), 1, 1)
-    return Partition(labels[: size[0], : size[1]], np.concatenate(sides))
-
-
-def _by_two_rows(values: np.ndarray) -> np.ndarray:
-    return np.asarray(values[0::2] + values[1::2])
-
-
-def _by_two_columns(values: np.ndarray) -> np.ndarray:
-    return np.asarray(values[:, 0::2] + values[:, 1::2])
-
-
-def _by_halves(values: np.ndarray, times: int, axis: int) -> np.ndarray:
-    """Each value for all the smaller rectangles that it is split into."""
-    return np.asarray(np.repeat(values, 1 << times, axis))

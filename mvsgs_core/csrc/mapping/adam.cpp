@@ -57,9 +57,7 @@ int64_t step_all(const std::vector<Parameter>& parameters, Flags visible, Counts
 
 }  // namespace
 
-#define MVSGS_DEFINE(name) NB_MODULE(name, m)
-MVSGS_DEFINE(MVSGS_MODULE) {
-    m.doc() = "Kernels of the online mapper.";
+void bind_adam(nb::module_& m) {
     m.def("adam", &step_all, nb::arg("parameters"), nb::arg("visible"), nb::arg("steps"), nb::arg("beta1"), nb::arg("beta2"),
           nb::arg("epsilon"), nb::arg("decay_steps"), nb::arg("threads"),
           "One step of every parameter in place; returns how many splats were refused for non-finite values.");

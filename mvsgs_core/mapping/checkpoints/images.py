@@ -18,6 +18,11 @@ from torch import Tensor
 from mvsgs_core.atomic_file import replacing
 from mvsgs_core.mapping.keyframes import TrainingView
 
+QUICK = [  # a third of the time that PNG's own choice takes, of photographs for the same size
+    cv2.IMWRITE_PNG_COMPRESSION, 1,
+    cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
+    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB,
+]  # fmt: skip
 NAME = re.compile(r"-?\d{1,19}-[0-9a-f]{8}\.png", re.ASCII)  # frame index, checksum
 
 
@@ -32,7 +37,7 @@ def write_image(folder: Path, view: TrainingView, name: str, *, sync: bool) -> N
         return
     pixels = pixels_of(view)
     channels = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    whole, data = cv2.imencode(".png", cv2.cvtColor(pixels, channels), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    whole, data = cv2.imencode(".png", cv2.cvtColor(pixels, channels), QUICK)
     if not whole:
         raise OSError(f"{name} cannot be encoded as PNG")
     with replacing(folder / name, sync=sync) as aside:

@@ -8,6 +8,7 @@ images.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import product
 
@@ -24,6 +25,8 @@ BESIDE = 0.1  # of a level that one may be off that does not
 MIN_SAMPLES = 30
 TERMS = 9  # 1, what an offset adds, three of the radius, what an offset adds to these, the log ratio
 _STEPS = 4  # of reweighting
+_LOWEST, _HIGHEST = math.ceil(255.0 * DARKEST), math.floor(255.0 * BRIGHTEST)  # that tell, 0 to 255
+_GRAY = np.full((1, 3), 1.0 / 3.0, np.float32)  # mean of the colors: NumPy's over an axis of three is slow
 _RIDGE = 1e-4  # share of the whole: few samples tell the terms apart
 
 
@@ -33,11 +36,11 @@ class Levels:
     def __init__(self, half: np.ndarray, mask: np.ndarray | None = None) -> None:
         """mask: (h, w) bool, False where a pixel is to be ignored; None: all count."""
         values = half.astype(np.float32) * np.float32(1.0 / 255.0)
-        mean, gray = np.asarray(cv2.blur(values, (3, 3))), values.mean(axis=2)
+        mean, gray = np.asarray(cv2.blur(values, (3, 3))), cv2.transform(values, _GRAY)
         window = np.ones((3, 3), np.uint8)
-        clipped = cv2.dilate(half, window).max(axis=2) > 255.0 * BRIGHTEST
-        clipped |= cv2.erode(half, window).min(axis=2) < 255.0 * DARKEST
-        mean[clipped] = np.nan
+        bright = cv2.inRange(cv2.dilate(half, window), (0,) * 3, (_HIGHEST,) * 3) == 0
+        dark = cv2.inRange(cv2.erode(half, window), (_LOWEST,) * 3, (255,) * 3) == 0
+        mean[bright | dark] = np.nan
         spread = np.sqrt(np.maximum(cv2.blur(gray * gray, (3, 3)) - cv2.blur(gray, (3, 3)) ** 2, 0.0))
         if mask is not None:
             mean[~mask], spread[~mask] = np.nan, 1.0

@@ -40,17 +40,21 @@ def localize_by(
     weight = np.stack([np.where(k.triangulated, m.weight, 0.0) for k, m in zip(keyframes, matches.values())])
     if (weight > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
         weight = np.stack([m.weight for m in matches.values()])
-    target = np.stack([np.nan_to_num(_rectified(graph, k, m).T) for k, m in matches.items()])
-    cells = weight.shape[1]
+    cells = int((weight > 0).sum(axis=1).max())  # the others say nothing
+    chosen = [np.argsort(w <= 0, kind="stable")[:cells] for w in weight]
+    weight = np.stack([w[c] for w, c in zip(weight, chosen)])
+    target = np.stack([np.nan_to_num(_rectified(graph, k, m)[c].T) for (k, m), c in zip(matches.items(), chosen)])
     problem = Graph(
         cam_from_world=np.stack([*(k.cam_from_world for k in keyframes), start]),
-        inverse_depth=np.stack([*(k.inverse_depth for k in keyframes), np.ones(cells)]),
-        pixels=np.stack([*(graph.pixels(index) for index in matches), np.zeros((2, cells))]),
+        inverse_depth=np.stack([*(k.inverse_depth[c] for k, c in zip(keyframes, chosen)), np.ones(cells)]),
+        pixels=np.stack([*(graph.pixels(index)[:, c] for index, c in zip(matches, chosen)), np.zeros((2, cells))]),
         intrinsics=graph.intrinsics,
         source=np.arange(count, dtype=np.int32),
         to=np.full(count, count, np.int32),
         target=target,
-        information=np.stack([k.image.cells.information.T * w for k, w in zip(keyframes, weight)]),
+        information=np.stack(
+            [k.image.cells.information[c].T * w for k, c, w in zip(keyframes, chosen, weight)],
+        ),
         free_pose=np.arange(count + 1) == count,
         free_depth=np.zeros(count + 1, bool),
     )

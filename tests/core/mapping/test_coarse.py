@@ -65,6 +65,23 @@ def test_a_keyframe_without_splats_for_now_gets_them_all_later() -> None:
     assert set(mapper.state.anchors.tolist()) == {0, 7, 14}
 
 
+def test_keyframes_without_splats_get_coarse_ones_before_the_map_is_handed_out() -> None:
+    mapper, coarse_at_once = mapped(NONE_NOW), mapped(1)
+    before = mapper.iterations
+    for _ in VIEWS[1:]:
+        assert mapper.make_up(splats=False)
+    assert mapper.iterations == before
+    assert set(mapper.state.anchors.tolist()) == {0, 7, 14}
+    assert 0.5 < len(mapper.state) / len(coarse_at_once.state) < 1.5
+    assert mapper.make_up(splats=False)  # an iteration: all have some
+    assert mapper.iterations == before + 1
+    assert LATER not in mapper.log.counts
+    assert len(mapper.coarse) == len(VIEWS)  # the rest is still to come
+    while mapper.make_up():
+        pass
+    assert mapper.log.counts[LATER] == len(VIEWS)
+
+
 def test_what_a_rolling_shutter_took_gets_its_splats_from_the_image_without_it() -> None:
     mapper, photograph = OnlineMapper(LIVE), np.full_like(VIEWS[0].image, 255)
     moving = replace(VIEWS[0], photograph=photograph, velocity=np.full(6, 0.1), readout_time=0.02)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from mvsgs_core import native
+from mvsgs_core.mapping import partition_plain
 from mvsgs_core.mapping.insertion import InsertionConfig
-from mvsgs_core.mapping.partition import EMPTY, Partition, partition
+from mvsgs_core.mapping.partition import EMPTY, Partition, Split, partition
 
 SIZE = (48, 64)
 PRICE = InsertionConfig().price
@@ -29,6 +33,42 @@ def split(
 
 def textured(size: tuple[int, int] = SIZE) -> np.ndarray:
     return np.random.default_rng(0).uniform(size=(*size, 3))
+
+
+@pytest.mark.parametrize("size", [(48, 64), (45, 61)])
+def test_the_kernel_finds_what_its_plain_twin_finds(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(2)
+    u, v = np.meshgrid(np.arange(size[1]), np.arange(size[0]))
+    image = 0.5 + 0.4 * np.sin((u / 12.0) ** 2 + v / 15.0)[..., None] * [1.0, 0.8, 0.6]  # finer to the right
+    depth = 2.0 + 0.3 * np.sin(np.arange(size[1]) / 9.0)[None] + np.zeros((size[0], 1))
+    depth[:, size[1] // 2 :] += 1.0
+    known, wanted = random.random(size) < 0.95, (u + v) % 40 > 3
+    residual = np.where(v < 20, EMPTY, 0.01 * random.random(size)).astype(np.float32)
+    found = partition(image, residual, wanted, depth, known, ANGLE, PRICE)
+    given: list[Split] = []
+
+    def plain(*values: Any) -> tuple[np.ndarray, np.ndarray]:
+        given.append(Split(*values[:-1]))
+        return partition_plain.split(given[0])
+
+    monkeypatch.setattr(native, "load", lambda name: SimpleNamespace(partition=plain))
+    twin = partition(image, residual, wanted, depth, known, ANGLE, PRICE)
+    assert len(given) == 1
+    assert len({*map(tuple, twin.sides.tolist())}) > 8  # of many shapes
+    np.testing.assert_array_equal(found.labels, twin.labels)
+    np.testing.assert_array_equal(found.sides, twin.sides)
+
+
+def test_the_kernel_refuses_images_of_no_whole_rectangles() -> None:
+    flat, nothing = np.zeros((8, 12), np.float32), np.zeros((8, 12), bool)
+    with pytest.raises(ValueError, match="multiples of 8"):
+        native.load("mapping").partition(
+            np.zeros((8, 12, 3), np.float32), flat, flat, nothing, nothing, np.zeros((8, 12)), 0.1, 0.25, 1
+        )
+    with pytest.raises(ValueError, match="sizes differ"):
+        native.load("mapping").partition(
+            np.zeros((8, 8, 3), np.float32), flat, flat, nothing, nothing, np.zeros((8, 12)), 0.1, 0.25, 1
+        )
 
 
 def test_a_smooth_image_has_few_rectangles_and_a_textured_one_many() -> None:
