@@ -57,7 +57,7 @@ class BackEnd:
         for source, to in [pair for pair in self.graph.edges.of([index]) if pair[0] == index]:
             edge = self.graph.edges[source, to]
             expected, inside = self.graph.predict(source, to)
-            seen = (edge.weight > 0) & inside
+            seen = edge.found & inside
             if seen.sum() and np.median(np.linalg.norm(expected - edge.target.T, axis=1)[seen]) < self.config.max_error:
                 continue
             matched += 1

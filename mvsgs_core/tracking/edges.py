@@ -30,6 +30,16 @@ class Edge:
         self._weight, self.fraction = weight[found], fraction
 
     @property
+    def found(self) -> np.ndarray:
+        """(M,) bool."""
+        return np.unpackbits(self._found, count=self._points).view(bool)
+
+    @property
+    def of_found(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Target (2, N), velocity (2, N) and weight (N,) of the points that were found."""
+        return self._target, self._velocity, self._weight
+
+    @property
     def target(self) -> np.ndarray:
         """(2, M) float32, 0 where lost."""
         return self._whole(self._target)
@@ -52,7 +62,7 @@ class Edge:
     def _whole(self, values: np.ndarray) -> np.ndarray:
         """(..., M) of values (..., N) of the points that were found."""
         whole = np.zeros((*values.shape[:-1], self._points), values.dtype)
-        whole[..., np.unpackbits(self._found, count=self._points).view(bool)] = values
+        whole[..., self.found] = values
         return whole
 
 

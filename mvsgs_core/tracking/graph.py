@@ -85,6 +85,8 @@ class KeyframeGraph:
     def rectified(self, points: np.ndarray, velocity: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Where a global shutter would have seen what the rolling one saw at points (N, 2), which move at `velocity`
         (N, 2) pixels a second, of an image of `size` (height, width)."""
+        if not self.readout_time:
+            return points
         return points - self._moved(points, velocity, size)
 
     def _moved(self, points: np.ndarray, velocity: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -107,12 +109,12 @@ class KeyframeGraph:
         ]
         frames = [self.keyframes[index] for index in order]
         cells = len(frames[0].inverse_depth)
-        information = np.empty((len(pairs), 3, cells))
-        target = np.empty((len(pairs), 2, cells))
+        information = np.zeros((len(pairs), 3, cells))
+        target = np.zeros((len(pairs), 2, cells))
         for n, (a, b) in enumerate(pairs):
-            edge = self.edges[a, b]
-            target[n] = self.rectified(edge.target.T, edge.velocity.T, frames[0].image.size).T
-            information[n] = self.keyframes[a].image.cells.information.T * edge.weight
+            found, (at, velocity, weight) = self.edges[a, b].found, self.edges[a, b].of_found
+            target[n][:, found] = self.rectified(at.T, velocity.T, frames[0].image.size).T
+            information[n][:, found] = self.keyframes[a].image.cells.information[found].T * weight
         inverse_depth = np.stack([k.inverse_depth for k in frames])
         return Graph(
             cam_from_world=np.stack([k.cam_from_world for k in frames]),

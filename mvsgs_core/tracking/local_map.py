@@ -170,7 +170,7 @@ class LocalMap:
         for source, to in self.graph.edges.of([index]):
             edge = self.graph.edges[source, to]
             expected, _ = self.graph.predict(source, to)
-            seen = edge.weight > 0
+            seen = edge.found
             with np.errstate(invalid="ignore"):
                 good += int((np.linalg.norm(expected - edge.target.T, axis=1)[seen] < pixels).sum())
             total += int(seen.sum())

@@ -136,7 +136,7 @@ class Photometer:
                 self._moments.pop((a, b), None)
             elif known is None or known[0] is not edge:
                 _, image = (images.use(graph.keyframes[index].image) for index in (a, b))
-                self._moments[a, b] = edge, _compared(graph, a, image, edge.target.T, edge.weight > 0)
+                self._moments[a, b] = edge, _compared(graph, a, image, edge.target.T, edge.found)
                 yield
 
     def edges(self, order: Sequence[int]) -> PhotometricEdges:

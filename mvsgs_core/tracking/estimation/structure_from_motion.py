@@ -165,13 +165,13 @@ def _essential_starts(graph: KeyframeGraph, order: list[int]) -> list[np.ndarray
         if a not in order or b not in order or a >= b:
             continue
         edge = graph.edges[a, b]
-        moved = np.linalg.norm(edge.target.T - graph.keyframes[a].points, axis=1)[edge.weight > 0]
+        moved = np.linalg.norm(edge.target.T - graph.keyframes[a].points, axis=1)[edge.found]
         rated.append((float(np.median(moved)) * edge.fraction, a, b))
     camera = matrix(graph.intrinsics)
     starts = []
     for _, a, b in sorted(rated, reverse=True)[:2]:
         edge = graph.edges[a, b]
-        seen = edge.weight > 0
+        seen = edge.found
         here, there = graph.keyframes[a].points[seen].astype(np.float64), edge.target.T[seen].astype(np.float64)
         cv2.setRNGSeed(0)
         essential, mask = cv2.findEssentialMat(here, there, camera, cv2.USAC_MAGSAC, 0.999, 1.0)

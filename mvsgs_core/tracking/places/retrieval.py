@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from array import array
+from collections import defaultdict
+from functools import partial
 
 import numpy as np
 
@@ -17,7 +19,7 @@ class Retrieval:
     def __init__(self, seed: int = 0) -> None:
         random = np.random.default_rng(seed)
         self._bits = np.stack([random.choice(256, BITS, replace=False) for _ in range(TABLES)])
-        self._postings: dict[int, array[int]] = {}  # of a word: places in `_indices`
+        self._postings: dict[int, array[int]] = defaultdict(partial(array, "i"))  # of a word: places in `_indices`
         self._indices: list[int] = []  # of keyframes, as they were added
         self._places: dict[int, int] = {}  # in it
 
@@ -26,7 +28,7 @@ class Retrieval:
         place = self._places[index] = len(self._indices)
         self._indices.append(index)
         for word in np.unique(self._words(descriptors)).tolist():
-            self._postings.setdefault(word, array("i")).append(place)
+            self._postings[word].append(place)
 
     def query(self, descriptors: np.ndarray, count: int, exclude: set[int], usual: set[int] | None = None) -> list[int]:
         """The keyframes outside `exclude` that look most alike, best first.
@@ -34,16 +36,16 @@ class Retrieval:
         usual: keyframes that are known to see the same: those that look less than half as much like it are no match.
         """
         words = np.unique(self._words(descriptors)).tolist()
-        found = [self._postings[word] for word in words if word in self._postings]
+        found = [postings for postings in map(self._postings.get, words) if postings is not None]
         if not found:
             return []
-        lengths = np.array([len(postings) for postings in found])
+        lengths = np.array(list(map(len, found)))
         if lengths.sum() > MOST_POSTINGS:
             rarest = np.argsort(lengths, kind="stable")
             rarest = np.sort(rarest[np.cumsum(lengths[rarest]) <= MOST_POSTINGS])
             found, lengths = [found[n] for n in rarest], lengths[rarest]
         rarity = np.log(1.0 + len(self._indices) / lengths)
-        places = np.concatenate([np.frombuffer(postings, np.int32) for postings in found])
+        places = np.frombuffer(b"".join(found), np.int32)
         scores = np.bincount(places, np.repeat(rarity, lengths), len(self._indices))
         known = [self._places[index] for index in usual or () if index in self._places]
         min_score = 0.5 * max((scores[place] for place in known), default=0.0)
