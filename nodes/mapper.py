@@ -200,7 +200,10 @@ class Mapper(Node):
         return [*replies, *self._preview()]
 
     def _piece(self) -> bool:
-        """An iteration; of a live stream, where none is pending, a piece of what there was no time for."""
+        """An iteration; of a live stream the first splats of a keyframe without any before it, and where none is
+        pending, a piece of what there was no time for."""
+        if self._live and self.atlas.begin_late():
+            return True
         return self.atlas.step() or (self._live and self.atlas.make_up(self._pace.fits))
 
     @property
@@ -317,7 +320,11 @@ class Mapper(Node):
         start, until = time.time(), self._last_captured + LAST_SECONDS if self._last_captured else math.inf
         while not self._frozen and (now := time.time()) < until:
             rate = FINAL_RATE ** ((now - start) / (until - start))  # what the last images pulled at would show
-            if not (self.atlas.make_up(splats=False, rate=rate) if self._live else self.atlas.step()):
+            if self._live:
+                done = self.atlas.begin_late() or self.atlas.make_up(splats=False, rate=rate)
+            else:
+                done = self.atlas.step()
+            if not done:
                 break
             self._keep()
 

@@ -105,6 +105,10 @@ class Atlas:
             f"{lost}: the map shows the largest of {len(parts)} parts, {len(self.current.views)} of {total} keyframes"
         )
 
+    def begin_late(self) -> bool:
+        """The first splats of a keyframe that got none when it came, as in `OnlineMapper`; False when none is left."""
+        return self.current.begin_late()
+
     def make_up(self, splats: bool = True, rate: float | None = None) -> bool:
         """A piece of what a live stream left no time for, as in `OnlineMapper`; False when nothing is left.
 

@@ -49,7 +49,7 @@ class MapperConfig:
     refine: RefineConfig = field(default_factory=RefineConfig)  # on which machines, in which parts
     window: int = 6  # newest keyframes, on which the local half of the budget goes
     realtime: bool = False  # a new keyframe waits for no iteration: it cancels the pending ones of older keyframes
-    share: float = 0.3  # of a core's time that new splats may take in real time: beyond, they get larger
+    share: float = 0.1  # of a core's time that new splats may take in real time: beyond, they get larger
     max_pixels: int | None = None  # area of the training images; null: as they come
     # images that are kept and trained on; beyond, those of frames between keyframes, then of keyframes are thinned out
     max_keyframes: int = 10_000

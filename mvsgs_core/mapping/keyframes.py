@@ -246,6 +246,12 @@ def mean_color(image: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
     return np.array(cv2.mean(image, mask)[:3]) / 255.0  # NumPy takes eighty times as long
 
 
+def median_of_known(depth: np.ndarray) -> float:
+    """Of the depths that are known, 0 where none is."""
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    return float(np.median(known)) if len(known) else 0.0
+
+
 def checked_image(image: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """uint8 image and its valid pixels (H, W) bool, None if all are."""
     if image.dtype == np.uint8:

@@ -21,7 +21,7 @@ from mvsgs_core.mapping.exposure import ImageFormation, recolor_with_anchors
 from mvsgs_core.mapping.frame_of_reference import FrameOfReference
 from mvsgs_core.mapping.keyframe_checks import NO_POSE, checked_keyframe, is_pose
 from mvsgs_core.mapping.keyframe_store import KeyframeStore
-from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, training_view
+from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, median_of_known, training_view
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.schedule import Schedule
 from mvsgs_core.mapping.self_check import SelfCheck, check
@@ -193,18 +193,18 @@ class OnlineMapper:
         canceled iteration, on any image. False when nothing is left.
 
         limit: iterations at most that are left, None: all, beside those that keyframes bring that get their splats so
-        late: a thirtieth of the refinement each; splats: whether they may get them, False: only those that have none
-        do, of half the size; rate: factor on all learning rates of an iteration that is still the stream's own, None:
-        it is made up.
+        late: a thirtieth of the refinement each; splats: whether they may get them; rate: factor on all learning rates
+        of an iteration that is still the stream's own, None: it is made up.
         """
         schedule, images = self.schedule, self.keyframes.trained
         schedule.spare()
         if not images or len(self.state) == 0:
             return False
-        found = self.coarse.next() if splats else self.coarse.without()
+        found = self.coarse.next() if splats else None
         if found is not None:
-            self._late += splats and limit is not None
-            self._complete(*found, 0 if splats else NONE_NOW - 1)
+            self._late += limit is not None
+            self._complete(*found)
+            self.log.count(LATER)
             return True
         if limit is not None:
             schedule.spared = min(schedule.spared, limit + self._late * (self.config.refinement_of(0) // LATE))
@@ -218,8 +218,16 @@ class OnlineMapper:
             self.trainer.rate = 1.0
         return True
 
-    def _complete(self, keyframe: RGBDKeyframe, image: np.ndarray | None, halvings: int) -> None:
-        """Adds the splats that a keyframe lacks that has waited."""
+    def begin_late(self) -> bool:
+        """Adds splats as of half the image's size of the keyframe that has waited longest without any; False when none
+        does."""
+        found = self.coarse.without() if len(self.state) else None
+        if found is not None:
+            self._complete(*found, NONE_NOW - 1)
+        return found is not None
+
+    def _complete(self, keyframe: RGBDKeyframe, image: np.ndarray | None, halvings: int = 0) -> None:
+        """Adds the splats that a keyframe lacks, which waited for them."""
         view = self.keyframes.of(keyframe.index)
         if view is None or not view.has_image:
             return
@@ -227,8 +235,6 @@ class OnlineMapper:
             at_once = view if image is None else view.rectified(image)
             depth = keyframe.depth * np.float32(view.scale / keyframe.scale)
             self.log.count("inserted", self.densifier.add(keyframe, at_once.smaller(halvings), depth))
-        if not halvings:
-            self.log.count(LATER)
 
     def refine(self, done: int, total: int) -> None:
         """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates; half of
@@ -373,9 +379,9 @@ class OnlineMapper:
 
     def _placed(self, keyframe: RGBDKeyframe, depth: np.ndarray, pose: np.ndarray, scale: float) -> TrainingView | None:
         """To train on, in the mapper's frame, which the first ones begin; None where it is too far away from it."""
-        median = _median(depth)
+        median = median_of_known(depth)
         if median == 0 and keyframe.unfiltered is not None:  # the filters kept nothing: doubtful depth gives the scale
-            median = _median(keyframe.unfiltered) * scale / keyframe.scale
+            median = median_of_known(keyframe.unfiltered) * scale / keyframe.scale
         if not self.frame.holds(pose, median):
             return None
         if self.frame.begin(pose, median):
@@ -391,9 +397,3 @@ class OnlineMapper:
             else:
                 self.log.refuse("pixels", left_out, "pixels that are not finite were left out of the training")
         return view
-
-
-def _median(depth: np.ndarray) -> float:
-    """Of the depths that are known, 0 where none is."""
-    known = depth[np.isfinite(depth) & (depth > 0)]
-    return float(np.median(known)) if len(known) else 0.0
