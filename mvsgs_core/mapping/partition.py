@@ -79,7 +79,7 @@ def partition(
         angle=angle,
         price=price,
     )
-    labels, sides = native.load("mapping").partition(*vars(given).values(), torch.get_num_threads())
+    labels, sides = native.load("mapping").partition(**vars(given), threads=torch.get_num_threads())
     return Partition(labels[: size[0], : size[1]], sides)
 
 

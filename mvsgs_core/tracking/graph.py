@@ -96,7 +96,7 @@ class KeyframeGraph:
     def pixels(self, index: int) -> np.ndarray:
         """Where a global shutter would have seen the points of a keyframe: (2, M) float64."""
         image = self.keyframes[index].image
-        return self.rectified(image.cells.points, image.cell_velocity, image.size).T
+        return self.rectified(image.cells.points, image.cell_velocity, image.size).T.astype(np.float64)
 
     def problem(self, indices: Iterable[int], free_poses: set[int], free_depths: set[int]) -> Graph:
         """The bundle adjustment of these keyframes and every edge among them that has something free at an end."""

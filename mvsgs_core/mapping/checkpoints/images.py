@@ -18,7 +18,7 @@ from torch import Tensor
 from mvsgs_core.atomic_file import replacing
 from mvsgs_core.mapping.keyframes import TrainingView
 
-QUICK = [  # a third of the time that PNG's own choice takes, of photographs for the same size
+QUICK = [  # half the time that the encoder's own choice takes, for photographs of about the same size
     cv2.IMWRITE_PNG_COMPRESSION, 1,
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB,

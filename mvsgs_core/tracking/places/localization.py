@@ -40,7 +40,7 @@ def localize_by(
     weight = np.stack([np.where(k.triangulated, m.weight, 0.0) for k, m in zip(keyframes, matches.values())])
     if (weight > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
         weight = np.stack([m.weight for m in matches.values()])
-    cells = int((weight > 0).sum(axis=1).max())  # the others say nothing
+    cells = max(1, int((weight > 0).sum(axis=1).max()))  # the others say nothing
     chosen = [np.argsort(w <= 0, kind="stable")[:cells] for w in weight]
     weight = np.stack([w[c] for w, c in zip(weight, chosen)])
     target = np.stack([np.nan_to_num(_rectified(graph, k, m)[c].T) for (k, m), c in zip(matches.items(), chosen)])
@@ -52,9 +52,7 @@ def localize_by(
         source=np.arange(count, dtype=np.int32),
         to=np.full(count, count, np.int32),
         target=target,
-        information=np.stack(
-            [k.image.cells.information[c].T * w for k, c, w in zip(keyframes, chosen, weight)],
-        ),
+        information=np.stack([k.image.cells.information[c].T * w for k, c, w in zip(keyframes, chosen, weight)]),
         free_pose=np.arange(count + 1) == count,
         free_depth=np.zeros(count + 1, bool),
     )

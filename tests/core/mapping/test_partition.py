@@ -47,8 +47,8 @@ def test_the_kernel_finds_what_its_plain_twin_finds(size: tuple[int, int], monke
     found = partition(image, residual, wanted, depth, known, ANGLE, PRICE)
     given: list[Split] = []
 
-    def plain(*values: Any) -> tuple[np.ndarray, np.ndarray]:
-        given.append(Split(*values[:-1]))
+    def plain(threads: int, **values: Any) -> tuple[np.ndarray, np.ndarray]:
+        given.append(Split(**values))
         return partition_plain.split(given[0])
 
     monkeypatch.setattr(native, "load", lambda name: SimpleNamespace(partition=plain))
