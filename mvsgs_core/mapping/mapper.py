@@ -32,7 +32,7 @@ from mvsgs_core.stats import Stats
 
 LATE = 30  # part of the refinement's iterations that a keyframe's late splats bring: 1 / LATE
 FINAL_RATE = 0.1  # of the learning rates, with which a map is handed out
-NONE_NOW = 2  # halvings of an image of which nothing worth a splat is left
+NONE_NOW = 2  # halvings of an image from which on it gets no splats as it comes
 
 
 class OnlineMapper:

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from mvsgs_core import native
+from mvsgs_core.camera import mean_of_colors
 from mvsgs_core.rasterizer.ssim_window import C2, RADIUS, SIGMA
 
 LEVELS = 3  # halvings of the largest rectangle along an axis: of 8 pixels
-MEAN = np.full((1, 3), 1.0 / 3.0, np.float32)  # of the colors: NumPy's over an axis of three is slow
 EMPTY = 1e3  # error of a pixel that the map does not show: more than any splat costs
 
 
@@ -88,5 +88,5 @@ def _per_contrast(image: np.ndarray) -> np.ndarray:
     colors = image.astype(np.float32)
     window = (2 * RADIUS + 1, 2 * RADIUS + 1)
     mean = cv2.GaussianBlur(colors, window, SIGMA)
-    variance = cv2.transform(np.maximum(cv2.GaussianBlur(colors * colors, window, SIGMA) - mean * mean, 0), MEAN)
+    variance = mean_of_colors(np.maximum(cv2.GaussianBlur(colors * colors, window, SIGMA) - mean * mean, 0))
     return np.asarray(1 / (2 * variance + np.float32(C2)), dtype=np.float32)

@@ -112,7 +112,8 @@ class KeyframeGraph:
         information = np.zeros((len(pairs), 3, cells))
         target = np.zeros((len(pairs), 2, cells))
         for n, (a, b) in enumerate(pairs):
-            found, (at, velocity, weight) = self.edges[a, b].found, self.edges[a, b].of_found
+            edge = self.edges[a, b]
+            found, (at, velocity, weight) = edge.found, edge.of_found
             target[n][:, found] = self.rectified(at.T, velocity.T, frames[0].image.size).T
             information[n][:, found] = self.keyframes[a].image.cells.information[found].T * weight
         inverse_depth = np.stack([k.inverse_depth for k in frames])

@@ -189,7 +189,7 @@ private:
                 int8_t best = kNothing;
                 const auto take = [&](float other, int8_t what) {
                     best = other < cost ? what : best;
-                    cost = std::min(other, cost);
+                    cost = other < cost ? other : cost;  // NaN is no cost
                 };
                 take(on_two ? kImpossible : here.distortion[i] + price_, kLeaf);
                 if (halves_by_rows)

@@ -1,4 +1,4 @@
-// What the Python bindings of stereo and fusion share: array types, checks, results.
+// What the Python bindings of stereo, fusion and the mapper share: array types, checks, results.
 #pragma once
 
 #include <nanobind/nanobind.h>

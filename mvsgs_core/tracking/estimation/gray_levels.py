@@ -15,6 +15,7 @@ from itertools import product
 import cv2
 import numpy as np
 
+from mvsgs_core.camera import mean_of_colors
 from mvsgs_core.tracking.estimation.response import BRIGHTEST, DARKEST, offset_term
 
 NOISE = 1.0 / 255.0  # of a window's mean, gray levels 0 to 1: quantization and what is left of the sensor's noise
@@ -26,7 +27,6 @@ MIN_SAMPLES = 30
 TERMS = 9  # 1, what an offset adds, three of the radius, what an offset adds to these, the log ratio
 _STEPS = 4  # of reweighting
 _LOWEST, _HIGHEST = math.ceil(255.0 * DARKEST), math.floor(255.0 * BRIGHTEST)  # that tell, 0 to 255
-_GRAY = np.full((1, 3), 1.0 / 3.0, np.float32)  # mean of the colors: NumPy's over an axis of three is slow
 _RIDGE = 1e-4  # share of the whole: few samples tell the terms apart
 
 
@@ -36,7 +36,7 @@ class Levels:
     def __init__(self, half: np.ndarray, mask: np.ndarray | None = None) -> None:
         """mask: (h, w) bool, False where a pixel is to be ignored; None: all count."""
         values = half.astype(np.float32) * np.float32(1.0 / 255.0)
-        mean, gray = np.asarray(cv2.blur(values, (3, 3))), cv2.transform(values, _GRAY)
+        mean, gray = np.asarray(cv2.blur(values, (3, 3))), mean_of_colors(values)
         window = np.ones((3, 3), np.uint8)
         bright = cv2.inRange(cv2.dilate(half, window), (0,) * 3, (_HIGHEST,) * 3) == 0
         dark = cv2.inRange(cv2.erode(half, window), (_LOWEST,) * 3, (255,) * 3) == 0
