@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,9 +15,10 @@ from mvsgs_core.stats import Stats
 from nodes.once import Once
 from nodes.runtime.addresses import PeerLost
 from nodes.runtime.inbox import Inbox
-from nodes.runtime.transport import Publisher, ReliableReader, kept
+from nodes.runtime.transport import Publisher, ReliableReader, create_keys, kept
 from nodes.runtime.transport.kept import Kept
 from tests.support.patience import LONG, until
+from tests.support.viewer_page import free_port
 
 AWAY = 5.0  # s
 ONE = np.ones((2, 2), np.float32)
@@ -114,6 +116,27 @@ def test_who_stays_away_is_an_error_and_holds_the_sender_back_until_then(tmp_pat
     with pytest.raises(PeerLost, match=r"was not back within 1\.5 s"):
         publisher.send(frame(2))
     assert time.monotonic() - began >= 1.0
+
+
+def test_a_sender_that_dies_in_a_handshake_refuses_nobody_whom_it_let_in(tmp_path: Path, opened: Callable) -> None:
+    port, keys, said = free_port(), create_keys(tmp_path / "keys"), list[str]()
+    address = f"tcp://127.0.0.1:{port}"
+    publisher: Publisher = opened(Publisher(address, keys=keys))
+    reader: ReliableReader = opened(ReliableReader(address, Frame, keys=keys, away=AWAY, say=said.append))
+    inbox = Inbox([reader], [])
+    until(lambda: ready(publisher, inbox))
+    publisher.close(farewell=False)
+    with socket.create_server(("127.0.0.1", port)) as dying:
+        dying.settimeout(LONG)
+        for _ in range(3):  # nothing has come from there yet, as from the tracker's Trajectory until the end
+            dying.accept()[0].close()
+            inbox.watch(0.05)
+    again: Publisher = opened(Publisher(address, keys=keys))
+    until(lambda: ready(again, inbox))
+    again.start()
+    again.send(frame(0))
+    assert indices(taken(inbox, 1)) == [0]
+    assert ["was lost" in said[0], "is back" in said[1]] == [True, True]
 
 
 def test_a_sender_that_is_started_again_begins_anew_and_keeps_the_order_of_its_topics(

@@ -28,7 +28,7 @@ class _Reader:
     """What both kinds of readers share: the connection, its monitor, and decoding."""
 
     delivery: bytes
-    monitored = LOST  # events of the connection
+    monitored = LOST | zmq.EVENT_HANDSHAKE_SUCCEEDED  # events of the connection
     longest_pause = 0  # ms between two attempts to connect, from 50 on twice as long each time; 0: always 50
 
     def __init__(
@@ -58,11 +58,11 @@ class _Reader:
         self._away, self._say = away, say
         self._token, self._observer = token.encode(), observer
         self.broke = False  # the connection did, and nothing came since
+        self._met = False  # the publisher let this reader in once
         self._socket = open_socket(zmq.SUB, address, keys, self._max_bytes)
         self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 50, self.longest_pause
-        back = zmq.EVENT_HANDSHAKE_SUCCEEDED if away else 0
-        self.monitor = self._socket.get_monitor_socket(self.monitored | back)
+        self.monitor = self._socket.get_monitor_socket(self.monitored)
         self._socket.connect(address)
         # Where strangers can knock, one's message can hide who said this: it is then said again, under the same name.
         self._said = [token.encode() + self.delivery + (os.urandom(NAME_BYTES) if token else b"")]
@@ -77,16 +77,16 @@ class _Reader:
         """Takes note of a lost connection. Raises TransportError if the publisher refuses this reader's keys."""
         while readable(self.monitor):
             event = recv_monitor_message(self.monitor)["event"]
-            known = self._away > 0 and self.received > 0  # one that is just starting or going may fail so, too
-            if event & REFUSED and self._keys is not None and not known:
+            # Whom it let in before it does not refuse: a process that dies in a handshake looks the same from here.
+            if event & REFUSED and self._keys is not None and not self._met:
                 raise TransportError(f"the publisher of {self.topic} refused the keys: both ends need the same file")
-            if event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL and not known:
+            if event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL and not self._met:
                 raise TransportError(f"the publisher of {self.topic} speaks another protocol: keys on one side only?")
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                if self._lost_at is not None:
-                    gone = time.monotonic() - self._lost_at
-                    self._say(f"the publisher of {self.topic} is back after {gone:.1f} s")
-                self._lost_at = None
+                self._met = True
+                if self._lost_at is not None and self._away:
+                    self._say(f"the publisher of {self.topic} is back after {time.monotonic() - self._lost_at:.1f} s")
+                    self._lost_at = None
             elif self._lost_at is None:
                 self._lost_at, self.broke = time.monotonic(), True
                 if self._away and not self.ended:
