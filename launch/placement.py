@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
-from pathlib import Path
 
 import msgs
 from launch.graph import Graph
+from mvsgs_core.machine import available_cores
 
 # Share of the cores by work per keyframe; a slot that is not named counts as 1.
 SHARES: Mapping[str, float] = {"mapper": 4, "mvs": 3, "tracker": 2, "depth_fusion": 1, "dataset": 0.5}
@@ -20,17 +19,6 @@ HEAVIEST_SHARE = 0.75
 # Niceness in real time, for each stage that stands between a node and the frames, and of who only looks: a level is a
 # tenth of the time of a core that two share, so that stereo is hardly slowed by a mapper that fills what is left.
 STEP, WATCHING = 4, 15
-
-
-def available_cores() -> int:
-    """Cores that this process may use: its affinity, limited by a container's quota."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quota = Path("/sys/fs/cgroup/cpu.max")
-    if quota.exists():
-        limit, _, period = quota.read_text().partition(" ")
-        if limit != "max":
-            cores = min(cores, max(1, math.ceil(int(limit) / int(period))))
-    return cores
 
 
 def thread_plan(graph: Graph, cores: int | None = None) -> dict[str, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import math
 import os
 import platform
 import subprocess
@@ -17,10 +18,20 @@ _GIT_SECONDS = 5.0  # for git to answer
 KERNELS = {"v4": "AVX-512", "v3": "AVX2", "generic": "generic kernels"}
 
 
+def available_cores() -> int:
+    """Cores that this process may use: its affinity, limited by a container's quota."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota = Path("/sys/fs/cgroup/cpu.max")
+    if quota.exists():
+        limit, _, period = quota.read_text().partition(" ")
+        if limit != "max":
+            cores = min(cores, max(1, math.ceil(int(limit) / int(period))))
+    return cores
+
+
 def processor() -> str:
     """In one line: its name, the cores that this process may use, the instructions that the kernels use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{_model()}, {cores} cores, {KERNELS[native.instruction_sets()[0]]}"
+    return f"{_model()}, {available_cores()} cores, {KERNELS[native.instruction_sets()[0]]}"
 
 
 def gpus() -> list[str]:

@@ -24,9 +24,9 @@ from bench.finished import read_frames
 from bench.runs import FEWER, QUICK, Run, fewer_iterations, figure, folder
 from bench.table import Row, at_least, at_most, main
 from bench.tracking.baselines import Baseline, solve
-from launch.placement import available_cores
 from mvsgs_core.datasets import Item
 from mvsgs_core.held_out import is_held_out
+from mvsgs_core.machine import available_cores
 
 QUICK_SCENE = "room"  # scene of a quick run: in 30 frames of the real ones COLMAP puts no two images together
 EVENLY = 100  # frames that COLMAP gets, about, besides our keyframes and every 5th

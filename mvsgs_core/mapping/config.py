@@ -14,6 +14,7 @@ from mvsgs_core.mapping.optimizer import OptimizerConfig
 
 ITERATIONS, LIVE = 15, 30  # of a keyframe while the stream runs; in real time, where nothing waits for them
 FEWEST = 16  # keyframes that a refinement is long enough for: a map of fewer has as much to settle
+VISITS = 6  # of each image in a refinement in real time, on average: where keyframes are few, frames between are many
 LONGEST = 1000  # iterations of a refinement in real time: somebody waits for the map
 
 
@@ -43,8 +44,8 @@ class MapperConfig:
 
     # of each keyframe in the stream, half on the newest, half on all (the paper: 1000); null: 15, in real time 30
     iterations: int | None = None
-    # at the end, over all images; null: 25 a keyframe or 5/3 of `iterations`, of 16 keyframes at least, in real time at
-    # most 1000
+    # at the end, over all images; null: 25 a keyframe or 5/3 of `iterations`, of 16 keyframes at least, in real time 6
+    # an image at least, and 1000 at most
     refinement: int | None = None
     refine: RefineConfig = field(default_factory=RefineConfig)  # on which machines, in which parts
     window: int = 6  # newest keyframes, on which the local half of the budget goes
@@ -71,10 +72,10 @@ class MapperConfig:
             return self.iterations
         return LIVE if self.realtime else ITERATIONS
 
-    def refinement_of(self, keyframes: int) -> int:
-        """Iterations of the final refinement of a map of so many."""
+    def refinement_of(self, keyframes: int, images: int = 0) -> int:
+        """Iterations of the final refinement of a map of so many, trained on `images`, frames between them included."""
         if self.refinement is not None:
             return self.refinement
         each = ITERATIONS if self.iterations is None else self.iterations
         total = 5 * each * max(keyframes, FEWEST) // 3
-        return min(total, LONGEST) if self.realtime else total
+        return min(max(total, VISITS * images), LONGEST) if self.realtime else total

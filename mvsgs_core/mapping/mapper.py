@@ -88,7 +88,7 @@ class OnlineMapper:
     @property
     def refinement(self) -> int:
         """Iterations of the final refinement."""
-        return self.config.refinement_of(len(self.keyframes.with_image))
+        return self.config.refinement_of(len(self.keyframes.with_image), len(self.keyframes.trained))
 
     @property
     def figures(self) -> dict[str, int]:

@@ -41,12 +41,15 @@ class PosedConfig(KeyframeTrackingConfig):
 
 @dataclass(frozen=True)
 class TrackerConfig(KeyframeTrackingConfig):
-    """Raises ValueError for what can't be a readout time or a number of frames."""
+    """Raises ValueError for what can't be a readout time, a share or a number of frames."""
 
     readout_time: float | None = None  # seconds of the camera's rolling shutter, 0 for a global one; null: estimated
     reads_columns: bool = False  # where that is given, of a phone that is held upright: it reads columns, not rows
     loops: bool = True  # old keyframes are looked for by appearance
     realtime: bool = False  # keyframes are worked on as there is time, not before the next frame
+    # of a core's time that the tracker may take in real time: beyond, keyframes are farther apart; null: half of all
+    # cores', at most 0.9
+    share: float | None = None
     frames_between: int = 8  # frames between two keyframes, at most, that the map is trained on, too; 0: none
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
     min_texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
@@ -63,6 +66,8 @@ class TrackerConfig(KeyframeTrackingConfig):
 
     def __post_init__(self) -> None:
         check_readout_time(self.readout_time, self.reads_columns)
+        if self.share is not None and not 0.0 < self.share <= 1.0:
+            raise ValueError(f"tracker.share={self.share}: of a core's time, above 0 and at most 1; null: half of all")
         if self.frames_between < 0:
             raise ValueError(f"tracker.frames_between={self.frames_between}: a number of frames, 0 for none")
 

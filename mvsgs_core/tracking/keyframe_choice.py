@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.front_end import Step
+from mvsgs_core.tracking.keyframe_spacing import KeyframeSpacing
 
 DOUBT = 0.5  # of the flow that makes a keyframe: where few matches agree with the pose, so much is enough
 LATE_FLOW = 2.0  # of the flow that makes a keyframe: the next frame may have moved by so much, and not further
@@ -32,9 +33,15 @@ class KeyframeChoiceConfig:
 class KeyframeChoice:
     """Follows how fast the frames move away from their reference keyframe."""
 
-    def __init__(self, config: KeyframeChoiceConfig) -> None:
-        self.config = config
+    def __init__(self, config: KeyframeChoiceConfig, spacing: KeyframeSpacing | None = None) -> None:
+        """spacing: of a live stream; None: keyframes are as far apart as configured."""
+        self.config, self.spacing = config, spacing
         self._before = (-1, 0.0, 1.0)  # reference of the last frame, its flow in pixels, its fraction of points found
+
+    @property
+    def max_flow(self) -> float:
+        """As a fraction of the width, now."""
+        return self.config.max_flow * (1.0 if self.spacing is None else self.spacing.factor)
 
     def moved(self, step: Step, width: int, limit: float) -> bool:
         """Whether the image has changed enough since the reference. limit: largest flow, as a fraction of the width."""
@@ -45,6 +52,8 @@ class KeyframeChoice:
 
     def saw(self, step: Step) -> None:
         """A frame that becomes no keyframe, however much it moved."""
+        if self.spacing is not None:
+            self.spacing.look()
         self._before = (step.reference, step.flow, step.fraction)
 
     def wants(self, index: int, step: Step, width: int, limit: float) -> bool:
@@ -52,11 +61,12 @@ class KeyframeChoice:
         known, flow, fraction = self._before
         flow, fraction = (flow, fraction) if known == step.reference else (0.0, 1.0)
         self.saw(step)
-        if not self.moved(step, width, limit):
-            return False
-        if not is_held_out(index):
-            return True
-        return self._late(2.0 * step.flow - flow, 2.0 * step.fraction - fraction, width, limit)
+        wanted = self.moved(step, width, limit)
+        if wanted and is_held_out(index):
+            wanted = self._late(2.0 * step.flow - flow, 2.0 * step.fraction - fraction, width, limit)
+        if wanted and self.spacing is not None:
+            self.spacing.made(step.flow / (self.config.max_flow * width))
+        return wanted
 
     def is_late(self, step: Step, width: int, limit: float) -> bool:
         """Whether the frames after this one may be lost without a keyframe. limit: as of `moved`."""

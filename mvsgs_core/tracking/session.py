@@ -30,6 +30,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.initializer import Initializer
 from mvsgs_core.tracking.keyframe_choice import KeyframeChoice, newest
+from mvsgs_core.tracking.keyframe_spacing import spacing_of
 from mvsgs_core.tracking.keyframe_work import KeyframeWork
 from mvsgs_core.tracking.local_map import LocalMap
 from mvsgs_core.tracking.matching.flow import make_flow
@@ -67,7 +68,7 @@ class Session:
         )  # fmt: skip
         self.matcher = Matcher(make_flow(config.flow))
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, threads)
-        self.choice = KeyframeChoice(config.keyframe_choice)
+        self.choice = KeyframeChoice(config.keyframe_choice, spacing_of(config.share) if config.realtime else None)
         self.diagnosis = Diagnosis(config.front_end.lost_fraction, config.min_texture)
         self.initializer = Initializer(self.graph, self.matcher, config.initialization, threads, self.diagnosis)
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, threads)
@@ -168,7 +169,7 @@ class Session:
             self._note_tail(frame, step)
         self.waiting.add(frame, record)
         self.choice.saw(step)
-        self.late |= self.choice.is_late(step, frame.size[1], self.config.keyframe_choice.max_flow)
+        self.late |= self.choice.is_late(step, frame.size[1], self.choice.max_flow)
         return Update(record.state)
 
     def _begin_work(self, frame: TrackingImage, record: FrameRecord, steps: Steps[Update]) -> Update:
@@ -270,7 +271,7 @@ class Session:
         record.state = TrackingState.TRACKED
         record.follow(self.graph, step.reference, step.matches, step.pose, frame)
         width = frame.size[1]
-        limit = self.covisible_keyframes.limit(step.reference, self.config.keyframe_choice.max_flow)
+        limit = self.covisible_keyframes.limit(step.reference, self.choice.max_flow)
         wanted = self.choice.wants(frame.index, step, width, limit)
         if self.choice.moved(step, width, limit) and self._reuse_keyframe(frame, step):
             return Update(record.state)

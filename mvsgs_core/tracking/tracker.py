@@ -38,6 +38,7 @@ NOT_FOUND = (
     "the camera was not found at once in the map to go on in: a part of its own was begun, which is joined to it where "
     "the camera comes by"
 )
+SPARED = "keyframes, about: farther apart, as the tracker took more than its share of time"
 
 
 class NewestPose(NamedTuple):
@@ -262,6 +263,8 @@ class Tracker:
         tracking = session.phase is not Phase.INITIALIZING
         if tracking and not self._frozen:
             session.calibration.check(session.members)
+        if session.choice.spacing is not None and (spared := round(session.choice.spacing.spared)):
+            stats.skip(SPARED, spared)
         stats.counts["matches"] = session.matcher.calls
         stats.counts["matches that needed features"] = session.matcher.feature_calls
         self.nothing = "" if graph.keyframes else f"tracking never started: {session.initializer.reason}"

@@ -270,8 +270,18 @@ def test_the_refinement_is_as_long_as_the_map_is_large() -> None:
     live = MapperConfig(realtime=True)
     assert live.budget == 30  # nothing waits for them
     assert [live.refinement_of(count) for count in (0, 30, 5000)] == [400, 750, 1000]  # for which somebody waits
+    assert [live.refinement_of(20, images) for images in (20, 83, 84, 160, 500)] == [500, 500, 504, 960, 1000]
+    assert MapperConfig().refinement_of(20, 500) == 500
     assert MapperConfig(realtime=True, iterations=7).budget == 7
     assert MapperConfig(realtime=True, refinement=3000).refinement_of(5000) == 3000
+
+
+def test_in_real_time_frames_between_few_keyframes_make_the_refinement_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = OnlineMapper(replace(CONFIG, realtime=True, refinement=None))
+    mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.5)))
+    assert mapper.refinement == mapper.config.refinement_of(1)
+    monkeypatch.setattr(type(mapper.keyframes), "trained", property(lambda self: [None] * 100))
+    assert mapper.refinement == mapper.config.refinement_of(1, 100) == 600
 
 
 def test_the_atlas_refines_for_as_long_as_its_map_asks_for() -> None:
