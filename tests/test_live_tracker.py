@@ -47,7 +47,7 @@ def split(sent: list[msgs.Message]) -> tuple[dict[int, np.ndarray], dict[int, np
 @pytest.mark.slow
 def test_with_time_for_it_all_comes_out_as_without_hurry() -> None:
     unhurried = split(list(sent_by(Tracker())))
-    node = Tracker(Tracker.Config(realtime=True))
+    node = Tracker(Tracker.Config(realtime=True, share=1.0))  # frames come without a pause
     live = split(list(sent_by(node)))
     for one, other in zip(unhurried[:2], live[:2], strict=True):
         assert one.keys() == other.keys()
