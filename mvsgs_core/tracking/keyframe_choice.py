@@ -41,14 +41,18 @@ class KeyframeChoice:
     @property
     def max_flow(self) -> float:
         """As a fraction of the width, now."""
-        return self.config.max_flow * (1.0 if self.spacing is None else self.spacing.factor)
+        return self.config.max_flow * self._factor
+
+    @property
+    def _factor(self) -> float:
+        return 1.0 if self.spacing is None else self.spacing.factor
 
     def moved(self, step: Step, width: int, limit: float) -> bool:
         """Whether the image has changed enough since the reference. limit: largest flow, as a fraction of the width."""
         if step.flow > limit * width or step.fraction < self.config.min_fraction:
             return True
         doubted = step.localization is not None and step.localization.inliers < self.config.min_inliers
-        return doubted and step.flow > DOUBT * limit * width
+        return doubted and step.flow > DOUBT * limit / self._factor * width  # doubt waits for no wider spacing
 
     def saw(self, step: Step) -> None:
         """A frame that becomes no keyframe, however much it moved."""
@@ -65,7 +69,7 @@ class KeyframeChoice:
         if wanted and is_held_out(index):
             wanted = self._late(2.0 * step.flow - flow, 2.0 * step.fraction - fraction, width, limit)
         if wanted and self.spacing is not None:
-            self.spacing.made(step.flow / (self.config.max_flow * width))
+            self.spacing.made(step.flow, self.config.max_flow * width)
         return wanted
 
     def is_late(self, step: Step, width: int, limit: float) -> bool:

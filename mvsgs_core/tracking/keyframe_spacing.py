@@ -46,9 +46,9 @@ class KeyframeSpacing:
             step = RATE * (taken / passed / self.share - 1.0) * passed
             self.factor = min(max(self.factor * math.exp(min(step, 1.0)), 1.0), WIDEST)
 
-    def made(self, flow: float) -> None:
-        """A keyframe, after a flow that is so many times the usual one."""
-        self.spared += max(min(self.factor, flow) - 1.0, 0.0)
+    def made(self, flow: float, usual: float) -> None:
+        """A keyframe, after this flow where another is usual."""
+        self.spared += max(min(self.factor, flow / usual) - 1.0, 0.0) if usual > 0.0 else 0.0
 
 
 def spacing_of(share: float | None, cores: int | None = None) -> KeyframeSpacing:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.keyframe_choice import KeyframeChoice, KeyframeChoiceConfig
 from mvsgs_core.tracking.keyframe_spacing import WIDEST, KeyframeSpacing, spacing_of
+from mvsgs_core.tracking.places.localization import Localization
 from mvsgs_core.tracking.tracker import SPARED, Tracker
 from tests.core.tracking.test_keyframe_choice import WIDTH, step
 from tests.support.sequences import synthetic
@@ -77,6 +79,18 @@ def test_a_keyframe_is_made_after_as_much_more_flow_and_the_spared_ones_are_coun
     assert spacing.spared == pytest.approx(1.0)
     assert choice.wants(3, step(0.2 * usual, fraction=0.3), WIDTH, choice.max_flow), "too few points are found"
     assert spacing.spared == pytest.approx(1.0), "that one would have been made anyway"
+    every = KeyframeChoice(KeyframeChoiceConfig(max_flow=0.0), spacing)
+    assert every.wants(4, step(1.0), WIDTH, every.max_flow)
+    assert spacing.spared == pytest.approx(1.0), "nothing is farther apart than each frame"
+
+
+def test_few_matches_that_agree_make_a_keyframe_as_early_as_ever(spacing: KeyframeSpacing) -> None:
+    choice = KeyframeChoice(KeyframeChoiceConfig(), spacing)
+    usual = choice.config.max_flow * WIDTH
+    spacing.factor = 2.0
+    for flow, inliers, wanted in ((0.6, 0.7, True), (0.4, 0.7, False), (1.9, 0.8, False)):
+        seen = replace(step(flow * usual), localization=Localization(np.eye(4), inliers))
+        assert choice.moved(seen, WIDTH, choice.max_flow) == wanted
 
 
 @pytest.mark.slow
