@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 
 from mvsgs_core.tracking.config import TrackerConfig
+from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.keyframe_choice import KeyframeChoice, KeyframeChoiceConfig
 from mvsgs_core.tracking.keyframe_spacing import WIDEST, KeyframeSpacing, spacing_of
+from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.places.localization import Localization
 from mvsgs_core.tracking.tracker import SPARED, Tracker
-from tests.core.tracking.test_keyframe_choice import WIDTH, step
 from tests.support.sequences import synthetic
 
 FRAME = 1.0 / 30.0  # s
+WIDTH = 320
+
+
+def step(flow: float, fraction: float = 0.9) -> Step:
+    return Step(0, Matches(np.zeros((0, 2)), np.zeros(0)), fraction, flow, False, None)
 
 
 class Core:
