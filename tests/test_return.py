@@ -17,6 +17,7 @@ from nodes.runtime.addresses import PeerLost
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.transport import Publisher, ReliableReader, create_keys, kept
 from nodes.runtime.transport.kept import Kept
+from nodes.runtime.transport.live import LiveReader
 from tests.support.patience import LONG, until
 from tests.support.viewer_page import free_port
 
@@ -137,6 +138,30 @@ def test_a_sender_that_dies_in_a_handshake_refuses_nobody_whom_it_let_in(tmp_pat
     again.send(frame(0))
     assert indices(taken(inbox, 1)) == [0]
     assert ["was lost" in said[0], "is back" in said[1]] == [True, True]
+
+
+def test_a_live_sender_that_dies_in_a_handshake_refuses_nobody_either(tmp_path: Path, opened: Callable) -> None:
+    port, keys = free_port(), create_keys(tmp_path / "keys")
+    address = f"tcp://127.0.0.1:{port}"
+    publisher: Publisher = opened(Publisher(address, keys=keys))
+    reader: LiveReader = opened(LiveReader(address, Frame, keys=keys))
+    until(lambda: publisher.ready(1))
+    publisher.close(farewell=False)
+    with socket.create_server(("127.0.0.1", port)) as dying:
+        dying.settimeout(LONG)
+        for _ in range(3):  # a robot's program that was connected, and had no frame yet
+            dying.accept()[0].close()
+            reader.watch()
+    again: Publisher = opened(Publisher(address, keys=keys))
+    until(lambda: again.ready(1))
+    again.send(frame(7))
+
+    def taken_up() -> bool:
+        reader.watch()
+        found = reader.take()
+        return isinstance(found, Frame) and found.index == 7
+
+    until(taken_up)
 
 
 def test_a_sender_that_is_started_again_begins_anew_and_keeps_the_order_of_its_topics(

@@ -345,6 +345,12 @@ def test_keys_let_in_only_those_who_have_them(tmp_path: Path, opened: Callable) 
     assert publisher.readers.total() == 1
 
 
+def test_publishers_with_keys_follow_each_other_at_once(tmp_path: Path) -> None:
+    keys = create_keys(tmp_path / "keys")
+    for address in [tcp_address() for _ in range(50)]:
+        Publisher(address, keys=keys).close(farewell=False)
+
+
 def test_keys_that_others_can_read_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TransportError, match="create_keys"):
         load_keys(tmp_path)

@@ -66,6 +66,7 @@ class SlowMapper(Mapper):
         super().__init__(config)
         self._add = slowed(self._add, self.config.factor)  # type: ignore[method-assign]
         self.atlas.step = slowed(self.atlas.step, self.config.factor)  # type: ignore[method-assign]
+        self.atlas.begin_late = slowed(self.atlas.begin_late, self.config.factor)  # type: ignore[method-assign]
         made_up = self.atlas.make_up
         slowly = slowed(made_up, self.config.factor)
         self.atlas.make_up = lambda splats=True, rate=None: (  # type: ignore[method-assign]

@@ -16,7 +16,7 @@ from zmq.utils.monitor import recv_monitor_message
 from msgs.codec import CodecError, decode
 from nodes.runtime.addresses import TransportError
 from nodes.runtime.transport.publisher import Publisher
-from nodes.runtime.transport.readers import LOST, REFUSED, NewestReader
+from nodes.runtime.transport.readers import REFUSED, NewestReader
 from nodes.runtime.transport.sockets import readable
 
 RETRY = 0.3  # s without ZeroMQ's own attempt after which a lost connection is made anew
@@ -31,7 +31,7 @@ class LiveReader(NewestReader):
     `skipped` counts what can have been sent in the time that passed, whatever the sender's numbers say.
     """
 
-    monitored = LOST | zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED
+    monitored = NewestReader.monitored | zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED
     longest_pause = 2000
 
     def __init__(self, address: str, type: type, **options: Any) -> None:
@@ -73,14 +73,12 @@ class LiveReader(NewestReader):
         """In the thread that reads: the socket is its own."""
         while readable(self.monitor):
             event = recv_monitor_message(self.monitor)["event"]
-            if event & REFUSED and self._keys is not None:
-                self._refusal = f"the publisher of {self.topic} refused the keys: both ends need the same file"
-            elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
-                self._refusal = f"the publisher of {self.topic} speaks another protocol: keys on one side only?"
+            self._met |= event == zmq.EVENT_HANDSHAKE_SUCCEEDED
+            self._refusal = None if self._met else self._refused_by(event) or self._refusal
             if event == zmq.EVENT_DISCONNECTED and self.received and not self.ended and self._end is None:
                 self.breaks += 1
                 self._tell()
-            if event & (zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED):
+            if event & (zmq.EVENT_CONNECTED | zmq.EVENT_CONNECT_RETRIED | zmq.EVENT_HANDSHAKE_SUCCEEDED):
                 self._broken_at = None
             else:
                 self._broken_at = time.monotonic()

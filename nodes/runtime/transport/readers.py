@@ -77,11 +77,8 @@ class _Reader:
         """Takes note of a lost connection. Raises TransportError if the publisher refuses this reader's keys."""
         while readable(self.monitor):
             event = recv_monitor_message(self.monitor)["event"]
-            # Whom it let in before it does not refuse: a process that dies in a handshake looks the same from here.
-            if event & REFUSED and self._keys is not None and not self._met:
-                raise TransportError(f"the publisher of {self.topic} refused the keys: both ends need the same file")
-            if event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL and not self._met:
-                raise TransportError(f"the publisher of {self.topic} speaks another protocol: keys on one side only?")
+            if (refusal := self._refused_by(event)) is not None:
+                raise TransportError(refusal)
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._met = True
                 if self._lost_at is not None and self._away:
@@ -91,6 +88,19 @@ class _Reader:
                 self._lost_at, self.broke = time.monotonic(), True
                 if self._away and not self.ended:
                     self._say(f"the publisher of {self.topic} was lost: it is waited for up to {self._away:g} s")
+
+    def _refused_by(self, event: int) -> str | None:
+        """What is wrong with the keys, as this event of the connection says; None: nothing.
+
+        A publisher that let this reader in does not refuse it: one that dies in a handshake looks the same from here.
+        """
+        if self._met:
+            return None
+        if event & REFUSED and self._keys is not None:
+            return f"the publisher of {self.topic} refused the keys: both ends need the same file"
+        if event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+            return f"the publisher of {self.topic} speaks another protocol: keys on one side only?"
+        return None
 
     def check_peer(self) -> None:
         """Raises PeerLost if the publisher is gone without End. To be called when no message waits."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,6 +14,7 @@ from nodes.runtime.addresses import Keys, save_keys
 
 OBSERVER = b"O"  # begins the subscription by which a reader says its delivery and its name: no frame begins so
 GOODBYE = b"G"  # the subscription by which a reader says that it has read the end: no frame begins so either
+FREE = 5.0  # s within which ZeroMQ has freed the address of an authenticator that was stopped
 NAME_BYTES = 8  # of the name that follows the delivery in a reader's subscription: which of its attempts are its own
 
 
@@ -33,8 +35,7 @@ class _Guard:
     def enter(self, keys: Keys) -> None:
         self._users[keys] += 1
         if self._authenticator is None:
-            self._authenticator = ThreadAuthenticator(zmq.Context.instance())
-            self._authenticator.start()
+            self._authenticator = _started_authenticator()
             self._authenticator.configure_curve_callback("*", self)
 
     def leave(self, keys: Keys) -> None:
@@ -45,6 +46,22 @@ class _Guard:
 
     def callback(self, domain: str, key: bytes) -> bool:
         return any(key == keys.public and users > 0 for keys, users in list(self._users.items()))
+
+
+def _started_authenticator() -> ThreadAuthenticator:
+    """Raises ZMQError. ZeroMQ frees the address of one that was stopped in its own time, after that."""
+    until = time.monotonic() + FREE
+    while True:
+        authenticator = ThreadAuthenticator(zmq.Context.instance())
+        try:
+            authenticator.start()
+        except zmq.ZMQError as error:
+            authenticator.stop()
+            if error.errno != zmq.EADDRINUSE or time.monotonic() > until:
+                raise
+            time.sleep(0.001)
+        else:
+            return authenticator
 
 
 guard = _Guard()
