@@ -92,5 +92,6 @@ def test_the_slow_stages_slow_what_they_are_paced_by(monkeypatch: pytest.MonkeyP
     stereo = SlowStereo(SlowStereo.Config(realtime=True, threads=1))
     fusion = SlowFusion(SlowFusion.Config(realtime=True, threads=1))
     mapper = SlowMapper(SlowMapper.Config(realtime=True, threads=1, device="cpu"))
-    for slow in (stereo._core._estimate, fusion._core._fuse, mapper._add, mapper.atlas.step):
+    mapped = (mapper._add, mapper.atlas.step, mapper.atlas.begin_late)
+    for slow in (stereo._core._estimate, fusion._core._fuse, *mapped):
         assert hasattr(slow, "__wrapped__")
