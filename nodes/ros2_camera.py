@@ -25,7 +25,7 @@ from nodes.stream_presence import Presence
 if TYPE_CHECKING:
     from nodes.ros2.dds import Reader
 
-POLL = 0.5  # s at most between two looks at the clock
+POLL = 0.1  # s at most between two looks at the clock and at what was lost
 
 
 class Ros2Camera(LiveSource):
@@ -46,7 +46,8 @@ class Ros2Camera(LiveSource):
         crop: int | None = None  # pixels cut off after undistortion; null: zoom to hide the empty border
         info_timeout: float = 5.0  # s from the first image without a CameraInfo before the focal length is guessed
         timeout: float = 30.0  # s without a usable image before the camera counts as gone
-        reliable: bool = False  # lost images are sent again; the sender must be reliable too
+        # lost images are sent again, for which the sender must be reliable too; null: once some were lost, if it is
+        reliable: bool | None = None
         queue: int = SENSOR_DATA.depth  # images that may wait; of these the newest is taken
 
         def __post_init__(self) -> None:
@@ -70,6 +71,7 @@ class Ros2Camera(LiveSource):
         self._info_topic = c.topic(c.info_topic) if c.info_topic else camera_info_topic(self._topic)
         self._lens: Lens | None = None
         self._uncalibrated_since: float | None = None  # the first image without
+        self._met = False  # somebody who publishes them
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -82,19 +84,22 @@ class Ros2Camera(LiveSource):
         """Raises DdsError."""
         from nodes.ros2.dds import Participant
 
+        self._participant = Participant(self.config)
+        self._read(reliable=bool(self.config.reliable))
+
+    def _read(self, reliable: bool) -> None:
         c = self.config
         compressed = self._topic.endswith(COMPRESSED) if c.type == "auto" else c.type == "compressed"
-        quality = replace(SENSOR_DATA, reliable=c.reliable, depth=c.queue)
-        participant = Participant(c)
+        quality = replace(SENSOR_DATA, reliable=reliable, depth=c.queue)
         self._images: Reader[Image] | Reader[CompressedImage]
         if compressed:
-            self._images = participant.reader(self._topic, CompressedImage, quality)
+            self._images = self._participant.reader(self._topic, CompressedImage, quality)
         else:
-            self._images = participant.reader(self._topic, Image, quality)
-        self._infos = participant.reader(self._info_topic, CameraInfo, SENSOR_DATA)
+            self._images = self._participant.reader(self._topic, Image, quality)
+        self._infos = self._participant.reader(self._info_topic, CameraInfo, SENSOR_DATA)
 
     def _close(self) -> None:
-        del self._images, self._infos
+        del self._images, self._infos, self._participant
 
     def _take(self, first: bool) -> Frame | None:
         """The next usable image. Raises TimeoutError where none ever comes."""
@@ -102,6 +107,8 @@ class Ros2Camera(LiveSource):
         while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
             self._images.wait(min(POLL, left))
             waiting = self._images.take()
+            self._note_losses()
+            self._met = self._met or self._images.writers > 0
             if not waiting:
                 if not first and not self._images.writers:
                     self._presence.lost("nobody publishes its images any more")
@@ -119,9 +126,30 @@ class Ros2Camera(LiveSource):
         self.stats.warn(f"{silence}: the stream ends here")
         return None
 
+    def _note_losses(self) -> None:
+        """Of datagrams: a best-effort image of which one is lost never comes, and nothing else tells of it."""
+        lost = self._participant.overrun()
+        if not lost.datagrams or self.config.reliable:
+            return
+        known = "datagrams_lost" in self.stats.counts
+        self.stats.counts["datagrams_lost"] = lost.datagrams
+        if known:
+            return
+        offered = self._images.offered_reliable
+        again = offered and self.config.reliable is None
+        if again:
+            self._read(reliable=True)
+            what = "from now on they are sent again"
+        else:
+            what = "dataset.reliable=true has them sent again" if offered else "who publishes them sends none again"
+        self.stats.warn(
+            f"images are lost between processes: the kernel keeps {lost.room // 1000} kB for what waits to be read; "
+            f"{what}. More room: sudo sysctl net.core.rmem_max=16777216"
+        )
+
     def _why_nothing(self) -> str:
         c = self.config
-        if self._images.writers:
+        if self._met:
             return "somebody publishes there, but sends nothing"
         hint = f"nobody publishes it in domain {c.number} on interface={c.interface}"
         if c.interface == LOOPBACK:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import socket
+import struct
 import time
 import uuid
 from functools import cache
@@ -37,6 +38,7 @@ T = TypeVar("T", bound=Message)
 _BLOCKED = 100  # ms that a writer waits for a slow reader before it goes on without it
 _EVERYTHING = SampleState.Any | ViewState.Any | InstanceState.Any
 _TAKEN = 64  # samples at once
+_SO_MEMINFO, _MEMINFO, _ROOM, _DROPS = 55, "9I", 1, 8  # linux/sock_diag.h; Python's socket does not name it
 _IDL = {
     "?": bool, "u1": types.uint8, "i4": types.int32, "u4": types.uint32, "f8": types.float64,
     "i8": types.int64, "u8": types.uint64,
@@ -47,6 +49,13 @@ class DdsError(RuntimeError):
     """DDS cannot do it; the message says what to change."""
 
 
+class Overrun(NamedTuple):
+    """Datagrams that the kernel had no room for: each costs a best-effort reader a message, a reliable one time."""
+
+    datagrams: int
+    room: int  # bytes: the smallest limit (net.core.rmem_max) of a socket that lost some; 0: none did
+
+
 class Participant:
     """One of a domain's. Raises DdsError where the interface is none, or nothing can keep DDS on this machine."""
 
@@ -54,6 +63,11 @@ class Participant:
         self._domain = _Domain.of(connection)
         self._entity = DomainParticipant(connection.number)
         self._domain.confine()
+
+    def overrun(self) -> Overrun:
+        """What this process has lost so far because it was not read in time."""
+        full = [memory for memory in self._domain.memories() if memory[_DROPS]]
+        return Overrun(sum(memory[_DROPS] for memory in full), min((memory[_ROOM] // 2 for memory in full), default=0))
 
     def writer(self, topic: str, message_type: type[T], quality: Quality) -> Writer[T]:
         """topic: its full name in ROS, with its first /."""
@@ -108,6 +122,14 @@ class Reader(Generic[T]):
     @property
     def writers(self) -> int:
         return len(self._entity.get_matched_publications())
+
+    @property
+    def offered_reliable(self) -> bool:
+        """Whether all who write it, and somebody does, would send again what is lost."""
+        of = Policy.Reliability
+        writers = map(self._entity.get_matched_publication_data, self._entity.get_matched_publications())
+        offered = [writer is not None and isinstance(writer.qos[of], of.Reliable) for writer in writers]
+        return bool(offered) and all(offered)
 
     def wait(self, seconds: float) -> None:
         """Until something came, so many seconds at most."""
@@ -194,6 +216,7 @@ class _Domain:
     def __init__(self, connection: Connection) -> None:
         self._interface = connection.interface
         self._before = _sockets()
+        self._own: set[int] = set()  # descriptors of its sockets
         try:
             self._entity = Domain(connection.number, connection.xml)
         except DDSException as error:
@@ -217,9 +240,14 @@ class _Domain:
 
     def confine(self) -> None:
         """Cyclone sends on the interface that it is told, but binds to all: on loopback, the kernel is told as well."""
+        self._own = {descriptor for descriptor in _sockets() - self._before if _is_udp(descriptor)}
         if self._interface == LOOPBACK:
-            for descriptor in _sockets() - self._before:
+            for descriptor in self._own:
                 _bind_to_loopback(descriptor)
+
+    def memories(self) -> list[tuple[int, ...]]:
+        """Of each of its sockets what the kernel says of its memory; nothing where the system does not tell."""
+        return [memory for descriptor in self._own if (memory := _memory(descriptor))]
 
 
 def _sockets() -> set[int]:
@@ -238,11 +266,26 @@ def _sockets() -> set[int]:
     return found
 
 
+def _is_udp(descriptor: int) -> bool:
+    try:
+        with socket.socket(fileno=os.dup(descriptor)) as own:
+            return own.family in (socket.AF_INET, socket.AF_INET6) and own.type == socket.SOCK_DGRAM
+    except OSError:  # closed meanwhile: Cyclone's are not
+        return False
+
+
+def _memory(descriptor: int) -> tuple[int, ...]:
+    """The kernel's sock_diag(7) SK_MEMINFO of a socket; empty where it has none, as outside of Linux."""
+    with socket.socket(fileno=os.dup(descriptor)) as own:
+        try:
+            return struct.unpack(_MEMINFO, own.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, struct.calcsize(_MEMINFO)))
+        except (OSError, struct.error):
+            return ()
+
+
 def _bind_to_loopback(descriptor: int) -> None:
     """Nothing that came in by another interface reaches the socket any more."""
     with socket.socket(fileno=os.dup(descriptor)) as own:
-        if own.family not in (socket.AF_INET, socket.AF_INET6) or own.type != socket.SOCK_DGRAM:
-            return
         try:
             own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LOOPBACK.encode())
         except OSError as error:
