@@ -30,7 +30,9 @@ class LocalMapConfig:
     tolerance: float = (
         0.01  # fraction of the cost: a step that gains less is the last (0.001 costs more and gains nothing)
     )
-    min_fraction: float = 0.25  # of the textured points that an edge must have found
+    # of the textured points that an edge must have found: the few that a car still sees two keyframes later hold the
+    # scale (with .25 each is tied to its neighbors alone), and below .15 they are worse ones
+    min_fraction: float = 0.15
 
 
 class LocalMap:
