@@ -13,6 +13,7 @@ from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches, propagate
 from mvsgs_core.tracking.matching.matcher import Matcher
+from mvsgs_core.tracking.shared_scale import share_scale
 from mvsgs_core.tracking.steps import Steps, whole
 
 
@@ -24,6 +25,7 @@ class InitializationConfig:
     patience: int = 40  # frames without a keyframe over which it falls
     recent: int = 5  # keyframes before that each is matched with
     min_fraction: float = 0.25  # of the textured points that an edge must have found
+    weak_fraction: float = 0.15  # the same where without such edges the scale between the keyframes is open
     criteria: ReconstructionCriteria = field(default_factory=ReconstructionCriteria)
     forced: ReconstructionCriteria = field(
         default_factory=lambda: ReconstructionCriteria(
@@ -43,6 +45,7 @@ class Initializer:
         self.config = config
         self.threads = threads
         self.waiting: list[int] = []
+        self._weak: dict[tuple[int, int], Matches] = {}  # of pairs of them, too few for an edge
         self.diagnosis = diagnosis
 
     @property
@@ -72,7 +75,7 @@ class Initializer:
         """Forgets the waiting keyframes."""
         for index in self.waiting:
             self.graph.remove(index)
-        self.waiting = []
+        self.waiting, self._weak = [], {}
 
     def initialize(self, forced: bool = False, focal: FocalConfig | None = None) -> bool:
         """Solves the waiting keyframes; True where that succeeded: they are then part of the map.
@@ -85,6 +88,7 @@ class Initializer:
         """`initialize`, a bundle adjustment a step."""
         if len(self.waiting) < (3 if forced else self.config.min_keyframes):
             return False
+        self._tie()
         criteria = self.config.forced if forced else self.config.criteria
         if focal is None:
             start = yield from reconstructing(self.graph, self.waiting, criteria, self.threads)
@@ -101,8 +105,22 @@ class Initializer:
             keyframe = self.graph.keyframes[index]
             keyframe.cam_from_world, keyframe.inverse_depth = start.cam_from_world[n], start.inverse_depth[n]
             keyframe.information = start.information[n]
-        self.waiting = []
+        self.waiting, self._weak = [], {}
         return True
+
+    def _tie(self) -> None:
+        """Where too few points are seen by three keyframes, edges of fewer matches tie their scale: better than none,
+        and worse than the others where those do."""
+        if share_scale(self.graph, self.waiting):
+            return
+        for (source, to), matches in self._weak.items():
+            if source in self.waiting and to in self.waiting:
+                self.graph.connect(source, to, matches, self.config.weak_fraction)
+        self._weak = {}
+
+    def _connect(self, source: int, to: int, matches: Matches) -> None:
+        if not self.graph.connect(source, to, matches, self.config.min_fraction):
+            self._weak[source, to] = matches
 
     def _connecting(self, image: TrackingImage, earlier: list[int], matches: Matches) -> Steps[None]:
         """Edges both ways with the keyframes before, the guesses chained from one to the next."""
@@ -123,12 +141,12 @@ class Initializer:
                 guess = propagate(start[seen], there - start[seen], start)
                 forward, _ = self.matcher.match(old, image, guess, fraction)
                 yield
-            self.graph.connect(index, image.index, forward, fraction)
+            self._connect(index, image.index, forward)
             if forward.alive.sum() < 30:
                 continue
             at = forward.target[forward.alive]
             guess = propagate(at, old.cells.points[forward.alive] - at, points)
-            self.graph.connect(image.index, index, self.matcher.match(image, old, guess, fraction)[0], fraction)
+            self._connect(image.index, index, self.matcher.match(image, old, guess, fraction)[0])
             yield
 
 
