@@ -107,8 +107,8 @@ class Ros2Camera(LiveSource):
         while (left := max(began, self._frames.heard) + self.config.timeout - time.monotonic()) > 0:
             self._images.wait(min(POLL, left))
             waiting = self._images.take()
-            self._note_losses()
             self._met = self._met or self._images.writers > 0
+            self._note_losses()
             if not waiting:
                 if not first and not self._images.writers:
                     self._presence.lost("nobody publishes its images any more")
@@ -129,22 +129,24 @@ class Ros2Camera(LiveSource):
     def _note_losses(self) -> None:
         """Of datagrams: a best-effort image of which one is lost never comes, and nothing else tells of it."""
         lost = self._participant.overrun()
-        if not lost.datagrams or self.config.reliable:
+        if not lost.datagrams or self.config.reliable or not self._met:
             return
-        known = "datagrams_lost" in self.stats.counts
+        if "datagrams_lost" not in self.stats.counts:
+            self._ask_again(lost.room)
         self.stats.counts["datagrams_lost"] = lost.datagrams
-        if known:
-            return
-        offered = self._images.offered_reliable
-        again = offered and self.config.reliable is None
-        if again:
+
+    def _ask_again(self, room: int) -> None:
+        """For lost images, if that is wanted and offered. room: bytes that the kernel keeps."""
+        if not self._images.offered_reliable:
+            what = "who publishes them sends none again"
+        elif self.config.reliable is None:
             self._read(reliable=True)
             what = "from now on they are sent again"
         else:
-            what = "dataset.reliable=true has them sent again" if offered else "who publishes them sends none again"
+            what = "dataset.reliable=true has them sent again"
         self.stats.warn(
-            f"images are lost between processes: the kernel keeps {lost.room // 1000} kB for what waits to be read; "
-            f"{what}. More room: sudo sysctl net.core.rmem_max=16777216"
+            f"images are lost between processes: the kernel keeps {room // 1000} kB for what waits to be read; {what}. "
+            "More room: sudo sysctl net.core.rmem_max=16777216"
         )
 
     def _why_nothing(self) -> str:

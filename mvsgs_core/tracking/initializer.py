@@ -111,11 +111,12 @@ class Initializer:
     def _tie(self) -> None:
         """Where too few points are seen by three keyframes, edges of fewer matches tie their scale: better than none,
         and worse than the others where those do."""
-        if share_scale(self.graph, self.waiting):
+        waiting = set(self.waiting)
+        self._weak = {pair: matches for pair, matches in self._weak.items() if waiting.issuperset(pair)}
+        if not self._weak or share_scale(self.graph, self.waiting):
             return
-        for (source, to), matches in self._weak.items():
-            if source in self.waiting and to in self.waiting:
-                self.graph.connect(source, to, matches, self.config.weak_fraction)
+        for pair, matches in self._weak.items():
+            self.graph.connect(*pair, matches, self.config.weak_fraction)
         self._weak = {}
 
     def _connect(self, source: int, to: int, matches: Matches) -> None:

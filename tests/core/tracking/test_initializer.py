@@ -33,6 +33,15 @@ def moving(config: InitializationConfig = CONFIG, frames: tuple[int, ...] = FRAM
     return made
 
 
+class Nothing:
+    """A flow that finds no point."""
+
+    needs_color = False
+
+    def match(self, a: TrackingImage, b: TrackingImage, points: np.ndarray, guess: np.ndarray) -> Matches:
+        return Matches(np.full((len(points), 2), np.nan), np.zeros(len(points)))
+
+
 def resting(count: int) -> Initializer:
     """With the same view again and again."""
     made = initializer()
@@ -109,3 +118,19 @@ def test_what_is_abandoned_leaves_nothing_behind() -> None:
 @pytest.mark.parametrize(("since", "flow"), [(0, 0.035), (20, 0.0175), (400, 0.035 / 3)])
 def test_a_slow_camera_makes_keyframes_earlier(since: int, flow: float) -> None:
     assert initializer().flow(since) == pytest.approx(flow)
+
+
+@pytest.mark.parametrize(("found", "tied"), [(0.2, True), (0.1, False)])
+def test_few_matches_are_edges_where_the_scale_is_open_without(found: float, tied: bool) -> None:
+    made, true = initializer(), true_graph(*FRAMES)
+    made.matcher.flow = Nothing()
+    made.add(image(FRAMES[0]), 3)
+    for before, index in pairwise(FRAMES):
+        all_of_them = exact_matches(true, before, true_pose(index))
+        textured = image(before).cells.textured
+        few = np.cumsum(all_of_them.alive) <= found * textured.sum()
+        made.add(image(index), 3, Matches(all_of_them.target, np.where(few, all_of_them.weight, 0.0)))
+    assert not made.graph.edges, "fewer than a quarter"
+    made.initialize()
+    assert set(made.graph.edges) == (set(pairwise(FRAMES)) if tied else set())
+    assert not made._weak
