@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 import msgs
-from msgs import Message
+from msgs import Frame, Message
 from mvsgs_core.named_modules import import_named
 from nodes import Node, is_source, outputs
 from nodes.parameters import build
@@ -36,7 +36,7 @@ from nodes.runtime.inbox import Inbox, Reader
 from nodes.runtime.requests import Requests
 from nodes.runtime.runner import Runner, end_of, stats_of
 from nodes.runtime.signals import ABORT_SECONDS, Signals, Stopped, end_within
-from nodes.runtime.spec import Spec
+from nodes.runtime.spec import Input, Spec
 from nodes.runtime.status import Status, peak_bytes
 from nodes.runtime.transport import NewestReader, Publisher, ReliableReader, shut_down
 
@@ -115,10 +115,8 @@ class _Process:
         runner.node.unread = frozenset(sent for sent in outputs(node_type) if sent.__name__ not in read)
         inbox = self._open()
         self.status.set("waiting")
-        for given in self._spec.outputs:
-            publisher = self._publishers[given.type]
-            while not publisher.ready(given.readers, self._spec.awaited_observers(given)):
-                self._wait(inbox, publisher)
+        self._await_readers(inbox)
+        inbox = self._open_frames(inbox)
         for publisher in self._publishers.values():
             publisher.start()
         self.status.set("running")
@@ -132,6 +130,12 @@ class _Process:
             self._send(message)
         self._finish(runner, inbox)
         self.status.set("done")
+
+    def _await_readers(self, inbox: Inbox) -> None:
+        for given in self._spec.outputs:
+            publisher = self._publishers[given.type]
+            while not publisher.ready(given.readers, self._spec.awaited_observers(given)):
+                self._wait(inbox, publisher)
 
     def _rest(self) -> None:
         """In the midst of a hook's long work."""
@@ -163,14 +167,35 @@ class _Process:
 
     def _open(self) -> Inbox:
         """Readers first: the nodes upstream wait for them, whoever waits here for others."""
+        spec, shared = self._spec, self._shared()
+        self._read([i for i in spec.inputs if not _of_a_camera(i)], shared)
+        for o in spec.outputs:
+            topic = f"{spec.name}.{o.type}"
+            self._publishers[o.type] = Publisher(
+                o.address, topic=topic, buffer=spec.buffer, held_back=partial(self._held_back, topic), away=o.away,
+                **shared,
+            )  # fmt: skip
+        return self._inbox()
+
+    def _open_frames(self, inbox: Inbox) -> Inbox:
+        """A camera is not to begin before those who wait here for others can take its frames: the first would be lost,
+        for as long as the slowest of them needs to start."""
+        late = [i for i in self._spec.inputs if _of_a_camera(i)]
+        self._read(late, self._shared())
+        return self._inbox() if late else inbox
+
+    def _inbox(self) -> Inbox:
+        return Inbox([] if self._is_source else self._readers, list(self._publishers.values()))
+
+    def _shared(self) -> dict[str, Any]:
+        """What all readers and publishers are given."""
+        keys = None if self._spec.keys is None else load_keys(Path(self._spec.keys))
+        return {"keys": keys, "token": self._spec.token, "say": self._say}
+
+    def _read(self, inputs: Sequence[Input], shared: dict[str, Any]) -> None:
         spec = self._spec
-        shared: dict[str, Any] = {
-            "keys": None if spec.keys is None else load_keys(Path(spec.keys)),
-            "token": spec.token,
-            "say": self._say,
-        }
         observer = spec.name if spec.observer or self._is_source else None  # of requests, which may come too late
-        for i in spec.inputs:
+        for i in inputs:
             kind = msgs.TYPES[i.type]
             if i.best_effort:
                 reader: Reader = NewestReader(
@@ -182,13 +207,6 @@ class _Process:
                     joins=spec.returns, **shared,
                 )  # fmt: skip
             self._readers.append(reader)
-        for o in spec.outputs:
-            topic = f"{spec.name}.{o.type}"
-            self._publishers[o.type] = Publisher(
-                o.address, topic=topic, buffer=spec.buffer, held_back=partial(self._held_back, topic), away=o.away,
-                **shared,
-            )  # fmt: skip
-        return Inbox([] if self._is_source else self._readers, list(self._publishers.values()))
 
     def _answers(self, runner: Runner, inbox: Inbox) -> Iterator[Message]:
         """What a node makes of its inputs, and of the time when none waits."""
@@ -266,9 +284,11 @@ class _Process:
             self._runner.node.stats.warn(text)
 
     def _wait(self, inbox: Inbox, publisher: Publisher) -> None:
-        """For readers of that topic, which are not there yet or have not said goodbye."""
+        """For readers of that topic, which are not there yet or have not said goodbye. Messages that wait here are none
+        of its news: with them this would never rest, and take the time that others need to start."""
         self._held_back(publisher.topic)
-        inbox.watch(POLL)
+        publisher.socket.poll(round(1000 * POLL))
+        inbox.watch()
 
     def _held_back(self, topic: str) -> None:
         self._step.topic, self._step.doing = topic, "held back"  # in this order: another thread reads them
@@ -291,6 +311,11 @@ class _Process:
             "queue": {reader.topic: reader.waiting for reader in self._readers},
             "out": dict(self._runner.sent) if self._runner else {},
         }
+
+
+def _of_a_camera(given: Input) -> bool:
+    """Whether it is of frames that nobody waits for."""
+    return given.best_effort and given.type == Frame.__name__
 
 
 class _Source:
