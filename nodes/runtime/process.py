@@ -1,9 +1,9 @@
 """One node in this process: its topics opened, its hooks called as messages come, and everything closed at the end.
 
-Life: start, wait for the readers of its topics, run, `on_end` once every input has ended (a source: once `run` is
-exhausted, or SIGINT has come), End on each topic, wait for the goodbyes, done. A failure at any point is reported
-with its traceback, the node saves what it has (`on_abort`), and the process ends with exit code 1; the neighbors notice
-and fail as well. SIGTERM ends it in the same way at the next safe point, with exit code 143.
+Life: start, wait for the readers of its topics, ask for a camera's frames, run, `on_end` once every input has ended (a
+source: once `run` is exhausted, or SIGINT has come), End on each topic, wait for the goodbyes, done. A failure at any
+point is reported with its traceback, the node saves what it has (`on_abort`), and the process ends with exit code 1;
+the neighbors notice and fail as well. SIGTERM ends it in the same way at the next safe point, with exit code 143.
 """
 
 from __future__ import annotations

@@ -214,3 +214,26 @@ class Uncorrected(Node):
             yield Keyframe(
                 frame.index, frame.timestamp, frame.image, frame.intrinsics, np.eye(4), 1.0, unknown, unknown, 0
             )
+
+
+class LateSink(Node):
+    """Takes long to start, as what loads torch on a busy machine does; writes `output`/late.json."""
+
+    @dataclass
+    class Config:
+        output: str
+        seconds: float = 2.0
+
+    config: Config
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        time.sleep(self.config.seconds)
+        self.keyframes: list[int] = []
+
+    def on_keyframe(self, keyframe: Keyframe) -> None:
+        self.keyframes.append(keyframe.index)
+
+    def on_end(self) -> None:
+        told = {"keyframes": self.keyframes, "relay_cpu": self.upstream["relay"]["cpu_seconds"]}
+        Path(self.config.output, "late.json").write_text(json.dumps(told))
