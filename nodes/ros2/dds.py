@@ -10,6 +10,7 @@ A service `/mvsgs/pause` is the topics `rq/mvsgs/pauseRequest` and `rr/mvsgs/pau
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import struct
@@ -270,7 +271,9 @@ def _is_udp(descriptor: int) -> bool:
     try:
         with socket.socket(fileno=os.dup(descriptor)) as own:
             return own.family in (socket.AF_INET, socket.AF_INET6) and own.type == socket.SOCK_DGRAM
-    except OSError:  # closed meanwhile: Cyclone's are not
+    except OSError as error:
+        if error.errno not in (errno.EBADF, errno.ENOTSOCK):  # closed meanwhile, and so not Cyclone's
+            raise
         return False
 
 

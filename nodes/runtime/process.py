@@ -19,7 +19,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +116,7 @@ class _Process:
         inbox = self._open()
         self.status.set("waiting")
         self._await_readers(inbox)
-        inbox = self._open_frames(inbox)
+        inbox = self._open_frames()
         for publisher in self._publishers.values():
             publisher.start()
         self.status.set("running")
@@ -167,33 +167,33 @@ class _Process:
 
     def _open(self) -> Inbox:
         """Readers first: the nodes upstream wait for them, whoever waits here for others."""
-        spec, shared = self._spec, self._shared()
-        self._read([i for i in spec.inputs if not _of_a_camera(i)], shared)
+        spec = self._spec
+        self._read([i for i in spec.inputs if not _of_a_camera(i)])
         for o in spec.outputs:
             topic = f"{spec.name}.{o.type}"
             self._publishers[o.type] = Publisher(
                 o.address, topic=topic, buffer=spec.buffer, held_back=partial(self._held_back, topic), away=o.away,
-                **shared,
+                **self._shared,
             )  # fmt: skip
         return self._inbox()
 
-    def _open_frames(self, inbox: Inbox) -> Inbox:
+    def _open_frames(self) -> Inbox:
         """A camera is not to begin before those who wait here for others can take its frames: the first would be lost,
         for as long as the slowest of them needs to start."""
-        late = [i for i in self._spec.inputs if _of_a_camera(i)]
-        self._read(late, self._shared())
-        return self._inbox() if late else inbox
+        self._read([i for i in self._spec.inputs if _of_a_camera(i)])
+        return self._inbox()
 
     def _inbox(self) -> Inbox:
         return Inbox([] if self._is_source else self._readers, list(self._publishers.values()))
 
+    @cached_property
     def _shared(self) -> dict[str, Any]:
         """What all readers and publishers are given."""
         keys = None if self._spec.keys is None else load_keys(Path(self._spec.keys))
         return {"keys": keys, "token": self._spec.token, "say": self._say}
 
-    def _read(self, inputs: Sequence[Input], shared: dict[str, Any]) -> None:
-        spec = self._spec
+    def _read(self, inputs: Sequence[Input]) -> None:
+        spec, shared = self._spec, self._shared
         observer = spec.name if spec.observer or self._is_source else None  # of requests, which may come too late
         for i in inputs:
             kind = msgs.TYPES[i.type]

@@ -55,5 +55,6 @@ def test_images_that_find_no_room_are_sent_again(
     other.close()
     assert any("the kernel keeps " in text and said in text for text in node.stats.warnings)
     assert node.stats.counts["datagrams_lost"] > 0
-    # 33 to 39 come, 17 to 27 where a machine gives as little as Linux does by itself, 3 without a second attempt
-    assert len(frames) >= (SENT / 4 if "now" in said else 0)
+    if offered and asked is None:
+        # 33 to 39 come, 17 to 27 where a machine gives as little as Linux does by itself, 3 without a second attempt
+        assert len(frames) >= SENT / 4
