@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import socket
 import tempfile
 import threading
 import time
@@ -28,6 +27,7 @@ from bench.table import Row, all_of, at_least, at_most, main
 from bench.tracking.cases import CASES, Case
 from launch.compose import compose
 from launch.inline import run_inline
+from launch.ports import free_ports
 from msgs import CameraPose, End, Frame, GroundTruth, Keyframe, Poses, Trajectory
 from mvsgs_core.datasets import Item
 from mvsgs_core.trajectory import Trajectory as CameraTrajectory
@@ -176,10 +176,7 @@ class Seen:
 
 def run(shown: list[Piece], interval: float) -> tuple[Program, Seen, dict[str, float]]:
     """The program, what the tracker told, and what the source counted."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
-    program, seen = Program(address, shown, interval), Seen()
+    program, seen = Program(f"tcp://127.0.0.1:{free_ports(1)[0]}", shown, interval), Seen()
 
     def observe(slot: str, node: Any, message: Any) -> None:
         seen.note(message)
@@ -189,7 +186,13 @@ def run(shown: list[Piece], interval: float) -> tuple[Program, Seen, dict[str, f
 
     with tempfile.TemporaryDirectory() as folder:
         off = [f"{slot}._target_=null" for slot in OFF]
-        given = ["dataset=robot", f"dataset.path={address}", "device=cpu", "tracker.threads=1", f"output={folder}"]
+        given = [
+            "dataset=robot",
+            f"dataset.path={program.address}",
+            "device=cpu",
+            "tracker.threads=1",
+            f"output={folder}",
+        ]
         graph = compose([*given, *off])
         thread = program.start()
         try:

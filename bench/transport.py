@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
-import socket
 import statistics
 import tempfile
 import time
@@ -26,6 +25,7 @@ import numpy as np
 import zmq
 
 from bench.table import Row, main, timed
+from launch.ports import free_ports
 from msgs import End, Frame, GroundTruth
 from nodes.runtime.transport import Publisher, ReliableReader, shut_down, wait
 
@@ -240,13 +240,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
 def _addresses(transport: str, folder: Path) -> tuple[str, str]:
     if transport == "ipc":
         return f"ipc://{folder}/ours", f"ipc://{folder}/plain"
-    sockets = [socket.socket(), socket.socket()]
-    for each in sockets:
-        each.bind(("127.0.0.1", 0))
-    ports = [each.getsockname()[1] for each in sockets]
-    for each in sockets:
-        each.close()
-    return f"tcp://127.0.0.1:{ports[0]}", f"tcp://127.0.0.1:{ports[1]}"
+    ours, plain = free_ports(2)
+    return f"tcp://127.0.0.1:{ours}", f"tcp://127.0.0.1:{plain}"
 
 
 if __name__ == "__main__":

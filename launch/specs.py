@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import secrets
-import socket
 from pathlib import Path
 from typing import Any
 
 from launch.graph import Edge, Graph
 from launch.placement import niceness
+from launch.ports import free_ports
 from launch.refusal import GraphError
 from nodes.runtime.addresses import TransportError, load_keys
 
@@ -28,25 +28,13 @@ def addresses(graph: Graph, directory: Path) -> dict[str, str]:
         return {topic: f"ipc://{directory}/{topic}" for topic in topics}
     found = {}
     first = graph.settings.port
-    ports = [first + i for i in range(len(topics))] if first is not None else _free_ports(len(topics))
+    ports = [first + i for i in range(len(topics))] if first is not None else free_ports(len(topics))
     for topic, port in zip(topics, ports, strict=True):
         host = graph.slots[topic.partition(".")[0]].placement.host or graph.settings.host
         if host not in LOOPBACK and graph.settings.keys is None:
             raise GraphError(f"{topic} at {host}: beyond loopback only with keys=DIR (CURVE keys); see the README")
         found[topic] = f"tcp://{host}:{port}"
     return found
-
-
-def _free_ports(count: int) -> list[int]:
-    """Ports free at this moment: all held open at once, so that they differ, then released."""
-    sockets = [socket.socket() for _ in range(count)]
-    try:
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in sockets]
-    finally:
-        for each in sockets:
-            each.close()
 
 
 def new_token(graph: Graph) -> str:

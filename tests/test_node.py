@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from launch.ports import free_ports
 from nodes.runtime.spec import gone_file
 from nodes.runtime.transport import create_keys
 from tests.support.patience import LONG, Stopwatch, until
@@ -54,16 +54,6 @@ def test_a_node_with_other_keys_is_not_let_in(tmp_path: Path) -> None:
         g.wait()
         assert "refused the keys: both ends need the same" in stranger.last["error"]
         assert g.processes["source"].last["state"] == "waiting"
-
-
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.socket() for _ in range(count)]
-    for each in sockets:
-        each.bind(("127.0.0.1", 0))
-    ports = [each.getsockname()[1] for each in sockets]
-    for each in sockets:
-        each.close()
-    return ports
 
 
 def test_statistics_of_all_nodes_reach_the_end_once() -> None:

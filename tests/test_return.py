@@ -19,7 +19,7 @@ from nodes.runtime.transport import Publisher, ReliableReader, create_keys, kept
 from nodes.runtime.transport.kept import Kept
 from nodes.runtime.transport.live import LiveReader
 from tests.support.patience import LONG, until
-from tests.support.viewer_page import free_port
+from tests.support.ports import free_port
 
 AWAY = 5.0  # s
 ONE = np.ones((2, 2), np.float32)

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +24,10 @@ from msgs.codec import NEWEST, encode
 from nodes.robot import Robot
 from nodes.runtime.addresses import TransportError
 from nodes.runtime.transport import create_keys
+from nodes.runtime.transport.live import LivePublisher, LiveReader
 from nodes.stream_times import StreamTimes
+from tests.support.patience import until
+from tests.support.ports import tcp_address
 from tests.support.shared_data import ROOT
 
 pytestmark = pytest.mark.slow
@@ -33,9 +37,7 @@ INTERVAL = 0.03  # s between two frames
 
 @pytest.fixture
 def address() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    return tcp_address()
 
 
 def picture(number: int, timestamp: float | None = None) -> Frame:
@@ -370,3 +372,29 @@ def test_the_launcher_refuses_a_robot_without_its_keys(tmp_path: Path) -> None:
     done = example("--video", "x.mp4", "--keys", str(tmp_path))
     assert "error: no keys at" in done.communicate(timeout=60)[1]
     assert done.returncode == 1
+
+
+def test_a_stranger_who_tries_for_hours_does_not_stop_the_stream(address: str, tmp_path: Path) -> None:
+    keys = create_keys(tmp_path / "keys")
+    publisher, reader = LivePublisher(address, keys=keys), LiveReader(address, Frame, keys=keys)
+    try:
+        for _ in range(3000):  # without keys; nobody asks the publisher how many were refused
+            with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as stranger:
+                stranger.sendall(b"\xff" + bytes(8) + b"\x7f\x03\x01NULL" + bytes(48))
+                with suppress(ConnectionError):
+                    while stranger.recv(100):
+                        pass
+        until(lambda: publisher.refused == 3000, what=lambda: publisher.refused)
+        until(lambda: publisher.ready(1))
+        publisher.send(picture(0))
+        until(lambda: reader.take() is not None)
+    finally:
+        publisher.close()
+        reader.close()
+
+
+def test_an_address_that_is_taken_is_named(address: str) -> None:
+    first = LivePublisher(address)
+    with pytest.raises(TransportError, match=f"cannot bind {address}: Address already in use"):
+        LivePublisher(address)
+    first.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import socket
 import subprocess
 import sys
 import threading
@@ -21,6 +20,7 @@ from nodes.reader import Reader
 from nodes.robot import Robot
 from nodes.runtime.transport import Publisher
 from tests.support.dataset_folders import truncate, write_photos, write_tum
+from tests.support.ports import tcp_address
 from tests.support.shared_data import ROOT
 
 # ---------------------------------------------------------------- recorded
@@ -92,9 +92,7 @@ def test_a_played_frame_says_when_it_was_due(tmp_path: Path) -> None:
 
 @pytest.fixture
 def address() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    return tcp_address()
 
 
 def frame(number: int, size: tuple[int, int] = (48, 64), focal: float = 50.0) -> Frame:

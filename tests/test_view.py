@@ -19,9 +19,10 @@ from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.export.ply import read_ply
 from nodes.map_page import MapPage
+from tests.support.ports import free_port
 from tests.support.shared_data import ROOT
 from tests.support.tiny_map import SIZE, write_tiny_run
-from tests.support.viewer_page import free_port, page
+from tests.support.viewer_page import page
 
 
 @pytest.fixture

@@ -21,8 +21,8 @@ from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes.map_page import MapPage
 from nodes.viewer import Viewer
 from tests.support.chromium import Browser, browser
+from tests.support.ports import free_port
 from tests.support.tiny_map import INTRINSICS, SIZE, cameras_around, final_map
-from tests.support.viewer_page import free_port
 
 WINDOW = (480, 960)  # height, width of the window; the panel covers its right third
 FOCAL = WINDOW[0] / SIZE[0] * INTRINSICS[1]  # the page's view is as high as the keyframe's

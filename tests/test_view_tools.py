@@ -13,8 +13,8 @@ from mvsgs.view import SavedMapView
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import read_ply
 from nodes.map_page import MapPage
+from tests.support.ports import free_port
 from tests.support.tiny_map import SIZE, write_tiny_run
-from tests.support.viewer_page import free_port
 
 HALF = np.array([[0.0, 50.0], [0.0, 100.0], [0.0, 100.0]])
 

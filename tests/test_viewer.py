@@ -24,9 +24,10 @@ from mvsgs_core.mapping.preview import as_bytes
 from nodes import handlers, outputs
 from nodes.splat_map import splat_map
 from nodes.viewer import Viewer
+from tests.support.ports import free_port
 from tests.support.shared_data import ROOT
 from tests.support.tiny_map import INTRINSICS, SIZE, final_map, poses_around
-from tests.support.viewer_page import free_port, page
+from tests.support.viewer_page import page
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import socket
 import tempfile
 import threading
 import time
@@ -21,6 +20,7 @@ import msgs
 from bench.faults.frame_mutations import good, mutated
 from bench.runs import launch
 from bench.table import Row, at_least, at_most
+from launch.ports import free_ports
 from msgs import End, Frame, Message
 from msgs.codec import NEWEST, CodecError, decode, encode
 from mvsgs_core.datasets import open_dataset
@@ -96,7 +96,7 @@ class _Robot:
     """
 
     def __init__(self, count: int, good: int) -> None:
-        self.address = f"tcp://127.0.0.1:{_free_port()}"
+        self.address = f"tcp://127.0.0.1:{free_ports(1)[0]}"
         self.mutated = self.good = 0
         self._count, self._goal = count, good
         self._images: set[bytes] = set()  # of good frames
@@ -183,9 +183,3 @@ def _graph(count: int, good_frames: int) -> list[Row]:
         at_least("  good frames taken", 100 * taken / robot.good, "%", 60),
         at_least("  connections made anew after a frame of 300 MiB", counts.get("reconnected", 0), "times", 1),
     ]
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

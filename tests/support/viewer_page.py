@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import socket
-
 import msgpack
 import viser
 import zstandard
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 def page(url: str) -> str:

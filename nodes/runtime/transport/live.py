@@ -6,6 +6,7 @@ up for good, without a word; here it connects anew. An XPUB socket turns readers
 
 from __future__ import annotations
 
+import threading
 import time
 from contextlib import suppress
 from typing import Any
@@ -17,7 +18,7 @@ from msgs.codec import CodecError, decode
 from nodes.runtime.addresses import TransportError
 from nodes.runtime.transport.publisher import Publisher
 from nodes.runtime.transport.readers import REFUSED, NewestReader
-from nodes.runtime.transport.sockets import readable
+from nodes.runtime.transport.sockets import open_monitor, readable
 
 RETRY = 0.3  # s without ZeroMQ's own attempt after which a lost connection is made anew
 FASTEST = 1000  # frames a second: a larger jump of the sequence numbers is no loss, but a sender that counts anew
@@ -94,22 +95,23 @@ class LivePublisher(Publisher):
     """A topic that programs elsewhere read; `refused` says how many of them were turned away."""
 
     def __init__(self, address: str, **options: Any) -> None:
+        self._count: threading.Thread | None = None
         super().__init__(address, **options)
-        self._refused = 0
-        self._monitor = self.socket.get_monitor_socket(TURNED_AWAY)
+        self.refused = 0  # attempts of readers without the right keys; one tries again several times a second
+        monitor = open_monitor(self.socket, TURNED_AWAY | zmq.EVENT_MONITOR_STOPPED)
+        self._count = threading.Thread(target=self._count_refused, args=(monitor,), name="refused", daemon=True)
+        self._count.start()
 
-    @property
-    def refused(self) -> int:
-        """Attempts of readers without the right keys; one tries again several times a second."""
-        while readable(self._monitor):
-            recv_monitor_message(self._monitor)
-            self._refused += 1
-        return self._refused
+    def _count_refused(self, monitor: zmq.Socket[bytes]) -> None:
+        """As they come, whatever the program does meanwhile: strangers must not fill its memory."""
+        with monitor:
+            while recv_monitor_message(monitor)["event"] != zmq.EVENT_MONITOR_STOPPED:
+                self.refused += 1
 
     def close(self, *, farewell: bool = True) -> None:
-        if not self.socket.closed:
+        if self._count is not None and not self.socket.closed:
             self.socket.disable_monitor()
-            self._monitor.close()
+            self._count.join()
         super().close(farewell=farewell)
 
 

@@ -16,7 +16,7 @@ from msgs.codec import AGAIN, NEWEST, RELIABLE, encode
 from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
 from nodes.runtime.frame_pool import FramePool
 from nodes.runtime.transport.kept import Kept
-from nodes.runtime.transport.sockets import GOODBYE, NAME_BYTES, OBSERVER, guard, open_socket, readable
+from nodes.runtime.transport.sockets import GOODBYE, NAME_BYTES, OBSERVER, free_address, guard, open_socket, readable
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
 NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
@@ -184,8 +184,8 @@ class Publisher:
         return not there and (late or self.readers[NEWEST] <= 0)
 
     def close(self, *, farewell: bool = True) -> None:
-        """Unbinds. A publisher outside a graph first sends End to those who listen and waits a second for them; without
-        `farewell` they notice that it is lost."""
+        """Frees the address. A publisher outside a graph first sends End to those who listen and waits a second for
+        them; without `farewell` they notice that it is lost."""
         if self.socket.closed:
             return
         if farewell and not self._started and not self._ended:
@@ -193,6 +193,7 @@ class Publisher:
             until = time.monotonic() + 1.0
             while not self.gone() and time.monotonic() < until:
                 self.socket.poll(20)
+        free_address(self.socket)
         self.socket.close(linger=0)
         if self._file is not None:
             self._file.unlink(missing_ok=True)

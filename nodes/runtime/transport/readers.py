@@ -15,7 +15,7 @@ from zmq.utils.monitor import recv_monitor_message
 from msgs import End, Message
 from msgs.codec import AGAIN, NEWEST, RELIABLE, CodecError, Decoded, decode, max_message_bytes, type_name
 from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
-from nodes.runtime.transport.sockets import GOODBYE, NAME_BYTES, OBSERVER, open_socket, readable
+from nodes.runtime.transport.sockets import GOODBYE, NAME_BYTES, OBSERVER, open_monitor, open_socket, readable
 
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 LOST = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
@@ -62,7 +62,7 @@ class _Reader:
         self._socket = open_socket(zmq.SUB, address, keys, self._max_bytes)
         self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 50, self.longest_pause
-        self.monitor = self._socket.get_monitor_socket(self.monitored)
+        self.monitor = open_monitor(self._socket, self.monitored)
         self._socket.connect(address)
         # Where strangers can knock, one's message can hide who said this: it is then said again, under the same name.
         self._said = [token.encode() + self.delivery + (os.urandom(NAME_BYTES) if token else b"")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -14,7 +15,7 @@ from nodes.runtime.addresses import Keys, save_keys
 
 OBSERVER = b"O"  # begins the subscription by which a reader says its delivery and its name: no frame begins so
 GOODBYE = b"G"  # the subscription by which a reader says that it has read the end: no frame begins so either
-FREE = 5.0  # s within which ZeroMQ has freed the address of an authenticator that was stopped
+FREE = 5.0  # s within which ZeroMQ has freed an address that is no longer used
 NAME_BYTES = 8  # of the name that follows the delivery in a reader's subscription: which of its attempts are its own
 
 
@@ -82,6 +83,30 @@ def open_socket(kind: int, address: str, keys: Keys | None, max_bytes: int) -> z
         else:
             socket.curve_serverkey = keys.public
     return socket
+
+
+def open_monitor(socket: zmq.Socket[bytes], events: int) -> zmq.Socket[bytes]:
+    """What happens to its connections, in messages, until `socket.disable_monitor`.
+
+    It holds as many as come: ZeroMQ's thread waits, and with it every socket, where a monitor that is full is not read.
+    """
+    address = f"inproc://monitor-{os.urandom(8).hex()}"
+    socket.monitor(address, events)
+    monitor: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PAIR)
+    monitor.linger = monitor.rcvhwm = 0
+    monitor.connect(address)
+    return monitor
+
+
+def free_address(socket: zmq.Socket[bytes]) -> None:
+    """Of a bound tcp socket: returns when the next one can bind there. Closing alone frees it in ZeroMQ's own time."""
+    address = bytes(socket.getsockopt(zmq.LAST_ENDPOINT)).rstrip(b"\0").decode()
+    if not address.startswith("tcp"):
+        return  # none, as binding failed, or a file that its owner removes
+    with open_monitor(socket, zmq.EVENT_CLOSED) as monitor:
+        socket.unbind(address)
+        monitor.poll(round(FREE * 1000))
+        socket.disable_monitor()
 
 
 def readable(socket: zmq.Socket[bytes]) -> bool:
