@@ -1,14 +1,21 @@
-"""Ports for nodes that listen later."""
+"""Ports for nodes that listen later, and addresses of those who no longer do."""
 
 from __future__ import annotations
 
+import hashlib
 import socket
+import threading
 from pathlib import Path
 
 import pytest
 
 from launch import ports
 from launch.ports import free_ports
+from msgs import Frame
+from nodes.runtime.transport import Publisher, ReliableReader, create_keys
+from nodes.runtime.transport.live import LivePublisher
+from tests.support.patience import until
+from tests.support.ports import free_port, tcp_address
 
 
 def test_ports_differ_can_be_bound_and_are_none_that_one_who_connects_gets() -> None:
@@ -34,3 +41,35 @@ def test_where_all_ports_are_given_to_who_connects_they_are_free_ones(
 def test_without_linux_they_are_below_those_of_iana(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "RANGE", tmp_path / "none")
     assert max(free_ports(50)) < 49152
+
+
+def test_publishers_with_keys_follow_each_other_at_once(tmp_path: Path) -> None:
+    keys = create_keys(tmp_path / "keys")
+    for address in [tcp_address() for _ in range(50)]:
+        Publisher(address, keys=keys).close(farewell=False)
+
+
+@pytest.mark.parametrize("kind", [Publisher, LivePublisher])
+def test_who_closes_has_freed_the_address(kind: type[Publisher]) -> None:
+    """Even where ZeroMQ's thread, which closes it, has to wait for a core."""
+    port, stop = free_port(), threading.Event()
+    busy = [threading.Thread(target=_use_a_core, args=(stop,)) for _ in range(8)]
+    for each in busy:
+        each.start()
+    try:
+        for _ in range(60):
+            publisher = kind(f"tcp://127.0.0.1:{port}")
+            reader = ReliableReader(f"tcp://127.0.0.1:{port}", Frame)
+            until(lambda: publisher.ready(1))  # noqa: B023
+            publisher.close(farewell=False)
+            socket.create_server(("127.0.0.1", port)).close()
+            reader.close()
+    finally:
+        stop.set()
+        for each in busy:
+            each.join()
+
+
+def _use_a_core(stop: threading.Event) -> None:
+    while not stop.is_set():
+        hashlib.sha256(bytes(10**6))  # without Python's lock

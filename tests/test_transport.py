@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import resource
 import socket
 import struct
@@ -21,9 +20,8 @@ from msgs.codec import NEWEST, CodecError, encode
 from nodes.runtime.addresses import IPC_PATH_BYTES, PeerLost, TransportError, check_address, load_keys
 from nodes.runtime.inbox import Inbox
 from nodes.runtime.transport import NewestReader, Publisher, ReliableReader, create_keys
-from nodes.runtime.transport.live import LivePublisher
 from tests.support.patience import LONG, until
-from tests.support.ports import free_port, tcp_address
+from tests.support.ports import tcp_address
 
 
 def frame(index: int, width: int = 64) -> Frame:
@@ -341,38 +339,6 @@ def test_keys_let_in_only_those_who_have_them(tmp_path: Path, opened: Callable) 
         sub.disable_monitor()
         monitor.close()
     assert publisher.readers.total() == 1
-
-
-def test_publishers_with_keys_follow_each_other_at_once(tmp_path: Path) -> None:
-    keys = create_keys(tmp_path / "keys")
-    for address in [tcp_address() for _ in range(50)]:
-        Publisher(address, keys=keys).close(farewell=False)
-
-
-@pytest.mark.parametrize("kind", [Publisher, LivePublisher])
-def test_who_closes_has_freed_the_address(kind: type[Publisher], opened: Callable) -> None:
-    """Even where ZeroMQ's thread, which closes it, has to wait for a core."""
-    port, stop = free_port(), threading.Event()
-    busy = [threading.Thread(target=_use_a_core, args=(stop,)) for _ in range(8)]
-    for each in busy:
-        each.start()
-    try:
-        for _ in range(60):
-            publisher = opened(kind(f"tcp://127.0.0.1:{port}"))
-            reader = opened(ReliableReader(f"tcp://127.0.0.1:{port}", Frame))
-            until(lambda: publisher.ready(1))  # noqa: B023
-            publisher.close(farewell=False)
-            socket.create_server(("127.0.0.1", port)).close()
-            reader.close()
-    finally:
-        stop.set()
-        for each in busy:
-            each.join()
-
-
-def _use_a_core(stop: threading.Event) -> None:
-    while not stop.is_set():
-        hashlib.sha256(bytes(10**6))  # without Python's lock
 
 
 def test_keys_that_others_can_read_are_refused(tmp_path: Path) -> None:
