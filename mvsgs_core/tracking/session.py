@@ -63,8 +63,8 @@ class Session:
         self.intrinsics = scale_intrinsics(intrinsics, size, self.size)
         self.graph = KeyframeGraph(self.intrinsics, config.device)
         self.calibration = Calibration(
-            self.graph, config.focal, stats, float(intrinsics[0]), not guessed, config.readout_time,
-            config.reads_columns, threads,
+            self.graph, config.focal, stats, float(intrinsics[0]), size, not guessed,
+            config.readout_time, config.reads_columns, threads,
         )  # fmt: skip
         self.matcher = Matcher(make_flow(config.flow))
         self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, threads)

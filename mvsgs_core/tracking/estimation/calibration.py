@@ -17,6 +17,8 @@ from mvsgs_core.tracking.steps import Steps, timed, whole
 
 BENT_LENS = "the lens bends, and the focal length makes up for it"
 UNKNOWN_LENS = "these images hardly tell a focal length from a lens that bends"
+CONTRADICTION = 2.0  # standard deviations by which the matches contradict a calibration that was given
+FEW = 128  # keyframes, the first ones, that a given calibration is checked with
 REESTIMATED_AT = (10, 20, 40)  # keyframes of the map at which the readout time is estimated again
 
 
@@ -27,7 +29,8 @@ class Calibration:
     graph: KeyframeGraph
     config: FocalConfig
     stats: Stats
-    pixels: float  # the focal length that came with the frames, at their own size
+    pixels: float  # the focal length that came with the frames, at their own size ...
+    size: tuple[int, int]  # ... (height, width)
     settled: bool  # from the start on, where the intrinsics are no guess
     readout_time: float | None  # seconds; None: to be estimated
     reads_columns: bool  # where it is given
@@ -78,13 +81,16 @@ class Calibration:
         self.stats.values["focal_doubt"] = "it can't be told from these images, and the guess is kept"
         self.stats.warn(
             "the focal length can't be told from these images (a camera that hardly turns, or a flat scene): the guess "
-            f"is kept, {self.pixels:.0f} px, and the map may be stretched in depth; calibrate and set "
+            f"is kept, {self._told(self.pixels)}, and the map may be stretched in depth; calibrate and set "
             "dataset.intrinsics=[fx,fy,cx,cy]"
         )
 
     def check(self, members: list[int]) -> None:
         """At the end: whether the whole stream agrees with the focal length that the keyframes went out with."""
-        if not self.guessed or len(members) < self.config.min_keyframes:
+        if len(members) < self.config.min_keyframes:
+            return
+        if not self.guessed:
+            self._check_given(members[:FEW])
             return
         factor = focal_of_all(self.graph, members, self.threads)
         if factor is None:
@@ -93,16 +99,46 @@ class Calibration:
         if not np.isfinite(sigma):
             return
         used = self.focal_factor * self.pixels
-        self.stats.values["focal_checked_px"] = factor * used
-        self.stats.values["focal length, whole stream"] = f"{factor * used:.1f} px, give or take {100 * sigma:.1f} %"
+        self._say_checked(factor, sigma)
         if "focal_sigma_percent" in self.stats.values:
             self._report_radial(estimate_radial(lens_problem(self.graph, members), self.threads), sigma)
         if abs(np.log(factor)) > max(self.config.drift, sigma):
             self.stats.values["focal_doubt"] = f"all keyframes together want {factor:.4f} times as much"
             self.stats.warn(
-                f"all keyframes together want a focal length of {factor * used:.0f} px, give or take {100 * sigma:.1f} "
-                f"%, and {used:.0f} px was used: run again with dataset.intrinsics=[fx,fy,cx,cy] set to it"
+                f"all keyframes together want a focal length of {self._told(factor * used)}, give or take "
+                f"{100 * sigma:.1f} %, and {used:.0f} px was used: run again with dataset.intrinsics=[fx,fy,cx,cy] set "
+                "to it"
             )
+
+    def _check_given(self, members: list[int]) -> None:
+        """A calibration is taken as it is, but what clearly contradicts it is said: poses are worth no more than it."""
+        with self.stats.time("calibration"):
+            factor = focal_of_all(self.graph, members, self.threads)
+            if factor is None or abs(np.log(factor)) <= self.config.drift:
+                return
+            if observability(self.graph, members, self.config.probe, self.threads, factor) <= self.config.certain:
+                return
+            sigma = uncertainty(self.graph, members, self.config.probe, self.threads, factor)
+        if abs(np.log(factor)) <= CONTRADICTION * sigma:
+            return
+        self._say_checked(factor, sigma)
+        self.stats.values["focal_doubt"] = f"the keyframes want {factor:.4f} times as much"
+        self.stats.warn(
+            "the given calibration and the images contradict each other: the keyframes want a focal length of "
+            f"{self._told(factor * self.pixels)}, {factor:.3f} times the {self.pixels:.0f} px that were given, give or "
+            f"take {100 * sigma:.1f} %; poses and map may be bent. Is it of this camera at this size, and does the "
+            "lens bend (dataset.distortion)? Or run again with dataset.intrinsics=[fx,fy,cx,cy] as they want it"
+        )
+
+    def _told(self, focal: float) -> str:
+        """Pixels, and of what: frames may come smaller than they were taken."""
+        return f"{focal:.0f} px in images of {self.size[1]}x{self.size[0]}"
+
+    def _say_checked(self, factor: float, sigma: float) -> None:
+        """factor: on what was used."""
+        found = factor * self.focal_factor * self.pixels
+        self.stats.values["focal_checked_px"] = found
+        self.stats.values["focal length, whole stream"] = f"{found:.1f} px, give or take {100 * sigma:.1f} %"
 
     def estimate_readout(self, members: list[int]) -> None:
         """Of a rolling shutter, from these keyframes."""
@@ -145,10 +181,11 @@ class Calibration:
             self.stats.values["focal_doubt"] = BENT_LENS if radial.clear else UNKNOWN_LENS
         if radial.clear:
             focal = used * radial.focal_factor
+            height, width = self.size
             self.stats.warn(
                 f"the lens bends: a radial distortion of {radial.k1:.3f}, give or take {radial.k1_sigma:.3f}, which is "
-                f"left in the images; run again with dataset.intrinsics=[{focal:.0f},{focal:.0f},cx,cy] "
-                f"dataset.distortion=[{radial.k1:.4f},0,0,0], which undistorts them"
+                f"left in the images; run again with dataset.intrinsics=[{focal:.0f},{focal:.0f},cx,cy], of images of "
+                f"{width}x{height}, and dataset.distortion=[{radial.k1:.4f},0,0,0], which undistorts them"
             )
 
     def _report_radial(self, radial: Radial, alone: float) -> None:

@@ -91,12 +91,31 @@ def test_a_camera_that_never_turns_keeps_the_guess_and_says_so() -> None:
     assert trajectory.keyframe.sum() >= 4
 
 
-def test_a_known_focal_length_is_left_alone() -> None:
-    tracker = Tracker()
-    for item in room(0.5)[:40]:
-        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+@pytest.mark.parametrize(("off", "said"), [(1.0, False), (0.95, True), (1.05, True)])
+def test_a_known_focal_length_is_left_alone_and_a_wrong_one_is_said(off: float, said: bool) -> None:
+    tracker, true = Tracker(), 1.3 * SIZE[1]
+    for item in room(1.3):
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics * [off, off, 1.0, 1.0])
     assert tracker.phase is Phase.TRACKING
+    list(tracker.finish())
     assert tracker.focal_factor == 1.0
+    assert ("focal_doubt" in tracker.stats.values) == said
+    if said:
+        assert tracker.stats.values["focal_checked_px"] == pytest.approx(true, rel=0.015)
+        (warning,) = [w for w in tracker.stats.warnings if "contradict" in w]
+        assert f"px in images of {SIZE[1]}x{SIZE[0]}, " in warning
+        assert f"times the {off * true:.0f} px that were given" in warning
+        assert "dataset.intrinsics" in warning
+    else:
+        assert tracker.stats.warnings == []
+
+
+def test_a_motion_that_hardly_tells_a_focal_length_contradicts_none() -> None:
+    tracker = Tracker()
+    for item in straight():
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics * [1.1, 1.1, 1.0, 1.0])
+    list(tracker.finish())
+    assert not any("contradict" in w for w in tracker.stats.warnings)
 
 
 def test_the_check_in_the_end_says_both_focal_lengths_and_how_sure_it_is() -> None:
