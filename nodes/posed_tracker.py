@@ -1,4 +1,4 @@
-"""Frame, GroundTruth -> Keyframe, Poses, Trajectory: true poses, so that the later stages can be measured alone."""
+"""Frame, GroundTruth -> Keyframe, TrackedFrame, Poses, Trajectory: given poses, to measure later stages alone."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msgs import Frame, GroundTruth, Keyframe, Poses, Request, TrackingState, Trajectory
+from msgs import Frame, GroundTruth, Keyframe, Poses, Request, TrackedFrame, TrackingState, Trajectory
+from mvsgs_core.tracking.between import Between
 from mvsgs_core.tracking.coarse_depth import coarse_map
 from mvsgs_core.tracking.config import PosedConfig
 from mvsgs_core.tracking.estimation.rolling_shutter import camera_velocity, rectified, rectified_mask
 from mvsgs_core.tracking.posed import PosedTracker as CoreTracker
 from mvsgs_core.tracking.publish import affine_of, changed_vignetting, differ
+from mvsgs_core.trajectory import velocities
 from nodes import Node
 from nodes.tracking import keep_place, places_of, refused, warn_of_guessed_focal
 
@@ -40,14 +42,14 @@ class PosedTracker(Node):
         self._places: dict[int, np.ndarray] = {}  # by GPS
         self._revision = 0
 
-    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses]:
+    def on_frame(self, frame: Frame) -> Iterator[Keyframe | Poses | TrackedFrame]:
         self._frames[frame.index] = frame
         keep_place(self._places, frame)
         warn_of_guessed_focal(self.stats, frame)
         if frame.index in self._truths:
             yield from self._join(frame.index)
 
-    def on_ground_truth(self, truth: GroundTruth) -> Iterator[Keyframe | Poses]:
+    def on_ground_truth(self, truth: GroundTruth) -> Iterator[Keyframe | Poses | TrackedFrame]:
         self._truths[truth.index] = truth
         if truth.index in self._frames:
             yield from self._join(truth.index)
@@ -55,11 +57,9 @@ class PosedTracker(Node):
     def on_request(self, request: Request) -> Iterator[Request]:
         yield refused(request, type(self))
 
-    def on_end(self) -> Iterator[Keyframe | Poses | Trajectory]:
+    def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
         if self._core is not None:
-            for index in self._core.finish():
-                yield self._keyframe(self._core, index)
-            yield from self._exposed(self._core)
+            yield from self._complete(self._core, self._core.finish())
             self.stats.include(self._core.stats)
         else:
             self.stats.nothing(
@@ -92,7 +92,7 @@ class PosedTracker(Node):
             places=places_of(np.array(order, np.int64), self._places),
         )
 
-    def _join(self, index: int) -> Iterator[Keyframe | Poses]:
+    def _join(self, index: int) -> Iterator[Keyframe | Poses | TrackedFrame]:
         frame, pose = self._frames[index], self._truths.pop(index).world_from_cam
         self._joined[index] = (frame.timestamp, np.full((4, 4), np.nan) if pose is None else pose)
         if pose is None:
@@ -102,12 +102,47 @@ class PosedTracker(Node):
             return
         if self._core is None:
             self._core = CoreTracker(self.config, frame.image.shape[:2], frame.intrinsics)
-        for done in self._core.add(index, frame.timestamp, frame.image, pose, frame.exposure, frame.mask):
-            yield self._keyframe(self._core, done)
-            yield from self._exposed(self._core)
+        done = self._core.add(index, frame.timestamp, frame.image, pose, frame.exposure, frame.mask)
+        yield from self._complete(self._core, done)
         for old in (self._frames.keys() & self._joined.keys()) - self._core.pending:
             del self._frames[old]
         self.stats.include(self._core.stats)
+
+    def _complete(self, core: CoreTracker, keyframes: list[int]) -> Iterator[Keyframe | Poses | TrackedFrame]:
+        for index in keyframes:
+            yield self._keyframe(core, index)
+            yield from self._exposed(core)
+            for found in core.between(index):
+                self.stats.count("frames between keyframes")
+                yield self._between(found)
+
+    def _between(self, found: Between) -> TrackedFrame:
+        frame = self._frames[found.index]
+        velocity = self._velocity(frame.index) if self.config.readout_time else None
+        return TrackedFrame(
+            index=frame.index,
+            timestamp=frame.timestamp,
+            image=frame.image,
+            intrinsics=frame.intrinsics,
+            keyframe=found.keyframe,
+            keyframe_from_cam=found.keyframe_from_cam,
+            scale=1.0,
+            exposure=found.exposure,
+            velocity=velocity,
+            readout_time=0.0 if velocity is None else self.config.readout_time,
+            reads_columns=self.config.reads_columns,
+            mask=frame.mask,
+        )
+
+    def _velocity(self, index: int) -> np.ndarray | None:
+        """(6,) between the poses before and after a frame; None where no neighbor tells it."""
+        order = sorted(self._joined)
+        place = order.index(index)
+        near = [self._joined[n] for n in order[max(place - 1, 0) : place + 2]]
+        poses = np.stack([pose for _, pose in near])
+        known = np.isfinite(poses).all(axis=(1, 2))
+        velocity = velocities(np.array([at for at, _ in near]), poses, known)[place - max(place - 1, 0)]
+        return velocity if velocity.any() else None
 
     def _keyframe(self, core: CoreTracker, index: int) -> Keyframe:
         frame, keyframe = self._frames[index], core.keyframe(index)

@@ -47,7 +47,7 @@ def test_contracts() -> None:
     assert handlers(Tracker).keys() == {Frame, Request}
     assert set(outputs(Tracker)) == {Keyframe, Poses, TrackedFrame, CameraPose, TrackerPhase, Trajectory, Request}
     assert handlers(PosedTracker).keys() == {Frame, GroundTruth, Request}
-    assert set(outputs(PosedTracker)) == {Keyframe, Poses, Trajectory, Request}
+    assert set(outputs(PosedTracker)) == {Keyframe, Poses, TrackedFrame, Trajectory, Request}
 
 
 def test_a_tracker_that_can_only_be_paused_says_so() -> None:

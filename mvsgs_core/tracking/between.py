@@ -7,7 +7,7 @@ better ones. So the frames wait for that keyframe. Held-out frames never go out.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Container, Set
+from collections.abc import Container, Mapping, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,9 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photometry import compose, inverse
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.frames import FrameRecord, solve_trajectory
-from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
+from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
-from mvsgs_core.tracking.photometer import Photometer
+from mvsgs_core.tracking.photometer import Photometer, Seen
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class FramesBetween:
             return
         self._newest[frame.index] = (frame.bare(), record)
         if len(self._newest) > self.limit:
-            del self._newest[self._spared()]
+            del self._newest[spared({index: image for index, (image, _) in self._newest.items()})]
 
     def end(self) -> None:
         """A keyframe, which is still to be solved: others follow."""
@@ -91,23 +91,26 @@ class FramesBetween:
             if record.index not in waiting or record.reference is None or record.reference not in published:
                 continue
             reference = self.graph.keyframes[record.reference]
-            pose, exposure = reference.cam_from_world @ track.world_from_cam[k], self._exposure(record, reference)
+            pose = reference.cam_from_world @ track.world_from_cam[k]
+            exposure = exposure_from(self.photometer, record, reference.index)
             velocity = velocities[k] if np.isfinite(velocities[k]).all() else None
             found.append(Between(record.index, reference.index, pose, exposure, velocity))
         return tuple(found)
 
-    def _exposure(self, record: FrameRecord, reference: Keyframe) -> np.ndarray | None:
-        """(3, 4) of a frame, from the colors of its reference."""
-        own, there = self.photometer.of_frames([record], np.ones(1, bool)), self.photometer.exposure(reference.index)
-        if own is None or there is None or not np.isfinite(own).all():
-            return None
-        return compose(own[0], inverse(there)).astype(np.float32)
 
-    def _spared(self) -> int:
-        """Of the two frames that are closest in time, the one with less detail: motion blurs."""
-        order = sorted(self._newest)
-        first = min(range(len(order) - 1), key=lambda k: order[k + 1] - order[k])
-        return min(order[first : first + 2], key=lambda index: _detail(self._newest[index][0].gray))
+def exposure_from(photometer: Photometer, frame: Seen, keyframe: int) -> np.ndarray | None:
+    """(3, 4) float32 of a frame, from the colors of a keyframe; None: no difference is known."""
+    own, there = photometer.of_frames([frame], np.ones(1, bool)), photometer.exposure(keyframe)
+    if own is None or there is None or not np.isfinite(own).all():
+        return None
+    return compose(own[0], inverse(there)).astype(np.float32)
+
+
+def spared(frames: Mapping[int, TrackingImage]) -> int:
+    """Of the two frames that are closest in time, the one with less detail: motion blurs."""
+    order = sorted(frames)
+    first = min(range(len(order) - 1), key=lambda k: order[k + 1] - order[k])
+    return min(order[first : first + 2], key=lambda index: _detail(frames[index].gray))
 
 
 def _with_neighbors(records: list[FrameRecord], indices: Set[int]) -> list[FrameRecord]:
@@ -127,4 +130,4 @@ def _detail(gray: np.ndarray) -> float:
     return float(np.mean(down**2) + np.mean(across**2))
 
 
-__all__ = ["Between", "FramesBetween"]
+__all__ = ["Between", "FramesBetween", "exposure_from", "spared"]

@@ -24,18 +24,24 @@ class KeyframeTrackingConfig:
     area: int = 320 * 240  # pixels of the tracker's own image, aspect kept; enlarges at most to twice the size
     flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
     threads: int | None = None  # of the C++ kernels; null: 1
+    frames_between: int = 8  # frames between two keyframes, at most, that the map is trained on, too; 0: none
     keyframe_choice: KeyframeChoiceConfig = field(default_factory=KeyframeChoiceConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
+
+    def __post_init__(self) -> None:
+        if self.frames_between < 0:
+            raise ValueError(f"tracker.frames_between={self.frames_between}: a number of frames, 0 for none")
 
 
 @dataclass(frozen=True)
 class PosedConfig(KeyframeTrackingConfig):
-    """Raises ValueError for what can't be a readout time."""
+    """Raises ValueError for what can't be a readout time, or a number of frames."""
 
     readout_time: float = 0.0  # seconds of the camera's rolling shutter, 0 for a global one: true poses don't tell it
     reads_columns: bool = False  # of a phone that is held upright: it reads columns within that time, not rows
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_readout_time(self.readout_time, self.reads_columns)
 
 
@@ -50,7 +56,6 @@ class TrackerConfig(KeyframeTrackingConfig):
     # of a core's time that the tracker may take in real time: beyond, keyframes are farther apart; null: half of all
     # cores', at most 0.9
     share: float | None = None
-    frames_between: int = 8  # frames between two keyframes, at most, that the map is trained on, too; 0: none
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
     min_texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
     min_matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is warned of
@@ -65,11 +70,10 @@ class TrackerConfig(KeyframeTrackingConfig):
     focal: FocalConfig = field(default_factory=FocalConfig)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_readout_time(self.readout_time, self.reads_columns)
         if self.share is not None and not 0.0 < self.share <= 1.0:
             raise ValueError(f"tracker.share={self.share}: of a core's time, above 0 and at most 1; null: half of all")
-        if self.frames_between < 0:
-            raise ValueError(f"tracker.frames_between={self.frames_between}: a number of frames, 0 for none")
 
 
 __all__ = ["PosedConfig", "TrackerConfig"]

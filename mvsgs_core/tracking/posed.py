@@ -1,8 +1,8 @@
-"""A tracker whose poses are given: it chooses keyframes and triangulates their depths from matches."""
+"""A tracker whose poses are given: it chooses keyframes and frames between them, and triangulates depths."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.between import Between, exposure_from, spared
 from mvsgs_core.tracking.config import PosedConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, reproject
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig, Step
@@ -22,6 +23,15 @@ from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.photometer import FrameLight, Photometer, observed
 
 FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to be apart where no match says it
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """A frame that may train the map."""
+
+    image: TrackingImage
+    light: FrameLight
+    world_from_cam: np.ndarray  # (4, 4) as it was given
 
 
 class PosedTracker:
@@ -50,6 +60,7 @@ class PosedTracker:
         self._undecided = True  # about the unit: no two keyframes have given the first depth yet
         self._complete: list[int] = []  # keyframes not given out yet
         self._tail: dict[int, tuple[TrackingImage, np.ndarray, Step]] = {}  # the last two frames since
+        self._between: dict[int, dict[int, _Waiting]] = {}  # by the keyframe that they were followed from
 
     def add(
         self, index: int, timestamp: float, image: np.ndarray, world_from_cam: np.ndarray, exposure: float = 0.0,
@@ -76,13 +87,24 @@ class PosedTracker:
                 self.graph.remove(step.reference)  # the first frame of all: this one is as good
                 return self._first(frame, pose)
             self._tail = {i: self._tail[i] for i in sorted(self._tail)[-1:]} | {index: (frame, pose, step)}
+            self._wait(step.reference, _Waiting(frame.bare(), self._lights[-1], world_from_cam))
             return []
         return self._insert(frame, pose, {step.reference: step.matches})
 
     @property
     def pending(self) -> set[int]:
-        """Frames that may still be given out as keyframes."""
-        return set(self._complete) | set(self._tail)
+        """Frames that may still be given out, as keyframes or between them."""
+        return set(self._complete).union(self._tail, *self._between.values())
+
+    def between(self, keyframe: int) -> list[Between]:
+        """Frames that were followed from this keyframe, once it is complete, in the unit of the given poses. Held-out
+        frames never are; at most `frames_between`, spread evenly over the time."""
+        found = []
+        for index, waiting in sorted(self._between.pop(keyframe, {}).items()):
+            pose = self.keyframe(keyframe).cam_from_world @ waiting.world_from_cam
+            exposure = exposure_from(self.photometer, waiting.light, keyframe)
+            found.append(Between(index, keyframe, pose, exposure, None))
+        return found
 
     def finish(self) -> list[int]:
         """The stream has ended: the last keyframes, one of them of the last frames if they show something new."""
@@ -116,8 +138,18 @@ class PosedTracker:
             return {}
         return {light.index: affine for light, affine in zip(self._lights, known) if np.isfinite(affine).all()}
 
+    def _wait(self, reference: int, frame: _Waiting) -> None:
+        if self.config.frames_between == 0 or is_held_out(frame.image.index):
+            return
+        waiting = self._between.setdefault(reference, {})
+        waiting[frame.image.index] = frame
+        if len(waiting) > self.config.frames_between:
+            del waiting[spared({index: each.image for index, each in waiting.items()})]
+
     def _insert(self, frame: TrackingImage, pose: np.ndarray, matches: dict[int, Matches]) -> list[int]:
         """A frame becomes a keyframe; returns those that are complete now. matches: of the reference's points."""
+        for waiting in self._between.values():
+            waiting.pop(frame.index, None)
         if self._undecided:
             pose = self._decide_unit(pose, matches)
         with self.stats.time("triangulation"):

@@ -46,3 +46,33 @@ def test_held_out_frames_are_no_keyframes_and_the_newest_view_is_one() -> None:
     assert len(keyframes) >= 5
     assert not [k for k in keyframes if is_held_out(k)]
     assert keyframes[-1] >= 38, "the newest view"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [0, 2, 8])
+def test_frames_between_keyframes_have_their_given_poses_and_no_held_out_one_is_among_them(limit: int) -> None:
+    items = synthetic(frames=80)[:40]
+    tracker = PosedTracker(PosedConfig(frames_between=limit), (240, 320), items[0].intrinsics)
+    found, keyframes = [], []
+    for item in [*items, None]:
+        if item is None:
+            complete = tracker.finish()
+        else:
+            complete = tracker.add(item.index, item.timestamp, item.image, item.world_from_cam)
+        for index in complete:
+            keyframes.append(index)
+            between = tracker.between(index)
+            assert len(between) <= limit
+            found += between
+    indices = [each.index for each in found]
+    assert len(set(indices)) == len(indices)
+    assert not any(is_held_out(index) or index in keyframes for index in indices)
+    if limit == 8:
+        assert len(indices) + len(keyframes) == sum(not is_held_out(item.index) for item in items)
+    for each in found:
+        true = np.linalg.inv(items[each.keyframe].world_from_cam) @ items[each.index].world_from_cam
+        np.testing.assert_allclose(each.keyframe_from_cam, true, atol=1e-9)
+        assert each.exposure is None  # under steady light
+    assert tracker.pending == set()
+    with pytest.raises(ValueError, match=r"tracker\.frames_between=-1"):
+        PosedConfig(frames_between=-1)
