@@ -185,7 +185,8 @@ def test_another_target_starts_from_its_own_defaults() -> None:
 
 def test_corrections_are_not_lost_in_silence() -> None:
     """Poses may be missing where no tracker makes any, not where a stage on their way does not pass them on."""
-    assert compose(["tracker=ground_truth", "dataset=tum", "dataset.path=."]).warnings
+    (warning,) = compose(["tracker=ground_truth", "viewer=viser", "dataset=tum", "dataset.path=."]).warnings
+    assert warning.startswith("viewer gets no TrackerPhase: tracker: ")
     with pytest.raises(GraphError, match=r"set mapper.reads.Poses to one that does: tracker"):
         compose(["mapper.reads.Poses=evaluator"])
 
