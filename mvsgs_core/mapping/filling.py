@@ -1,4 +1,4 @@
-"""Depth where the filters left none and the map shows nothing: doubtful, or continued from what surrounds it.
+"""Depth where the filters left none: doubtful, or, where the map shows nothing, continued from what surrounds it.
 
 What a filter rejects is doubtful, not unknown: a rough surface there, which the optimization and density control can
 move, split or fade out, is worth more than a hole. Neither can make a splat where there is none. Where matching says

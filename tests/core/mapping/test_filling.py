@@ -1,4 +1,4 @@
-"""Where the filters left no depth and the map shows nothing, sparse splats come from the depth before them."""
+"""Where the filters left no depth, splats come from the depth before them, if the map shows nothing or it is likely."""
 
 from __future__ import annotations
 
@@ -50,6 +50,20 @@ def test_what_the_map_shows_is_not_filled() -> None:
     mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.5)))
     mapper.add_keyframe(with_hole(5, 0.5))
     assert mapper.log.counts["pixels_filled"] == 0
+
+
+@pytest.mark.parametrize(("confidence", "used"), [(0.3, False), (0.5, True), (None, False)])
+def test_what_the_map_shows_otherwise_is_filled_where_doubtful_depth_is_likely(
+    confidence: float | None, used: bool
+) -> None:
+    mapper = mapper_with(True, iterations=60)
+    mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.5)))
+    view = with_hole(5, 0.5)
+    other = view.image.copy()
+    other[:, HOLE][:, ::4] = 255 - other[:, HOLE][:, ::4]
+    sure = None if confidence is None else np.full(view.depth.shape, confidence, np.float32)
+    mapper.add_keyframe(replace(view, image=other, confidence=sure))
+    assert (mapper.log.counts["pixels_filled"] > 0) == used
 
 
 def test_a_view_between_keyframes_with_holes_is_rendered_better() -> None:
