@@ -180,9 +180,11 @@ def test_keyframes_with_true_poses_are_as_a_global_shutter_would_have_taken_them
     for frame, truth in zip(frames, truths, strict=True):
         sent += [*node.on_frame(frame), *node.on_ground_truth(truth)]
     sent += list(node.on_end())
-    assert sent[-1].readout_time == 0.5 / FPS  # type: ignore[union-attr]
+    (trajectory,) = of_type(sent, Trajectory)
+    assert trajectory.readout_time == 0.5 / FPS
     check_global_shutter(of_type(sent, Keyframe), frames)
     check_photographs(of_type(sent, Keyframe), frames)
+    check_frames_between(of_type(sent, TrackedFrame), frames, trajectory)
 
 
 @pytest.mark.parametrize("node", [Tracker, PosedTracker])
