@@ -49,7 +49,7 @@ class Densifier:
         if self.config.doubtful and keyframe.unfiltered is not None and self.frame.unit is not None:
             doubtful, confidence = self._doubtful_depth(keyframe, view, shown)
             empty = residual >= EMPTY
-            likely = confidence >= self.config.min_confidence if keyframe.confidence is not None else empty
+            likely = confidence >= self.config.doubtful_confidence if keyframe.confidence is not None else empty
             filled = ~known & valid & (doubtful > 0) & (empty | likely)
             depth, wanted = np.where(filled, doubtful, depth), known | filled
         if not wanted.any():
