@@ -186,14 +186,8 @@ def run(shown: list[Piece], interval: float) -> tuple[Program, Seen, dict[str, f
 
     with tempfile.TemporaryDirectory() as folder:
         off = [f"{slot}._target_=null" for slot in OFF]
-        given = [
-            "dataset=robot",
-            f"dataset.path={program.address}",
-            "device=cpu",
-            "tracker.threads=1",
-            f"output={folder}",
-        ]
-        graph = compose([*given, *off])
+        source = ["dataset=robot", f"dataset.path={program.address}"]
+        graph = compose([*source, "device=cpu", "tracker.threads=1", f"output={folder}", *off])
         thread = program.start()
         try:
             found = run_inline(graph, observe)["dataset"]

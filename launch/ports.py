@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import random
 import socket
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 LOWEST = 10000  # below are the ports that programs are known by
 RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")  # of ports for those who connect; elsewhere as IANA has it
 FEW = 2000  # ports below that range, with which two runs hardly ever choose the same
+TRIES = 1000
 
 
 def free_ports(count: int) -> list[int]:
@@ -23,13 +24,12 @@ def free_ports(count: int) -> list[int]:
 
 
 def _bound(probe: socket.socket) -> int:
+    """The port that a socket was bound to. Raises OSError where none can be."""
     beyond = int(RANGE.read_text().split()[0]) if RANGE.exists() else 49152
-    while beyond - LOWEST >= FEW:
-        try:
+    for _ in range(TRIES if beyond - LOWEST >= FEW else 0):
+        with suppress(OSError):
             probe.bind(("127.0.0.1", random.randrange(LOWEST, beyond)))
             break
-        except OSError:
-            continue
     else:
         probe.bind(("127.0.0.1", 0))
     return int(probe.getsockname()[1])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import socket
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from nodes.runtime.transport import Publisher, ReliableReader, create_keys
 from nodes.runtime.transport.live import LivePublisher
 from tests.support.patience import until
 from tests.support.ports import free_port, tcp_address
+from tests.support.shared_data import ROOT
 
 
 def test_ports_differ_can_be_bound_and_are_none_that_one_who_connects_gets() -> None:
@@ -36,6 +39,13 @@ def test_where_all_ports_are_given_to_who_connects_they_are_free_ones(
     ports.RANGE.write_text(f"{beyond}\t65000\n")
     for port in free_ports(3):
         socket.create_server(("127.0.0.1", port)).close()
+
+
+def test_where_those_are_all_taken_it_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", free_port())) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(ports.random, "randrange", lambda *_: port)
+        assert free_port() != port
 
 
 def test_without_linux_they_are_below_those_of_iana(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,3 +83,14 @@ def test_who_closes_has_freed_the_address(kind: type[Publisher]) -> None:
 def _use_a_core(stop: threading.Event) -> None:
     while not stop.is_set():
         hashlib.sha256(bytes(10**6))  # without Python's lock
+
+
+def test_a_program_that_destroys_its_context_with_a_publisher_open_ends_in_silence() -> None:
+    code = (
+        "from nodes.runtime.transport import LivePublisher, shut_down\n"
+        f"publisher = LivePublisher('{tcp_address()}')\n"
+        "shut_down()\n"
+        "publisher._count.join()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -114,7 +114,10 @@ class Calibration:
         """A calibration is taken as it is, but what clearly contradicts it is said: poses are worth no more than it."""
         with self.stats.time("calibration"):
             factor = focal_of_all(self.graph, members, self.threads)
-            if factor is None or abs(np.log(factor)) <= self.config.drift:
+            if factor is None:
+                self.stats.skip("check of the calibration: its bundle adjustment failed")
+                return
+            if abs(np.log(factor)) <= self.config.drift:
                 return
             if observability(self.graph, members, self.config.probe, self.threads, factor) <= self.config.certain:
                 return
