@@ -85,12 +85,17 @@ def _use_a_core(stop: threading.Event) -> None:
         hashlib.sha256(bytes(10**6))  # without Python's lock
 
 
-def test_a_program_that_destroys_its_context_with_a_publisher_open_ends_in_silence() -> None:
+def test_a_program_that_shuts_down_with_publishers_and_readers_open_ends_in_silence() -> None:
+    """Their threads use sockets: to close one under a thread that reads it aborts the process, now and then."""
     code = (
-        "from nodes.runtime.transport import LivePublisher, shut_down\n"
-        f"publisher = LivePublisher('{tcp_address()}')\n"
-        "shut_down()\n"
-        "publisher._count.join()\n"
+        "from msgs import Frame\n"
+        "from nodes.runtime.transport import LivePublisher, LiveReader, NewestReader, ReliableReader, shut_down\n"
+        "for _ in range(20):\n"
+        f"    publisher = LivePublisher('{(address := tcp_address())}')\n"
+        f"    readers = [kind('{address}', Frame) for kind in (LiveReader, NewestReader, ReliableReader)]\n"
+        "    shut_down()\n"
+        "    assert publisher.socket.closed and all(reader._socket.closed for reader in readers)\n"
+        "    assert not any(thread.is_alive() for thread in (publisher._count, readers[0]._thread))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

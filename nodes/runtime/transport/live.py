@@ -104,7 +104,7 @@ class LivePublisher(Publisher):
 
     def _count_refused(self, monitor: zmq.Socket[bytes]) -> None:
         """As they come, whatever the program does meanwhile: strangers must not fill its memory."""
-        with monitor, suppress(zmq.ZMQError):  # its context was destroyed: nobody is left to be counted
+        with monitor:
             while recv_monitor_message(monitor)["event"] != zmq.EVENT_MONITOR_STOPPED:
                 self.refused += 1
 

@@ -16,7 +16,16 @@ from msgs.codec import AGAIN, NEWEST, RELIABLE, encode
 from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
 from nodes.runtime.frame_pool import FramePool
 from nodes.runtime.transport.kept import Kept
-from nodes.runtime.transport.sockets import GOODBYE, NAME_BYTES, OBSERVER, free_address, guard, open_socket, readable
+from nodes.runtime.transport.sockets import (
+    GOODBYE,
+    NAME_BYTES,
+    OBSERVER,
+    free_address,
+    guard,
+    left_open,
+    open_socket,
+    readable,
+)
 
 MAX_SUBSCRIPTION_BYTES = 64 * 2**10  # of what a reader may send: one byte, and the handshake
 NEWEST_GOODBYE = 3.0  # s that a best-effort reader has to take its End
@@ -77,6 +86,7 @@ class Publisher:
         except zmq.ZMQError as error:
             self.close()
             raise TransportError(f"{self.topic}: cannot bind {address}: {error}") from error
+        left_open.add(self)
 
     def ready(self, readers: int, observers: Collection[str] = ()) -> bool:
         """Whether that many readers, of either kind, are there, and these observers beside them."""

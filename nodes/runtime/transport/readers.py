@@ -15,7 +15,15 @@ from zmq.utils.monitor import recv_monitor_message
 from msgs import End, Message
 from msgs.codec import AGAIN, NEWEST, RELIABLE, CodecError, Decoded, decode, max_message_bytes, type_name
 from nodes.runtime.addresses import Keys, PeerLost, TransportError, check_address
-from nodes.runtime.transport.sockets import GOODBYE, NAME_BYTES, OBSERVER, open_monitor, open_socket, readable
+from nodes.runtime.transport.sockets import (
+    GOODBYE,
+    NAME_BYTES,
+    OBSERVER,
+    left_open,
+    open_monitor,
+    open_socket,
+    readable,
+)
 
 REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 LOST = zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
@@ -172,6 +180,7 @@ class ReliableReader(_Reader):
         self._joining = joins
         if joins:
             self._socket.subscribe(AGAIN)  # for this socket's own filter: to the publisher it says nothing
+        left_open.add(self)
 
     @property
     def pollable(self) -> zmq.Socket[bytes]:
@@ -269,6 +278,7 @@ class NewestReader(_Reader):
         self._socket.rcvtimeo = 100
         self._thread = threading.Thread(target=self._drain, name=f"newest {self.topic}", daemon=True)
         self._thread.start()
+        left_open.add(self)
 
     def take(self) -> Message | None:
         """The newest message that was not taken yet, or None. Raises CodecError for a frame that is no message."""

@@ -7,6 +7,8 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Protocol
+from weakref import WeakSet
 
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
@@ -113,8 +115,21 @@ def readable(socket: zmq.Socket[bytes]) -> bool:
     return bool(int(socket.events) & zmq.POLLIN)
 
 
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+left_open: WeakSet[_Closable] = WeakSet()  # publishers and readers, which end their threads themselves
+
+
 def shut_down() -> None:
-    """Closes what is left and waits until ZeroMQ's threads have sent the last goodbyes and removed the socket files."""
+    """Closes what is left and waits until ZeroMQ's threads have sent the last goodbyes and removed the socket files.
+
+    A socket belongs to the thread that uses it: to close one of another thread, as destroying the context does, aborts
+    the process.
+    """
+    for each in list(left_open):
+        each.close()
     zmq.Context.instance().destroy()
 
 
