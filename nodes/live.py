@@ -13,6 +13,7 @@ from msgs import Frame, GroundTruth
 from mvsgs_core.datasets.masks import CameraMask
 from mvsgs_core.datasets.options import SizedSelection
 from nodes import Node
+from nodes.fixed_mask import FixedMask
 
 
 def camera_mask(file: str | Path | None) -> CameraMask | None:
@@ -27,7 +28,7 @@ class LiveSource(Node, ABC):
 
     @dataclass
     class Config(SizedSelection):
-        pass
+        hide_fixed: bool = True  # mask what is fixed to the camera: a logo, a robot's arm; not beside `mask`
 
     config: Config
 
@@ -40,6 +41,7 @@ class LiveSource(Node, ABC):
     def run(self) -> Iterator[Frame | GroundTruth]:
         """Ends where the stream does, and when nothing comes any more, so that a session still finishes its map."""
         taken = index = 0
+        fixed = FixedMask(self.stats, self.config.hide_fixed and self.config.mask is None)
         self._open()
         try:
             while self.config.stop is None or taken < self.config.stop:
@@ -48,7 +50,7 @@ class LiveSource(Node, ABC):
                     return
                 came = time.time()
                 if self.config.has(taken):
-                    shown = replace(self._framed(frame), index=index, captured=came)
+                    shown = replace(fixed.masked(self._framed(frame)), index=index, captured=came)
                     self.stats.count("frames")
                     yield shown
                     yield GroundTruth(

@@ -13,6 +13,7 @@ from mvsgs_core.datasets.options import FileOptions
 from mvsgs_core.datasets.sequence import ImageSequence
 from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes import Advice, Node
+from nodes.fixed_mask import FixedMask
 from nodes.parameters import Parameter, parameter_names, parameters
 from nodes.playback import Playback
 
@@ -26,6 +27,7 @@ class Reader(Node):
     class Config(FileOptions):
         name: str  # format, a file of mvsgs_core.datasets
         realtime: bool = False  # play at the recorded rate, not as fast as it is read
+        hide_fixed: bool = True  # mask what is fixed to the camera: bars, a logo, a car's hood; not beside `mask`
         options: dict[str, Any] = field(default_factory=dict)  # of that format: see its class in mvsgs_core.datasets
 
     config: Config
@@ -64,7 +66,8 @@ class Reader(Node):
         self.stats.values[LENS] = lens_values(sequence.lens)
         self._pass_warnings_on(sequence)  # those that opening gave; the others are counted until the end
         playback = Playback()
-        frames = iter(sequence)
+        fixed = FixedMask(self.stats, self.config.hide_fixed and self.config.mask is None)
+        frames = map(fixed.masked, sequence) if self.config.realtime else fixed.masked_ahead(sequence)
         try:
             while True:
                 with self.stats.time("read"):

@@ -1,0 +1,157 @@
+"""What is fixed to the camera and not of the scene: bars beside a video, a logo, a date, a car's hood, a robot's arm.
+
+An edge of the scene moves in the image as the camera does. One that stays where it is to half a pixel, from picture to
+picture while the rest moves, is of something that moves with the camera, and so is what such edges cut off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from mvsgs_core.camera import fit_size, resize_image
+
+AREA = 320 * 240  # pixels of the reduced pictures that are compared, at most
+DOUBT = 12  # pictures after which a stream without any such edge has nothing that is fixed
+STAGES = (24, 48)  # pictures after which they are looked for; after the last all is said
+CHANGED = 8.0  # gray levels by which a pixel that shows something else differs
+MOVED = 0.25  # of the pixels that change at all: so many differ between two pictures of a camera that moved
+EDGE = 6.0  # gray levels a pixel: the least gradient of an edge
+STAYS = 0.9  # of the pictures: those in which a fixed edge is there
+TURNS = 0.02  # squared, of a thing's gradients across and along its edges: a straight edge along the motion stays, too
+SMALLEST = 40  # pixels of one thing's edges
+MOST = 0.5  # of all edges: if more stay, the camera does, and something else moves
+DARK, NOISE = 40.0, 6.0  # gray levels of a bar: the most, and how much they differ
+REACH = 4  # pixels between edges of one thing
+BESIDE, STILL = 12, 3.0  # pixels from a thing and the deviation in gray levels of what is still of it, without edges
+MARGIN = 3  # pixels beside what is fixed that show some of it
+
+
+class FixedParts:
+    """Finds them in the pictures of one camera, as they come."""
+
+    def __init__(self) -> None:
+        self.mask: np.ndarray | None = None  # (H, W) bool, False where something is fixed; None: nothing is
+        self.judged = False  # enough pictures came to know, or to think that nothing is fixed
+        self.settled = False  # more pictures change nothing
+        self._pictures: list[np.ndarray] = []  # (h, w) float32 gray, each of a camera that moved since the one before
+        self._size = (0, 0)
+        self._low = self._high = np.zeros((0, 0), np.float32)  # (h, w) a pixel's darkest and brightest, of all frames
+
+    @property
+    def share(self) -> float:
+        """Of the image."""
+        return 0.0 if self.mask is None else 1.0 - float(self.mask.mean())
+
+    def add(self, image: np.ndarray) -> None:
+        """The next frame, (H, W, 3) uint8. One of another size begins anew."""
+        size = image.shape[0], image.shape[1]
+        if self.settled and size == self._size:
+            return
+        gray = cv2.cvtColor(resize_image(image, fit_size(*size, AREA, 1)), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        if size != self._size:
+            self.mask, self.judged, self.settled = None, False, False
+            self._pictures, self._size, self._low, self._high = [], size, gray, gray
+        self._low, self._high = np.minimum(self._low, gray), np.maximum(self._high, gray)
+        if self._pictures and not self._moved(gray):
+            return
+        self._pictures.append(gray)
+        count = len(self._pictures)
+        self.settled = count >= STAGES[-1] or (count == DOUBT and find_fixed(self._pictures, most=1.0) is None)
+        self.judged = self.settled or count >= STAGES[0]
+        if count in STAGES:
+            found = find_fixed(self._pictures)
+            self.mask = None if found is None else ~_enlarged(found, size)
+
+    def _moved(self, gray: np.ndarray) -> bool:
+        active = self._high - self._low > 2.0 * CHANGED
+        return bool(active.any() and np.mean(np.abs(gray - self._pictures[-1])[active] > CHANGED) > MOVED)
+
+
+def find_fixed(pictures: Sequence[np.ndarray], most: float = MOST) -> np.ndarray | None:
+    """(h, w) bool: what is fixed to the camera, of pictures (h, w) float32 between which it moved; None: nothing is.
+
+    most: of all edges that may stay; if more do, nothing is.
+    """
+    stack = np.stack(pictures)
+    fixed = _things(stack, most)
+    changes = stack.std(axis=0)
+    fixed |= _cut_off(fixed, changes)
+    fixed |= (changes < STILL) & (cv2.dilate(fixed.astype(np.uint8), _disk(BESIDE)) > 0)
+    fixed |= _bars(stack, fixed)
+    if not fixed.any():
+        return None
+    fixed = cv2.dilate(fixed.astype(np.uint8), _disk(MARGIN)) > 0
+    return None if fixed.all() else fixed
+
+
+def _things(stack: np.ndarray, most: float) -> np.ndarray:
+    """(h, w) bool: edges that stay, and what is between those of one thing."""
+    gradients = np.stack([_gradient(picture) for picture in stack])
+    usual = gradients.mean(axis=0)
+    strength = np.hypot(usual[..., 0], usual[..., 1])
+    apart = np.hypot(*np.moveaxis(gradients - usual, -1, 0))
+    stays = (strength > EDGE) & (np.mean(apart < 0.35 * strength + 1.0, axis=0) >= STAYS)
+    any_edge = np.hypot(gradients[..., 0], gradients[..., 1]).mean(axis=0) > EDGE
+    if stays.sum() > most * any_edge.sum():
+        return np.zeros_like(stays)
+    joined = cv2.morphologyEx(stays.astype(np.uint8), cv2.MORPH_CLOSE, _disk(REACH))
+    count, labels = cv2.connectedComponents(joined, connectivity=8)
+    across = usual[stays] / strength[stays, None]  # (N, 2)
+    of = labels[stays]
+    pixels = np.bincount(of, minlength=count)
+    xx, xy, yy = (
+        np.bincount(of, across[:, a] * across[:, b], minlength=count) / np.maximum(pixels, 1)
+        for a, b in ((0, 0), (0, 1), (1, 1))
+    )
+    spread = np.sqrt((xx - yy) ** 2 + 4.0 * xy**2)  # of the eigenvalues of their second moments, which sum to 1
+    turns = (1.0 - spread) > TURNS * (1.0 + spread)
+    kept = (pixels >= SMALLEST) & turns
+    kept[0] = False
+    return np.asarray(kept[labels])
+
+
+def _cut_off(things: np.ndarray, changes: np.ndarray) -> np.ndarray:
+    """(h, w) bool: what things part from the largest piece, the scene, and changes less. changes: (h, w) deviations."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~things).astype(np.uint8), connectivity=4)
+    if count <= 2:
+        return np.zeros_like(things)
+    scene = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    usual = np.median(changes[labels == scene])
+    still = [n for n in range(1, count) if n != scene and np.median(changes[labels == n]) < 0.5 * usual]
+    return np.isin(labels, still)
+
+
+def _bars(stack: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """(h, w) bool: dark bars of one thickness at two opposite sides, with what is fixed in them."""
+    low, high = stack.min(axis=0), stack.max(axis=0)
+    dark = ((high < DARK) & (high - low < NOISE)) | fixed
+    bars = np.zeros_like(dark)
+    for lines, marked in ((dark, bars), (dark.T, bars.T)):
+        whole = np.mean(lines, axis=1) > 0.995
+        first, last = int(np.argmin(whole)), int(np.argmin(whole[::-1]))  # thickness of both
+        if not whole.all() and min(first, last) >= 2 and abs(first - last) <= 2 + 0.1 * max(first, last):
+            marked[:first] = marked[len(whole) - last :] = True
+    return bars
+
+
+def _gradient(picture: np.ndarray) -> np.ndarray:
+    """(h, w, 2) float32 in gray levels a pixel."""
+    smooth = cv2.GaussianBlur(picture, (0, 0), 0.7)
+    return np.stack(
+        [cv2.Sobel(smooth, cv2.CV_32F, *which, ksize=3, scale=1 / 8) for which in ((1, 0), (0, 1))], axis=-1
+    )
+
+
+def _disk(radius: int) -> np.ndarray:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)))
+
+
+def _enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask (h, w) bool at (height, width)."""
+    return cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+__all__ = ["FixedParts", "find_fixed"]
