@@ -56,7 +56,7 @@ def run(items: Sequence[Item], config: TrackerConfig | None = None) -> Result:
     tracker = Tracker(config, clock=time.process_time)
     start = time.process_time()
     for item in items:
-        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics, mask=item.mask)
     total = time.process_time() - start
     start = time.process_time()
     for _ in tracker.finish():

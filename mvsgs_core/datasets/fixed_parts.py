@@ -6,7 +6,8 @@ picture while the rest moves, is of something that moves with the camera, and so
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Collection
 
 import cv2
 import numpy as np
@@ -15,10 +16,10 @@ from mvsgs_core.camera import fit_size, resize_image
 
 AREA = 320 * 240  # pixels of the reduced pictures that are compared, at most
 DOUBT = 12  # pictures after which a stream without any such edge has nothing that is fixed
-STAGES = (24, 48)  # pictures after which they are looked for; after the last all is said
+EVERY, WINDOW = 24, 48  # pictures after which they are looked for, again and again, in the newest so many
 CHANGED = 8.0  # gray levels by which a pixel that shows something else differs
 MOVED = 0.25  # of the pixels that change at all: so many differ between two pictures of a camera that moved
-EDGE = 6.0  # gray levels a pixel: the least gradient of an edge
+EDGE = 3.5  # gray levels a pixel: the least gradient of an edge
 STAYS = 0.9  # of the pictures: those in which a fixed edge is there
 TURNS = 0.02  # squared, of a thing's gradients across and along its edges: a straight edge along the motion stays, too
 SMALLEST = 40  # pixels of one thing's edges
@@ -35,8 +36,10 @@ class FixedParts:
     def __init__(self) -> None:
         self.mask: np.ndarray | None = None  # (H, W) bool, False where something is fixed; None: nothing is
         self.judged = False  # enough pictures came to know, or to think that nothing is fixed
-        self.settled = False  # more pictures change nothing
-        self._pictures: list[np.ndarray] = []  # (h, w) float32 gray, each of a camera that moved since the one before
+        self._settled = False  # nothing is fixed: no more pictures are compared
+        self._count = 0  # of the pictures that were
+        # (h, w) float32 gray, each of a camera that moved since the one before
+        self._pictures: deque[np.ndarray] = deque(maxlen=WINDOW)
         self._size = (0, 0)
         self._low = self._high = np.zeros((0, 0), np.float32)  # (h, w) a pixel's darkest and brightest, of all frames
 
@@ -48,34 +51,38 @@ class FixedParts:
     def add(self, image: np.ndarray) -> None:
         """The next frame, (H, W, 3) uint8. One of another size begins anew."""
         size = image.shape[0], image.shape[1]
-        if self.settled and size == self._size:
+        if self._settled and size == self._size:
             return
         gray = cv2.cvtColor(resize_image(image, fit_size(*size, AREA, 1)), cv2.COLOR_RGB2GRAY).astype(np.float32)
         if size != self._size:
-            self.mask, self.judged, self.settled = None, False, False
-            self._pictures, self._size, self._low, self._high = [], size, gray, gray
+            self.mask, self.judged, self._settled = None, False, False
+            self._size, self._low, self._high = size, gray, gray
+            self._pictures.clear()
+            self._count = 0
         self._low, self._high = np.minimum(self._low, gray), np.maximum(self._high, gray)
         if self._pictures and not self._moved(gray):
             return
         self._pictures.append(gray)
-        count = len(self._pictures)
-        self.settled = count >= STAGES[-1] or (count == DOUBT and find_fixed(self._pictures, most=1.0) is None)
-        self.judged = self.settled or count >= STAGES[0]
-        if count in STAGES:
+        self._count += 1
+        if self._count == DOUBT:
+            self._settled = find_fixed(self._pictures, most=1.0) is None
+        elif self._count % EVERY == 0:  # a robot may stand before a crowd at first, or lift its arm
             found = find_fixed(self._pictures)
             self.mask = None if found is None else ~_enlarged(found, size)
+            self._settled = found is None and self._count == WINDOW
+        self.judged |= self._settled or self._count >= EVERY
 
     def _moved(self, gray: np.ndarray) -> bool:
         active = self._high - self._low > 2.0 * CHANGED
         return bool(active.any() and np.mean(np.abs(gray - self._pictures[-1])[active] > CHANGED) > MOVED)
 
 
-def find_fixed(pictures: Sequence[np.ndarray], most: float = MOST) -> np.ndarray | None:
+def find_fixed(pictures: Collection[np.ndarray], most: float = MOST) -> np.ndarray | None:
     """(h, w) bool: what is fixed to the camera, of pictures (h, w) float32 between which it moved; None: nothing is.
 
     most: of all edges that may stay; if more do, nothing is.
     """
-    stack = np.stack(pictures)
+    stack = np.stack(list(pictures))
     fixed = _things(stack, most)
     changes = stack.std(axis=0)
     fixed |= _cut_off(fixed, changes)
@@ -92,18 +99,22 @@ def _things(stack: np.ndarray, most: float) -> np.ndarray:
     gradients = np.stack([_gradient(picture) for picture in stack])
     usual = gradients.mean(axis=0)
     strength = np.hypot(usual[..., 0], usual[..., 1])
-    apart = np.hypot(*np.moveaxis(gradients - usual, -1, 0))
-    stays = (strength > EDGE) & (np.mean(apart < 0.35 * strength + 1.0, axis=0) >= STAYS)
+    direction = usual / np.maximum(strength, EDGE)[..., None]
+    along = np.einsum("nhwc,hwc->nhw", gradients, direction)  # what is behind a text makes it stronger or weaker
+    across = gradients[..., 0] * direction[..., 1] - gradients[..., 1] * direction[..., 0]
+    least = 0.5 if len(stack) >= WINDOW else 0.8  # straight ahead, what is far stays for a while, and grows
+    same = (along > least * strength) & (np.abs(across) < 0.2 * strength + 0.7)
+    stays = (strength > EDGE) & (same.mean(axis=0) >= STAYS)
     any_edge = np.hypot(gradients[..., 0], gradients[..., 1]).mean(axis=0) > EDGE
     if stays.sum() > most * any_edge.sum():
         return np.zeros_like(stays)
     joined = cv2.morphologyEx(stays.astype(np.uint8), cv2.MORPH_CLOSE, _disk(REACH))
     count, labels = cv2.connectedComponents(joined, connectivity=8)
-    across = usual[stays] / strength[stays, None]  # (N, 2)
+    normals = direction[stays]  # (N, 2)
     of = labels[stays]
     pixels = np.bincount(of, minlength=count)
     xx, xy, yy = (
-        np.bincount(of, across[:, a] * across[:, b], minlength=count) / np.maximum(pixels, 1)
+        np.bincount(of, normals[:, a] * normals[:, b], minlength=count) / np.maximum(pixels, 1)
         for a, b in ((0, 0), (0, 1), (1, 1))
     )
     spread = np.sqrt((xx - yy) ** 2 + 4.0 * xy**2)  # of the eigenvalues of their second moments, which sum to 1
@@ -121,7 +132,7 @@ def _cut_off(things: np.ndarray, changes: np.ndarray) -> np.ndarray:
     scene = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
     usual = np.median(changes[labels == scene])
     still = [n for n in range(1, count) if n != scene and np.median(changes[labels == n]) < 0.5 * usual]
-    return np.isin(labels, still)
+    return np.asarray(np.isin(labels, still))
 
 
 def _bars(stack: np.ndarray, fixed: np.ndarray) -> np.ndarray:
