@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ CHANGED = 8.0  # gray levels by which a pixel that shows something else differs
 MOVED = 0.25  # of the pixels that change at all: so many differ between two pictures of a camera that moved
 EDGE = 3.5  # gray levels a pixel: the least gradient of an edge
 STAYS = 0.9  # of the pictures: those in which a fixed edge is there
-TURNS = 0.02  # squared, of a thing's gradients across and along its edges: a straight edge along the motion stays, too
+TURNS = 0.02  # of a thing's gradients, the second moment along its edges over that across: a straight edge may slide
 SMALLEST = 40  # pixels of one thing's edges
 MOST = 0.5  # of all edges: if more stay, the camera does, and something else moves
 DARK, NOISE = 40.0, 6.0  # gray levels of a bar: the most, and how much they differ
@@ -65,53 +66,67 @@ class FixedParts:
         self._pictures.append(gray)
         self._count += 1
         if self._count == DOUBT:
-            self._settled = find_fixed(self._pictures, most=1.0) is None
+            self._settled = not fixed_in(Edges.of(self._pictures)).any()
         elif self._count % EVERY == 0:  # a robot may stand before a crowd at first, or lift its arm
-            found = find_fixed(self._pictures)
-            self.mask = None if found is None else ~_enlarged(found, size)
-            self._settled = found is None and self._count == WINDOW
+            self._judge(Edges.of(self._pictures))
         self.judged |= self._settled or self._count >= EVERY
+
+    def _judge(self, edges: Edges) -> None:
+        if edges.share > MOST:  # the camera stood, and something else moved
+            self._pictures.clear()
+            self._count = 0
+            self.judged = True
+            return
+        fixed = fixed_in(edges)
+        self.mask = ~_enlarged(fixed, self._size) if fixed.any() and not fixed.all() else None
+        self._settled = self.mask is None and self._count == WINDOW
 
     def _moved(self, gray: np.ndarray) -> bool:
         active = self._high - self._low > 2.0 * CHANGED
         return bool(active.any() and np.mean(np.abs(gray - self._pictures[-1])[active] > CHANGED) > MOVED)
 
 
-def find_fixed(pictures: Collection[np.ndarray], most: float = MOST) -> np.ndarray | None:
-    """(h, w) bool: what is fixed to the camera, of pictures (h, w) float32 between which it moved; None: nothing is.
+@dataclass(frozen=True)
+class Edges:
+    """Which edges of some pictures (n, h, w) stay where they are."""
 
-    most: of all edges that may stay; if more do, nothing is.
-    """
-    stack = np.stack(list(pictures))
-    fixed = _things(stack, most)
-    changes = stack.std(axis=0)
+    pictures: np.ndarray  # float32
+    stay: np.ndarray  # (h, w) bool
+    direction: np.ndarray  # (h, w, 2) of their gradients, of length 1
+    share: float  # of all edges
+
+    @staticmethod
+    def of(pictures: Collection[np.ndarray]) -> Edges:
+        """Of pictures (h, w) float32."""
+        stack = np.stack(list(pictures))
+        gradients = np.stack([_gradient(picture) for picture in stack])
+        usual = gradients.mean(axis=0)
+        strength = np.hypot(usual[..., 0], usual[..., 1])
+        direction = usual / np.maximum(strength, EDGE)[..., None]
+        along = np.einsum("nhwc,hwc->nhw", gradients, direction)  # what is behind a text makes it stronger or weaker
+        across = gradients[..., 0] * direction[..., 1] - gradients[..., 1] * direction[..., 0]
+        least = 0.5 if len(stack) >= WINDOW else 0.8  # straight ahead, what is far stays for a while, and grows
+        same = (along > least * strength) & (np.abs(across) < 0.2 * strength + 0.7)
+        stay = (strength > EDGE) & (same.mean(axis=0) >= STAYS)
+        edges = int(np.sum(np.hypot(gradients[..., 0], gradients[..., 1]).mean(axis=0) > EDGE))
+        return Edges(stack, stay, direction, float(stay.sum() / max(1, edges)))
+
+
+def fixed_in(edges: Edges) -> np.ndarray:
+    """(h, w) bool: what is fixed to the camera that took the pictures."""
+    changes = edges.pictures.std(axis=0)
+    fixed = _things(edges)
     fixed |= _cut_off(fixed, changes)
     fixed |= (changes < STILL) & (cv2.dilate(fixed.astype(np.uint8), _disk(BESIDE)) > 0)
-    fixed |= _bars(stack, fixed)
-    if not fixed.any():
-        return None
-    fixed = cv2.dilate(fixed.astype(np.uint8), _disk(MARGIN)) > 0
-    return None if fixed.all() else fixed
+    fixed |= _bars(edges.pictures, fixed)
+    return np.asarray(cv2.dilate(fixed.astype(np.uint8), _disk(MARGIN)) > 0)
 
 
-def _things(stack: np.ndarray, most: float) -> np.ndarray:
+def _things(edges: Edges) -> np.ndarray:
     """(h, w) bool: edges that stay, and what is between those of one thing."""
-    gradients = np.stack([_gradient(picture) for picture in stack])
-    usual = gradients.mean(axis=0)
-    strength = np.hypot(usual[..., 0], usual[..., 1])
-    direction = usual / np.maximum(strength, EDGE)[..., None]
-    along = np.einsum("nhwc,hwc->nhw", gradients, direction)  # what is behind a text makes it stronger or weaker
-    across = gradients[..., 0] * direction[..., 1] - gradients[..., 1] * direction[..., 0]
-    least = 0.5 if len(stack) >= WINDOW else 0.8  # straight ahead, what is far stays for a while, and grows
-    same = (along > least * strength) & (np.abs(across) < 0.2 * strength + 0.7)
-    stays = (strength > EDGE) & (same.mean(axis=0) >= STAYS)
-    any_edge = np.hypot(gradients[..., 0], gradients[..., 1]).mean(axis=0) > EDGE
-    if stays.sum() > most * any_edge.sum():
-        return np.zeros_like(stays)
-    joined = cv2.morphologyEx(stays.astype(np.uint8), cv2.MORPH_CLOSE, _disk(REACH))
+    joined = cv2.morphologyEx(edges.stay.astype(np.uint8), cv2.MORPH_CLOSE, _disk(REACH))
     count, labels = cv2.connectedComponents(joined, connectivity=8)
-    normals = direction[stays]  # (N, 2)
-    of = labels[stays]
+    normals, of = edges.direction[edges.stay], labels[edges.stay]  # (N, 2), (N,)
     pixels = np.bincount(of, minlength=count)
     xx, xy, yy = (
         np.bincount(of, normals[:, a] * normals[:, b], minlength=count) / np.maximum(pixels, 1)
@@ -165,4 +180,4 @@ def _enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
 
 
-__all__ = ["FixedParts", "find_fixed"]
+__all__ = ["FixedParts"]

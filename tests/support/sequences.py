@@ -27,7 +27,7 @@ def synthetic(**options: Any) -> tuple[Item, ...]:
 def track(items: Sequence[Item], config: TrackerConfig | None = None) -> tuple[Tracker, Trajectory, list[Update]]:
     """A tracker that has seen all of them."""
     tracker = Tracker(config)
-    updates = [tracker.add(i.index, i.timestamp, i.image, i.intrinsics) for i in items]
+    updates = [tracker.add(i.index, i.timestamp, i.image, i.intrinsics, mask=i.mask) for i in items]
     updates += tracker.finish()
     return tracker, tracker.trajectory(), updates
 
