@@ -10,6 +10,7 @@ import numpy as np
 _NARROWEST, _WIDEST = 1000.0, 0.01  # focal lengths as multiples of the longer side: 0.06 and 179 degrees of view
 _OFF_CENTER = 2.0  # image sizes from the middle: a principal point farther out is not even that of a cropped picture
 _LONGEST_SIDE = 2**20  # pixels
+WHITE, BRIGHT, BLACK = 0.01, 128, 10  # of an image, its brightest part: how bright it should be, and is at least
 MAX_READOUT_TIME = 0.2  # seconds from the first row to the last: a longer one is a mistake, of the unit for one
 
 
@@ -86,6 +87,18 @@ def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     shrink = size[0] < image.shape[0]
     resized = cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
     return np.asarray(resized)
+
+
+def brightening(gray: np.ndarray, seen: np.ndarray | None = None) -> float:
+    """By how much an image (H, W) uint8 is too dark for what is measured in gray levels, as texture is; at least 1.
+
+    A black one, as of a covered lens, shows nothing. seen: (H, W) bool, where it counts; None: everywhere.
+    """
+    values = gray if seen is None else gray[seen]
+    if np.count_nonzero(values >= BRIGHT) >= WHITE * values.size:
+        return 1.0
+    brightest = float(np.quantile(values, 1.0 - WHITE))
+    return max(1.0, BRIGHT / brightest) if brightest >= BLACK else 1.0
 
 
 def mean_of_colors(image: np.ndarray) -> np.ndarray:

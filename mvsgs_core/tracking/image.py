@@ -8,7 +8,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from mvsgs_core.camera import fit_size, mask_at, resize_image, shrunk
+from mvsgs_core.camera import brightening, fit_size, mask_at, resize_image, shrunk
 from mvsgs_core.tracking.estimation.gray_levels import Levels, Samples
 
 CELL = 8  # pixels: one point a cell
@@ -46,13 +46,13 @@ class TrackingImage:
         mask: np.ndarray | None = None,
     ) -> TrackingImage:  # fmt: skip
         """From an RGB image of any size, and a mask (bool) of any size: False where a pixel is to be ignored."""
-        if size[0] > image.shape[0]:  # cubic: linear interpolation blurs at every other pixel
-            resized = np.asarray(cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_CUBIC))
-        else:
-            resized = resize_image(image, size)
+        resized = _resized(image, size)
         gray = cv2.cvtColor(resized, cv2.COLOR_RGB2GRAY)
         half = np.asarray(cv2.resize(resized, (size[1] // 2, size[0] // 2), interpolation=cv2.INTER_AREA))
         seen = mask_at(mask, size)
+        gain = brightening(gray, seen)
+        if gain > 1.0:  # before it is rounded
+            gray = cv2.cvtColor(_resized(cv2.convertScaleAbs(image, alpha=gain), size), cv2.COLOR_RGB2GRAY)
         seen = None if seen is None else shrunk(seen, MASK_MARGIN)
         return TrackingImage(index, timestamp, gray, resized if color else None, half, exposure, mask=seen)
 
@@ -165,6 +165,13 @@ def tracking_size(height: int, width: int, area: int) -> tuple[int, int]:
     """
     factor = max(1.0, min(2.0, (area / (height * width)) ** 0.5))
     return fit_size(round(height * factor), round(width * factor), area)
+
+
+def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Cubic where it is enlarged: linear interpolation blurs at every other pixel."""
+    if size[0] > image.shape[0]:
+        return np.asarray(cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_CUBIC))
+    return resize_image(image, size)
 
 
 def find_cells(gray: np.ndarray, noise: float = 20.0, mask: np.ndarray | None = None) -> Cells:

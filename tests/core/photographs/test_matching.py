@@ -42,6 +42,12 @@ def test_features_turn_and_grow_with_the_image() -> None:
     assert np.mean(np.linalg.norm(b - expected, axis=1) < 1.0) > 0.95
 
 
+def test_a_dark_photograph_has_the_features_of_a_bright_one() -> None:
+    image = synthetic(frames=80)[0].image
+    bright, dark = find_features(image, 800), find_features(image // 8, 800)
+    assert len(dark.points) > 0.7 * len(bright.points)
+
+
 def test_an_image_without_texture_has_no_features() -> None:
     found = find_features(np.full((100, 120, 3), 90, np.uint8), 100)
     assert found.points.shape == (0, 2)

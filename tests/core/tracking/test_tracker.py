@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,17 @@ def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:
     assert sorted(published) == sorted(set(published)) == trajectory.index[trajectory.keyframe].tolist()
     assert 8 <= len(published) <= 30
     assert tracker.stats.warnings == []
+
+
+def test_the_room_is_tracked_in_the_dark() -> None:
+    """Texture is measured in gray levels: in a tenth of the light there was none."""
+    rng, bright = np.random.default_rng(0), synthetic(frames=80)
+    noise = [rng.normal(0.0, 1.5, item.image.shape) for item in bright]
+    items = [replace(i, image=(0.1 * i.image + n).clip(0, 255).astype(np.uint8)) for i, n in zip(bright, noise)]
+    _, trajectory, _ = track(items)
+    error, length = ate(trajectory, items)
+    assert (trajectory.state == TrackingState.TRACKED).all()
+    assert error < 0.003 * length
 
 
 @pytest.mark.parametrize("flow", sorted(FLOWS.keys() - {"raft_small"}))  # a network: `bench.learned` tracks with it
