@@ -12,7 +12,6 @@ import numpy as np
 from bench.runs import DATA
 from mvsgs_core.datasets import Item, open_dataset
 
-
 NOISE = 1.5  # gray levels, of a sensor in the dark
 
 
