@@ -10,7 +10,9 @@ import numpy as np
 _NARROWEST, _WIDEST = 1000.0, 0.01  # focal lengths as multiples of the longer side: 0.06 and 179 degrees of view
 _OFF_CENTER = 2.0  # image sizes from the middle: a principal point farther out is not even that of a cropped picture
 _LONGEST_SIDE = 2**20  # pixels
-WHITE, BRIGHT, BLACK = 0.01, 128, 10  # of an image, its brightest part: how bright it should be, and is at least
+CONTRAST, REST = 96, 0.98  # gray levels between the darkest and brightest of an image, without 1 % of it at each end
+BLACK, FLAT = 10, 4  # of an image that shows nothing: less bright, or with less contrast
+DARKEST = 16  # gray level where contrast begins once it is stretched: some is darker
 MAX_READOUT_TIME = 0.2  # seconds from the first row to the last: a longer one is a mistake, of the unit for one
 
 
@@ -89,16 +91,19 @@ def resize_image(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.asarray(resized)
 
 
-def brightening(gray: np.ndarray, seen: np.ndarray | None = None) -> float:
-    """By how much an image (H, W) uint8 is too dark for what is measured in gray levels, as texture is; at least 1.
+def stretching(gray: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray | None:
+    """(256,) uint8: the gray levels of a dark or hazy image (H, W) uint8 spread, so that texture shows as in any other.
 
-    A black one, as of a covered lens, shows nothing. seen: (H, W) bool, where it counts; None: everywhere.
+    None for what needs it not, and for a black image, as of a covered lens, or a flat one, which show nothing.
+    seen: (H, W) bool, where it counts; None: everywhere.
     """
     values = gray if seen is None else gray[seen]
-    if np.count_nonzero(values >= BRIGHT) >= WHITE * values.size:
-        return 1.0
-    brightest = float(np.quantile(values, 1.0 - WHITE))
-    return max(1.0, BRIGHT / brightest) if brightest >= BLACK else 1.0
+    below = np.cumsum(np.bincount(values.ravel(), minlength=256))
+    low, high = np.searchsorted(below, [(1.0 - REST) * 0.5 * below[-1], (1.0 + REST) * 0.5 * below[-1]])
+    if high < BLACK or high - low < FLAT or high - low >= CONTRAST:
+        return None
+    gain = CONTRAST / float(high - low)
+    return np.clip(gain * (np.arange(256.0) - low) + DARKEST, 0.0, 255.0).astype(np.uint8)
 
 
 def mean_of_colors(image: np.ndarray) -> np.ndarray:

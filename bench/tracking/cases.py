@@ -27,6 +27,7 @@ class Case:
     quick: bool = False
     baseline_stride: int = 2  # every nth frame is for COLMAP, and for us beside it; 0: none
     light: float = 1.0  # of the images; below 1 with the noise of a sensor added
+    haze: float = 0.0  # gray levels that are added then
 
     @property
     def path(self) -> Path | None:
@@ -43,11 +44,11 @@ class Case:
         if self.path is not None:
             options["path"] = self.path
         items = list(open_dataset(self.reader, **options))
-        return items if self.light == 1.0 else [_darkened(item, self.light) for item in items]
+        return items if self.light == 1.0 else [_dimmed(item, self.light, self.haze) for item in items]
 
 
-def _darkened(item: Item, light: float) -> Item:
-    noise = np.random.default_rng(item.index).normal(0.0, NOISE, item.image.shape)
+def _dimmed(item: Item, light: float, haze: float) -> Item:
+    noise = np.random.default_rng(item.index).normal(haze, NOISE, item.image.shape)
     return replace(item, image=(light * item.image + noise).clip(0, 255).astype(np.uint8))
 
 
@@ -61,6 +62,9 @@ CASES: dict[str, Case] = {
     "redkitchen, color camera 525": Case("seven_scenes", {}, "seven_scenes_redkitchen", goal="4.5"),
     "redkitchen, a tenth of its light": Case(
         "seven_scenes", {"registered": False}, "seven_scenes_redkitchen", goal="4.5", light=0.1
+    ),
+    "redkitchen, a tenth of its contrast": Case(
+        "seven_scenes", {"registered": False}, "seven_scenes_redkitchen", goal="4.5", light=0.1, haze=180.0
     ),
     "icl_nuim_of_kt0": Case("icl_nuim", folder="icl_nuim_of_kt0", baseline_stride=1),
     "kitti_piece": Case("tum", folder="kitti_piece", goal="0.15%", baseline_stride=1),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mvsgs_core.camera import brightening, fit_size, mask_at, resize_image
+from mvsgs_core.camera import fit_size, mask_at, resize_image, stretching
 
 AREA = 1280 * 960  # pixels of the image that features are found in, at most
 CONTRAST = 0.02  # of a blob: half of Lowe's, who had photographs of higher contrast
@@ -37,7 +37,8 @@ def find_features(image: np.ndarray, count: int, mask: np.ndarray | None = None)
     gray = cv2.cvtColor(resize_image(image, size), cv2.COLOR_RGB2GRAY)
     sift = cv2.SIFT.create(count, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     seen = mask_at(mask, size)
-    gray = cv2.convertScaleAbs(gray, alpha=brightening(gray, seen))
+    table = stretching(gray, seen)
+    gray = gray if table is None else np.asarray(cv2.LUT(gray, table))
     found, descriptors = sift.detectAndCompute(gray, None if seen is None else seen.astype(np.uint8))
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros(0), np.zeros(0))

@@ -8,7 +8,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from mvsgs_core.camera import brightening, fit_size, mask_at, resize_image, shrunk
+from mvsgs_core.camera import fit_size, mask_at, resize_image, shrunk, stretching
 from mvsgs_core.tracking.estimation.gray_levels import Levels, Samples
 
 CELL = 8  # pixels: one point a cell
@@ -50,9 +50,9 @@ class TrackingImage:
         gray = cv2.cvtColor(resized, cv2.COLOR_RGB2GRAY)
         half = np.asarray(cv2.resize(resized, (size[1] // 2, size[0] // 2), interpolation=cv2.INTER_AREA))
         seen = mask_at(mask, size)
-        gain = brightening(gray, seen)
-        if gain > 1.0:  # before it is rounded
-            gray = cv2.cvtColor(_resized(cv2.convertScaleAbs(image, alpha=gain), size), cv2.COLOR_RGB2GRAY)
+        table = stretching(gray, seen)
+        if table is not None:  # before it is rounded
+            gray = cv2.cvtColor(_resized(np.asarray(cv2.LUT(image, table)), size), cv2.COLOR_RGB2GRAY)
         seen = None if seen is None else shrunk(seen, MASK_MARGIN)
         return TrackingImage(index, timestamp, gray, resized if color else None, half, exposure, mask=seen)
 

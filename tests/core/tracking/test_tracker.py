@@ -32,11 +32,12 @@ def test_the_room_is_tracked_from_the_first_frame_to_the_last() -> None:
     assert tracker.stats.warnings == []
 
 
-def test_the_room_is_tracked_in_the_dark() -> None:
-    """Texture is measured in gray levels: in a tenth of the light there was none."""
-    rng, bright = np.random.default_rng(0), synthetic(frames=80)
-    noise = [rng.normal(0.0, 1.5, item.image.shape) for item in bright]
-    items = [replace(i, image=(0.1 * i.image + n).clip(0, 255).astype(np.uint8)) for i, n in zip(bright, noise)]
+@pytest.mark.parametrize("haze", [0.0, 180.0])
+def test_the_room_is_tracked_in_the_dark_and_in_haze(haze: float) -> None:
+    """Texture is measured in gray levels: in a tenth of the light, or of the contrast, there was none."""
+    rng, clear = np.random.default_rng(0), synthetic(frames=80)
+    noise = [rng.normal(haze, 1.5, item.image.shape) for item in clear]
+    items = [replace(i, image=(0.1 * i.image + n).clip(0, 255).astype(np.uint8)) for i, n in zip(clear, noise)]
     _, trajectory, _ = track(items)
     error, length = ate(trajectory, items)
     assert (trajectory.state == TrackingState.TRACKED).all()
