@@ -26,8 +26,8 @@ class Case:
     hard: bool = False  # what counts is that the loss is reported and nothing wrong goes out
     quick: bool = False
     baseline_stride: int = 2  # every nth frame is for COLMAP, and for us beside it; 0: none
-    light: float = 1.0  # of the images; below 1 with the noise of a sensor added
-    haze: float = 0.0  # gray levels that are added then
+    light: float = 1.0  # factor on the images; where it or haze is set, the noise of a sensor is added
+    haze: float = 0.0  # gray levels that are added
 
     @property
     def path(self) -> Path | None:
@@ -44,7 +44,8 @@ class Case:
         if self.path is not None:
             options["path"] = self.path
         items = list(open_dataset(self.reader, **options))
-        return items if self.light == 1.0 else [_dimmed(item, self.light, self.haze) for item in items]
+        clear = self.light == 1.0 and self.haze == 0.0
+        return items if clear else [_dimmed(item, self.light, self.haze) for item in items]
 
 
 def _dimmed(item: Item, light: float, haze: float) -> Item:
