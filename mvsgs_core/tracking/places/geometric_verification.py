@@ -59,15 +59,18 @@ def verifying_place(
     depth = 1.0 / keyframe.inverse_depth[known]
     points = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], axis=1)
     cv2.setRNGSeed(0)
-    found, rotation, translation, _ = cv2.solvePnPRansac(
-        points,
-        matches.target[known],
-        matrix(graph.intrinsics),
-        np.zeros(4),
-        iterationsCount=200,
-        reprojectionError=3.0,
-        flags=cv2.SOLVEPNP_SQPNP,
-    )
+    try:
+        found, rotation, translation, _ = cv2.solvePnPRansac(
+            points,
+            matches.target[known],
+            matrix(graph.intrinsics),
+            np.zeros(4),
+            iterationsCount=200,
+            reprojectionError=3.0,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:  # OpenCV throws where the points are no configuration for it
+        return None
     if not found:
         return None
     relative = np.eye(4)

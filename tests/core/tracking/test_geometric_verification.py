@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -49,6 +50,14 @@ def test_another_place_is_refused() -> None:
 
 def test_the_same_features_in_other_places_are_refused() -> None:
     assert verify_place(true_graph(PLACE), matcher(), PLACE, shuffled(PLACE, FRAME), CRITERIA) is None
+
+
+def test_points_that_opencv_has_no_pose_for_are_no_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    def asserts(*_: object, **__: object) -> None:
+        raise cv2.error("sqpnp.cpp: (-215:Assertion failed) ++num_null_vectors_ <= 6")
+
+    monkeypatch.setattr(cv2, "solvePnPRansac", asserts)
+    assert verify_place(true_graph(PLACE), matcher(), PLACE, image(FRAME), CRITERIA) is None
 
 
 def test_a_match_that_the_maps_depths_contradict_is_refused() -> None:
