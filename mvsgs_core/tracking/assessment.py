@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.estimation.static_points import STILL
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
@@ -37,4 +38,14 @@ def warn_of_few_matches(stats: Stats, graph: KeyframeGraph, enough: int) -> None
         )
 
 
-__all__ = ["warn_of_few_matches", "warn_of_gaps"]
+def tell_what_moves(stats: Stats, graph: KeyframeGraph) -> None:
+    """How many points no standing point explains, over all keyframes in which they were found: left out of poses."""
+    weights = [keyframe.static[keyframe.static < 1.0] for keyframe in graph.keyframes.values()]
+    seen = sum(len(some) for some in weights)
+    if graph.weighing and seen:
+        left_out = sum(int(np.sum(some <= STILL)) for some in weights)
+        stats.counts["points that move, or contradict the map"] = left_out
+        stats.values["points that stand still"] = f"{100 * (1 - left_out / seen):.0f} % of those seen again"
+
+
+__all__ = ["tell_what_moves", "warn_of_few_matches", "warn_of_gaps"]

@@ -10,6 +10,7 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.tracking.edges import Edge, Edges
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
+from mvsgs_core.tracking.estimation.static_points import static_weights
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.keyframes import Keyframe, KeyframeTable
 from mvsgs_core.tracking.matching.flow import Matches
@@ -29,6 +30,7 @@ class KeyframeGraph:
         self.readout_time = 0.0  # seconds that the camera needs for an image, from the first row to the last
         self.reads_columns = False  # the same from the first column to the last
         self.vignetting = np.zeros(3)  # of log V = l1 r² + l2 r⁴ + l3 r⁶, as far as it is known
+        self.weighing = False  # points by how still they stand: a calibration that may be wrong would move them all
         self.keyframes = KeyframeTable()  # by frame index
         self.edges = Edges()  # by frame indices
 
@@ -154,6 +156,8 @@ class KeyframeGraph:
         order = sorted(indices)
         problem = self.problem(order, free_poses, free_depths)
         problem.free_focal = free_focal
+        if self.weighing:
+            problem.static = np.stack([self.keyframes[index].static for index in order])
         yield
         solution = adjust(problem, replace(solver, device=self.device))
         if not solution.failure:
@@ -165,7 +169,23 @@ class KeyframeGraph:
                 if index in free_depths:
                     keyframe.inverse_depth = solution.inverse_depth[n].copy()
                     keyframe.information = solution.information[n].copy()
+            self._weigh(problem, solution, order)
         return solution
+
+    def _weigh(self, problem: Graph, solution: Solution, order: list[int]) -> None:
+        """The weights of the points whose depths are new."""
+        if not self.weighing:
+            return
+        adjusted = replace(
+            problem,
+            cam_from_world=solution.cam_from_world,
+            inverse_depth=solution.inverse_depth,
+            intrinsics=self.intrinsics,
+        )
+        weights = static_weights(adjusted)
+        for n in np.flatnonzero(problem.free_depth):
+            keyframe = self.keyframes[order[n]]
+            keyframe.static = np.where(np.isnan(weights[n]), keyframe.static, weights[n])
 
     def rescale(self, indices: Iterable[int], factor: float) -> None:
         """Multiplies every length of these keyframes, as seen from the world's origin."""

@@ -104,7 +104,7 @@ class Initializer:
         for n, index in enumerate(self.waiting):
             keyframe = self.graph.keyframes[index]
             keyframe.cam_from_world, keyframe.inverse_depth = start.cam_from_world[n], start.inverse_depth[n]
-            keyframe.information = start.information[n]
+            keyframe.information, keyframe.static = start.information[n], start.static[n]
         self.waiting, self._weak = [], {}
         return True
 

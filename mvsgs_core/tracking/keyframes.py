@@ -6,11 +6,12 @@ What a new keyframe asks of the whole map is so answered by a few operations on 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from mvsgs_core.tracking.estimation.static_points import STILL
 from mvsgs_core.tracking.image import TrackingImage
 
 FIRST = 64  # rows of the arrays, doubled when they are full
@@ -28,6 +29,10 @@ class Keyframe:
     inverse_depth: np.ndarray  # (M,) float64
     information: np.ndarray  # (M,) float64 of the inverse depth, pixels^-2; 0: never triangulated
     segment: int
+    static: np.ndarray = field(init=False)  # (M,) weight of each point, see `static_points`; 1 where nothing is known
+
+    def __post_init__(self) -> None:
+        self.static = np.ones(len(self.inverse_depth))
 
     def __setattr__(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -51,6 +56,11 @@ class Keyframe:
     def triangulated(self) -> np.ndarray:
         """(M,) bool: the depth is known to better than about 30 %, for an error of one pixel."""
         return self.information * self.inverse_depth**2 > 10.0
+
+    @property
+    def still(self) -> np.ndarray:
+        """(M,) bool: nothing says that the point moves."""
+        return self.static > STILL
 
     @property
     def median_depth(self) -> float:

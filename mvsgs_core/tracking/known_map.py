@@ -78,6 +78,7 @@ def save(file: Path, graph: KeyframeGraph, publisher: Publisher, vignetting: np.
         "cam_from_world": np.stack([keyframe.cam_from_world for keyframe in keyframes]),
         "inverse_depth": np.stack([keyframe.inverse_depth for keyframe in keyframes]),
         "information": np.stack([keyframe.information for keyframe in keyframes]),
+        "static": np.stack([keyframe.static for keyframe in keyframes]).astype(np.float32),
         "gray": np.stack([image.gray for image in images]),
         "half_color": _stacked([image.half_color for image in images], (height // 2, width // 2, 3), np.uint8, 0),
         "color": _stacked([image.color for image in images], (height, width, 3), np.uint8, 0),
@@ -133,6 +134,11 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
     information = arrays.take("information", np.float64, (count, points))
     if (inverse_depth <= 0).any() or (information < 0).any():
         raise ValueError("its keyframes have depths that are none")
+    static = np.ones((count, points))
+    if "static" in arrays:  # which an earlier version knew nothing of
+        static = arrays.take("static", np.float32, (count, points)).astype(np.float64)
+    if (static < 0).any() or (static > 1).any():
+        raise ValueError("its keyframes have points that stand still more than wholly, or less than not at all")
     intrinsics = arrays.take("intrinsics", np.float64, (4,))
     if (intrinsics[:2] <= 0).any():
         raise ValueError("its intrinsics are none")
@@ -160,6 +166,8 @@ def _unpacked(meta: dict[str, object], arrays: Arrays) -> KnownMap:
         )
         for k in range(count)
     ]  # fmt: skip
+    for keyframe, weights in zip(keyframes, static):
+        keyframe.static = weights.copy()
     edges = _edges(arrays, {keyframe.index: keyframe.image for keyframe in keyframes}, points)
     vignetting = arrays.take("vignetting", np.float64, (3,)).copy()
     return KnownMap(
@@ -205,7 +213,11 @@ def _unknown(value: np.ndarray) -> bool:
 def _renumbered(keyframe: Keyframe, frames: int) -> Keyframe:
     i = keyframe.image
     image = TrackingImage(i.index - frames, i.timestamp, i.gray, i.color, i.half_color, i.exposure, i.velocity, i.mask)
-    return Keyframe(image, keyframe.cam_from_world, keyframe.inverse_depth, keyframe.information, keyframe.segment)
+    renumbered = Keyframe(
+        image, keyframe.cam_from_world, keyframe.inverse_depth, keyframe.information, keyframe.segment
+    )
+    renumbered.static = keyframe.static
+    return renumbered
 
 
 __all__ = ["KnownMap", "load", "save"]

@@ -10,12 +10,13 @@ import numpy as np
 from mvsgs_core import native
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solution, Solver
 from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
-from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core.tracking.image import CELL, TrackingImage
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.steps import Steps, whole
 
 FEW = 256  # keyframes of which the flow to each is computed; of more, to those within reach
+MUST_STAND = 0.8  # of the matches: if more are left out because their points move, the map is what is wrong
 REACH = 5.0  # median depths of the scene
 
 
@@ -56,6 +57,7 @@ class LocalMap:
         """`insert`, an edge a step."""
         inverse_depth = self._propagate_depth(image, cam_from_world, matches)
         keyframe = Keyframe(image, cam_from_world, inverse_depth, np.zeros(len(inverse_depth)), segment)
+        keyframe.static = self._propagate_static(image, matches)
         earlier = self.members(segment)
         self.graph.add(keyframe)
         yield
@@ -168,14 +170,17 @@ class LocalMap:
 
     def agreement(self, index: int, pixels: float = 2.0) -> float:
         """Fraction of the matches to and from a keyframe that its pose and the depths explain."""
-        good = total = 0
+        good, total, every = 0, 0.0, 0
         for source, to in self.graph.edges.of([index]):
             edge = self.graph.edges[source, to]
             expected, _ = self.graph.predict(source, to)
-            seen = edge.found
+            found, still = edge.found, self.graph.keyframes[source].still
+            seen = found & still
             with np.errstate(invalid="ignore"):
                 good += int((np.linalg.norm(expected - edge.target.T, axis=1)[seen] < pixels).sum())
             total += int(seen.sum())
+            every += int(found.sum())
+        total = max(total, MUST_STAND * every)
         return good / total if total else 0.0
 
     def adjust_window(self, newest: int) -> Solution:
@@ -228,6 +233,17 @@ class LocalMap:
             points, values, image.cells.points.astype(np.float64), 5, float(image.size[1])
         )
         return np.where(np.isfinite(near), near, np.median(values))
+
+    def _propagate_static(self, image: TrackingImage, matches: dict[int, Matches]) -> np.ndarray:
+        """Weights (M,): the median of the five nearest points of others that were found here; 1 where none was."""
+        at = [found.target[found.alive] for found in matches.values()]
+        weights = [self.graph.keyframes[index].static[found.alive] for index, found in matches.items()]
+        if not any(len(some) for some in at):
+            return np.ones(len(image.cells.points))
+        near = native.load("tracking").median_of_nearest(
+            np.concatenate(at), np.concatenate(weights), image.cells.points.astype(np.float64), 5, 2.0 * CELL
+        )
+        return np.where(np.isfinite(near), near, 1.0)
 
 
 __all__ = ["LocalMap", "LocalMapConfig"]

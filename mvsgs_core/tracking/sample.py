@@ -24,8 +24,9 @@ def sample(graph: KeyframeGraph, index: int, matches: Matches, cam_from_world: n
     """At most 48 of the matches of keyframe `index` that agree with the frame's pose (4, 4): 16 bytes each."""
     keyframe = graph.keyframes[index]
     use = located(graph, index, matches, cam_from_world)
-    if (use & keyframe.triangulated).sum() >= 20:  # as in `localize`: what is not triangulated says nothing then
-        use &= keyframe.triangulated
+    stands = keyframe.triangulated & keyframe.still
+    if (use & stands).sum() >= 20:  # as in `localize`: the others say nothing then
+        use &= stands
     chosen = _thinned(matches.target, np.flatnonzero(use), keyframe.image.size)
     few = np.zeros(len(use))
     few[chosen] = 1.0

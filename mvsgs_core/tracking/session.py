@@ -63,7 +63,7 @@ class Session:
         self.intrinsics = scale_intrinsics(intrinsics, size, self.size)
         self.graph = KeyframeGraph(self.intrinsics, config.device)
         self.calibration = Calibration(
-            self.graph, config.focal, stats, float(intrinsics[0]), size, not guessed,
+            self.graph, config.focal, stats, float(intrinsics[0]), size, guessed,
             config.readout_time, config.reads_columns, threads,
         )  # fmt: skip
         self.matcher = Matcher(make_flow(config.flow))

@@ -19,7 +19,7 @@ from mvsgs_core.devices import resolve_device
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.kept_map import NOTHING_MAPPED
 from mvsgs_core.stats import Stats
-from mvsgs_core.tracking.assessment import warn_of_few_matches, warn_of_gaps
+from mvsgs_core.tracking.assessment import tell_what_moves, warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, check_device
 from mvsgs_core.tracking.frames import seen_pose, solve_trajectory
@@ -260,6 +260,7 @@ class Tracker:
         self._trajectory = replace(trajectory, exposure=exposure, vignetting=session.photometer.vignetting)
         stats.count("frames posed in the end", found)
         stats.count(HELD_OUT, sum(is_held_out(index) for index in graph.keyframes if index >= 0))
+        tell_what_moves(stats, graph)
         tracking = session.phase is not Phase.INITIALIZING
         if tracking and not self._frozen:
             session.calibration.check(session.members)

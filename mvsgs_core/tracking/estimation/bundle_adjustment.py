@@ -34,7 +34,7 @@ def adjust(graph: Graph, solver: Solver) -> Solution:
         source=np.ascontiguousarray(graph.source, dtype=np.int32),
         to=np.ascontiguousarray(graph.to, dtype=np.int32),
         target=_f64(graph.target),
-        information=_f64(graph.information),
+        information=_f64(graph.weighed),
         free_pose=np.ascontiguousarray(graph.free_pose, dtype=np.uint8),
         free_depth=np.ascontiguousarray(graph.free_depth, dtype=np.uint8),
         damping=_f64(damping),

@@ -24,14 +24,12 @@ REESTIMATED_AT = (10, 20, 40)  # keyframes of the map at which the readout time 
 
 @dataclass
 class Calibration:
-    """`settled`: the focal length will not change any more, so keyframes may go out with it."""
-
     graph: KeyframeGraph
     config: FocalConfig
     stats: Stats
     pixels: float  # the focal length that came with the frames, at their own size ...
     size: tuple[int, int]  # ... (height, width)
-    settled: bool  # from the start on, where the intrinsics are no guess
+    guessed: bool  # the focal length that came with the frames
     readout_time: float | None  # seconds; None: to be estimated
     reads_columns: bool  # where it is given
     threads: int
@@ -42,8 +40,17 @@ class Calibration:
             self.stats.values["readout_time"] = self.readout_time
             self.stats.values["reads_columns"] = self.reads_columns
         self.given = self.graph.intrinsics  # (4,) that came with the frames, at the tracker's size
-        self.guessed = not self.settled
+        self.settled = not self.guessed
         self.rolled = False  # a readout time that is not 0 was used before the one now, also by a map gone on with
+
+    @property
+    def settled(self) -> bool:
+        """The focal length will not change any more: keyframes may go out with it, and what contradicts it moves."""
+        return self.graph.weighing
+
+    @settled.setter
+    def settled(self, settled: bool) -> None:
+        self.graph.weighing = settled
 
     @property
     def focal_factor(self) -> float:

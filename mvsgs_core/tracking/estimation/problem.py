@@ -51,6 +51,12 @@ class Graph:
     prior: np.ndarray | None = None  # (K, M) inverse depth drawn to ...
     prior_weight: np.ndarray | None = None  # (K, M) ... with this information
     free_focal: bool = False  # one factor on fx and fy is unknown too
+    static: np.ndarray | None = None  # (K, M) factor on the information of all matches of a cell; None: 1
+
+    @property
+    def weighed(self) -> np.ndarray:
+        """The information with `static` in it."""
+        return self.information if self.static is None else self.information * self.static[self.source][:, None]
 
     def check(self) -> None:
         """Raises ValueError where shapes disagree, an edge leads nowhere or to itself, or an input is not finite."""
@@ -67,6 +73,7 @@ class Graph:
             "damping": (k, m),
             "prior": (k, m),
             "prior_weight": (k, m),
+            "static": (k, m),
         }
         for name, shape in shapes.items():
             values = getattr(self, name)

@@ -1,21 +1,28 @@
 """Structure from motion: poses and depths of the first keyframes from nothing but their matches.
 
-Two starts from essential matrices and one from identity poses are bundle adjusted; the lowest cost wins, if the
-cameras moved enough against the depths for it to mean anything.
+Two starts from pairs of views and one from identity poses are bundle adjusted; the lowest cost wins, if the cameras
+moved enough against the depths for it to mean anything. Where the calibration is known, what moves is then told from
+what stands: things that move may have bent what all points together gave.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.camera import matrix
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solution, Solver, adjust, reproject
+from mvsgs_core.tracking.estimation.static_points import STILL, static_weights
+from mvsgs_core.tracking.estimation.two_view_starts import two_view_poses, widest_pairs
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.steps import Steps, whole
+
+PAIRS = 4  # of keyframes that poses are taken from ...
+EPIPOLAR = (0.3, 1.0)  # ... by the matches that are so many pixels from their epipolar lines
+TRIED = 2  # of those poses, the ones in which the most stands still
+WEIGHINGS = 4  # rounds in which a start's points are weighed by how still they stand
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,7 @@ class ReconstructionCriteria:
     max_cost: float = 0.7  # robust cost (Cauchy, 1 pixel) a match
     min_turn_error: float = 0.8  # pixels by which the best rotations must miss the matches, median of the worst pair
     min_parallax: float = 2.0  # pixels, median over the matches of the longest pair: what a rotation can't explain
+    min_still: float = 0.5  # of the points, that do not seem to move
     min_baseline: float = 0.03  # largest distance of two cameras over the median depth
 
 
@@ -36,6 +44,7 @@ class Reconstruction:
     cam_from_world: np.ndarray  # (K, 4, 4)
     inverse_depth: np.ndarray  # (K, M), median 1
     information: np.ndarray  # (K, M)
+    static: np.ndarray  # (K, M) weight of each point, see `static_points`
     cost: float  # a match
     failure: str
     focal_factor: float = 1.0  # on the graph's focal length, where it was free
@@ -55,7 +64,7 @@ def reconstructing(
     everything = set(order)
     problem = graph.problem(order, everything - {order[0]}, everything)
     k, m = problem.inverse_depth.shape
-    none = Reconstruction(problem.cam_from_world, np.ones((k, m)), np.zeros((k, m)), np.inf, "")
+    none = Reconstruction(problem.cam_from_world, np.ones((k, m)), np.zeros((k, m)), np.ones((k, m)), np.inf, "")
     turned = yield from _rotation_error(problem, threads, free_focal)
     if turned < criteria.min_turn_error:
         reason = (
@@ -63,12 +72,16 @@ def reconstructing(
             f"{criteria.min_turn_error:.1f} or more are parallax"
         )
         return replace(none, failure=reason)
-    starts = [np.tile(np.eye(4), (k, 1, 1)), *_essential_starts(graph, order)]
+    views = [two_view_poses(graph, order, pair) for pair in widest_pairs(graph, order, 2)]
+    starts = [np.tile(np.eye(4), (k, 1, 1)), *(poses for poses in views if poses is not None)]
     matched = float(np.sum(_matched(problem)))
     yield
     best = yield from _best_of(problem, starts, criteria.certain_cost * matched, threads, free_focal)
     if best is None:
         return replace(none, failure="no start could be solved: every bundle adjustment failed")
+    static = np.ones((k, m))
+    if graph.weighing:
+        best, static = yield from _stillest(problem, best, graph, order, threads)
     poses, depths = best.cam_from_world, best.inverse_depth
     known = best.information * depths**2 > 10.0
     scale = float(np.median(depths[known])) if known.sum() > 50 else float(np.median(depths))
@@ -79,10 +92,15 @@ def reconstructing(
     baseline = float(np.max(np.linalg.norm(centers[:, None] - centers[None], axis=-1)))
     intrinsics = graph.intrinsics * [best.focal_factor, best.focal_factor, 1.0, 1.0]
     parallax = _parallax(replace(problem, cam_from_world=poses, inverse_depth=depths, intrinsics=intrinsics))
-    cost = best.cost / max(matched, 1.0)
+    cost = best.cost / max(float(np.sum(_standing(problem, static))), 1.0)
     failure = ""
     if not np.isfinite(cost) or cost > criteria.max_cost:
         failure = f"the matches do not agree: cost {cost:.2f} a match, {criteria.max_cost:.2f} at most"
+    elif (still := float(np.mean(static > STILL))) < criteria.min_still:
+        failure = (
+            f"the matches do not agree: {100 * still:.0f} % of the points stand still, "
+            f"{100 * criteria.min_still:.0f} % needed"
+        )
     elif parallax < criteria.min_parallax or baseline < criteria.min_baseline:
         failure = (
             f"too little parallax: {parallax:.1f} pixels of {criteria.min_parallax:.1f} needed, cameras {baseline:.3f} "
@@ -90,7 +108,7 @@ def reconstructing(
         )
     elif known.sum() < 0.3 * np.mean(_matched(problem)) * k * m:
         failure = f"too few points could be triangulated: {known.sum()} of {k * m}"
-    return Reconstruction(poses, depths, best.information * scale**2, cost, failure, best.focal_factor)
+    return Reconstruction(poses, depths, best.information * scale**2, static, cost, failure, best.focal_factor)
 
 
 def _best_of(
@@ -115,6 +133,62 @@ def _best_of(
             if best.cost < certain_cost:
                 break
     return best
+
+
+def _stillest(
+    problem: Graph, found: Solution, graph: KeyframeGraph, order: list[int], threads: int
+) -> Steps[tuple[Solution, np.ndarray]]:
+    """What the most matches stand still in, and the weights of its points (K, M): that solution with them weighed, or
+    one that has them weighed from the start on. Things that move may have bent the first."""
+    best, static = yield from _weighed(problem, found, threads)
+    tried = []
+    for pair, epipolar in itertools.product(widest_pairs(graph, order, PAIRS), EPIPOLAR):
+        poses = two_view_poses(graph, order, pair, epipolar)
+        yield
+        if poses is None:
+            continue
+        held = replace(problem, cam_from_world=poses, inverse_depth=np.ones_like(problem.inverse_depth))
+        depths = yield from _depths(held, threads)
+        if depths is not None:
+            weights = _weights(replace(held, inverse_depth=depths.inverse_depth))
+            tried.append((float(np.sum(_standing(problem, weights))), depths))
+    for _, depths in sorted(tried, key=lambda each: -each[0])[:TRIED]:
+        attempt, weights = yield from _weighed(problem, depths, threads)
+        if np.sum(_standing(problem, weights)) > np.sum(_standing(problem, static)):
+            best, static = attempt, weights
+    return best, static
+
+
+def _depths(problem: Graph, threads: int) -> Steps[Solution | None]:
+    """Depths for poses that are held."""
+    problem = replace(problem, free_pose=np.zeros_like(problem.free_pose))
+    for scale in (8.0, 3.0, 1.0):
+        solution = adjust(problem, Solver(steps=10, robust_scale=scale, threads=threads))
+        yield
+        if solution.failure:
+            return None
+        problem = replace(problem, inverse_depth=solution.inverse_depth)
+    return solution
+
+
+def _weighed(problem: Graph, found: Solution, threads: int) -> Steps[tuple[Solution, np.ndarray]]:
+    """The solution again, of points weighed by how still they stand, and their weights (K, M)."""
+    for _ in range(WEIGHINGS):
+        problem = replace(problem, cam_from_world=found.cam_from_world, inverse_depth=found.inverse_depth)
+        problem = replace(problem, static=_weights(problem))
+        again = adjust(problem, Solver(steps=12, lm=1e-3, threads=threads))
+        yield
+        if again.failure:
+            break
+        found = again
+    assert problem.static is not None
+    return found, problem.static
+
+
+def _weights(problem: Graph) -> np.ndarray:
+    """(K, M): `static_weights`, 1 of what was not seen again."""
+    weights = static_weights(problem)
+    return np.where(np.isnan(weights), 1.0, weights)
 
 
 def _rotation_error(problem: Graph, threads: int, free_focal: bool) -> Steps[float]:
@@ -153,38 +227,14 @@ def _matched(problem: Graph) -> np.ndarray:
     return problem.information[:, 0] > 0
 
 
+def _standing(problem: Graph, static: np.ndarray) -> np.ndarray:
+    """(E, M) weight of each match whose point has a weight (K, M)."""
+    return np.asarray(_matched(problem) * static[problem.source])
+
+
 def _largest_median(distance: np.ndarray, seen: np.ndarray) -> float:
     """Of distances (E, M), over the edges that see enough of them."""
     return max((float(np.median(d[s])) for d, s in zip(distance, seen) if s.sum() > 30), default=0.0)
-
-
-def _essential_starts(graph: KeyframeGraph, order: list[int]) -> list[np.ndarray]:
-    """Poses (K, 4, 4) from the two pairs whose essential matrices hold over the widest flow, spread by time."""
-    rated = []
-    for a, b in graph.edges:
-        if a not in order or b not in order or a >= b:
-            continue
-        edge = graph.edges[a, b]
-        moved = np.linalg.norm(edge.target.T - graph.keyframes[a].points, axis=1)[edge.found]
-        rated.append((float(np.median(moved)) * edge.fraction, a, b))
-    camera = matrix(graph.intrinsics)
-    starts = []
-    for _, a, b in sorted(rated, reverse=True)[:2]:
-        edge = graph.edges[a, b]
-        seen = edge.found
-        here, there = graph.keyframes[a].points[seen].astype(np.float64), edge.target.T[seen].astype(np.float64)
-        cv2.setRNGSeed(0)
-        essential, mask = cv2.findEssentialMat(here, there, camera, cv2.USAC_MAGSAC, 0.999, 1.0)
-        if essential is None or essential.shape != (3, 3):
-            continue
-        _, rotation, translation, _ = cv2.recoverPose(essential, here, there, camera, mask=mask)
-        relative = np.eye(4)
-        relative[:3, :3], relative[:3, 3] = rotation, 0.1 * translation.ravel()
-        twist = geometry.se3_log(relative)
-        at = np.array([(index - a) / (b - a) for index in order])
-        poses = geometry.se3_exp(at[:, None] * twist)
-        starts.append(poses @ geometry.inverse(poses[0]))
-    return starts
 
 
 __all__ = ["Reconstruction", "ReconstructionCriteria", "reconstruct", "reconstructing"]

@@ -69,7 +69,7 @@ class _Adjuster:
         self.i, self.j = (torch.from_numpy(ends).to(device) for ends in (self.source, self.to))
         self.pixels = self._tensor(graph.pixels)
         self.target = self._tensor(graph.target[order])
-        information = self._tensor(graph.information[order])
+        information = self._tensor(graph.weighed[order])
         self.wxx, self.wyy = information[:, 0], information[:, -1]
         self.wxy = information[:, 1] if information.shape[1] == 3 else torch.zeros_like(self.wxx)
         self.intrinsics = [float(v) for v in graph.intrinsics]

@@ -34,10 +34,13 @@ def localize_by(
 ) -> Localization:
     """The pose (4, 4) that explains where the points of keyframes, by index, were found, from a start near it.
 
-    Points that were never triangulated are left out: in a pure rotation their depths would invent a translation.
+    Points that were never triangulated are left out: in a pure rotation their depths would invent a translation. So are
+    those that move.
     """
     keyframes, count = [graph.keyframes[index] for index in matches], len(matches)
-    weight = np.stack([np.where(k.triangulated, m.weight, 0.0) for k, m in zip(keyframes, matches.values())])
+    weight = np.stack(
+        [np.where(k.triangulated & k.still, m.weight * k.static, 0.0) for k, m in zip(keyframes, matches.values())]
+    )
     if (weight > 0).sum() < 20:  # nothing triangulated yet, or a camera that only turned: every depth will do
         weight = np.stack([m.weight for m in matches.values()])
     cells = max(1, int((weight > 0).sum(axis=1).max()))  # the others say nothing

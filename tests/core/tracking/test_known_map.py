@@ -51,8 +51,11 @@ def test_a_map_comes_back_as_it_was(file: Path) -> None:
         assert np.array_equal(keyframe.cam_from_world, was.cam_from_world)
         assert np.array_equal(keyframe.inverse_depth, was.inverse_depth)
         assert np.array_equal(keyframe.triangulated, was.triangulated)
+        assert np.array_equal(keyframe.static, was.static.astype(np.float32))
         assert np.array_equal(keyframe.image.gray, was.image.gray)
         assert np.array_equal(keyframe.points, was.points)
+    assert any((keyframe.static < 0.5).any() for keyframe in known.keyframes), "nothing to compare"
+    assert np.array_equal(known.renumbered(STREAM).keyframes[0].static, known.keyframes[0].static)
     for pair, edge in known.edges.items():
         assert np.array_equal(edge.target, graph.edges[pair].target)
         assert np.array_equal(edge.weight, graph.edges[pair].weight)
@@ -73,6 +76,13 @@ def test_a_map_knows_whether_its_camera_reads_columns(file: Path, tmp_path: Path
     write_arrays(tmp_path / "map.npz", FORMAT, VERSION, meta | {"reads_columns": 1}, arrays)
     with pytest.raises(ValueError, match="1 does not say whether columns are read"):
         load(tmp_path / "map.npz")
+
+
+def test_of_a_map_that_was_kept_without_weights_all_points_stand_still(file: Path, tmp_path: Path) -> None:
+    meta, arrays = read_arrays(file, FORMAT, VERSION, WHAT)
+    meta = {name: value for name, value in meta.items() if name not in ("format", "version")}
+    write_arrays(tmp_path / "map.npz", FORMAT, VERSION, meta, {n: a for n, a in arrays.items() if n != "static"})
+    assert all((keyframe.static == 1.0).all() for keyframe in load(tmp_path / "map.npz").keyframes)
 
 
 def test_the_camera_is_found_and_tracked_in_the_frame_of_the_map(file: Path) -> None:
@@ -160,6 +170,7 @@ def test_what_is_damaged_or_of_another_version_is_refused(file: Path, tmp_path: 
         "order": {"index": arrays["index"][::-1].copy()},
         "not there": {"edges": arrays["edges"] + 1000},
         "gray": {"gray": arrays["gray"][:, :8].copy()},
+        "stand still": {"static": arrays["static"] + np.float32(1.0)},
     }
     for said, change in wrong.items():
         write_arrays(bad, FORMAT, VERSION, meta, {**arrays, **change})
