@@ -14,14 +14,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from bench.fixed_parts import AGREES, TIMES, tracked
 from bench.table import Row, at_most, main
-from bench.tracking.__main__ import run
 from bench.tracking.cases import CASES, Case
 from mvsgs_core.datasets import Item
 
 VIDEOS = {name: CASES[name] for name in ("redkitchen", "tum_fr1_xyz", "room")}
 QUICK = {"room": Case("synthetic", {"frames": 90, "threads": 1})}
-TIMES, AGREES = 1.25, 0.1  # goals: times the error with the known mask, or cm
 WIDTHS, PERIODS = (0.2, 0.35, 0.5), (60, 120)  # of the picture's width; frames from one side to the other and back
 
 
@@ -30,7 +29,7 @@ def person(size: tuple[int, int], width: float, phase: float, stride: float) -> 
     rows, columns = size
     v, u = np.mgrid[:rows, :columns].astype(np.float32)
     at = -width / 2 + phase * (columns + width)
-    down = v / rows  # the head at .15, the feet below the picture
+    down = v / rows  # the head at .22, the feet below the picture
     lean = 0.08 * width * np.sin(stride) * (down - 0.5)
     across = (u - at - lean) / (width / 2)
     head = (across / 0.35) ** 2 + ((down - 0.22) / 0.11) ** 2 < 1.0
@@ -60,14 +59,6 @@ def with_person(items: Sequence[Item], share: float, period: int) -> tuple[list[
         shown.append(replace(item, image=np.where(where[..., None], worn, item.image)))
         wheres.append(where)
     return shown, wheres
-
-
-def tracked(name: str, items: Sequence[Item]) -> tuple[list[Row], float, int]:
-    """Rows, the error in cm, and the frames without a pose."""
-    result = run(items)
-    error = 100.0 * max(result.frame_errors, default=float("nan"))
-    shown = Row(f"{name}: error", error if np.isfinite(error) else None, "cm")
-    return [shown, Row(f"{name}: without a pose", result.unposed, f"of {len(items)}")], error, result.unposed
 
 
 def measure(options: argparse.Namespace) -> list[Row]:

@@ -15,6 +15,13 @@ def inverse(pose: np.ndarray) -> np.ndarray:
     return result
 
 
+def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """(4, 4) of a rotation (3, 3) and a translation (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    return pose
+
+
 def skew(v: np.ndarray) -> np.ndarray:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     x, y, z = v[..., 0], v[..., 1], v[..., 2]

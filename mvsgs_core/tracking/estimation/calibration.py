@@ -24,6 +24,8 @@ REESTIMATED_AT = (10, 20, 40)  # keyframes of the map at which the readout time 
 
 @dataclass
 class Calibration:
+    """The camera as far as the tracker knows it: it changes the graph's intrinsics until they are settled."""
+
     graph: KeyframeGraph
     config: FocalConfig
     stats: Stats

@@ -11,6 +11,7 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.camera import matrix
 from mvsgs_core.tracking.edges import Edge
+from mvsgs_core.tracking.estimation.perspective import pose_of_points
 from mvsgs_core.tracking.graph import KeyframeGraph
 
 AGREES = 1.0  # pixels from where a pose puts a point
@@ -48,7 +49,7 @@ def two_view_poses(
     _, rotation, translation, inside, points = cv2.recoverPose(
         essential, here, there, camera, distanceThresh=100.0, mask=mask
     )
-    relative = _rigid(rotation, translation)
+    relative = geometry.rigid(rotation, translation.ravel())
     known = inside.ravel() > 0
     points = (points[:3, known] / points[3, known]).T
     seen = seen[known]
@@ -74,26 +75,7 @@ def _pose(points: np.ndarray, cells: np.ndarray, edge: Edge, camera: np.ndarray)
     use = edge.found[cells]
     if use.sum() < FEW:
         return None
-    cv2.setRNGSeed(0)
-    try:
-        found, rotation, translation, _ = cv2.solvePnPRansac(
-            points[use],
-            edge.target.T[cells[use]].astype(np.float64),
-            camera,
-            np.zeros(4),
-            iterationsCount=200,
-            reprojectionError=AGREES,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-    except cv2.error:  # OpenCV throws where the points are no configuration for it
-        return None
-    return _rigid(cv2.Rodrigues(rotation)[0], translation) if found else None
-
-
-def _rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation.ravel()
-    return pose
+    return pose_of_points(points[use], edge.target.T[cells[use]].astype(np.float64), camera, AGREES)
 
 
 __all__ = ["two_view_poses", "widest_pairs"]

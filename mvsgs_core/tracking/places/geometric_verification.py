@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from mvsgs_core import geometry
 from mvsgs_core.camera import matrix
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
+from mvsgs_core.tracking.estimation.perspective import pose_of_points
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.features import match_features
@@ -58,23 +57,9 @@ def verifying_place(
     fx, fy, cx, cy = graph.intrinsics
     depth = 1.0 / keyframe.inverse_depth[known]
     points = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], axis=1)
-    cv2.setRNGSeed(0)
-    try:
-        found, rotation, translation, _ = cv2.solvePnPRansac(
-            points,
-            matches.target[known],
-            matrix(graph.intrinsics),
-            np.zeros(4),
-            iterationsCount=200,
-            reprojectionError=3.0,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-    except cv2.error:  # OpenCV throws where the points are no configuration for it
+    relative = pose_of_points(points, matches.target[known], matrix(graph.intrinsics), 3.0)
+    if relative is None:
         return None
-    if not found:
-        return None
-    relative = np.eye(4)
-    relative[:3, :3], relative[:3, 3] = geometry.so3_exp(rotation.ravel()), translation.ravel()
     localization = localize(graph, index, matches, relative @ keyframe.cam_from_world, Solver(steps=10))
     if not criteria.accept(graph, index, matches, localization):
         return None
