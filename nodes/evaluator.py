@@ -8,6 +8,7 @@ import resource
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -55,7 +56,10 @@ class Evaluator(Node):
         self.folder = folder
         self._lpips = self._load_lpips()
         given = {"lpips": self._lpips.compare} if self._lpips else {}
-        self.evaluation = Evaluation(self.config.max_frames, self.config.max_bytes, given, folder, self.config.fitted)
+        self.evaluation = Evaluation(
+            self.config.max_frames, self.config.max_bytes, given, folder, self.config.fitted,
+            scored=partial(self.stats.count, "frames_scored"),
+        )  # fmt: skip
         self.report: dict[str, Any] = {}
 
     @classmethod

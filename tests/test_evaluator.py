@@ -59,6 +59,7 @@ def test_report(evaluator: Evaluator) -> None:
     assert report["memory"]["peak_bytes"]["tracker"] == 5
     assert report["skipped"] == {"tracker": {"frames": 2}}
     assert report["warnings"]["tracker"] == ["w"]
+    assert evaluator.stats.counts["frames_scored"] == 2 * N + after["held_out_fitted"]["count"], "a user waits for them"
 
 
 def test_files(evaluator: Evaluator) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_de
 from mvsgs_core.evaluation.exposure import FrameExposures, frame_exposures, summary
 from mvsgs_core.evaluation.fitted_camera import fit_camera
 from mvsgs_core.evaluation.frames import Frames, Photograph
+from mvsgs_core.evaluation.many_frames import each
 from mvsgs_core.evaluation.straight import undistortion
 from mvsgs_core.evaluation.trajectory_metrics import AlignedPath, known_poses
 from mvsgs_core.export.keyframe_render import NEAR, near_plane
@@ -33,6 +34,7 @@ class Evaluation:
     given: Mapping[str, scoring.Compare] = field(default_factory=dict)  # image metrics made at run time, by key
     folder: Path | None = None  # where they wait
     fitted: bool = True  # held-out frames are scored a second time, their cameras fitted at test time
+    scored: Callable[[], None] = lambda: None  # told of each frame that was scored
     started: float | None = None
     mapped: float | None = None
     trajectory: Trajectory | None = None
@@ -197,9 +199,13 @@ class Evaluation:
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
         chosen = scoring.choose(self.scored_frames(refined), self.max_frames)
-        scores = [scoring.score_frame(finished.splats, finished.kernel, frame, self.given) for frame in chosen]
+        scores = self._scores(finished, chosen)
         if refined and self.fitted:
-            scores = [self._fitted(finished, frame, score) for frame, score in zip(chosen, scores)]
+            started = time.perf_counter()
+            cameras = [frame for frame, score in zip(chosen, scores) if score.held_out]
+            fitted = {score.index: score.figures for score in self._scores(finished, cameras, fit=True)}
+            scores = [replace(score, fitted=fitted.get(score.index)) for score in scores]
+            self.fitting = time.perf_counter() - started
         self.scores[refined] = scores
         held_out = sum(score.held_out for score in scores)
         few = f"{held_out} of the {len(scores)} frames scored are held out: their mean and their worst say little"
@@ -214,14 +220,22 @@ class Evaluation:
         finished = self.maps[refined]
         return summary(finished.keyframes, finished.exposures, self.exposures(refined), finished.vignetting)
 
-    def _fitted(self, finished: Snapshot, frame: scoring.ScoredFrame, score: scoring.Score) -> scoring.Score:
-        """The same score, and that of a held-out frame with its camera fitted at test time beside it."""
-        if not score.held_out:
-            return score
-        started = time.perf_counter()
-        fitted = fit_camera(finished.splats, finished.kernel, frame)
-        self.fitting += time.perf_counter() - started
-        return replace(score, fitted=scoring.score_frame(finished.splats, finished.kernel, fitted, self.given).figures)
+    def _scores(self, finished: Snapshot, frames: list[scoring.ScoredFrame], fit: bool = False) -> list[scoring.Score]:
+        """fit: with each frame's camera fitted to it at test time."""
+        if not frames:
+            return []
+        splats, kernel = finished.splats, finished.kernel
+        height, width = self.size or frames[0].photograph().shape[:2]
+
+        def score(frame: scoring.ScoredFrame) -> scoring.Score:
+            frame = fit_camera(splats, kernel, frame) if fit else frame
+            return scoring.score_frame(splats, kernel, frame, self.given)
+
+        scores = []
+        for found in each(score, frames, (height, width), splats):
+            scores.append(found)
+            self.scored()
+        return scores
 
     def _score_trajectory(self, notes: list[str]) -> tuple[trajectory_metrics.Alignment | None, dict[str, Any]]:
         trajectory = self.final_trajectory or Trajectory.empty()

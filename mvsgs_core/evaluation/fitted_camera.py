@@ -19,10 +19,11 @@ from mvsgs_core.rasterizer.splats import Splats
 
 SMALLEST = 24  # pixels of the shorter side, below which a resolution is left out
 RENDERS = 8  # at each of the two resolutions, beside the first
-CONVERGED = 1e-3  # fall of the error, as a fraction, at which it ends: 0.004 dB
+CONVERGED = 1e-3  # fall of the error, as a fraction, that a step must promise and bring, or it ends: 0.004 dB
 REFUSED = 3  # steps in a row that do not lower the error, at which it ends
 DAMPING = 1e-3  # of the first step, as a fraction of the diagonal
 FLOOR = 1e-6  # of the diagonal, a pixel: what the photograph does not show stays as it is
+SAMPLES = 80_000  # pixels, about, that the normal equations are summed over; the error is always that of all
 MOTION = 6  # unknowns: translation in median depths and rotation of the camera; then the rows of the color affine
 
 
@@ -57,6 +58,8 @@ def _aligned(splats: Splats, kernel: str, best: _State, target: np.ndarray) -> S
     linear = linearized(best.seen, target, best.frame)
     for _ in range(RENDERS):
         step = np.linalg.solve(linear.hessian + damping * np.diag(np.diag(linear.hessian)), linear.gradient)
+        if linear.fall(step) < CONVERGED:
+            break
         trial = _seen(splats, kernel, _moved(best.frame, step, linear.length), target)
         fall = (best.error - trial.error) / max(best.error, 1e-12)
         if fall > 0.0:
@@ -73,11 +76,16 @@ def _aligned(splats: Splats, kernel: str, best: _State, target: np.ndarray) -> S
 
 @dataclass(frozen=True)
 class Linear:
-    """Normal equations of the residuals photograph - render in the 18 unknowns."""
+    """Normal equations of the residuals photograph - render in the 18 unknowns, over a grid of pixels."""
 
     hessian: np.ndarray  # (18, 18) float64
     gradient: np.ndarray  # (18,) float64
+    squares: float  # sum of the squared residuals
     length: float  # map units in one of the translation's
+
+    def fall(self, step: np.ndarray) -> float:
+        """Of the error, as a fraction, that a step (18,) promises."""
+        return float(step @ (2.0 * self.gradient - self.hessian @ step)) / max(self.squares, 1e-12)
 
 
 def linearized(seen: Rendered, target: np.ndarray, frame: ScoredFrame) -> Linear:
@@ -86,40 +94,49 @@ def linearized(seen: Rendered, target: np.ndarray, frame: ScoredFrame) -> Linear
     The render follows the camera as the pixels of a still scene of its depth do; where nothing is rendered, or a color
     is cut off at 0 or 1, it follows nothing.
     """
-    color, depth = seen.color, seen.depth
+    every = max(1, round((seen.depth.size / SAMPLES) ** 0.5))
+
+    def taken(image: np.ndarray) -> np.ndarray:
+        """(C, N) of the grid, for an image (H, W, C): its planes one after the other."""
+        return np.ascontiguousarray(image[every // 2 :: every, every // 2 :: every].reshape(-1, image.shape[2]).T)
+
+    (depth,) = taken(seen.depth[..., None])
     known = np.isfinite(depth) & (depth > 0)
     length = float(np.median(depth[known])) if known.any() else 1.0
-    motion = _pixel_motion(np.where(known, depth, np.inf), frame.intrinsics, length)
-    motion[~known] = 0.0
-    factor = np.ones_like(depth)[..., None]
+    u, v = (taken(axis[..., None])[0] for axis in camera.pixel_grid(*seen.depth.shape))
+    of_u, of_v = _pixel_motion(u, v, np.where(known, depth, np.inf), frame.intrinsics, length)
+    of_u[:, ~known] = of_v[:, ~known] = 0.0
+    factor = np.ones_like(seen.depth)[..., None]
     if frame.vignetting is not None:  # of the camera: it comes after the affine and does not move with the scene
         factor = factor * vignetting_factor(frame.vignetting, frame.intrinsics, target.shape[:2])[..., None]
-    rows, columns = (factor * slope for slope in np.gradient(color / factor, axis=(0, 1)))
-    affine = np.concatenate([color, factor], axis=2).reshape(-1, 4)
-    count = MOTION + color.shape[2] * affine.shape[1]
-    hessian, gradient = np.zeros((count, count)), np.zeros(count)
-    for channel in range(color.shape[2]):
-        moves = -(columns[..., channel, None] * motion[..., 0, :] + rows[..., channel, None] * motion[..., 1, :])
-        jacobian = np.concatenate([moves.reshape(-1, MOTION), affine], axis=1)
-        residual = (target[..., channel] - color[..., channel]).ravel()
-        jacobian[((color[..., channel] <= 0.0) | (color[..., channel] >= 1.0)).ravel() | np.isnan(residual)] = 0.0
+    rows, columns = (taken(factor * slope) for slope in np.gradient(seen.color / factor, axis=(0, 1)))
+    color, residuals = taken(seen.color), taken(target - seen.color)
+    jacobian = np.empty((MOTION + 4, len(depth)), dtype=np.float32)
+    count = MOTION + 4 * len(color)
+    hessian, gradient, squares = np.zeros((count, count)), np.zeros(count), 0.0
+    for channel, residual in enumerate(residuals):
+        jacobian[:MOTION] = -(columns[channel] * of_u + rows[channel] * of_v)
+        jacobian[MOTION:-1], jacobian[-1] = color, taken(factor)
+        jacobian[:, (color[channel] <= 0.0) | (color[channel] >= 1.0) | np.isnan(residual)] = 0.0
         residual = np.nan_to_num(residual)
         unknowns = np.r_[0:MOTION, MOTION + 4 * channel : MOTION + 4 * channel + 4]
-        hessian[np.ix_(unknowns, unknowns)] += jacobian.T @ jacobian
-        gradient[unknowns] += jacobian.T @ residual
-    return Linear(hessian + FLOOR * color[..., 0].size * np.eye(count), gradient, length)
+        hessian[np.ix_(unknowns, unknowns)] += jacobian @ jacobian.T
+        gradient[unknowns] += jacobian @ residual
+        squares += float(residual @ residual)
+    return Linear(hessian + FLOOR * len(depth) * np.eye(count), gradient, squares, length)
 
 
-def _pixel_motion(depth: np.ndarray, intrinsics: np.ndarray, length: float) -> np.ndarray:
-    """(H, W, 2, 6) float32: how a point's pixel (u, v) moves with the twist of the camera, its translation in `length`;
-    the interaction matrix of visual servoing (Chaumette and Hutchinson 2006)."""
+def _pixel_motion(
+    u: np.ndarray, v: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray, length: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(6, N) float32 of each axis: how pixels (u, v) of points at a depth, all (N,), move with the twist of the camera,
+    its translation in `length`; the interaction matrix of visual servoing (Chaumette and Hutchinson 2006)."""
     fx, fy, cx, cy = intrinsics
-    u, v = camera.pixel_grid(*depth.shape)
-    x, y, near = (u - cx) / fx, (v - cy) / fy, length / depth
+    x, y, near = ((a.astype(np.float32)) for a in ((u - cx) / fx, (v - cy) / fy, length / depth))
     zero = np.zeros_like(x)
-    of_u = np.stack([-near, zero, x * near, x * y, -(1.0 + x * x), y], axis=-1) * fx
-    of_v = np.stack([zero, -near, y * near, 1.0 + y * y, -x * y, -x], axis=-1) * fy
-    return np.stack([of_u, of_v], axis=2).astype(np.float32)
+    of_u = np.stack([-near, zero, x * near, x * y, -(1.0 + x * x), y])
+    of_v = np.stack([zero, -near, y * near, 1.0 + y * y, -x * y, -x])
+    return of_u * np.float32(fx), of_v * np.float32(fy)
 
 
 def _moved(frame: ScoredFrame, step: np.ndarray, length: float) -> ScoredFrame:
