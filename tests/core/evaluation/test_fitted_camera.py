@@ -67,8 +67,13 @@ def apart(a: ScoredFrame, b: ScoredFrame) -> tuple[float, float]:
     return float(np.linalg.norm(twist[:3])), float(np.degrees(np.linalg.norm(twist[3:])))
 
 
+@pytest.mark.parametrize("samples", [fitted_camera.SAMPLES, 3000])
 @pytest.mark.parametrize("readout", [None, np.array([0.01, 0.003, 0.0, 0.003, 0.01, 0.003])])
-def test_a_disturbed_pose_and_exposure_are_recovered(splats: Splats, readout: np.ndarray | None) -> None:
+def test_a_disturbed_pose_and_exposure_are_recovered(
+    splats: Splats, readout: np.ndarray | None, samples: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """3000: from every second pixel along both axes, as on images of many pixels."""
+    monkeypatch.setattr(fitted_camera, "SAMPLES", samples)
     true = true_frame(splats, noise=0.01, readout=readout)
     start = disturbed(true)
     assert psnr(splats, start) < 24
@@ -121,10 +126,13 @@ def test_a_frame_costs_a_bounded_number_of_renders(splats: Splats, monkeypatch: 
         return render_frame(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(fitted_camera, "render_frame", counted)
-    fit_camera(splats, "gaussian", disturbed(true_frame(splats, noise=0.05)))
+    found = fit_camera(splats, "gaussian", disturbed(true_frame(splats, noise=0.05)))
     assert set(sizes) == {(48, 64), SIZE}
     assert sizes.count((48, 64)) <= fitted_camera.RENDERS + 1
     assert sizes.count(SIZE) <= fitted_camera.RENDERS + 2
+    sizes.clear()
+    fit_camera(splats, "gaussian", found)
+    assert sizes.count(SIZE) == 2, "a step that promises nothing is not rendered"
 
 
 def test_the_normal_equations_are_those_of_the_render(splats: Splats) -> None:
