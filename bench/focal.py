@@ -2,7 +2,8 @@
 
 Every video and its parts, tracked from a guess of 65 degrees across the longer side, principal point in the middle.
 What the tracker estimates, and how sure it says it is, against the calibration that came with the data. Then whole
-videos with a calibration that is given, as it came and wrong by a twentieth: whether the contradiction is said.
+videos with a calibration that is given, as it came and wrong by a twentieth: whether the contradiction is said. Then
+with the picture magnified from its middle on, as by a zoom: whether that is said.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ VIDEOS = {
 }
 PART = 80  # frames
 WRONG = 0.05  # fraction by which a calibration that is given is off
+ZOOMS, ZOOMING = (1.1, 1.2, 1.5), 30  # times; frames that a zoom takes
 QUICK = {"room": Case("synthetic", {"frames": 60, "threads": 1})}
 MEDIAN_ERROR, SURE_ERROR, INTERVAL, WITHIN = 2.0, 5.0, 2.0, 0.9  # %, %, standard deviations, share
 
@@ -87,20 +89,37 @@ class Given:
     name: str
     off: float  # of the calibration that came with the data, as a fraction
     found: float | None  # the same, of the focal length that the keyframes are said to want
+    zoom: float | None  # by which the camera is said to have zoomed
+    zoomed: float = 1.0
 
     def row(self) -> Row:
+        if self.zoomed != 1.0:
+            name = f"{self.name}, zoomed by {self.zoomed:.1f}"
+            return Row(name, "nothing said") if self.zoom is None else Row(f"{name}: said", self.zoom, "")
         name = f"{self.name}, given {100.0 * self.off:+.0f} %"
         return Row(name, "nothing said") if self.found is None else Row(f"{name}: wanted", 100.0 * self.found, "%")
 
 
-def given(name: str, items: Sequence[Item], off: float) -> Given:
+def given(name: str, items: Sequence[Item], off: float, zoomed: float = 1.0) -> Given:
+    """zoomed: by so much through the frames from the middle one on."""
     tracker = Tracker()
     for n, item in enumerate(items):
-        tracker.add(n, item.timestamp, item.image, item.intrinsics * [1.0 + off, 1.0 + off, 1.0, 1.0])
+        part = np.clip((n - len(items) / 2) / ZOOMING, 0.0, 1.0)
+        image = magnified(item, 1.0 + (zoomed - 1.0) * part) if zoomed != 1.0 else item.image
+        tracker.add(n, item.timestamp, image, item.intrinsics * [1.0 + off, 1.0 + off, 1.0, 1.0])
     for _ in tracker.finish():
         pass
-    found = tracker.stats.values.get("focal_checked_px")
-    return Given(name, off, None if found is None else float(found) / float(items[0].intrinsics[0]) - 1.0)
+    values = tracker.stats.values
+    found = values.get("focal_checked_px")
+    wanted = None if found is None else float(found) / float(items[0].intrinsics[0]) - 1.0
+    return Given(name, off, wanted, values.get("zoom"), zoomed)
+
+
+def magnified(item: Item, times: float) -> np.ndarray:
+    """(H, W, 3) uint8, about the principal point."""
+    (height, width), (x, y) = item.image.shape[:2], item.intrinsics[2:]
+    turn = np.array([[times, 0.0, (1.0 - times) * x], [0.0, times, (1.0 - times) * y]])
+    return cv2.warpAffine(item.image, turn, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def summary(found: Sequence[Estimate]) -> list[Row]:
@@ -120,15 +139,17 @@ def summary(found: Sequence[Estimate]) -> list[Row]:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
-    found, known = list[Estimate](), list[Given]()
+    found, known, zooms = list[Estimate](), list[Given](), list[Given]()
     for name, case in (QUICK if options.quick else VIDEOS).items():
         if case.there:
             items = [replace(item, depth=None) for item in case.items()]
             found += [estimate(part, chosen) for part, chosen in parts(name, items)]
             known += [given(name, items, off) for off in (0.0, -WRONG, WRONG)]
-            print(found[-1], *known[-3:], flush=True)
+            zooms += [given(name, items, 0.0, zoomed) for zoomed in ZOOMS]
+            print(found[-1], *known[-3:], *zooms[-len(ZOOMS) :], sep="\n", flush=True)
     exact = [one for one in known if one.off == 0.0 and one.name.startswith("room")]  # of rendered images
     wrong = [one for one in known if one.off != 0.0 and one.name.startswith("room")]
+    still, said = sum(one.zoom is not None for one in known), [one for one in zooms if one.zoom is not None]
     blamed = sum(one.found is not None for one in exact)
     told = sum(one.found is not None and abs(one.found) < WRONG / 2.0 for one in wrong)
     return [
@@ -137,6 +158,9 @@ def measure(options: argparse.Namespace) -> list[Row]:
         *(one.row() for one in known),
         at_most("room: of right ones, called wrong", blamed, f"of {len(exact)}", 0),
         at_least("room: of wrong ones, mended by half at least", told, f"of {len(wrong)}", len(wrong)),
+        *(one.row() for one in zooms),
+        at_most("videos without a zoom, said to have one", still, f"of {len(known)}", 0),
+        Row("videos with a zoom, said to have one", len(said), f"of {len(zooms)}"),
     ]
 
 

@@ -12,6 +12,7 @@ from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
 from mvsgs_core.tracking.estimation.focal import FocalConfig, focal_of_all, observability, refine_focal, uncertainty
 from mvsgs_core.tracking.estimation.radial import Radial, estimate_radial, lens_problem
 from mvsgs_core.tracking.estimation.rolling_shutter import estimating_readout
+from mvsgs_core.tracking.estimation.zoom import Zoom, find_zoom
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.steps import Steps, timed, whole
 
@@ -98,6 +99,11 @@ class Calibration:
         """At the end: whether the whole stream agrees with the focal length that the keyframes went out with."""
         if len(members) < self.config.min_keyframes:
             return
+        with self.stats.time("calibration"):
+            zoom = find_zoom(self.graph, members, self.config.probe, self.threads)
+        if zoom is not None:
+            self._say_zoomed(zoom)
+            return
         if not self.guessed:
             self._check_given(members[:FEW])
             return
@@ -140,6 +146,21 @@ class Calibration:
             f"{self._told(factor * self.pixels)}, {factor:.3f} times the {self.pixels:.0f} px that were given, give or "
             f"take {100 * sigma:.1f} %; poses and map may be bent. Is it of this camera at this size, and does the "
             "lens bend (dataset.distortion)? Or run again with dataset.intrinsics=[fx,fy,cx,cy] as they want it"
+        )
+
+    def _say_zoomed(self, zoom: Zoom) -> None:
+        """Another focal length for all, or a lens that bends, would mend nothing."""
+        before, after = (
+            f"those of frames {part.frames[0]} to {part.frames[1]} want a focal length of "
+            f"{self._told(part.factor * self.focal_factor * self.pixels)}"
+            for part in (zoom.before, zoom.after)
+        )
+        self.stats.values["focal_doubt"] = f"the camera zoomed, by about {zoom.factor:.1f}"
+        self.stats.values["zoom"] = zoom.factor
+        self.stats.warn(
+            f"the camera zoomed while it filmed: of the keyframes, {before}, {after}, about {zoom.factor:.1f} times as "
+            "much. One focal length is used for all frames, so poses and map are bent. Film without zooming, or map "
+            "the parts before and after it each by itself (dataset.start, dataset.stop)"
         )
 
     def _told(self, focal: float) -> str:

@@ -102,11 +102,20 @@ def observability(graph: KeyframeGraph, members: list[int], probe: float, thread
     return min(rises)
 
 
-def focal_of_all(graph: KeyframeGraph, members: list[int], threads: int) -> float | None:
+def focal_of_all(graph: KeyframeGraph, members: list[int], threads: int, steps: int = 10) -> float | None:
     """Factor on the focal length that all these keyframes would rather have; None where they can't tell."""
     problem = replace(graph.problem(members, set(members[1:]), set(members)), free_focal=True)
-    solution = adjust(problem, Solver(steps=10, robust_scale=1.0, tolerance=1e-4, threads=threads))
+    solution = adjust(problem, Solver(steps=steps, robust_scale=1.0, tolerance=1e-4, threads=threads))
     return None if solution.failure else solution.focal_factor
+
+
+def curvature_sigma(graph: KeyframeGraph, members: list[int], rise: float, probe: float) -> float:
+    """Standard deviation of the focal length, as a fraction, from the curvature of the cost alone, with matches of the
+    same images that err together; infinite where there is none. rise: see `observability`."""
+    matches = sum(graph.edges[a, b].matches for a, b in graph.edges if {a, b} <= set(members))
+    if rise <= 0.0 or matches == 0:
+        return float("inf")
+    return TOGETHER**0.5 * probe / float(np.sqrt(matches * rise))
 
 
 def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0) -> float:
@@ -115,14 +124,11 @@ def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads:
 
     factor: what they give, on the graph's focal length.
 
-    From the curvature of the cost, with matches of the same images that err together, and from how far parts of the
-    keyframes, each alone, disagree.
+    From the curvature of the cost, and from how far parts of the keyframes, each alone, disagree.
     """
-    rise = observability(graph, members, probe, threads, factor)
-    matches = sum(graph.edges[a, b].matches for a, b in graph.edges if {a, b} <= set(members))
-    if rise <= 0.0 or matches == 0:
-        return float("inf")
-    curvature = TOGETHER**0.5 * probe / float(np.sqrt(matches * rise))
+    curvature = curvature_sigma(graph, members, observability(graph, members, probe, threads, factor), probe)
+    if curvature == float("inf"):
+        return curvature
     found, weights = [], []
     for part in np.array_split(np.array(members), PARTS):
         if len(part) < MIN_KEYFRAMES:
@@ -141,6 +147,7 @@ def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads:
 
 __all__ = [
     "FocalConfig",
+    "curvature_sigma",
     "focal_of_all",
     "observability",
     "reconstructing_with_unknown_focal",
