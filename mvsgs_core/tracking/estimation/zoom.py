@@ -34,8 +34,8 @@ class Part:
 
 @dataclass(frozen=True)
 class Zoom:
-    """Of the parts that clearly differ the two that are surest of themselves, the earlier first. By how much is good to
-    a tenth or two: a part during a zoom wants too much, and the others began from a map that the zoom had bent."""
+    """Of the parts that clearly differ the two that are surest of themselves, the earlier first. By how much is only
+    roughly right: a part during a zoom wants too much, and the others began from a map that the zoom had bent."""
 
     before: Part
     after: Part
