@@ -13,7 +13,7 @@ from mvsgs_core.rasterizer.splats import Splats
 T = TypeVar("T")
 R = TypeVar("R")
 
-MAX_BYTES = 2e9  # of all frames at a time, beyond the first
+MAX_BYTES = 2e9  # of all frames at a time, where there is more than one
 PIXEL, SPLAT = 280, 150  # bytes that a frame takes of each, measured: SSIM's doubles, the rasterizer's lists
 
 
