@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from mvsgs_core.datasets import Item
-from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.tracking.estimation.zoom import PART, find_zoom
 from mvsgs_core.tracking.tracker import Tracker
 from tests.support.sequences import synthetic, tracked_room
@@ -26,13 +25,11 @@ def zoomed(item: Item, times: float) -> Item:
     return replace(item, image=image)
 
 
-@pytest.mark.parametrize("guessed", [False, True])
-def test_a_zoom_while_it_films_is_told_and_when(guessed: bool) -> None:
+def test_a_zoom_while_it_films_is_told_and_when() -> None:
     tracker, times = Tracker(), 1.3
     items = [zoomed(item, 1.0 + (times - 1.0) * np.clip((n - 35) / 10, 0, 1)) for n, item in enumerate(room())]
-    lens = np.array(guess_lens(items[0].image.shape[:2]).intrinsics) if guessed else items[0].intrinsics
     for item in items:
-        tracker.add(item.index, item.timestamp, item.image, lens, guessed=guessed)
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
     list(tracker.finish())
     (warning,) = [w for w in tracker.stats.warnings if "zoomed" in w]
     assert "poses and map are bent" in warning
