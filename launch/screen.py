@@ -15,7 +15,7 @@ from launch.graph import Graph
 from launch.status import NodeStatus, total
 
 PLAIN_SECONDS = 5.0  # between two lines
-FOLLOWED = ("frames", "keyframes", "views", "splats", "iterations", "frames_scored")
+FOLLOWED = ("frames", "keyframes", "views", "splats", "iterations")
 
 
 class Screen:

@@ -110,13 +110,13 @@ def linearized(seen: Rendered, target: np.ndarray, frame: ScoredFrame) -> Linear
     if frame.vignetting is not None:  # of the camera: it comes after the affine and does not move with the scene
         factor = factor * vignetting_factor(frame.vignetting, frame.intrinsics, target.shape[:2])[..., None]
     rows, columns = (taken(factor * slope) for slope in np.gradient(seen.color / factor, axis=(0, 1)))
-    color, residuals = taken(seen.color), taken(target - seen.color)
+    color, unit, residuals = taken(seen.color), taken(factor), taken(target - seen.color)
     jacobian = np.empty((MOTION + 4, len(depth)), dtype=np.float32)
     count = MOTION + 4 * len(color)
     hessian, gradient, squares = np.zeros((count, count)), np.zeros(count), 0.0
     for channel, residual in enumerate(residuals):
         jacobian[:MOTION] = -(columns[channel] * of_u + rows[channel] * of_v)
-        jacobian[MOTION:-1], jacobian[-1] = color, taken(factor)
+        jacobian[MOTION:-1], jacobian[-1] = color, unit
         jacobian[:, (color[channel] <= 0.0) | (color[channel] >= 1.0) | np.isnan(residual)] = 0.0
         residual = np.nan_to_num(residual)
         unknowns = np.r_[0:MOTION, MOTION + 4 * channel : MOTION + 4 * channel + 4]
@@ -132,7 +132,7 @@ def _pixel_motion(
     """(6, N) float32 of each axis: how pixels (u, v) of points at a depth, all (N,), move with the twist of the camera,
     its translation in `length`; the interaction matrix of visual servoing (Chaumette and Hutchinson 2006)."""
     fx, fy, cx, cy = intrinsics
-    x, y, near = ((a.astype(np.float32)) for a in ((u - cx) / fx, (v - cy) / fy, length / depth))
+    x, y, near = (a.astype(np.float32) for a in ((u - cx) / fx, (v - cy) / fy, length / depth))
     zero = np.zeros_like(x)
     of_u = np.stack([-near, zero, x * near, x * y, -(1.0 + x * x), y])
     of_v = np.stack([zero, -near, y * near, 1.0 + y * y, -x * y, -x])

@@ -53,6 +53,7 @@ class Zoom:
 def find_zoom(graph: KeyframeGraph, members: list[int], probe: float, threads: int) -> Zoom | None:
     """The zoom that parts of these keyframes, in their order, say there was; None where none is clear. The graph stays
     as it is. probe: fraction by which a focal length is made wrong to see how sure a part is."""
+    members = [index for index in members if index >= 0]  # frames of this run, not of a map that it goes on with
     count = len(members) // PART
     if count < 2:
         return None

@@ -24,15 +24,16 @@ def two_threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def most_at_a_time(size: tuple[int, int], splats: Splats) -> int:
-    working, most, lock = 0, 0, threading.Lock()
+def threads_at_work(size: tuple[int, int], splats: Splats, at_a_time: int) -> int:
+    """Of so many frames; each waits until the others of its time are at work, too."""
+    working, most, lock, together = 0, 0, threading.Lock(), threading.Barrier(at_a_time, timeout=30)
 
     def work(_: int) -> int:
         nonlocal working, most
         with lock:
             working += 1
             most = max(most, working)
-        time.sleep(0.02)
+        together.wait()
         with lock:
             working -= 1
         return torch.get_num_threads()
@@ -44,8 +45,8 @@ def most_at_a_time(size: tuple[int, int], splats: Splats) -> int:
 
 
 def test_as_many_at_a_time_as_there_are_threads_unless_they_are_too_large() -> None:
-    assert most_at_a_time(SIZE, empty_map()) == 2
-    assert most_at_a_time((4000, 6000), empty_map()) == 1
+    assert threads_at_work(SIZE, empty_map(), 2) == 2
+    assert threads_at_work((4000, 6000), empty_map(), 1) == 1
 
 
 def test_they_come_in_their_order() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -34,6 +35,10 @@ def test_a_zoom_while_it_films_is_told_and_when() -> None:
     (warning,) = [w for w in tracker.stats.warnings if "zoomed" in w]
     assert "poses and map are bent" in warning
     assert f"px in images of {items[0].image.shape[1]}x{items[0].image.shape[0]}" in warning
+    (first, last), (later, end) = (tuple(map(int, found)) for found in re.findall(r"frames (\d+) to (\d+)", warning))
+    assert first < last < later < end
+    assert first < 35
+    assert end > 45
     values = tracker.stats.values
     assert values["zoom"] == pytest.approx(times, rel=0.15)
     assert "zoomed" in values["focal_doubt"]
@@ -52,4 +57,5 @@ def test_a_camera_that_does_not_zoom_is_not_said_to() -> None:
     assert find_zoom(graph, members, PROBE, 1) is None
     assert "zoom" not in tracker.stats.values
     assert find_zoom(graph, members[: 2 * PART - 1], PROBE, 1) is None, "too few to tell"
+    assert find_zoom(graph, [-1 - n for n in range(2 * PART)], PROBE, 1) is None, "of a map that it goes on with"
     assert all(np.array_equal(graph.keyframes[index].cam_from_world, pose) for index, pose in before.items())
