@@ -9,6 +9,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.datasets.files import read_numbers
 from mvsgs_core.datasets.lens import Lens
 
 _FARTHEST = 1e12  # in the file's own unit: the Earth's radius is 6e9 millimeters
@@ -74,6 +76,15 @@ def is_rigid(matrix: np.ndarray) -> bool:
     except ValueError:
         return False
     return True
+
+
+def read_pose(path: Path) -> np.ndarray | None:
+    """(4, 4) float64, None where the file is missing or no pose: lost frames are marked by NaN or infinity."""
+    try:
+        pose = read_numbers(path)
+    except (OSError, BadFileError):
+        return None
+    return pose.reshape(4, 4) if pose.shape == (16,) and is_rigid(pose.reshape(4, 4)) else None
 
 
 def _without_suffix(name: str) -> str:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
-from mvsgs_core.camera import project, unproject
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.files import Layout, natural_order, read_numbers
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.model import is_rigid
+from mvsgs_core.datasets.model import read_pose
+from mvsgs_core.datasets.registration import register
 from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
 
 LAYOUT = Layout(
@@ -66,7 +66,7 @@ class SevenScenes(ImageSequence):
         without_pose = []
         for image in images:
             stem = image.name.split(".")[0]
-            pose = _read_pose(folder / f"{stem}.pose.txt")
+            pose = read_pose(folder / f"{stem}.pose.txt")
             if pose is None:
                 without_pose.append(stem)
             elif self.registered:
@@ -83,20 +83,6 @@ class SevenScenes(ImageSequence):
             return depth
         size = depth.shape[0], depth.shape[1]
         return register(depth, self._depth_camera.at(size), self._color_camera.at(size), _BASELINE)
-
-
-def register(depth: np.ndarray, source: Lens, target: Lens, baseline: float) -> np.ndarray:
-    """Depth map (H, W) float32 as a camera `baseline` to the right of its own sees it; the nearest surface wins."""
-    height, width = depth.shape
-    v, u = np.nonzero(depth)
-    z = depth[v, u]
-    points = unproject(depth, np.array(source.intrinsics))[v, u] - (baseline, 0.0, 0.0)
-    pixels = np.rint(project(points, np.array(target.intrinsics))).astype(np.int64)
-    inside = np.all((pixels >= 0) & (pixels < (width, height)), axis=1)
-    result = np.full(height * width, np.inf, dtype=np.float32)
-    np.minimum.at(result, pixels[inside, 1] * width + pixels[inside, 0], z[inside])
-    result[np.isinf(result)] = 0.0
-    return result.reshape(height, width)
 
 
 def _sequence_folder(folder: Path, sequence: str | None) -> Path:
@@ -120,12 +106,3 @@ def _find_depth_camera(folder: Path) -> Lens:
             with reading(path, "holds a camera that cannot be"):
                 return Lens((fx, fy, cx, cy), _DEPTH_CAMERA.size)
     return _DEPTH_CAMERA
-
-
-def _read_pose(path: Path) -> np.ndarray | None:
-    """(4, 4) float64, None where the file is missing or no pose: lost frames are marked by NaN or infinity."""
-    try:
-        pose = read_numbers(path)
-    except (OSError, BadFileError):
-        return None
-    return pose.reshape(4, 4) if pose.shape == (16,) and is_rigid(pose.reshape(4, 4)) else None

@@ -10,11 +10,11 @@ import numpy as np
 
 from mvsgs_core.bad_file import reading
 from mvsgs_core.datasets import dataset
+from mvsgs_core.datasets.by_time import nearest, poses_at
 from mvsgs_core.datasets.calibration import lens_for_images
 from mvsgs_core.datasets.files import Layout, inside
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
-from mvsgs_core.geometry import interpolate
 from mvsgs_core.trajectory_file import LATEST, read_trajectory
 
 LAYOUT = Layout(
@@ -30,7 +30,8 @@ CAMERAS = {
     "freiburg2": Lens((520.9, 521.0, 325.1, 249.7), (480, 640), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "freiburg3": Lens((535.4, 539.2, 320.1, 247.6), (480, 640)),
 }
-CALIBRATION_FILE = "camera.txt"  # our own addition: `fx fy cx cy [distortion]` in one line, in pixels of the images
+# `fx fy cx cy [distortion]` in one line, in pixels of the images: our own addition, and ETH3D's
+CALIBRATION_FILE, _ETH3D = "camera.txt", "calibration.txt"
 _DEPTH = DepthFormat(per_unit=5000.0)
 
 
@@ -45,7 +46,8 @@ class Tum(ImageSequence):
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
-    # freiburg1, freiburg2, freiburg3; null: from camera.txt, the folder's name or the header of groundtruth.txt
+    # freiburg1, freiburg2, freiburg3; null: from camera.txt, calibration.txt, the folder's name or the head of
+    # groundtruth.txt
     camera: str | None = None
     max_difference: float = 0.02  # seconds between an image and its pose or depth map
 
@@ -67,30 +69,19 @@ class Tum(ImageSequence):
         return Found(records, _DEPTH if depth_of else None)
 
     def _camera(self, folder: Path, images: list[Path]) -> Lens:
-        calibration = folder / CALIBRATION_FILE
+        files = (folder / CALIBRATION_FILE, folder / _ETH3D)
+        calibration = next((file for file in files if file.is_file()), None)
         if self.intrinsics is not None:
             return self._given_lens(images, self.intrinsics)
         if self.camera is not None:
             if self.camera not in CAMERAS:
                 raise ValueError(f"camera is one of {', '.join(CAMERAS)}, got {self.camera!r}")
             return CAMERAS[self.camera]
-        if calibration.is_file():
+        if calibration is not None:
             with reading(calibration, "must hold `fx fy cx cy` and perhaps the distortion"):
                 values = [float(v) for v in calibration.read_text(encoding="utf-8").split("#")[0].split()]
                 return lens_for_images(values[:4], values[4:], images)[0]  # no guess, so no warning
         return _published(folder)
-
-
-def nearest(wanted: np.ndarray, available: np.ndarray, max_difference: float) -> dict[int, int]:
-    """Index into `wanted` (N,) -> index into `available` (M, sorted) of the nearest time, where it is near enough."""
-    if len(available) == 0:
-        return {}
-    right = np.clip(np.searchsorted(available, wanted), 1, max(len(available) - 1, 1))
-    left = right - 1
-    right = np.minimum(right, len(available) - 1)
-    best = np.where(np.abs(available[left] - wanted) <= np.abs(available[right] - wanted), left, right)
-    near = np.abs(available[best] - wanted) <= max_difference
-    return {int(i): int(best[i]) for i in np.flatnonzero(near)}
 
 
 def _read_list(folder: Path, path: Path) -> list[tuple[float, Path]]:
@@ -139,21 +130,4 @@ def _poses(folder: Path, times: np.ndarray, max_difference: float) -> tuple[dict
     known, true = read_trajectory(path)
     if len(known) == 0:
         return {}, [f"{path.name} is empty: the trajectory is not scored"]
-    poses = {
-        i: _pose_at(times[i], known, true, j, max_difference) for i, j in nearest(times, known, max_difference).items()
-    }
-    notes = []
-    if len(poses) < len(times):
-        notes.append(f"{len(times) - len(poses)} of {len(times)} images have no true pose within {max_difference} s")
-    return poses, notes
-
-
-def _pose_at(time: float, known: np.ndarray, poses: np.ndarray, closest: int, max_difference: float) -> np.ndarray:
-    """Half the time between two poses of motion capture is a millimeter, or a pixel, at the speed of a hand."""
-    other = closest + (1 if time > known[closest] else -1)
-    if not 0 <= other < len(known) or not 0.0 < abs(known[other] - time) <= max_difference:
-        return np.asarray(poses[closest])
-    span = known[other] - known[closest]
-    if span == 0.0:
-        return np.asarray(poses[closest])
-    return interpolate(poses[closest], poses[other], (time - known[closest]) / span)
+    return poses_at(times, known, true, max_difference)

@@ -9,7 +9,7 @@ import pytest
 
 from mvsgs_core.datasets import formats, open_dataset
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.seven_scenes import register
+from mvsgs_core.datasets.registration import register
 from tests.support.dataset_folders import (
     pose,
     write_depth,
@@ -148,4 +148,4 @@ def test_a_missing_path_says_layout_and_source(tmp_path: Path, name: str) -> Non
 
 def test_an_unknown_format_lists_those_there_are() -> None:
     with pytest.raises(ValueError, match=r"seven_scenes.*tum"):
-        open_dataset("kitti")
+        open_dataset("waymo")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mvsgs_core.datasets import open_dataset
-from mvsgs_core.datasets.tum import CAMERAS, nearest
+from mvsgs_core.datasets.by_time import nearest
+from mvsgs_core.datasets.tum import CAMERAS
 from mvsgs_core.trajectory_file import read_trajectory
 from tests.support.dataset_folders import pose, truncate, write_image, write_tum
 

@@ -1,0 +1,45 @@
+"""What was measured at other times than an image's: the nearest, and poses between two."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core.geometry import interpolate
+
+
+def nearest(wanted: np.ndarray, available: np.ndarray, max_difference: float) -> dict[int, int]:
+    """Index into `wanted` (N,) -> index into `available` (M, sorted) of the nearest time, where it is near enough."""
+    if len(available) == 0:
+        return {}
+    right = np.clip(np.searchsorted(available, wanted), 1, max(len(available) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(available) - 1)
+    best = np.where(np.abs(available[left] - wanted) <= np.abs(available[right] - wanted), left, right)
+    near = np.abs(available[best] - wanted) <= max_difference
+    return {int(i): int(best[i]) for i in np.flatnonzero(near)}
+
+
+def poses_at(
+    times: np.ndarray, known: np.ndarray, poses: np.ndarray, max_difference: float
+) -> tuple[dict[int, np.ndarray], list[str]]:
+    """Index into `times` (N,), seconds -> pose (4, 4), of `poses` (M, 4, 4) at the times `known` (M, sorted).
+
+    Between two that are near enough it is interpolated, else the nearest one counts; where none is near enough there is
+    none. Returns warnings of that, too.
+    """
+    near = nearest(times, known, max_difference)
+    found = {i: _pose_at(times[i], known, poses, j, max_difference) for i, j in near.items()}
+    if len(found) == len(times):
+        return found, []
+    return found, [f"{len(times) - len(found)} of {len(times)} images have no true pose within {max_difference} s"]
+
+
+def _pose_at(time: float, known: np.ndarray, poses: np.ndarray, closest: int, max_difference: float) -> np.ndarray:
+    """Half the time between two poses of motion capture is a millimeter, or a pixel, at the speed of a hand."""
+    other = closest + (1 if time > known[closest] else -1)
+    if not 0 <= other < len(known) or not 0.0 < abs(known[other] - time) <= max_difference:
+        return np.asarray(poses[closest])
+    span = known[other] - known[closest]
+    if span == 0.0:
+        return np.asarray(poses[closest])
+    return interpolate(poses[closest], poses[other], (time - known[closest]) / span)

@@ -1,0 +1,22 @@
+"""Depth maps of a camera of their own, brought to the color camera's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvsgs_core.camera import project, unproject
+from mvsgs_core.datasets.lens import Lens
+
+
+def register(depth: np.ndarray, source: Lens, target: Lens, baseline: float) -> np.ndarray:
+    """Depth map (H, W) float32 as a camera `baseline` to the right of its own sees it; the nearest surface wins."""
+    height, width = depth.shape
+    v, u = np.nonzero(depth)
+    z = depth[v, u]
+    points = unproject(depth, np.array(source.intrinsics))[v, u] - (baseline, 0.0, 0.0)
+    pixels = np.rint(project(points, np.array(target.intrinsics))).astype(np.int64)
+    inside = np.all((pixels >= 0) & (pixels < (width, height)), axis=1)
+    result = np.full(height * width, np.inf, dtype=np.float32)
+    np.minimum.at(result, pixels[inside, 1] * width + pixels[inside, 0], z[inside])
+    result[np.isinf(result)] = 0.0
+    return result.reshape(height, width)
