@@ -133,6 +133,7 @@ def parameters() -> frozenset[str]:
         ["tracker=droid"],
         ["tracker=ground_truth"],
         ["dataset=robot"],
+        ["dataset=euroc"],
         ["dataset=ros2"],
         ["mvs=itermvs"],
     )
