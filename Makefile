@@ -32,10 +32,12 @@ check-system:
 
 # Exact versions, all of them: constraints.txt is the complete list. PIP_FLAGS: for example, on Linux without a GPU,
 # PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" spares gigabytes of CUDA packages.
+# Byte code is made on all cores, where pip would use one; some packages carry templates that are no Python.
 $(PACKAGES): constraints.txt | check-system
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "installing packages into .venv (4.2 GB, some minutes)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -r constraints.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile $(PIP_FLAGS) -r constraints.txt
+	@$(BIN)/python -m compileall -q -j 0 -x '/tests?/' .venv/lib > /dev/null 2>&1 || true
 	@touch $@
 
 # The package itself, with its C++ kernels: editable, so that an edit of Python needs no reinstallation.
