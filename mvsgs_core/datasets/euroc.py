@@ -139,7 +139,8 @@ def _read_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _mounted(body: Path, camera: int) -> Mounted | None:
     """As sensor.yaml or camchain.yaml has it; None where there is neither. Raises BadFileError."""
     name = f"cam{camera}"
-    for path, read in ((body / name / "sensor.yaml", _sensor), (body.parent / "dso" / "camchain.yaml", _chained)):
+    kalibr = body.resolve().parent / "dso" / "camchain.yaml"
+    for path, read in ((body / name / "sensor.yaml", _sensor), (kalibr, _chained)):
         if path.is_file():
             with reading(path, "is no calibration that can be used"):
                 lines = path.read_text(encoding="utf-8").splitlines()

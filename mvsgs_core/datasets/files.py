@@ -174,6 +174,11 @@ def images_in(folder: Path) -> list[Path]:
     return sorted((p for p in found if not is_mask_beside(p)), key=lambda p: natural_order(p.name))
 
 
+def numbered_images(folder: Path) -> list[Path]:
+    """0.png, 1.png, ... of a folder, which may be none; any number of leading zeros."""
+    return [p for p in images_in(folder) if p.stem.isascii() and p.stem.isdecimal()] if folder.is_dir() else []
+
+
 def is_mask_beside(path: Path) -> bool:
     """Whether that is the mask of an image in the same folder: NAME.jpg.png of NAME.jpg."""
     image = path.with_suffix("")

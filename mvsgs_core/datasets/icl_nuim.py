@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core.datasets import dataset
-from mvsgs_core.datasets.files import Layout, images_in
+from mvsgs_core.datasets.files import Layout, numbered_images
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import DepthFormat, Found, ImageSequence, Record
 from mvsgs_core.trajectory_file import read_trajectory
@@ -38,12 +38,12 @@ class IclNuim(ImageSequence):
     @staticmethod
     def recognizes(path: Path) -> bool:
         known = _truth_files(path) and (path / "depth").is_dir() and not (path / "rgb.txt").exists()
-        return bool(known and _numbered(path / "rgb"))
+        return bool(known and numbered_images(path / "rgb"))
 
     def _find(self) -> Found:
         folder = LAYOUT.folder(self.path)
         rgb = folder / "rgb"
-        images = _numbered(rgb)
+        images = numbered_images(rgb)
         if not images:
             raise LAYOUT.missing(f"{rgb} has no 0.png, 1.png, ...")
         lens = self._lens(images, _PUBLISHED)
@@ -62,11 +62,6 @@ class IclNuim(ImageSequence):
 def _mirror(pose: np.ndarray) -> np.ndarray:
     """A pose between left-handed frames (y up) as one between right-handed frames (y down)."""
     return np.asarray(_Y_DOWN @ pose @ _Y_DOWN)
-
-
-def _numbered(rgb: Path) -> list[Path]:
-    """0.png, 1.png, ... of a folder, which may be none."""
-    return [p for p in images_in(rgb) if p.stem.isascii() and p.stem.isdecimal()] if rgb.is_dir() else []
 
 
 def _truth_files(folder: Path) -> list[Path]:

@@ -10,7 +10,7 @@ import numpy as np
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import image_size
-from mvsgs_core.datasets.files import Layout, images_in, read_numbers
+from mvsgs_core.datasets.files import Layout, numbered_images, read_numbers
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import is_rigid
 from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
@@ -44,32 +44,35 @@ class Kitti(ImageSequence):
         folder = LAYOUT.folder(self.path)
         camera = (2 if (folder / "image_2").is_dir() else 0) if self.camera is None else self.camera
         source = LAYOUT.folder(folder / f"image_{camera}")
-        images = [p for p in images_in(source) if p.stem.isascii() and p.stem.isdecimal()]
+        images = numbered_images(source)
         if not images:
             raise LAYOUT.missing(f"{source} has no 000000.png, 000001.png, ...")
         published, cam0_from_cam = _camera(LAYOUT.file(folder / "calib.txt"), camera, images)
         lens = self._lens(images, published)
-        times, poses = self._times(folder), self._poses(folder)
+        times, poses = self._times(folder, last=int(images[-1].stem)), self._poses(folder)
         records = []
         for image in images:
             number = int(image.stem)
             pose = poses[number] @ cam0_from_cam if number < len(poses) and is_rigid(poses[number]) else None
-            time = times[number] if number < len(times) else number / _FRAME_RATE
-            records.append(Record(float(time), image, lens, pose))
+            time = number / _FRAME_RATE if times is None else float(times[number])
+            records.append(Record(time, image, lens, pose))
         missing = sum(record.world_from_cam is None for record in records)
         if missing and len(poses):
             self.warnings.append(f"{missing} of {len(records)} images have no true pose")
         return Found(records)
 
-    def _times(self, folder: Path) -> np.ndarray:
-        """Seconds (N,) of the frames from 0 on. Raises BadFileError for what can be none."""
+    def _times(self, folder: Path, last: int) -> np.ndarray | None:
+        """Seconds (N,) of the frames from 0 on, at least to the `last`; None where the file is missing. Raises
+        BadFileError for what can be none."""
         path = folder / "times.txt"
         if not path.is_file():
             self.warnings.append(f"{path} is missing: frames are taken to come at {_FRAME_RATE:g} a second")
-            return np.zeros(0)
+            return None
         times = read_numbers(path)
         if not np.all(np.abs(times) < LATEST) or np.any(np.diff(times) < 0):
             raise BadFileError(f"{path} must hold seconds that grow")
+        if len(times) <= last:
+            raise BadFileError(f"{path} has {len(times)} times, none of image {last}")
         return times
 
     def _poses(self, folder: Path) -> np.ndarray:

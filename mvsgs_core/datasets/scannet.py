@@ -10,7 +10,7 @@ import numpy as np
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import image_size
-from mvsgs_core.datasets.files import Layout, images_in, read_numbers
+from mvsgs_core.datasets.files import Layout, numbered_images, read_numbers
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import read_pose
 from mvsgs_core.datasets.registration import register
@@ -40,7 +40,7 @@ class ScanNet(ImageSequence):
 
     def _find(self) -> Found:
         folder = LAYOUT.folder(self.path)
-        images = [p for p in images_in(LAYOUT.folder(folder / "color")) if p.stem.isascii() and p.stem.isdecimal()]
+        images = numbered_images(folder / "color")
         if not images:
             raise LAYOUT.missing(f"{folder / 'color'} has no 0.jpg, 1.jpg, ...")
         if self.intrinsics is None:

@@ -140,7 +140,8 @@ def test_kitti_with_less(tmp_path: Path) -> None:
     "damage",
     [
         ("calib.txt", "P0: 1 2 3"), ("calib.txt", "P2: " + "nan " * 12), ("calib.txt", "P2: " + "1 " * 12),
-        ("times.txt", "0 1 x"), ("times.txt", "0 2 1 3"), ("times.txt", "0 nan"), ("poses.txt", "1 2 3"),
+        ("times.txt", "0 1 x"), ("times.txt", "0 2 1 3"), ("times.txt", "0 nan"), ("times.txt", "0 1 2"),
+        ("poses.txt", "1 2 3"),
     ],
 )  # fmt: skip
 def test_damaged_files_of_kitti_are_named(tmp_path: Path, damage: tuple[str, str]) -> None:
