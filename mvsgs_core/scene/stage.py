@@ -1,4 +1,4 @@
-"""The scenes by name: what is built, lit and walked through; kept in memory, because building takes seconds."""
+"""The scenes by name: what is built, lit and walked through; kept in memory and on disk, as building takes seconds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import numpy as np
 from .. import geometry
 from . import aerial, room, town
 from .drive import TownPath
+from .kept import kept
 from .lighting import Lighting
+from .lit import LitScene, lit
 from .materials import marbled
 from .patches import blob
 from .path import CameraPath, FlightPath, RoomPath
@@ -49,11 +51,15 @@ class Stage:
 @functools.lru_cache(maxsize=4)
 def renderer_of(scene: str, seed: int, textureless: int, streets: int = town.STREETS) -> SceneRenderer:
     """The scene built and lit; the same object for the same arguments. streets: of a town."""
-    if scene == "aerial":
-        return SceneRenderer(aerial.build(seed, textureless), aerial.LIGHTING, seed)
-    if scene == "town":
-        return SceneRenderer(town.build(seed, textureless, streets), town.LIGHTING, seed)
-    return SceneRenderer(room.build(seed, textureless), room.LIGHTING, seed)
+
+    def build() -> LitScene:
+        if scene == "aerial":
+            return lit(aerial.build(seed, textureless), aerial.LIGHTING, seed)
+        if scene == "town":
+            return lit(town.build(seed, textureless, streets), town.LIGHTING, seed)
+        return lit(room.build(seed, textureless), room.LIGHTING, seed)
+
+    return SceneRenderer(kept(f"{scene} {seed} {textureless} {streets if scene == 'town' else ''}", build))
 
 
 @functools.lru_cache(maxsize=4)
@@ -64,7 +70,7 @@ def ball_of(radius: float, seed: int) -> SceneRenderer:
     skin = marbled(rng, tones, density=70 / radius, grain=1.2 / radius)
     light = Lighting(texel=radius / 4, horizon=(0.5,) * 3, zenith=(0.9,) * 3, below=(0.25,) * 3)
     ball = blob((0, 0, 0), (radius, radius, radius), skin, rows=16, columns=24)
-    return SceneRenderer([ball], light, seed)
+    return SceneRenderer(lit([ball], light, seed))
 
 
 def stage(

@@ -18,6 +18,7 @@ from mvsgs_core.scene import materials
 from mvsgs_core.scene.difficulties import Difficulties
 from mvsgs_core.scene.furniture import table, vase
 from mvsgs_core.scene.lighting import Lighting, RectLight
+from mvsgs_core.scene.lit import lit
 from mvsgs_core.scene.patches import Patch, quad
 from mvsgs_core.scene.renderer import SceneRenderer
 from mvsgs_core.scene.room import HEIGHT, LENGTH, WIDTH
@@ -84,7 +85,7 @@ def error_of_wrong_pose(sequence: Synthetic) -> float:
 def test_depth_is_exact_at_pixel_centers() -> None:
     # A tilted plane z = 3 + 0.5 x - 0.25 y before a camera at the origin.
     corners = np.array([[[x, y, 3 + 0.5 * x - 0.25 * y] for x in (-5.0, 5.0)] for y in (-5.0, 5.0)])
-    scene = SceneRenderer([Patch(corners, np.full((8, 8, 3), 128, np.uint8))], LIGHT)
+    scene = SceneRenderer(lit([Patch(corners, np.full((8, 8, 3), 128, np.uint8))], LIGHT))
     intrinsics = np.array([100.0, 110.0, 30.2, 21.7])
     depth = scene.render(np.eye(4), intrinsics, (45, 63)).depth
     u, v = camera.pixel_grid(45, 63)
@@ -100,7 +101,7 @@ def test_nearest_hit_is_that_of_all_triangles_tried_one_by_one() -> None:
     paper = np.full((4, 4, 3), 128, np.uint8)
     patches = [Patch(np.stack([[a, b], [c, b + c - a]]), paper) for a, b, c in corners]
     intrinsics = np.array([40.0, 40.0, 19.5, 14.5])
-    depth = SceneRenderer(patches, LIGHT).render(np.eye(4), intrinsics, (30, 40)).depth
+    depth = SceneRenderer(lit(patches, LIGHT)).render(np.eye(4), intrinsics, (30, 40)).depth
     u, v = camera.pixel_grid(30, 40)
     rays = np.stack([(u - 19.5) / 40.0, (v - 14.5) / 40.0, np.ones_like(u)], axis=-1)
     expected = np.full((30, 40), np.inf)
@@ -119,14 +120,15 @@ def test_corner_that_is_not_finite_is_refused() -> None:
     points = quad((0, 0, 1), (1, 0, 0), (0, 1, 0))
     points[0, 0, 0] = np.nan
     with pytest.raises(ValueError, match="finite"):
-        SceneRenderer([Patch(points, np.zeros((4, 4, 3), np.uint8))], LIGHT)
+        lit([Patch(points, np.zeros((4, 4, 3), np.uint8))], LIGHT)
 
 
 def test_camera_axes_are_right_down_forward() -> None:
     white, dark = np.full((4, 4, 3), 255, np.uint8), np.full((4, 4, 3), 20, np.uint8)
     right_low = Patch(quad((0.2, 0.2, 2), (0.5, 0, 0), (0, 0.5, 0)), white, emission=1.0)
     rest = Patch(quad((-5, -5, 4), (10, 0, 0), (0, 10, 0)), dark, emission=1.0)
-    color = SceneRenderer([right_low, rest], LIGHT).render(np.eye(4), np.array([60, 60, 31.5, 23.5]), (48, 64)).color
+    scene = SceneRenderer(lit([right_low, rest], LIGHT))
+    color = scene.render(np.eye(4), np.array([60, 60, 31.5, 23.5]), (48, 64)).color
     rows, columns = np.nonzero(color[..., 0] > 0.9)
     assert rows.min() > 23.5
     assert columns.min() > 31.5
@@ -158,7 +160,7 @@ def test_build_does_not_depend_on_threads_and_changes_with_the_seed() -> None:
 
     def view(seed: int, threads: int) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        scene = SceneRenderer([*table(rng), *vase(rng, 1.1)], LIGHT, seed, threads)
+        scene = SceneRenderer(lit([*table(rng), *vase(rng, 1.1)], LIGHT, seed, threads))
         return scene.render(pose, intrinsics, (60, 80), threads=threads).color
 
     np.testing.assert_array_equal(view(0, 1), view(0, 2))

@@ -10,6 +10,7 @@ import pytest
 from mvsgs_core import camera
 from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.scene import drive, stage, town
+from mvsgs_core.scene.lit import lit
 from mvsgs_core.scene.path import look_at
 from mvsgs_core.scene.renderer import SceneRenderer
 
@@ -20,7 +21,7 @@ SIZE = (48, 64)
 @pytest.fixture(scope="module")
 def block() -> SceneRenderer:
     """The streets around a single block."""
-    return SceneRenderer(town.build(0, streets=2), town.LIGHTING, threads=1)
+    return SceneRenderer(lit(town.build(0, streets=2), town.LIGHTING, threads=1))
 
 
 def looking(plan: town.Plan, x: float, y: float, heading: float) -> np.ndarray:
