@@ -59,7 +59,7 @@ def test_with_time_for_it_all_comes_out_as_without_hurry() -> None:
 
 @pytest.mark.slow
 def test_frames_get_their_poses_while_a_keyframe_is_worked_on() -> None:
-    node, unhurried = Tracker(Tracker.Config(realtime=True)), split(list(sent_by(Tracker())))
+    node, unhurried = Tracker(Tracker.Config(realtime=True, share=1.0)), split(list(sent_by(Tracker())))
     meanwhile, begun = 0, 0
     sent: list[msgs.Message] = []
     for frame in frames():

@@ -96,13 +96,14 @@ class Synthetic:
         n = self.numbers[index]
         d = self.difficulties
         pose = self.path.pose(n)
-        view = self._view(pose, self.intrinsics, self.size, n)
+        at_once = not (d.motion_blur > 0 or d.rolling_shutter > 0 or d.rolling_columns > 0)
+        view = self._view(pose, self.intrinsics, self.size, n, color=at_once)
         light = view.color
         if d.motion_blur > 0:
             # The exposure is centered on the frame's time, where pose and depth are exact.
             offsets = d.motion_blur * ((np.arange(SUB_FRAMES) + 0.5) / SUB_FRAMES - 0.5)
             light = np.asarray(np.mean([self._light(n + o) for o in offsets], axis=0, dtype=np.float32))
-        elif d.rolling_shutter > 0 or d.rolling_columns > 0:
+        elif not at_once:
             light = self._light(n)
         covered = d.covered > 0 and d.covered_start <= n < d.covered_start + d.covered
         return Item(
@@ -132,17 +133,20 @@ class Synthetic:
         d = self.difficulties
         readout_time, axis = d.rolling_shutter or d.rolling_columns, 1 if d.rolling_columns else 0
         if readout_time == 0:
-            return self._view(self.path.pose(s), self.intrinsics, self.size, s).color
+            return self._view(self.path.pose(s), self.intrinsics, self.size, s, depth=False).color
         strips, lines = [], self.size[axis]
         for first in range(0, lines, STRIP):
             count = min(STRIP, lines - first)
             at = s + readout_time * ((first + (count - 1) / 2) / lines - 0.5)
             lens, size = self.intrinsics.copy(), (self.size[0], count) if axis else (count, self.size[1])
             lens[3 - axis] -= first
-            strips.append(self._view(self.path.pose(at), lens, size, at).color)
+            strips.append(self._view(self.path.pose(at), lens, size, at, depth=False).color)
         return np.concatenate(strips, axis)
 
-    def _view(self, pose: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], s: float) -> Rendering:
+    def _view(
+        self, pose: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int], s: float, color: bool = True,
+        depth: bool = True,
+    ) -> Rendering:  # fmt: skip
         d = self.difficulties
         moving = d.moving_object > 0
         return self.stage.renderer.render(
@@ -153,6 +157,8 @@ class Synthetic:
             mover=self.stage.ball if moving else None,
             world_from_mover=self.stage.world_from_ball(s, pose) if moving else None,
             threads=self.threads,
+            color=color,
+            depth=depth,
         )
 
     def _to_world(self, pose: np.ndarray) -> np.ndarray:

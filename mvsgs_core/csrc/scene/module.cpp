@@ -30,7 +30,9 @@ int thread_count(int threads) { return threads > 0 ? threads : omp_get_max_threa
 scene::Vec3 vector_at(const float* p) { return {p[0], p[1], p[2]}; }
 scene::Color color_at(const float* p) { return scene::Color{p[0], p[1], p[2], 0}; }
 
-nb::ndarray<nb::numpy, float> array(std::vector<size_t> shape, float*& data) {
+using Shape = std::vector<size_t>;
+
+nb::ndarray<nb::numpy, float> array(const Shape& shape, float*& data) {
     size_t n = 1;
     for (const size_t s : shape) n *= s;
     data = new float[n];
@@ -87,7 +89,7 @@ std::unique_ptr<Scene> make(const Corners& corners, const Coordinates& coordinat
 
 nb::tuple render(const Scene& self, const Matrix& world_from_cam, double fx, double fy, double cx, double cy,
                  int height, int width, float gloss, const Floats& gloss_light, const Scene* mover,
-                 const Matrix& mover_from_world, int threads) {
+                 const Matrix& mover_from_world, int threads, bool wants_color, bool wants_depth) {
     if (height < 1 || width < 1 || !(fx > 0) || !(fy > 0)) throw std::invalid_argument("size and focal length must be positive");
     if (gloss_light.shape(0) != 3) throw std::invalid_argument("gloss_light: (3,)");
     const scene::Camera camera{pose_of(world_from_cam), static_cast<float>(fx), static_cast<float>(fy),
@@ -95,10 +97,12 @@ nb::tuple render(const Scene& self, const Matrix& world_from_cam, double fx, dou
     const scene::Pose mover_pose = pose_of(mover_from_world);
     float *color = nullptr, *depth = nullptr;
     const size_t h = static_cast<size_t>(height), w = static_cast<size_t>(width);
-    auto color_array = array({h, w, 3}, color), depth_array = array({h, w}, depth);
+    auto color_array = array(wants_color ? Shape{h, w, 3} : Shape{0, 0, 3}, color);
+    auto depth_array = array(wants_depth ? Shape{h, w} : Shape{0, 0}, depth);
     {
         nb::gil_scoped_release release;
-        self.render(camera, gloss, vector_at(gloss_light.data()), mover, mover_pose, thread_count(threads), color, depth);
+        self.render(camera, gloss, vector_at(gloss_light.data()), mover, mover_pose, thread_count(threads),
+                    wants_color ? color : nullptr, wants_depth ? depth : nullptr);
     }
     return nb::make_tuple(color_array, depth_array);
 }
@@ -141,7 +145,8 @@ BIND(MVSGS_MODULE, m) {
     nb::class_<Scene>(m, "Scene")
         .def(nb::new_(&make), "corners"_a, "coordinates"_a, "patch_of"_a, "textures"_a, "light_sizes"_a, "gloss"_a, "sky"_a)
         .def("render", &render, "world_from_cam"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a, "height"_a, "width"_a, "gloss"_a,
-             "gloss_light"_a, "mover"_a.none(), "mover_from_world"_a, "threads"_a = 0)
+             "gloss_light"_a, "mover"_a.none(), "mover_from_world"_a, "threads"_a = 0, "wants_color"_a = true,
+             "wants_depth"_a = true)
         .def("direct_light", &direct_light, "points"_a, "normals"_a, "lights"_a, "rays"_a, "seed"_a, "threads"_a = 0)
         .def("bounced_light", &bounced_light, "points"_a, "normals"_a, "rays"_a, "seed"_a, "threads"_a = 0)
         .def("set_light", &set_light, "light"_a);

@@ -78,17 +78,19 @@ void Scene::render(const Camera& camera, float gloss, Vec3 gloss_light, const Sc
         };
         for (int tile_x = 0; tile_x < tiles_x; ++tile_x) {
             const int left = tile_x * TILE, top = tile_y * TILE;
-            for (int l = 0; l < LANES; ++l)
-                aim(packet, l, camera, static_cast<float>(left + l % TILE), static_cast<float>(top + l / TILE));
-            cast();
-            for (int l = 0; l < LANES; ++l) {
-                const int x = left + l % TILE, y = top + l / TILE;
-                if (x >= camera.width || y >= camera.height) continue;
-                const bool moving = mover && other.triangle[l] >= 0;
-                const float t = moving ? other.t[l] : packet.triangle[l] >= 0 ? packet.t[l] : 0.0f;
-                depth[static_cast<size_t>(y) * camera.width + x] = t;
+            if (depth) {
+                for (int l = 0; l < LANES; ++l)
+                    aim(packet, l, camera, static_cast<float>(left + l % TILE), static_cast<float>(top + l / TILE));
+                cast();
+                for (int l = 0; l < LANES; ++l) {
+                    const int x = left + l % TILE, y = top + l / TILE;
+                    if (x >= camera.width || y >= camera.height) continue;
+                    const bool moving = mover && other.triangle[l] >= 0;
+                    const float t = moving ? other.t[l] : packet.triangle[l] >= 0 ? packet.t[l] : 0.0f;
+                    depth[static_cast<size_t>(y) * camera.width + x] = t;
+                }
             }
-            for (int block = 0; block < 4; ++block) {
+            for (int block = 0; color && block < 4; ++block) {
                 const int x0 = left + 2 * (block % 2), y0 = top + 2 * (block / 2);
                 if (x0 >= camera.width || y0 >= camera.height) continue;
                 for (int l = 0; l < LANES; ++l)

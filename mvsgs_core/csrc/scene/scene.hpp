@@ -41,7 +41,8 @@ public:
         : surfaces(std::move(surfaces)), bvh(corners), sky(sky) {}
 
     // Linear color (H, W, 3), anti-aliased with 4 rays a pixel, and z (H, W) at pixel centers, 0 where there is nothing.
-    // `mover` is a second scene that stands at `mover_from_world`; its hits count where they are nearer.
+    // `mover` is a second scene that stands at `mover_from_world`; its hits count where they are nearer. Of color and
+    // depth, null is not wanted.
     void render(const Camera& camera, float gloss, Vec3 gloss_light, const Scene* mover, const Pose& mover_from_world,
                 int threads, float* color, float* depth) const;
 

@@ -10,6 +10,7 @@ namespace scene {
 namespace {
 
 typedef uint8_t Bytes __attribute__((vector_size(4)));
+typedef int32_t Whole __attribute__((vector_size(16)));
 
 float decode(float srgb) { return srgb <= 0.04045f ? srgb / 12.92f : std::pow((srgb + 0.055f) / 1.055f, 2.4f); }
 float encode(float x) { return x <= 0.0031308f ? 12.92f * x : 1.055f * std::pow(x, 1 / 2.4f) - 0.055f; }
@@ -34,7 +35,7 @@ const auto ENCODE = encode_table();
 Color unpack(uint32_t packed) {
     Bytes bytes;
     std::memcpy(&bytes, &packed, 4);
-    return __builtin_convertvector(bytes, Color);
+    return __builtin_convertvector(__builtin_convertvector(bytes, Whole), Color);  // in two steps: no scalar ones
 }
 
 uint32_t pack(Color linear) {
