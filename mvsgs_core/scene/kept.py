@@ -30,7 +30,8 @@ def kept(name: str, build: Callable[[], LitScene]) -> LitScene:
     with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         with file.open("rb") as data, np.load(data, allow_pickle=False) as stored:
             scene = LitScene(**{field.name: stored[field.name] for field in fields(LitScene)})
-        os.utime(file)
+        with contextlib.suppress(OSError):  # another user's folder, which can be read
+            os.utime(file)
         return scene
     scene = build()
     with contextlib.suppress(OSError):

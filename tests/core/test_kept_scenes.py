@@ -1,4 +1,4 @@
-"""Lit scenes on the disk: built once, the same from there, made anew where the file is no good."""
+"""Lit scenes: built once, the same from the disk, made anew where the file is no good; color or depth of them alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mvsgs_core.scene.kept import folder, kept
 from mvsgs_core.scene.lighting import Lighting
 from mvsgs_core.scene.lit import LitScene, lit
 from mvsgs_core.scene.patches import Patch, quad
-from mvsgs_core.scene.renderer import SceneRenderer
+from mvsgs_core.scene.renderer import Rendering, SceneRenderer
 
 LIGHT = Lighting(texel=0.5, horizon=(0.2, 0.3, 0.4), below=(0.9, 0.8, 0.7))
 
@@ -81,6 +81,17 @@ def test_where_nothing_can_be_written_it_is_built_each_time(own_folder: Path) ->
     assert build.built == 2
 
 
+def test_what_can_be_read_alone_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError("not the owner")
+
+    build = Builder()
+    kept("paper", build)
+    monkeypatch.setattr(module.os, "utime", refuse)
+    kept("paper", build)
+    assert build.built == 1
+
+
 def test_those_not_used_for_longest_make_room(own_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "LIMIT", 2)
     build = Builder()
@@ -96,3 +107,15 @@ def test_those_not_used_for_longest_make_room(own_folder: Path, monkeypatch: pyt
     assert build.built == 3
     kept("second", build)
     assert build.built == 4
+
+
+def test_what_is_not_wanted_is_not_rendered_and_the_rest_is_the_same() -> None:
+    def render(**wanted: bool) -> Rendering:
+        return renderer.render(np.eye(4), np.array([40.0, 40.0, 19.5, 14.5]), (30, 40), threads=1, **wanted)
+
+    renderer = SceneRenderer(Builder()())
+    both, color, depth = render(), render(depth=False), render(color=False)
+    assert both.depth.std() > 0.1
+    np.testing.assert_array_equal(color.color, both.color)
+    np.testing.assert_array_equal(depth.depth, both.depth)
+    assert color.depth.size == depth.color.size == 0
