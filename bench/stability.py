@@ -209,7 +209,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     steps = 2_000 if options.quick else 20_000
     usual = OptimizerConfig()
     wild = replace(usual, **{key: 100.0 * value for key, value in vars(usual).items()
-                             if key not in ("means_final", "decay_steps")})  # fmt: skip
+                             if key not in ("means_final", "decay_steps", "max_scale_in_stream")})  # fmt: skip
     for kernel in ("gaussian", "exact"):
         training = TrainingConfig(kernel=kernel, betas=True)
         convergence = replace(config.convergence, skip=False)

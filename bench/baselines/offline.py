@@ -21,9 +21,11 @@ from mvsgs_core import image_metrics
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.optimizer import OptimizerConfig
 
-RATES = {  # of places and extents: splats that begin at sparse points need not like what dense ones do
-    "small": OptimizerConfig(means=5e-4, log_scales=0.03), "ours": OptimizerConfig(),
-}  # fmt: skip
+RATES = {  # of places and extents: splats that begin at sparse points need not like what dense ones do; all views are
+    # there from the start, so that nothing is bounded as in a stream
+    "small": OptimizerConfig(means=5e-4, log_scales=0.03, max_scale_in_stream=1.0),
+    "ours": OptimizerConfig(max_scale_in_stream=1.0),
+}
 GAIN = 0.1  # dB: a doubling of the time that brings less is the end
 
 

@@ -13,13 +13,14 @@ from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.interface import Moved, SplatStep
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
+WIDE = 10.0  # pixels: standard deviation that every splat may have, a little more than the widest new one
 
 
 @dataclass(frozen=True)
 class OptimizerConfig:
     """Rates of a splat's parameters. Lengths are in units of the scene's median depth.
 
-    Raises ValueError for a `max_scale` that no splat has.
+    Raises ValueError for a `max_scale` that no splat has, and for a `max_scale_in_stream` that is no part of it.
     """
 
     means: float = 1.0e-3  # median depths a step, for a new splat
@@ -27,6 +28,8 @@ class OptimizerConfig:
     decay_steps: int = 600  # steps of a splat until then, log-linear
     log_scales: float = 0.1  # natural logarithm a step
     max_scale: float = 0.2  # median depths: the widest standard deviation; wider, it is fog to a camera that comes near
+    # of `max_scale`, before the refinement, when few views tell where a splat belongs; 10 pixels at least
+    max_scale_in_stream: float = 0.25
     quaternions: float = 0.015  # a step, of a unit quaternion
     opacity_logits: float = 0.05  # logit a step
     sh: float = 0.03  # color a step, degree 0; higher degrees a twentieth
@@ -35,11 +38,16 @@ class OptimizerConfig:
     def __post_init__(self) -> None:
         if not 1e-5 <= self.max_scale <= 1e5:
             raise ValueError(f"mapper.optimizer.max_scale={self.max_scale}: median depths, from 1e-5 to 1e5")
+        if not 1e-3 <= self.max_scale_in_stream <= 1.0:
+            raise ValueError(
+                f"mapper.optimizer.max_scale_in_stream={self.max_scale_in_stream}: a part of max_scale, from 0.001 to 1"
+            )
 
 
 @dataclass(frozen=True)
 class Group:
-    """One parameter's step: `low` and `high` bound its values, which is what keeps wild rates finite."""
+    """One parameter's step: it takes no value beyond `low` and `high`, which is what keeps wild rates finite. What is
+    beyond them already goes no further."""
 
     name: str
     rate: float
@@ -50,10 +58,20 @@ class Group:
     tail: float = 1.0  # the others this fraction of it
 
 
-def groups(rates: OptimizerConfig, median_depth: float, factor: float, train_betas: bool, kernel: str) -> list[Group]:
-    """The steps of all parameters for a scene of this median depth; `factor` scales all rates (the global decay)."""
+def groups(
+    rates: OptimizerConfig, median_depth: float, factor: float, train_betas: bool, kernel: str, *,
+    streaming: float | None = None,
+) -> list[Group]:  # fmt: skip
+    """The steps of all parameters for a scene of this median depth; `factor` scales all rates (the global decay).
+
+    streaming: focal length, pixels, of a stream in which splats may not yet grow as wide as in the refinement; None: in
+    that.
+    """
     log_depth = math.log(median_depth)
-    largest = log_depth + math.log(rates.max_scale)
+    widest = rates.max_scale
+    if streaming is not None:
+        widest *= min(max(rates.max_scale_in_stream, WIDE / streaming / widest), 1.0)
+    largest = log_depth + math.log(widest)
     means = rates.means * median_depth * factor
     beta_range = (-60.0, 60.0) if kernel == "ges_scale" else (0.1, 20.0)
     result = [
@@ -130,7 +148,8 @@ def step_reference(state: MapState, visible: Tensor, steps: list[Group], decay_s
         column = torch.arange(value.shape[1], device=value.device)
         rate = rate * torch.where(column < group.lead, 1.0, group.tail)
         update = rate * (m / (1 - BETA_1**age)) / ((v / (1 - BETA_2**age)).sqrt() + EPSILON)
-        stepped = (value - update).clamp(group.low, group.high).to(value.dtype)
+        low, high = value.clamp(max=group.low), value.clamp(min=group.high)
+        stepped = torch.minimum(torch.maximum(value - update, low), high).to(value.dtype)
         finite = torch.isfinite(stepped.abs().sum(dim=1) + m.abs().sum(dim=1) + v.sum(dim=1))
         refused |= taken & ~finite
         rows = (taken & finite)[:, None]

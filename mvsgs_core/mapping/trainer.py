@@ -81,12 +81,14 @@ class Trainer:
         return found
 
     def step(self, view: TrainingView, median_depth: float, *, refining: bool = False) -> None:
-        """One iteration on a keyframe. median_depth: of the scene; refining: no splat is added or removed."""
+        """One iteration on a keyframe. median_depth: of the scene; refining: no splat is added or removed, and
+        they may grow wider, see `OptimizerConfig`."""
         training = self.config.training
         exposure = None if view.measured is None else view.exposure.requires_grad_(self.exposure_rate > 0.0)
         moving = training.refine_poses and not view.fixed and view.visits >= training.pose_visits
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
-        step = self._fused_step(median_depth)
+        groups = self._groups(median_depth, None if refining else float(view.intrinsics[:2].max()))
+        step = self._fused_step(groups)
         at_once = self._own_loss is None and only_photometric(self._weights)
         render = self._rasterize(
             self.state.splats, view, view.intrinsics, view.size, median_depth, exposure, twist, step=step,
@@ -101,7 +103,7 @@ class Trainer:
         value = float(loss.detach())
         if value < float("inf"):
             loss.backward()
-            self._step_splats(render, median_depth, step)
+            self._step_splats(render, groups, step)
             self._step_camera(view, twist, median_depth)
             view.record(value)
         else:
@@ -187,13 +189,11 @@ class Trainer:
         frequency = frequency_of(view.visits, self.config.training.frequency_horizon)
         return LossInputs(render, target, self.state.splats, frequency, self.config.threads)
 
-    def _groups(self, median_depth: float) -> list[optimizer.Group]:
-        config = self.config
-        return optimizer.groups(
-            config.optimizer, median_depth, self.rate, config.training.betas, config.training.kernel
-        )
+    def _groups(self, median_depth: float, streaming: float | None) -> list[optimizer.Group]:
+        rates, training = self.config.optimizer, self.config.training
+        return optimizer.groups(rates, median_depth, self.rate, training.betas, training.kernel, streaming=streaming)
 
-    def _fused_step(self, median_depth: float) -> SplatStep | None:
+    def _fused_step(self, groups: list[optimizer.Group]) -> SplatStep | None:
         """Adam for the backward pass to take; None where gradients are needed: where a kernel or a loss leads them on,
         splats are stepped unseen, or the back end cannot."""
         training, state = self.config.training, self.state
@@ -201,9 +201,9 @@ class Trainer:
         leads_on = training.kernel == "ges_scale" or self._own_loss is not None or len(SPLAT_TERMS) > 0
         if backend != "cpu" or leads_on or not training.selective:
             return None
-        return optimizer.splat_step(state, self._groups(median_depth), self.config.optimizer.decay_steps)
+        return optimizer.splat_step(state, groups, self.config.optimizer.decay_steps)
 
-    def _step_splats(self, render: Render, median_depth: float, step: SplatStep | None) -> None:
+    def _step_splats(self, render: Render, groups: list[optimizer.Group], step: SplatStep | None) -> None:
         """Adam on the splats that were seen, by the gradients that the backward pass left, or as it did itself."""
         config, log = self.config, self.log
         if render.backward.refused:
@@ -218,7 +218,7 @@ class Trainer:
                 self.state.accumulate_means2d(gradient, render.visible)
             stepped = render.visible if selective else torch.ones_like(render.visible)
             decay_steps, threads = config.optimizer.decay_steps, config.threads or 0
-            refused = optimizer.step(self.state, stepped, self._groups(median_depth), decay_steps, threads)
+            refused = optimizer.step(self.state, stepped, groups, decay_steps, threads)
         if refused:
             log.refuse("steps", refused, "steps of splats with gradients that are not finite were refused")
         if selective:

@@ -19,7 +19,7 @@ struct Group {
     int width;
     float rate;        // learning rate of a new splat
     float final_rate;  // and of an old one: log-linear in between over `decay_steps`
-    float low, high;   // values are kept inside
+    float low, high;   // no step goes beyond; a value that is there already goes no further
     int lead;          // columns that take the full rate,
     float tail;        // the others this fraction of it: spherical harmonics beyond degree 0
     std::vector<float> rates{};  // by age, as far as a table goes; empty where the rate stays
@@ -75,7 +75,7 @@ inline float step_value(const Group& g, const Constants& c, float d, float rate,
     first = c.beta1 * first + (1.0f - c.beta1) * d;
     second = c.beta2 * second + (1.0f - c.beta2) * d * d;
     const float step = rate * (first * correction1) / (std::sqrt(second * correction2) + c.epsilon);
-    value = std::min(std::max(value - step, g.low), g.high);
+    value = std::min(std::max(value - step, std::min(g.low, value)), std::max(g.high, value));
     return std::fabs(value) + std::fabs(first) + second;
 }
 
