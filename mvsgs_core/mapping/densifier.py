@@ -21,6 +21,7 @@ from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.stats import Stats
 
 SOLID = 0.9  # opacity from which the map's depth at a pixel is its surface's
+_BEST, _SQUARE_OF_BEST = 0.1, 0.195  # share of pixels; mean square of three normal numbers that it stays below
 FAR = 1e6  # median depths from which float32 does not hold a splat beside the others
 
 
@@ -37,12 +38,15 @@ class Densifier:
         self._kernel = config.training.kernel
         self._max_splats = config.density_control.max_splats
 
-    def add(self, keyframe: RGBDKeyframe, view: TrainingView, depth: np.ndarray) -> int:
-        """Adds the splats of the store's newest keyframe; returns their number. depth: (h, w), checked, world units."""
+    def add(self, keyframe: RGBDKeyframe, view: TrainingView, depth: np.ndarray, late: bool = False) -> int:
+        """Adds the splats of the store's newest keyframe; returns their number.
+
+        depth: (h, w), checked, world units; late: the map is coarse there, as splats that were owed are added only now.
+        """
         size = view.size
         image = view.target.cpu().numpy()
         valid = np.ones(size, dtype=bool) if view.valid is None else view.valid.cpu().numpy()
-        residual, shown = self._residual(view, image)
+        residual, shown, noise = self._residual(view, image)
         depth = _nearest(self._near(depth / np.float32(self.frame.length)), size)
         known = wanted = (depth > 0) & valid
         confidence = np.ones(size, dtype=np.float32)
@@ -55,7 +59,7 @@ class Densifier:
         if not wanted.any():
             return 0
         focal = float(np.sqrt(view.intrinsics[0] * view.intrinsics[1]))
-        parts = partition(image, residual, wanted, depth, known, 1.0 / focal, self.config.price)
+        parts = partition(image, residual, wanted, depth, known, 1.0 / focal, self.config.price, 0.0 if late else noise)
         self.log.skip("pixels_explored", int((known & (parts.labels < 0)).sum()))
         self.log.count("pixels_filled", int((~known & (parts.labels >= 0)).sum()))
         normals = None if keyframe.normals is None else _nearest(keyframe.normals, size)
@@ -63,24 +67,29 @@ class Densifier:
         points = points_of_rectangles(parts, depth, known, confidence, view.intrinsics, colors, normals)
         return self._append(points, view)
 
-    def _residual(self, view: TrainingView, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Squared error (H, W), mean over RGB, of what the map shows of an image, and its depth there, 0: nothing.
+    def _residual(self, view: TrainingView, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Squared error (H, W), mean over RGB, of what the map shows of an image, its depth there, 0: nothing, and the
+        variance of the image's noise, 0 where there is no map.
 
-        It counts beyond `median_errors` times the median alone: that is what blur, noise, exposure and a pose's error
-        do to this view, which no splat mends. On a clean view it is small, and detail that the map lacks stands out.
+        The error counts beyond `median_errors` times the median alone: that is what blur, noise, exposure and a pose's
+        error do to this view, which no splat mends. On a clean view it is small, and detail that the map lacks stands
+        out.
         """
         residual, shown = np.full(view.size, EMPTY, dtype=np.float32), np.zeros(view.size, dtype=np.float32)
         if not len(self.state):
-            return residual, shown
+            return residual, shown, 0.0
+        noise = 0.0
         render = self.render(view)
         opacity = render.opacity.cpu().numpy()
         shown = np.where(opacity > SOLID, render.depth.cpu().numpy(), np.float32(0))
         mapped = opacity >= self.config.min_opacity
         if self.config.unexplored and mapped.any():
             squared = np.mean((render.color.cpu().numpy() - image) ** 2, axis=-1)
-            usual = self.config.median_errors**2 * np.median(squared[mapped])
-            residual[mapped] = np.where(squared > usual, squared - usual, 0.0)[mapped]
-        return residual, shown
+            usual = np.median(squared[mapped])
+            noise = noise_variance(squared[mapped])
+            beyond = squared - self.config.median_errors**2 * usual
+            residual[mapped] = np.maximum(beyond, 0.0)[mapped]
+        return residual, shown, noise
 
     def _doubtful_depth(
         self, keyframe: RGBDKeyframe, view: TrainingView, shown: np.ndarray
@@ -123,6 +132,14 @@ def checked_depth(depth: np.ndarray, log: Stats) -> np.ndarray:
     if bad.any():
         log.refuse("depths", int(bad.sum()), "depths that are not finite or negative were left out")
     return np.where(bad, 0.0, depth).astype(np.float32)
+
+
+def noise_variance(squared: np.ndarray) -> float:
+    """Of an image, from the squared errors (N,), mean over RGB, of the map's render of it.
+
+    Noise is everywhere alike, what the map lacks is not: so the best tenth of the pixels tell of it.
+    """
+    return float(np.quantile(squared, _BEST)) / _SQUARE_OF_BEST
 
 
 def _nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -26,7 +26,9 @@ class InsertionConfig:
     """Where splats are added and what they look like at first."""
 
     unexplored: bool = True  # only where the map's render differs from the image; false: as if there were no map
-    price: float = 0.25  # dissimilarity, as SSIM's, that a splat must mend (.11: 40 dB of a pixel amid gray ones)
+    # dissimilarity, as SSIM's, that a splat must mend (.11: 40 dB of a pixel amid gray ones); the noise of the view's
+    # image, in the same unit, comes to it, so that it at most doubles
+    price: float = 0.25
     median_errors: float = 3.0  # times a view's median error that a pixel of the map may have: blur, noise, pose
     min_opacity: float = 0.7  # rendered opacity below: the map shows nothing there, whatever the color
     doubtful: bool = True  # where it shows nothing, splats of doubtful or continued depth, too; false: it stays empty

@@ -234,7 +234,7 @@ class OnlineMapper:
         with self.log.time("insertion"):
             at_once = view if image is None else view.rectified(image)
             depth = keyframe.depth * np.float32(view.scale / keyframe.scale)
-            self.log.count("inserted", self.densifier.add(keyframe, at_once.smaller(halvings), depth))
+            self.log.count("inserted", self.densifier.add(keyframe, at_once.smaller(halvings), depth, late=True))
 
     def refine(self, done: int, total: int) -> None:
         """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates; half of

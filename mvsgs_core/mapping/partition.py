@@ -51,13 +51,15 @@ class Split:
 
 def partition(
     image: np.ndarray, residual: np.ndarray, wanted: np.ndarray, depth: np.ndarray, known: np.ndarray, angle: float,
-    price: float,
+    price: float, noise: float = 0.0,
 ) -> Partition:  # fmt: skip
     """The split of least cost.
 
     image: (H, W, 3) in [0, 1]; residual: (H, W) squared error, mean over RGB, that stays at a pixel without a splat,
     `EMPTY` where the map shows nothing; wanted: (H, W) bool, the pixels that can get one; depth: (H, W), positive where
-    known (H, W) bool; angle: of a pixel, radians; price: dissimilarity, summed over pixels, that a splat must save.
+    known (H, W) bool; angle: of a pixel, radians; price: dissimilarity, summed over pixels, that a splat must save;
+    noise: variance of the image's noise. A splat more follows the noise of a pixel more, which no other view has, so
+    that it must save that too, as the dissimilarity of a pixel of median contrast; the price at most once more.
 
     A splat shows the mean color of its rectangle, blended with its neighbors'. One whose known depths differ by more
     than its side, as standard deviations of the logarithm go, lies on two surfaces and is always split.
@@ -77,7 +79,7 @@ def partition(
         sure=sure,
         logarithm=np.log(np.where(sure, np.pad(depth, beyond), 1.0), dtype=np.float64),
         angle=angle,
-        price=price,
+        price=price + min(price, noise * float(np.median(scale))),
     )
     labels, sides = native.load("mapping").partition(**vars(given), threads=torch.get_num_threads())
     return Partition(labels[: size[0], : size[1]], sides)

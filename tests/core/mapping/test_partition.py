@@ -22,13 +22,14 @@ ANGLE = 1 / 60.0
 def split(
     image: np.ndarray, residual: np.ndarray | float = EMPTY, wanted: np.ndarray | bool = True,
     depth: np.ndarray | float = 2.0, known: np.ndarray | bool = True, price: float = PRICE,
+    noise: float = 0.0,
 ) -> Partition:  # fmt: skip
     size = image.shape[:2]
 
     def full(value: np.ndarray | float | bool) -> np.ndarray:
         return np.broadcast_to(np.asarray(value), size).copy()
 
-    return partition(image, full(residual), full(wanted), full(depth), full(known), ANGLE, price)
+    return partition(image, full(residual), full(wanted), full(depth), full(known), ANGLE, price, noise)
 
 
 def textured(size: tuple[int, int] = SIZE) -> np.ndarray:
@@ -155,6 +156,15 @@ def test_less_price_is_never_fewer_splats() -> None:
     assert counts == sorted(counts, reverse=True)
     assert counts[0] == 48 * 64
     assert counts[-1] == 0
+
+
+def test_amid_noise_faint_detail_is_worth_fewer_splats() -> None:
+    rng = np.random.default_rng(5)
+    image = (0.5 + 0.03 * (textured() - 0.5) + 0.01 * rng.standard_normal((48, 64, 3))).astype(np.float32)
+    counts = [len(split(image, noise=sigma**2)) for sigma in (0.0, 0.01, 0.03)]
+    assert counts[0] > 1.1 * counts[1] > 1.3 * counts[2] > 0
+    sharp = textured()
+    assert len(split(sharp, noise=0.01**2)) > 0.95 * len(split(sharp)), "beside high contrast it is nothing"
 
 
 def test_the_same_image_is_split_alike_and_in_bounded_time() -> None:
