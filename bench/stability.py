@@ -203,7 +203,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     rows.append(mapped("mapper, NaN pixels", [with_bad_pixels(view) for view in views], config, GOOD))
     bad_depths = [with_bad_depths(view) for view in views]
     rows.append(mapped("mapper, NaN, Inf and negative depths", bad_depths, config, FEWER_DEPTHS))
-    lost = [replace(views[0], world_from_cam=np.full((4, 4), np.nan)), *views[1:]]
+    lost = [replace(views[0], world_from_cam=np.full((4, 4), np.nan)), *(box_view(k + 1, 0.2 * k) for k in range(4))]
     rows.append(mapped("mapper, NaN pose", lost, config, GOOD))
     rows.append(mapped("mapper, images of one pixel", [box_view(k, 0.2 * k, size=(1, 1)) for k in range(3)], config))
     steps = 2_000 if options.quick else 20_000
