@@ -13,7 +13,6 @@ from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.interface import Moved, SplatStep
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
-WIDE = 10.0  # pixels: standard deviation that every splat may have, a little more than the widest new one
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class OptimizerConfig:
     decay_steps: int = 600  # steps of a splat until then, log-linear
     log_scales: float = 0.1  # natural logarithm a step
     max_scale: float = 0.2  # median depths: the widest standard deviation; wider, it is fog to a camera that comes near
-    # of `max_scale`, before the refinement, when few views tell where a splat belongs; 10 pixels at least
+    # of `max_scale`, before the refinement, when few views tell where a splat belongs; what a new one may have at least
     max_scale_in_stream: float = 0.25
     quaternions: float = 0.015  # a step, of a unit quaternion
     opacity_logits: float = 0.05  # logit a step
@@ -60,17 +59,17 @@ class Group:
 
 def groups(
     rates: OptimizerConfig, median_depth: float, factor: float, train_betas: bool, kernel: str, *,
-    streaming: float | None = None,
+    widest_new: float | None = None,
 ) -> list[Group]:  # fmt: skip
     """The steps of all parameters for a scene of this median depth; `factor` scales all rates (the global decay).
 
-    streaming: focal length, pixels, of a stream in which splats may not yet grow as wide as in the refinement; None: in
-    that.
+    widest_new: median depths, the standard deviation that a new splat may have in a stream, where none may yet grow
+    as wide as in the refinement; None: in that.
     """
     log_depth = math.log(median_depth)
     widest = rates.max_scale
-    if streaming is not None:
-        widest *= min(max(rates.max_scale_in_stream, WIDE / streaming / widest), 1.0)
+    if widest_new is not None:
+        widest = min(widest, max(widest * rates.max_scale_in_stream, widest_new))
     largest = log_depth + math.log(widest)
     means = rates.means * median_depth * factor
     beta_range = (-60.0, 60.0) if kernel == "ges_scale" else (0.1, 20.0)

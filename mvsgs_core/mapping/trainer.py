@@ -22,6 +22,7 @@ from mvsgs_core.mapping.losses import (
     weights_of,
 )
 from mvsgs_core.mapping.map_state import MapState
+from mvsgs_core.mapping.partition import LEVELS
 from mvsgs_core.mapping.pruning import prune
 from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.interface import SplatStep
@@ -31,6 +32,7 @@ from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 
 UNSURE = 0.01  # standard deviation of the background in training: no splat can leave its own color to it
+WIDEST_NEW = 2 << LEVELS  # pixels of a side that a new splat may stand for: the largest rectangle at half the size
 FACTORS = 8  # images of vignetting that are kept, one for each size and intrinsics
 
 
@@ -87,7 +89,7 @@ class Trainer:
         exposure = None if view.measured is None else view.exposure.requires_grad_(self.exposure_rate > 0.0)
         moving = training.refine_poses and not view.fixed and view.visits >= training.pose_visits
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True) if moving else None
-        groups = self._groups(median_depth, None if refining else float(view.intrinsics[:2].max()))
+        groups = self._groups(median_depth, None if refining else self._widest_new(view))
         step = self._fused_step(groups)
         at_once = self._own_loss is None and only_photometric(self._weights)
         render = self._rasterize(
@@ -189,9 +191,13 @@ class Trainer:
         frequency = frequency_of(view.visits, self.config.training.frequency_horizon)
         return LossInputs(render, target, self.state.splats, frequency, self.config.threads)
 
-    def _groups(self, median_depth: float, streaming: float | None) -> list[optimizer.Group]:
+    def _groups(self, median_depth: float, widest_new: float | None) -> list[optimizer.Group]:
         rates, training = self.config.optimizer, self.config.training
-        return optimizer.groups(rates, median_depth, self.rate, training.betas, training.kernel, streaming=streaming)
+        return optimizer.groups(rates, median_depth, self.rate, training.betas, training.kernel, widest_new=widest_new)
+
+    def _widest_new(self, view: TrainingView) -> float:
+        """Standard deviation at the median depth, in units of that."""
+        return WIDEST_NEW * self.config.insertion.initial_scale / float(view.intrinsics[:2].min())
 
     def _fused_step(self, groups: list[optimizer.Group]) -> SplatStep | None:
         """Adam for the backward pass to take; None where gradients are needed: where a kernel or a loss leads them on,
