@@ -11,6 +11,7 @@ LOWEST = 10000  # below are the ports that programs are known by
 RANGE = Path("/proc/sys/net/ipv4/ip_local_port_range")  # of ports for those who connect; elsewhere as IANA has it
 FEW = 2000  # ports below that range, with which two runs hardly ever choose the same
 TRIES = 1000
+RANDOM = random.SystemRandom()  # not the program's own numbers: two that begin with the same seed would meet
 
 
 def free_ports(count: int) -> list[int]:
@@ -28,7 +29,7 @@ def _bound(probe: socket.socket) -> int:
     beyond = int(RANGE.read_text().split()[0]) if RANGE.exists() else 49152
     for _ in range(TRIES if beyond - LOWEST >= FEW else 0):
         with suppress(OSError):
-            probe.bind(("127.0.0.1", random.randrange(LOWEST, beyond)))
+            probe.bind(("127.0.0.1", RANDOM.randrange(LOWEST, beyond)))
             break
     else:
         probe.bind(("127.0.0.1", 0))

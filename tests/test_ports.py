@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import random
 import socket
 import subprocess
 import sys
@@ -31,6 +32,16 @@ def test_ports_differ_can_be_bound_and_are_none_that_one_who_connects_gets() -> 
         assert not [port for port in found if first <= port <= last]
 
 
+def test_programs_of_the_same_seed_get_different_ones() -> None:
+    """The nodes' inline run seeds the process that it is in; two that look for ports at once would take the same."""
+    state, found = random.getstate(), list[list[int]]()
+    for _ in range(2):
+        random.seed(0)
+        found.append(free_ports(3))
+    random.setstate(state)
+    assert found[0] != found[1]
+
+
 @pytest.mark.parametrize("beyond", [1024, ports.LOWEST + ports.FEW - 1])
 def test_where_all_ports_are_given_to_who_connects_they_are_free_ones(
     beyond: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -44,7 +55,7 @@ def test_where_all_ports_are_given_to_who_connects_they_are_free_ones(
 def test_where_those_are_all_taken_it_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", free_port())) as taken:
         port = taken.getsockname()[1]
-        monkeypatch.setattr(ports.random, "randrange", lambda *_: port)
+        monkeypatch.setattr(ports.RANDOM, "randrange", lambda *_: port)
         assert free_port() != port
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import socket
 import threading
 import time
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import zmq
 
+from launch.ports import RANDOM
 from msgs import End, Frame
 from nodes.runtime.transport import NewestReader, Publisher, ReliableReader
 from nodes.runtime.transport.sockets import readable
@@ -29,7 +29,7 @@ GUESSES = [b"", b"R", b"N", b"O", b"ORevaluator", b"0", b"f" * 16 + b"R", b"0123
 def free_port(topics: int = 8) -> int:
     """The first of so many free ports in a row; below those that the system gives to whoever connects meanwhile."""
     while True:
-        first = random.randrange(20000, 32768 - topics)
+        first = RANDOM.randrange(20000, 32768 - topics)
         try:
             for port in range(first, first + topics):
                 with socket.socket() as probe:
