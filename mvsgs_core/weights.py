@@ -22,6 +22,8 @@ from rich.console import Console
 from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 from rich.table import Table
 
+from .cache_folder import cache_folder
+
 _BLOCK = 1 << 20  # bytes
 
 
@@ -86,10 +88,10 @@ REGISTRY = {
 
 
 def folders() -> list[Path]:
-    """Folders that are searched, in order; the last is the cache that `fetch` writes to."""
+    """Folders that are searched, in order: those that are given, then the cache that `fetch` writes to."""
     given = [Path(p) for p in os.environ.get("MVSGS_WEIGHTS", "").split(os.pathsep) if p]
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mvsgs" / "weights"
-    return [*given, cache]
+    cache = cache_folder()
+    return [*given, cache / "weights"] if cache else given
 
 
 def find(name: str, file: str | Path | None = None) -> Path:
@@ -111,7 +113,7 @@ def find(name: str, file: str | Path | None = None) -> Path:
 
 def missing(weights: Weights) -> str:
     """What to do about weights that are not there."""
-    searched = ", ".join(str(f) for f in folders())
+    searched = ", ".join(str(f) for f in folders()) or "no folder (MVSGS_WEIGHTS is not set, and there is no home)"
     return (
         f"no weights of {weights.network} ({weights.files[0]}) in {searched}: {remedy(weights.name)}, "
         "or set MVSGS_WEIGHTS to the folder that holds them"
@@ -156,10 +158,14 @@ def check(file: Path) -> str:
 def fetch(name: str, timeout: float = 30.0) -> Path:
     """Downloads weights into the cache, going on where an earlier try stopped, and verifies them.
 
-    Raises ValueError where they can only be had by hand or arrive wrong, and ConnectionError without network.
+    Raises ValueError where they can only be had by hand, arrive wrong or have no place to lie, and ConnectionError
+    without network.
     """
     weights = _entry(name)
-    target = folders()[-1] / weights.files[0]
+    cache = cache_folder()
+    if cache is None:
+        raise ValueError("no home folder to keep weights in: set XDG_CACHE_HOME to a folder (an absolute path)")
+    target = cache / "weights" / weights.files[0]
     if target.is_file() and (weights.sha256 is None or checksum(target) == weights.sha256):
         return target
     if weights.url is None:

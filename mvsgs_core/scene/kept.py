@@ -16,6 +16,7 @@ import numpy as np
 
 from .. import native
 from ..atomic_file import replacing
+from ..cache_folder import cache_folder
 from .lit import LitScene
 
 LIMIT = 8  # scenes; of some 50 MB each
@@ -24,9 +25,12 @@ LIMIT = 8  # scenes; of some 50 MB each
 def kept(name: str, build: Callable[[], LitScene]) -> LitScene:
     """What `build` makes, from the disk where it lies there. name: of the scene and all that it depends on but code.
 
-    A file that is damaged is made anew; where the disk is full or not ours, it is built each time.
+    A file that is damaged is made anew; where the disk is full or not ours, or there is no home, it is built each time.
     """
-    file = folder() / f"{hashlib.sha256((name + _code()).encode()).hexdigest()[:32]}.npz"
+    where = folder()
+    if where is None:
+        return build()
+    file = where / f"{hashlib.sha256((name + _code()).encode()).hexdigest()[:32]}.npz"
     with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         with file.open("rb") as data, np.load(data, allow_pickle=False) as stored:
             scene = LitScene(**{field.name: stored[field.name] for field in fields(LitScene)})
@@ -43,8 +47,9 @@ def kept(name: str, build: Callable[[], LitScene]) -> LitScene:
     return scene
 
 
-def folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mvsgs" / "scenes"
+def folder() -> Path | None:
+    cache = cache_folder()
+    return cache and cache / "scenes"
 
 
 @functools.cache

@@ -34,8 +34,9 @@ class Builder:
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert folder() == tmp_path / "mvsgs" / "scenes"
-    return folder()
+    own = folder()
+    assert own == tmp_path / "mvsgs" / "scenes"
+    return own
 
 
 def view(scene: LitScene) -> np.ndarray:
@@ -49,6 +50,14 @@ def test_it_is_built_once_and_looks_the_same_from_the_disk() -> None:
     assert view(first).std() > 0.01
     np.testing.assert_array_equal(view(first), view(second))
     kept("another paper", build)
+    assert build.built == 2
+
+
+def test_without_a_place_to_keep_it_it_is_built_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "folder", lambda: None)
+    build = Builder()
+    assert view(kept("paper", build)).std() > 0.01
+    kept("paper", build)
     assert build.built == 2
 
 
