@@ -47,13 +47,16 @@ class Densifier:
         image = view.target.cpu().numpy()
         valid = np.ones(size, dtype=bool) if view.valid is None else view.valid.cpu().numpy()
         residual, shown, noise = self._residual(view, image)
-        depth = _nearest(self._near(depth / np.float32(self.frame.length)), size)
+        near = self._near(depth / np.float32(self.frame.length))
+        depth = _nearest(near, size)
         known = wanted = (depth > 0) & valid
         confidence = np.ones(size, dtype=np.float32)
-        if self.config.doubtful and keyframe.unfiltered is not None and self.frame.unit is not None:
-            doubtful, confidence = self._doubtful_depth(keyframe, view, shown)
+        if self.config.doubtful and self.frame.unit is not None:
+            doubtful, confidence = self._doubtful_depth(keyframe, near, view, shown)
             empty = residual >= EMPTY
-            likely = confidence >= self.config.doubtful_confidence if keyframe.confidence is not None else empty
+            likely = empty
+            if keyframe.unfiltered is not None and keyframe.confidence is not None:
+                likely = confidence >= self.config.doubtful_confidence
             filled = ~known & valid & (doubtful > 0) & (empty | likely)
             depth, wanted = np.where(filled, doubtful, depth), known | filled
         if not wanted.any():
@@ -92,13 +95,16 @@ class Densifier:
         return residual, shown, noise
 
     def _doubtful_depth(
-        self, keyframe: RGBDKeyframe, view: TrainingView, shown: np.ndarray
+        self, keyframe: RGBDKeyframe, depth: np.ndarray, view: TrainingView, shown: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Depth before the filters and its confidence, (H, W) at the view's size, in the mapper's unit; where matching
-        says nothing it is continued from what surrounds it."""
-        assert keyframe.unfiltered is not None
-        depth = checked_depth(keyframe.unfiltered, self.log)
-        depth = self._near(depth * np.float32(view.scale / keyframe.scale / self.frame.length))
+        says nothing it is continued from what surrounds it.
+
+        depth: (h, w) after the filters, in that unit, which is taken where that before them was not sent.
+        """
+        if keyframe.unfiltered is not None:
+            depth = checked_depth(keyframe.unfiltered, self.log)
+            depth = self._near(depth * np.float32(view.scale / keyframe.scale / self.frame.length))
         size = (min(depth.shape[0], view.size[0]), min(depth.shape[1], view.size[1]))
         depth = _nearest(depth, size)
         sure = np.ones((1, 1), dtype=np.float32) if keyframe.confidence is None else keyframe.confidence

@@ -45,6 +45,21 @@ def test_a_hole_of_the_filters_is_covered_sparsely() -> None:
     assert (opacity[True] < 0.5).mean() < 0.2
 
 
+def test_a_hole_in_depth_without_that_before_the_filters_is_covered_too() -> None:
+    """As a depth camera or a user's own node gives it: what surrounds the hole goes on."""
+    view = replace(with_hole(0, 0.5), unfiltered=None)
+    assert view.confidence is not None
+    for each in (view, replace(view, confidence=None)):
+        mapper = mapper_with(True)
+        mapper.add_keyframe(each)
+        assert mapper.log.counts["pixels_filled"] == 48 * 24
+        assert (mapper.render(mapper.views[0]).opacity.numpy()[:, HOLE] < 0.5).mean() < 0.2
+    shown = mapper_with(True, iterations=60)
+    shown.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.5)))
+    shown.add_keyframe(replace(view, index=5, image=255 - view.image, confidence=np.ones_like(view.confidence)))
+    assert shown.log.counts["pixels_filled"] == 0  # its confidence says nothing of depth that is not there
+
+
 def test_what_the_map_shows_is_not_filled() -> None:
     mapper = mapper_with(True, iterations=60)
     mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.5)))
