@@ -50,7 +50,8 @@ def help_text(graph: Graph, choices: Mapping[str, Any], folders: Sequence[Path])
         slot: sorted({path.stem for folder in folders for path in (folder / slot).glob("*.yaml")}) for slot in slots
     }
     lines = [HEADER, "== Slots and their choices: slot=choice ==", ""]
-    lines += [f"{slot}: {', '.join(names)}" for slot, names in there.items()]
+    for where, names in there.items():
+        lines += textwrap.wrap(f"{where}: {', '.join(names)}", _width(), subsequent_indent="    ")
     lines += ["", "== What this command line gives: slot.parameter=value =="]
     for name, slot in graph.slots.items():
         choice = choices.get(name)
@@ -100,12 +101,15 @@ def _at(values: Any, path: str, default: Any) -> Any:
 
 def _columns(left: str, right: str) -> list[str]:
     left = f"  {left}"
-    width = min(max(shutil.get_terminal_size((MAX_WIDTH, 24)).columns, MIN_WIDTH), MAX_WIDTH)
-    wrapped = textwrap.wrap(right, width - COMMENT_COLUMN) or [""]
+    wrapped = textwrap.wrap(right, _width() - COMMENT_COLUMN) or [""]
     rest = [" " * COMMENT_COLUMN + line for line in wrapped]
     if len(left) < COMMENT_COLUMN:
         return [f"{left:{COMMENT_COLUMN}}{wrapped[0]}".rstrip(), *rest[1:]]
-    return [*textwrap.wrap(left, width, subsequent_indent="    "), *rest]
+    return [*textwrap.wrap(left, _width(), subsequent_indent="    "), *rest]
+
+
+def _width() -> int:
+    return min(max(shutil.get_terminal_size((MAX_WIDTH, 24)).columns, MIN_WIDTH), MAX_WIDTH)
 
 
 def _text(value: Any) -> str:

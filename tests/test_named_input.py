@@ -20,7 +20,14 @@ from tests.support.dataset_folders import (
     write_tum,
 )
 from tests.support.shared_data import shared
-from tests.support.slam_folders import write_euroc, write_kitti, write_scannet, write_tum_vi
+from tests.support.slam_folders import (
+    write_euroc,
+    write_kitti,
+    write_kitti_raw,
+    write_scannet,
+    write_tartanair,
+    write_tum_vi,
+)
 
 CHOICES = choices_of("dataset")
 
@@ -59,7 +66,8 @@ def within(folder: Path) -> Path:
         (write_seven_scenes, "seven_scenes"), (lambda path: write_seven_scenes(path) / "seq-01", "seven_scenes"),
         (write_icl_nuim, "icl_nuim"), (bag, "bag"), (recording, "player"),
         (write_euroc, "euroc"), (lambda path: write_euroc(path) / "mav0", "euroc"), (write_tum_vi, "euroc"),
-        (write_kitti, "kitti"), (write_scannet, "scannet"),
+        (write_kitti, "kitti"), (write_scannet, "scannet"), (write_kitti_raw, "kitti_raw"),
+        (write_tartanair, "tartanair"), (lambda path: write_tartanair(path, "lcam_front"), "tartanair"),
     ],
 )  # fmt: skip
 def test_files_and_folders_are_known_by_name_and_layout(

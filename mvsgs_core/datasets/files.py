@@ -139,6 +139,19 @@ def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> 
     return depth
 
 
+def read_array(path: Path) -> np.ndarray:
+    """(H, W) float32 that NumPy saved, without pickle. Raises UnreadableImageError."""
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # which a header of more than the file holds fails
+    except Exception as error:  # damaged content makes NumPy raise nearly anything
+        raise UnreadableImageError(f"{path.name}: {brief(error)}") from error
+    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiu":
+        raise UnreadableImageError(f"{path.name}: a depth map is an array of rows and columns of numbers")
+    if not 0 < array.size <= MAX_PIXELS:
+        raise UnreadableImageError(f"{path.name}: {array.size} pixels, where {MAX_PIXELS} are the most")
+    return array.astype(np.float32)
+
+
 def read_numbers(path: Path) -> np.ndarray:
     """(N,) float64: the numbers of a text file, separated by white space; NaN and infinity are for the caller to judge.
 

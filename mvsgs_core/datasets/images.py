@@ -28,6 +28,7 @@ from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.masks import FOLDERS, masks_of
 from mvsgs_core.datasets.model import Model
 from mvsgs_core.datasets.phone_scans import find_record3d, polycam_folders, read_polycam, read_record3d
+from mvsgs_core.datasets.scannetpp import read_scannetpp, scannetpp_images
 from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
 from mvsgs_core.datasets.strecha import find_strecha, read_strecha
 from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transforms
@@ -36,7 +37,8 @@ LAYOUT = Layout(
     "A folder of images",
     "photographs or frames (" + ", ".join(IMAGE_SUFFIXES) + ") in the order of their names, in the folder or in its "
     "subfolder images/; beside them, if there is one, a COLMAP model (sparse/0), a transforms.json, .camera files, "
-    "or what Polycam (raw data) or Record3D exported; masks (black: ignored) in masks/ under the images' names",
+    "or what Polycam (raw data) or Record3D exported; a scene of ScanNet++; masks (black: ignored) in masks/ under the "
+    "images' names",
     "your own camera; frames of a video: ffmpeg -i video.mp4 -qscale:v 2 images/%05d.jpg (or dataset=video directly)",
 )
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
@@ -47,10 +49,10 @@ _SUBFOLDERS = ("images", "rgb", "input", "frames")
 class Images(ImageSequence):
     """Images in natural order, undistorted where the distortion is known.
 
-    intrinsics: [fx, fy, cx, cy] in pixels of the images, "auto" for EXIF or a guess, null for what is found: a COLMAP
-    model, a transforms.json, Strecha's .camera files, an export of Polycam's or Record3D's, whose poses then are the
-    ground truth, or EXIF headers, in this order; where there is none of them it is the guess of "auto", for the tracker
-    to estimate.
+    intrinsics: [fx, fy, cx, cy] in pixels of the images, "auto" for EXIF or a guess, null for what is found: files of
+    ScanNet++, a COLMAP model, a transforms.json, Strecha's .camera files, an export of Polycam's or Record3D's, whose
+    poses then are the ground truth, or EXIF headers, in this order; where there is none of them it is the guess of
+    "auto", for the tracker to estimate.
     Raises FileNotFoundError and ValueError, which say what was expected.
     """
 
@@ -113,8 +115,9 @@ class Images(ImageSequence):
 
 def _places(folder: Path) -> list[Path]:
     """Where the images may be."""
-    polycam = polycam_folders(folder)
-    return [folder, *([polycam[0]] if polycam else []), *(folder / name for name in _SUBFOLDERS)]
+    polycam, scannetpp = polycam_folders(folder), scannetpp_images(folder)
+    special = [polycam[0]] if polycam else [scannetpp] if scannetpp else []
+    return [folder, *special, *(folder / name for name in _SUBFOLDERS)]
 
 
 def _find_images(folder: Path) -> list[Path]:
@@ -156,6 +159,8 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None) -> M
     place = folder if given is None else Path(given).expanduser()
     if given is not None and not place.exists():
         raise FileNotFoundError(f"model {place} is missing: a folder with cameras and images of COLMAP, or {NAMES[0]}")
+    if given is None and (scannetpp := read_scannetpp(images[0].parent, image_size(images))) is not None:
+        return scannetpp
     for base in dict.fromkeys((place, images[0].parent, images[0].parent.parent) if given is None else (place,)):
         transforms = base if base.is_file() else find_transforms(base)
         colmap = find_colmap(base)

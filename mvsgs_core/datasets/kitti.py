@@ -47,7 +47,7 @@ class Kitti(ImageSequence):
         images = numbered_images(source)
         if not images:
             raise LAYOUT.missing(f"{source} has no 000000.png, 000001.png, ...")
-        published, cam0_from_cam = _camera(LAYOUT.file(folder / "calib.txt"), camera, images)
+        published, cam0_from_cam = read_projection(LAYOUT.file(folder / "calib.txt"), f"P{camera}", images)
         lens = self._lens(images, published)
         times, poses = self._times(folder, last=int(images[-1].stem)), self._poses(folder)
         records = []
@@ -91,12 +91,12 @@ class Kitti(ImageSequence):
         return poses
 
 
-def _camera(calibration: Path, camera: int, images: list[Path]) -> tuple[Lens, np.ndarray]:
-    """The lens, and where the camera is as the left gray one sees it, (4, 4): K [I | t] in the file. Raises
-    BadFileError."""
-    with reading(calibration, f"must hold a line `P{camera}: ` and 12 numbers, a projection K [I | t]"):
+def read_projection(calibration: Path, name: str, images: list[Path]) -> tuple[Lens, np.ndarray]:
+    """The lens, and where the camera is as the left gray one sees it, (4, 4): K [I | t] in the file, on the line
+    `name`. Raises BadFileError."""
+    with reading(calibration, f"must hold a line `{name}: ` and 12 numbers, a projection K [I | t]"):
         lines = dict(line.split(":", 1) for line in calibration.read_text(encoding="utf-8").splitlines() if ":" in line)
-        projection = np.array([float(v) for v in lines[f"P{camera}"].split()]).reshape(3, 4)
+        projection = np.array([float(v) for v in lines[name].split()]).reshape(3, 4)
         k = projection[:, :3]
         if not np.all(np.isfinite(projection)) or k[2].tolist() != [0, 0, 1] or k[0, 1] != 0 or k[1, 0] != 0:
             raise ValueError(f"its first three columns are no camera matrix, {k.tolist()}")

@@ -292,6 +292,10 @@ class ImageSequence(FileReader, ABC):
         """The depth map (h, w) as the color camera would see it: of most sets it is already."""
         return depth
 
+    def _read_depth(self, path: Path, form: DepthFormat) -> np.ndarray:
+        """(H, W) float32 in the poses' unit, 0 where unknown. Raises UnreadableImageError."""
+        return read_depth(path, form.per_unit, form.invalid)
+
     def _depth(self, record: Record, native: tuple[int, int]) -> np.ndarray | None:
         """Depth map as it is on disk, None where there is none."""
         if self._depth_format is None:
@@ -300,7 +304,7 @@ class ImageSequence(FileReader, ABC):
             self._notices.tally("frames without a depth map, where depth is not scored", record.image.name)
             return None
         try:
-            depth = read_depth(record.depth, self._depth_format.per_unit, self._depth_format.invalid)
+            depth = self._read_depth(record.depth, self._depth_format)
         except UnreadableImageError as error:
             self._notices.tally("depth maps that could not be read, so that depth is not scored there", str(error))
             return None

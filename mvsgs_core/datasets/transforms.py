@@ -23,20 +23,24 @@ def find_transforms(folder: Path) -> Path | None:
     return next((folder / name for name in NAMES if (folder / name).is_file()), None)
 
 
-def read_transforms(path: Path, image_size: tuple[int, int]) -> Model:
-    """The model of a transforms.json; image_size (height, width) where the file does not say it.
+def read_transforms(path: Path, image_size: tuple[int, int], masks: Path | None = None) -> Model:
+    """The model of a transforms.json, with the images that it keeps for tests.
 
+    image_size (height, width) where the file does not say it; masks: folder that names of masks start at, where it is
+    not the file's; one that is not there has none.
     Raises BadFileError for a malformed file, or a camera or pose in it that cannot be.
     """
     shots = {}
     with reading(path, "is no transforms.json that can be used"):
         content = json.loads(path.read_bytes())
-        for frame in content["frames"]:
+        for frame in [*content["frames"], *content.get("test_frames", [])]:
             name = frame["file_path"]
             with reading(f"frame {name!r}", "cannot be"):
                 pose = rigid(np.array(frame["transform_matrix"], dtype=np.float64), "transform_matrix")
                 lens, mask = _lens({**content, **frame}, image_size), frame.get("mask_path", content.get("mask_path"))
-                masked = None if mask is None else inside(path.parent, mask, path)
+                masked = None if mask is None else inside(masks or path.parent, mask, path)
+                if masks is not None and not masks.is_dir():
+                    masked = None
                 shots[_relative(name)] = Shot(lens, pose @ _OPENGL_FROM_OPENCV, masked)
     return Model("transforms.json", shots)
 

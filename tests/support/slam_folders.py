@@ -1,4 +1,4 @@
-"""Small sequences on disk in the layouts of EuRoC, TUM VI, KITTI and ScanNet, as `dataset_folders` has others."""
+"""Small sequences on disk in the layouts of EuRoC, TUM VI, KITTI, ScanNet and TartanAir, beside `dataset_folders`."""
 
 from __future__ import annotations
 
@@ -102,4 +102,49 @@ def write_scannet(folder: Path, frames: int = 12) -> Path:
         k = np.eye(4)
         k[0, 0], k[1, 1], k[:2, 2] = focal, focal, middle
         (folder / f"intrinsic/intrinsic_{name}.txt").write_text("\n".join(" ".join(map(str, row)) for row in k))
+    return folder
+
+
+def write_kitti_raw(root: Path, frames: int = 4) -> Path:
+    """The folder of a drive, 100 m to the east a frame along the equator, heading east; image 1 was lost.
+
+    The color camera stands .06 m to the left of the gray one; the inertial unit's axes are forward, left, up, the
+    laser's are too, 1 m above it.
+    """
+    day = root / "2011_09_26"
+    folder = day / "2011_09_26_drive_0001_sync"
+    for i in (k for k in range(frames) if k != 1):
+        write_image(folder / f"image_02/data/{i:010d}.png", 20 + i)
+    times = [f"2011-09-26 13:02:25.{594360375 + 100000000 * i:09d}\n" for i in range(frames)]
+    (folder / "image_02/timestamps.txt").write_text("".join(times))
+    (folder / "oxts/data").mkdir(parents=True)
+    for i in range(frames):
+        east = np.degrees(100.0 * i / 6378137.0)
+        values = [0.0, east, 116.0, 0.0, 0.0, 0.0, *[0.0] * 24]
+        (folder / f"oxts/data/{i:010d}.txt").write_text(" ".join(map(str, values)))
+    (day / "calib_cam_to_cam.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\nR_rect_00: 1 0 0 0 1 0 0 0 1\n"
+        "P_rect_02: 50 0 31 3 0 51 23 0 0 0 1 0\n"  # 3 / 50 m to the right is what the camera sees moved
+    )
+    (day / "calib_velo_to_cam.txt").write_text("calib_time: x\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 0\n")
+    (day / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: 0 0 -1\n")
+    return folder
+
+
+def write_tartanair(folder: Path, camera: str = "left", frames: int = 3) -> Path:
+    """A trajectory going 1 m north a frame, that looks north and then turns to the east; depth of 2 m."""
+    for i in range(frames):
+        write_image(folder / f"image_{camera}/{i:06d}_{camera}.png", 20 + i)
+        depth = np.full((48, 64), 2.0, np.float32)
+        depth[0] = 10000.0  # the sky
+        path = folder / f"depth_{camera}/{i:06d}_{camera}_depth.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if camera == "left":
+            np.save(path, depth)
+        else:
+            bgra = np.ascontiguousarray(depth[..., None]).view(np.uint8)
+            Image.fromarray(np.ascontiguousarray(bgra[..., [2, 1, 0, 3]])).save(path.with_suffix(".png"))
+    turns = [np.sqrt(0.5) if i == frames - 1 else 0.0 for i in range(frames)]
+    lines = [f"{i} 0 -2 0 0 {turn} {np.sqrt(1 - turn**2)}" for i, turn in enumerate(turns)]
+    (folder / f"pose_{camera}.txt").write_text("\n".join(lines))
     return folder
