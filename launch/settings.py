@@ -33,8 +33,8 @@ class Settings:
     buffer: int | None = None  # messages that a reliable edge holds before it stops its sender; null: 4, live 128
     transport: Literal["ipc", "tcp"] = "ipc"
     host: str = "127.0.0.1"  # tcp: where the nodes' publishers are reached; a slot may have its own `host`
-    # tcp: the first of the ports, one a topic, best below 32768: from there on the system gives them to whoever connects;
-    # null: free ones, known to nodes started here
+    # tcp: the first of the ports, one a topic, best below 32768, from where on the system gives them to whoever
+    # connects; null: free ones, known to nodes started here
     port: int | None = None
     keys: str | None = None  # directory of CURVE keys: without them nothing listens beyond loopback
     screen: Literal["auto", "live", "plain", "off"] = "auto"
