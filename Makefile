@@ -109,7 +109,7 @@ $(DOCS)/.installed: docs/site/constraints.txt
 # Every module of bench/ that ends with main(measure, ...) is a benchmark. `make bench` takes hours: it runs them all, keeps
 # the rows in bench/recorded/ and writes docs/benchmarks/. `make bench-quick` takes minutes and says what got
 # slower or worse than the recorded line (RECORD=1: becomes the line; `make bench` does that at the end). Some of them,
-# with arguments: make bench BENCHMARKS="curves" ARGS="--scenes room,aerial"
+# with arguments: make bench BENCHMARKS="curves" ARGS="--scenes room,aerial". A newcomer needs what `make wheel` builds.
 BENCHMARKS ?= $(shell grep -lE '^ +main.measure' bench/*.py bench/*/__main__.py | sed 's|bench/||; s|/__main__||; s|\.py$$||')
 ARGS ?=
 
@@ -128,8 +128,8 @@ bench-quick: setup
 		$(BIN)/python -m bench.$$name --quick --json runs/bench-quick/$$name.json > runs/bench-quick/$$name.txt 2>&1 \
 		&& { test -z "$(RECORD)" || $(BIN)/python -m bench.record quick/$$name runs/bench-quick/$$name.json; } \
 		|| failed="$$failed $$name"; \
-	done; test -z "$$failed" || { echo "failed (see runs/bench-quick/NAME.txt):$$failed"; exit 1; }
-	@test -n "$(RECORD)" || $(BIN)/python -m bench.compare runs/bench-quick/*.json
+	done; test -n "$(RECORD)" || $(BIN)/python -m bench.compare runs/bench-quick/*.json || worse=1; \
+	test -z "$$failed" || { echo "failed (see runs/bench-quick/NAME.txt):$$failed"; exit 1; }; test -z "$$worse"
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,4 +1,4 @@
-"""From nothing to a map of one's own video: `python -m bench.newcomer --wheel dist/mvsgs-*.whl`.
+"""From nothing to a map of one's own video: `make wheel`, then `python -m bench.newcomer`.
 
 With the wheel, where no compiler is found, and with a clone of the checkout: a new virtual environment, an empty home,
 the commands that README names. Then what people get wrong: each must be refused in one line, before a process starts.
@@ -178,9 +178,10 @@ def with_checkout(root: Path, video: Path) -> list[Row]:
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    wheel = options.wheel.absolute()
+    built = sorted((ROOT / "dist").glob("mvsgs-*.whl"), key=lambda file: file.stat().st_mtime)
+    wheel = (options.wheel or (built[-1] if built else ROOT / "dist")).absolute()
     if not wheel.is_file():
-        raise SystemExit(f"{wheel}: no such file; `make wheel` builds one")
+        raise SystemExit(f"{wheel}: there is no wheel; `make wheel` builds one")
     with tempfile.TemporaryDirectory() as folder:
         video = Path(folder) / VIDEO
         record_video(video)
@@ -190,7 +191,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--wheel", type=Path, required=True, help="what `make wheel` built")
+    parser.add_argument("--wheel", type=Path, help="what `make wheel` built; default: the newest in dist/")
 
 
 if __name__ == "__main__":

@@ -77,6 +77,7 @@ class OursIn:
         """Waits for a message; its time."""
         while (message := self._reader.take()) is None:
             wait([self._reader.pollable, self._reader.monitor], 1.0)
+            self._reader.watch()  # as a node does: an event of the connection that nobody takes wakes it for ever
         return message.timestamp if isinstance(message, Sample) else 0.0
 
     def close(self) -> None:
