@@ -21,7 +21,8 @@ from mvsgs_core.tracking.places.relocalization import RelocalizationConfig
 class KeyframeTrackingConfig:
     """What a tracker takes that follows the points of keyframes, whether it finds poses or is given them."""
 
-    area: int = 320 * 240  # pixels of the tracker's own image, aspect kept; enlarges at most to twice the size
+    # pixels of the tracker's own image, aspect kept; doubled at most; more of one that is wider than 16:9
+    area: int = 320 * 240
     flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
     threads: int | None = None  # of the C++ kernels; null: 1
     frames_between: int = 8  # frames between two keyframes, at most, that the map is trained on, too; 0: none

@@ -24,6 +24,11 @@ class FrontEndConfig:
     lost_fraction: float = 0.2  # fewer found: the frame is lost
     lost_inliers: float = 0.5  # of the matches, within 2 pixels of one pose: fewer, and the frame is lost
 
+    def at(self, size: tuple[int, int], area: int) -> FrontEndConfig:
+        """For images of a size (height, width), where these are meant for `area` pixels: of the more points that a
+        larger one has fewer are enough."""
+        return replace(self, lost_fraction=self.lost_fraction * min(1.0, area / (size[0] * size[1])))
+
 
 @dataclass(frozen=True)
 class Step:

@@ -12,6 +12,7 @@ from mvsgs_core.camera import fit_size, mask_at, resize_image, shrunk, stretchin
 from mvsgs_core.tracking.estimation.gray_levels import Levels, Samples
 
 CELL = 8  # pixels: one point a cell
+WIDEST = 16 / 9  # longer over shorter side of an image from which on it is tracked with more pixels
 BORDER = 24  # pixels around every pyramid level, so that windows need no bounds checks
 LEVELS = 4
 MASK_MARGIN = 4  # pixels beside a masked one where no point lies: half of a window
@@ -161,8 +162,10 @@ def tracking_size(height: int, width: int, area: int) -> tuple[int, int]:
     """(height, width) at which images of a size are tracked: about `area` pixels, multiples of 8, at most doubled.
 
     Windows and cells have a fixed size in pixels: on small images they span objects of different depth, and the map
-    comes out bent (160x120: depths 9 % off, 1 % when enlarged).
+    comes out bent (160x120: depths 9 % off, 1 % when enlarged). So an image that is wider than WIDEST, of which `area`
+    would leave few rows, is as high as one of that shape: KITTI's 370 rows become 208, not 152.
     """
+    area = round(area * max(1.0, max(height, width) / min(height, width) / WIDEST))
     factor = max(1.0, min(2.0, (area / (height * width)) ** 0.5))
     return fit_size(round(height * factor), round(width * factor), area)
 

@@ -67,9 +67,9 @@ class Session:
             config.readout_time, config.reads_columns, threads,
         )  # fmt: skip
         self.matcher = Matcher(make_flow(config.flow))
-        self.front_end = FrontEnd(self.graph, self.matcher, config.front_end, threads)
+        self.front_end = FrontEnd(self.graph, self.matcher, config.front_end.at(self.size, config.area), threads)
         self.choice = KeyframeChoice(config.keyframe_choice, spacing_of(config.share) if config.realtime else None)
-        self.diagnosis = Diagnosis(config.front_end.lost_fraction, config.min_texture)
+        self.diagnosis = Diagnosis(self.front_end.config.lost_fraction, config.min_texture)
         self.initializer = Initializer(self.graph, self.matcher, config.initialization, threads, self.diagnosis)
         self.local_map = LocalMap(self.graph, self.matcher, config.local_map, threads)
         self.covisible_keyframes = CovisibleKeyframes(self.graph, self.local_map, config.covisibility, threads)
@@ -77,7 +77,7 @@ class Session:
         retrieval = Retrieval()
         self.loops = LoopCloser(self.graph, self.local_map, retrieval, config.loop)
         self.relocalizer = Relocalizer(self.graph, self.matcher, retrieval, config.relocalization)
-        self.recovery = Recovery(self.graph, self.matcher, config.recovery, config.front_end)
+        self.recovery = Recovery(self.graph, self.matcher, config.recovery, self.front_end.config)
         self.photometer = Photometer(self.graph, stats)
         self.publisher = Publisher(
             self.graph, config.tolerance, lambda index: self.graph.keyframes[index].segment, self.photometer

@@ -19,6 +19,12 @@ def test_small_images_are_enlarged_at_most_twice(size: tuple[int, int], expected
     assert tracking_size(*size, 320 * 240) == expected
 
 
+@pytest.mark.parametrize(("size", "expected"), [((540, 960), (208, 368)), ((370, 1226), (208, 688))])
+def test_wide_images_keep_the_rows_of_16_to_9(size: tuple[int, int], expected: tuple[int, int]) -> None:
+    assert tracking_size(*size, 320 * 240) == expected
+    assert tracking_size(*size[::-1], 320 * 240) == expected[::-1]
+
+
 @pytest.mark.slow
 def test_small_images_do_not_bend_the_map() -> None:
     """At 160x120 itself, depths were 9 % off the scale of the trajectory, and the error of the trajectory 0.4 %."""
