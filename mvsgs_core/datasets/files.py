@@ -141,6 +141,8 @@ def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> 
 
 def read_array(path: Path) -> np.ndarray:
     """(H, W) float32 that NumPy saved, without pickle. Raises UnreadableImageError."""
+    if not path.is_file():  # a pipe would be waited for
+        raise UnreadableImageError(f"{path.name}: is no file")
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)  # which a header of more than the file holds fails
     except Exception as error:  # damaged content makes NumPy raise nearly anything

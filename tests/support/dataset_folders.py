@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from mvsgs_core.geometry import inverse, quaternion_from_rotation
+from mvsgs_core.geometry import inverse, quaternion_from_rotation, so3_exp
 
 HEIGHT, WIDTH = 48, 64
 
@@ -92,7 +92,14 @@ def huge_png(path: Path, width: int = 30_000, height: int = 30_000) -> None:
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")[:1]))
 
 
-POSES = []
+def _turned(i: int) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = so3_exp(np.array([0.1 * i, -0.2, 0.3]))
+    pose[:3, 3] = (i, 2.0, -i)
+    return pose
+
+
+POSES = [_turned(i) for i in range(4)]  # of photographs' models
 
 
 def colmap_text(folder: Path, names: list[str]) -> None:

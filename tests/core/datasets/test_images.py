@@ -14,15 +14,10 @@ from PIL import Image
 
 from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.colmap import lens_of, read_colmap
-from mvsgs_core.geometry import inverse, quaternion_from_rotation, so3_exp
+from mvsgs_core.geometry import inverse, quaternion_from_rotation
 from tests.support.dataset_folders import POSES, colmap_text, truncate, write_image, write_photos
 
 PHOTO = Path(__file__).parents[2] / "support" / "photo.heic"
-for i in range(4):
-    pose = np.eye(4)
-    pose[:3, :3] = so3_exp(np.array([0.1 * i, -0.2, 0.3]))
-    pose[:3, 3] = (i, 2.0, -i)
-    POSES.append(pose)
 
 
 def colmap_binary(folder: Path, names: list[str]) -> None:
