@@ -95,12 +95,20 @@ def read_projection(calibration: Path, name: str, images: list[Path]) -> tuple[L
     """The lens, and where the camera is as the left gray one sees it, (4, 4): K [I | t] in the file, on the line
     `name`. Raises BadFileError."""
     with reading(calibration, f"must hold a line `{name}: ` and 12 numbers, a projection K [I | t]"):
-        lines = dict(line.split(":", 1) for line in calibration.read_text(encoding="utf-8").splitlines() if ":" in line)
-        projection = np.array([float(v) for v in lines[name].split()]).reshape(3, 4)
+        projection = named_numbers(calibration, name, 12).reshape(3, 4)
         k = projection[:, :3]
-        if not np.all(np.isfinite(projection)) or k[2].tolist() != [0, 0, 1] or k[0, 1] != 0 or k[1, 0] != 0:
+        if k[2].tolist() != [0, 0, 1] or k[0, 1] != 0 or k[1, 0] != 0:
             raise ValueError(f"its first three columns are no camera matrix, {k.tolist()}")
         lens = Lens((float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])), image_size(images))
         cam0_from_cam = np.eye(4)
         cam0_from_cam[:3, 3] = -np.linalg.solve(k, projection[:, 3])
     return lens, cam0_from_cam
+
+
+def named_numbers(calibration: Path, name: str, count: int) -> np.ndarray:
+    """(count,) finite float64 of the line `name: ` of a file. Raises KeyError, ValueError."""
+    lines = dict(line.split(":", 1) for line in calibration.read_text(encoding="utf-8").splitlines() if ":" in line)
+    values = np.array([float(v) for v in lines[name].split()])
+    if values.shape != (count,) or not np.all(np.isfinite(values)):
+        raise ValueError(f"{name}: {count} finite numbers are needed")
+    return values

@@ -11,7 +11,7 @@ import numpy as np
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.files import Layout, numbered_images, read_numbers
-from mvsgs_core.datasets.kitti import read_projection
+from mvsgs_core.datasets.kitti import named_numbers, read_projection
 from mvsgs_core.datasets.model import rigid
 from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
 from mvsgs_core.geometry import so3_exp
@@ -65,7 +65,7 @@ class KittiRaw(ImageSequence):
             return [None] * len(images)
         rectified = np.eye(4)
         with reading(needed[2], "must hold a line `R_rect_00: ` and 9 numbers, a rotation"):
-            rectified[:3, :3] = _values(needed[2], "R_rect_00", 9).reshape(3, 3)
+            rectified[:3, :3] = named_numbers(needed[2], "R_rect_00", 9).reshape(3, 3)
             rectified = rigid(rectified, "R_rect_00")
         cam0_from_imu = rectified @ _transform(needed[1]) @ _transform(needed[0])
         imu_from_cam = np.linalg.inv(cam0_from_imu) @ cam0_from_cam
@@ -95,20 +95,11 @@ def _times(path: Path, last: int) -> list[float]:
     return times
 
 
-def _values(path: Path, name: str, count: int) -> np.ndarray:
-    """(count,) finite float64 of the line `name: `. Raises KeyError, ValueError."""
-    lines = dict(line.split(":", 1) for line in path.read_text(encoding="utf-8").splitlines() if ":" in line)
-    values = np.array([float(v) for v in lines[name].split()])
-    if values.shape != (count,) or not np.all(np.isfinite(values)):
-        raise ValueError(f"{name}: {count} numbers are needed")
-    return values
-
-
 def _transform(path: Path) -> np.ndarray:
     """The (4, 4) that a file of R and T describes. Raises BadFileError."""
     with reading(path, "must hold `R: ` and 9 numbers, `T: ` and 3"):
         transform = np.eye(4)
-        transform[:3, :3], transform[:3, 3] = _values(path, "R", 9).reshape(3, 3), _values(path, "T", 3)
+        transform[:3, :3], transform[:3, 3] = named_numbers(path, "R", 9).reshape(3, 3), named_numbers(path, "T", 3)
         return rigid(transform, "R, T")
 
 

@@ -38,9 +38,8 @@ def read_transforms(path: Path, image_size: tuple[int, int], masks: Path | None 
             with reading(f"frame {name!r}", "cannot be"):
                 pose = rigid(np.array(frame["transform_matrix"], dtype=np.float64), "transform_matrix")
                 lens, mask = _lens({**content, **frame}, image_size), frame.get("mask_path", content.get("mask_path"))
-                masked = None if mask is None else inside(masks or path.parent, mask, path)
-                if masks is not None and not masks.is_dir():
-                    masked = None
+                there = mask is not None and (masks is None or masks.is_dir())
+                masked = inside(masks or path.parent, mask, path) if there else None
                 shots[_relative(name)] = Shot(lens, pose @ _OPENGL_FROM_OPENCV, masked)
     return Model("transforms.json", shots)
 

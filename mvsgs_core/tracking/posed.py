@@ -52,7 +52,9 @@ class PosedTracker:
         self.flow = make_flow(config.flow)
         matcher = Matcher(self.flow)
         self.choice = KeyframeChoice(config.keyframe_choice)
-        self.front_end = FrontEnd(self.graph, matcher, FrontEndConfig(still_flow=0.0), self.threads)
+        self.front_end = FrontEnd(
+            self.graph, matcher, FrontEndConfig(still_flow=0.0).at(self.size, config.area), self.threads
+        )
         self.local_map = LocalMap(self.graph, matcher, config.local_map, self.threads)
         self.photometer = Photometer(self.graph, self.stats)
         self._lights: list[FrameLight] = []  # of all frames
