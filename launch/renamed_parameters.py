@@ -31,7 +31,6 @@ RENAMED: tuple[tuple[str, str], ...] = (  # what it was, what it is with a node 
     ("mvs.least_cells", "mvs.ranges.min_cells"),
     ("mvs.skip_cells", "mvs.pruning.outside_cells"),
     ("depth_fusion.least_views", "depth_fusion.min_views"),
-    ("depth_fusion.rim", "depth_fusion.discontinuity_radius"),
     ("mapper.density", "mapper.training.kernel"),
     ("mapper.betas", "mapper.training.betas"),
     ("mapper.loss", "mapper.training.loss"),
@@ -74,6 +73,10 @@ GONE: Mapping[str, str] = {
         "splats of doubtful depth begin as all others: min_opacity, initial_opacity, initial_scale",
     ),
     "mapper.density_control.prune_scale": "no splat grows beyond mapper.optimizer.max_scale",
+    **dict.fromkeys(
+        (f"depth_fusion.{name}" for name in ("rim", "discontinuity_radius", "speckle")),
+        "the confidence knows edges and small patches: with a higher depth_fusion.confidence less of them is kept",
+    ),
     "mvs.skip_certain": "it cost precision and saved no time",
     "mvs.skip_explained": "it passed over no keyframe of a camera's stream",
     "mvs.tolerance": "it was of mvs=skipping",

@@ -34,6 +34,7 @@ SOURCES = {
     "room": Source("synthetic", {"scene": "room", "frames": 120, "threads": 2}, tolerance=0.02),
     "room_b": Source("synthetic", {"scene": "room", "frames": 120, "threads": 2, "seed": 5}, tolerance=0.02),
     "aerial": Source("synthetic", {"scene": "aerial", "frames": 80, "threads": 2}, tolerance=0.02),
+    "town": Source("synthetic", {"scene": "town", "frames": 160, "threads": 2}),
     "redkitchen": Source("seven_scenes", folder="seven_scenes_redkitchen"),
     "fr1_xyz": Source("tum", folder="tum_fr1_xyz"),
     "replica": Source("replica", folder="replica/room0_20f", tolerance=0.05, parallax=0.01, stride=2),

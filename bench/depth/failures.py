@@ -50,7 +50,7 @@ FAILURES: dict[str, Callable[[Scene], Scene]] = {
 }
 
 
-_FILTERS = ("confidence", "consistency", "discontinuity", "speckle")
+_FILTERS = ("confidence", "consistency")
 
 
 def failure_rows(area: int, count: int | None) -> list[Row]:

@@ -39,9 +39,7 @@ def part_variants(area: int) -> dict[str, Variant]:
         "4 maps to check with": (base, replace(fusion, neighbors=4)),
         "round trip": (base, replace(fusion, round_trip=True)),
         "no confidence threshold": (base, replace(fusion, confidence=0.0)),
-        "depth edges kept": (base, replace(fusion, discontinuity_radius=0)),
-        "speckles kept": (base, replace(fusion, speckle=0)),
-        "no filter": (base, replace(fusion, confidence=0.0, check=False, discontinuity_radius=0, speckle=0)),
+        "no filter": (base, replace(fusion, confidence=0.0, check=False)),
     }
 
 

@@ -27,7 +27,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from nodes.tracker import Tracker
 
 WITHIN = 0.05  # relative depth
-REASONS = ("confidence", "consistency", "discontinuity", "speckle")
+REASONS = ("confidence", "consistency")
 
 
 @dataclass(frozen=True)

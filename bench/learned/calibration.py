@@ -55,8 +55,7 @@ def main() -> None:
     torch.set_num_threads(1)
     os.environ.update(environment())
     data = {name: samples(name, options.keyframes) for name in (*FIT, *CHECK)}
-    x = np.concatenate([np.stack([np.ones(SAMPLES), logit(data[name][0])], axis=1) for name in FIT])
-    now = fit(x, np.concatenate([data[name][1] for name in FIT]))
+    now = fit([(np.stack([np.ones(SAMPLES), logit(data[name][0])], axis=1), data[name][1]) for name in FIT])
     print(f"itermvs: ({now[0]:.2f}, {now[1]:.2f})")
     in_code = NETWORKS["itermvs"].calibration
     assert in_code is not None

@@ -8,7 +8,7 @@ import numpy as np
 from mvsgs_core.fusion.interface import Fused
 
 # Logistic regression on `features_of`, by `python -m bench.depth.calibration`.
-WEIGHTS = np.array([-1.054, 0.811, 1.839, -0.76, -0.443, -0.475, 1.205, 0.044, -0.789, -0.387, 0.981, 0.953, -0.6])
+WEIGHTS = np.array([-1.332, 1.117, 1.636, -0.918, -0.127, -0.331, 1.004, -0.187, -0.538, -0.149, 0.7, 0.726, -0.416])
 
 _LOCATED = 1.0  # pixels to which the neighbors together locate a point
 _DOUBTS = (0.005, 0.2)  # relative depth: a doubt below the first and above the second is told from no other

@@ -10,7 +10,6 @@ import numpy as np
 from mvsgs_core import geometry
 from mvsgs_core.fusion.backend import make_fusion_backend
 from mvsgs_core.fusion.confidence import features_of, probability_of_inlier, uncertainty_of
-from mvsgs_core.fusion.filters import discontinuity_mask, speckle_mask
 from mvsgs_core.fusion.interface import FuseOptions, FusionBackend
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
@@ -38,9 +37,7 @@ class FusionConfig:
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
     min_views: int = 2  # views that must agree, the reference counted
-    confidence: float = 0.795  # of a kept pixel at least: lower fills more of the map, with more outliers
-    discontinuity_radius: int = 3  # pixels: nothing is kept that close to something farther; 0: off
-    speckle: int = 100  # pixels: patches up to this size are not kept; 0: off
+    confidence: float = 0.755  # of a kept pixel at least: lower keeps more, with more outliers
     device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
     threads: int | None = None  # of the C++ kernels; null: all
     realtime: bool = False  # less effort, see `EFFORTS`, where depth maps come faster than they are fused
@@ -191,12 +188,6 @@ def fuse(
         counts["rejected: consistency"] = float((keep & ~agreed).sum())
         keep = keep & agreed
     keep = keep & sure
-    at_edge = keep & discontinuity_mask(np.where(keep, depth, 0.0), config.discontinuity_radius)
-    counts["rejected: discontinuity"] = float(at_edge.sum())
-    keep = keep & ~at_edge
-    in_speckle = keep & speckle_mask(np.where(keep, depth, 0.0), config.speckle, config.relative)
-    counts["rejected: speckle"] = float(in_speckle.sum())
-    keep = keep & ~in_speckle
     counts["kept"] = float(keep.sum())
     filtered = np.where(keep, depth, 0.0).astype(np.float32)
     normals = normals_of(filtered, reference.intrinsics)

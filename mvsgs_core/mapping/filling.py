@@ -11,7 +11,7 @@ import numpy as np
 
 from mvsgs_core.membrane import membrane
 
-MIN_CONFIDENCE = 0.15  # a depth below is worse than what surrounds it, continued
+MIN_CONFIDENCE = 0.07  # a depth below is worse than what surrounds it, continued
 STIFFNESS, EDGE = 200.0, 5.0  # of what is continued, see membrane: in gray levels
 
 

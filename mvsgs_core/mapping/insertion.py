@@ -32,7 +32,7 @@ class InsertionConfig:
     median_errors: float = 3.0  # times a view's median error that a pixel of the map may have: blur, noise, pose
     min_opacity: float = 0.7  # rendered opacity below: the map shows nothing there, whatever the color
     doubtful: bool = True  # where it shows nothing, splats of doubtful or continued depth, too; false: it stays empty
-    doubtful_confidence: float = 0.4  # from which such depth counts as known, where the map shows something else
+    doubtful_confidence: float = 0.6  # from which such depth counts as known, where the map shows something else
     initial_scale: float = 0.6  # standard deviation over the side of the rectangle
     flatten: float = 0.3  # thickness along the normal over the smaller width; 1: as thick as that
     initial_opacity: float = 0.5  # 0 to 1 (Stereo-GS: 0.1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.depth.__main__ import SECTIONS, SMALL
-from bench.depth.calibration import reliability
+from bench.depth.calibration import fit, reliability
 from bench.depth.curves import Point, settings
 from bench.depth.data import Scene, coarse_grid, without_ragged_edges
 from bench.depth.parts import part_variants, skip_variants
@@ -101,3 +101,20 @@ def test_the_simulated_grid_is_sparse_noisy_and_partly_wrong() -> None:
 def test_sections_have_names() -> None:
     known = {"quality", "tracked", "oracle", "baselines", "photos", "skips", "curves", "failures", "calibration"}
     assert known <= set(SECTIONS)
+
+
+def test_a_fit_finds_the_weights_counts_scenes_alike_and_keeps_what_is_given() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.array([0.5, 1.5, -1.0])
+
+    def sampled(count: int, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = np.concatenate([np.ones((count, 1)), rng.normal(size=(count, 2))], axis=1)
+        return x, rng.random(count) < 1.0 / (1.0 + np.exp(-x @ weights))
+
+    scene = sampled(40000, truth)
+    np.testing.assert_allclose(fit([scene], ridge=0.0), truth, atol=0.06)
+    one = fit([sampled(1000, truth), sampled(40000, -truth)], ridge=0.0)
+    assert np.abs(one).max() < 0.2  # neither outvotes the other
+    given = fit([scene], {2: 0.25})
+    assert given[2] == 0.25
+    assert given[1] > 1.0

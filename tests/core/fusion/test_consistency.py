@@ -19,9 +19,7 @@ from tests.support.depth_views import SIZE, view
 from tests.support.plane_scene import intrinsics_of, look, true_depth
 
 FINE = (160, 224)  # where parallax is enough for a depth to be sure
-CONFIG = FusionConfig(  # of a small map: filters of few pixels
-    device="cpu", threads=1, relative=0.01, confidence=0.77, discontinuity_radius=2, speckle=200
-)
+CONFIG = FusionConfig(device="cpu", threads=1, relative=0.01, confidence=0.77)
 
 
 def brute_force(
@@ -164,9 +162,9 @@ def test_the_wrong_pose_of_one_neighbor_does_not_get_through() -> None:
 
 
 def test_few_agreeing_neighbors_count_against_a_depth_only_where_others_see_another() -> None:
-    """One neighbor agrees and nobody else looks; or one agrees and two see another depth there."""
+    """One neighbor agrees and nobody else looks; or one agrees and three see another depth there."""
     reference, agreeing = _fine(0, 0.0), _fine(1, 0.3)
-    others = [_fine(2, -0.3), _fine(3, 0.5)]
+    others = [_fine(2, -0.3), _fine(3, 0.5), _fine(4, -0.5)]
     for other in others:
         other.depth[:, :112] = 0.0
         other.depth[:, 112:] *= 0.8

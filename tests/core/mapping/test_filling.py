@@ -67,7 +67,7 @@ def test_what_the_map_shows_is_not_filled() -> None:
     assert mapper.log.counts["pixels_filled"] == 0
 
 
-@pytest.mark.parametrize(("confidence", "used"), [(0.3, False), (0.5, True), (None, False)])
+@pytest.mark.parametrize(("confidence", "used"), [(0.5, False), (0.7, True), (None, False)])
 def test_what_the_map_shows_otherwise_is_filled_where_doubtful_depth_is_likely(
     confidence: float | None, used: bool
 ) -> None:
