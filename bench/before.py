@@ -6,9 +6,10 @@
 One run at a time, the mapper with one thread; whatever else the machine does meets both. Figures are those of each
 checkout's own report, a scene's parameters are called as the checkout calls them. Where a report has no figure of each
 held-out frame, and none of the protocol that fits its camera at test time, the map is scored so here. Without --other
-this checkout is compared with itself: what it shows then is noise. --fewer 10:100,5:50 runs this checkout with so many
-iterations a keyframe and at the end, too: the best that takes no more of the mapper's time than before tells what is
-gained in equal time, the cheapest that is as good as before what the map of before costs. These are of the first seed.
+this checkout is compared with itself: what it shows then is noise. --fewer 10:100,5 runs this checkout with so many
+iterations a keyframe and at the end, or as many there as the mapper makes of it, too: the best that takes no more of
+the mapper's time than before tells what is gained in equal time, the cheapest that is as good as before what the map of
+before costs. These are of the first seed.
 """
 
 from __future__ import annotations

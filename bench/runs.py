@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CONF = ROOT / "bench" / "conf"
 SHARED = Path(os.environ.get("MVSGS_SHARED", ROOT.parent / "shared"))
 DATA = SHARED / "data"
-FEWER = "cheaper runs of ours besides: iterations a keyframe and at the end, such as 10:100,5:50"
+FEWER = "runs of ours besides: iterations a keyframe and at the end, such as 10:100,5:50, or 5: at the end by rule"
 QUICK = ("dataset.stop=30", "mapper.iterations=15", "mapper.refinement=50")  # overrides of a quick run
 
 
@@ -57,13 +57,17 @@ class Setting:
 
 
 def fewer_iterations(text: str | None) -> dict[str, tuple[str, ...]]:
-    """Overrides of cheaper runs, by what they are, of such as "10:100,5:50". Raises ValueError for anything else."""
+    """Overrides of other runs, by what they are, of such as "10:100,5": so many iterations a keyframe and at the end, or
+    as many at the end as the mapper makes of that. Raises ValueError for anything else."""
     found: dict[str, tuple[str, ...]] = {}
     for part in text.split(",") if text else ():
         each, colon, last = part.partition(":")
-        if not (colon and each.isdecimal() and last.isdecimal()):
+        if not each.isdecimal() or (colon and not last.isdecimal()):
             raise ValueError(f"--fewer {part!r} must be iterations a keyframe and at the end, such as 10:100")
-        found[f"{each} a keyframe, {last} at the end"] = (f"mapper.iterations={each}", f"mapper.refinement={last}")
+        name, overrides = f"{each} a keyframe", (f"mapper.iterations={each}",)
+        if colon:
+            name, overrides = f"{name}, {last} at the end", (*overrides, f"mapper.refinement={last}")
+        found[name] = overrides
     return found
 
 

@@ -122,6 +122,16 @@ def test_sides_are_checkouts_with_their_iterations() -> None:
         before.sides(ROOT, "10")
 
 
+def test_how_long_the_end_is_may_be_left_to_the_mapper() -> None:
+    assert runs.fewer_iterations("5:50,22") == {
+        "5 a keyframe, 50 at the end": ("mapper.iterations=5", "mapper.refinement=50"),
+        "22 a keyframe": ("mapper.iterations=22",),
+    }
+    for wrong in ("5:", "some", ":50"):
+        with pytest.raises(ValueError, match="iterations a keyframe"):
+            runs.fewer_iterations(wrong)
+
+
 def test_a_checkout_runs_its_own_code_and_its_own_scenes_first(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"no checkout of this project: it has no launch/run_all.py"):
         Matrix(["room"], checkout=tmp_path).check()
