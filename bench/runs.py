@@ -57,7 +57,7 @@ class Setting:
 
 
 def fewer_iterations(text: str | None) -> dict[str, tuple[str, ...]]:
-    """Overrides of other runs, by what they are, of such as "10:100,5": so many iterations a keyframe and at the end, or
+    """Overrides of other runs, by what they are, of "10:100,5": so many iterations a keyframe and at the end, or
     as many at the end as the mapper makes of that. Raises ValueError for anything else."""
     found: dict[str, tuple[str, ...]] = {}
     for part in text.split(",") if text else ():

@@ -119,7 +119,7 @@ def test_sides_are_checkouts_with_their_iterations() -> None:
     assert found["after"] == (ROOT, ())
     assert found["10 a keyframe, 100 at the end"] == (ROOT, ("mapper.iterations=10", "mapper.refinement=100"))
     with pytest.raises(ValueError, match="such as 10:100"):
-        before.sides(ROOT, "10")
+        before.sides(ROOT, "ten")
 
 
 def test_how_long_the_end_is_may_be_left_to_the_mapper() -> None:
