@@ -114,10 +114,10 @@ class Images(ImageSequence):
 
 
 def _places(folder: Path) -> list[Path]:
-    """Where the images may be."""
+    """Where the images may be; exports of an app come first, beside which it puts a picture of the whole."""
     polycam, scannetpp = polycam_folders(folder), scannetpp_images(folder)
     special = [polycam[0]] if polycam else [scannetpp] if scannetpp else []
-    return [folder, *special, *(folder / name for name in _SUBFOLDERS)]
+    return [*special, folder, *(folder / name for name in _SUBFOLDERS)]
 
 
 def _find_images(folder: Path) -> list[Path]:

@@ -17,6 +17,7 @@ _TURN = so3_exp(np.array([0.3, -0.2, 0.1]))  # of the camera in ARKit's axes
 
 
 def _polycam(folder: Path, kind: str = "corrected_") -> None:
+    write_image(folder / "thumbnail.jpg", 9, (32, 32))  # of the whole scan: none of its frames
     for i in range(3):
         write_image(folder / f"keyframes/{kind}images/10{i}.jpg", 20 + i)
         values = {f"t_{r}{c}": float(_TURN[r, c]) for r in range(3) for c in range(3)}
