@@ -12,6 +12,7 @@ from pathlib import Path
 from launch.refusal import GraphError
 from mvsgs_core.datasets import recognized
 from mvsgs_core.datasets.files import IMAGE_SUFFIXES
+from mvsgs_core.datasets.mcap_file import ROS_2, profile_of
 from nodes.parameters import did_you_mean
 
 SLOT = "dataset"
@@ -19,7 +20,7 @@ SCHEMES = {
     **dict.fromkeys(("rtsp", "rtsps", "rtmp", "rtp", "udp", "http", "https"), "camera"),
     **dict.fromkeys(("tcp", "ipc"), "robot"),
 }
-SUFFIXES = {".mcap": "player"}  # of files that no reader of data sets has
+RECORDING = ".mcap"  # a recording of ours, or a bag of ROS 2
 MAPS = (".ply", ".spz", ".splat")
 # Hydra's own options that take a word of their own after them
 _WITH_VALUE = ("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd", "--package", "-p", "--cfg", "-c",
@@ -89,7 +90,9 @@ def _meaning(word: str, choices: Sequence[str]) -> list[str]:
 
 def _of_file(path: Path) -> str:
     suffix = path.suffix.lower()
-    found = SUFFIXES.get(suffix) or next(iter(recognized(path)), None)
+    if suffix == RECORDING:
+        return "bag" if profile_of(path) == ROS_2 else "player"
+    found = next(iter(recognized(path)), None)
     if found is not None:
         return found
     if suffix in MAPS:
@@ -110,7 +113,7 @@ def _of_folder(path: Path) -> str:
     within = sorted(path.iterdir())
     if not within:
         raise GraphError(f"{path}: is an empty folder")
-    usable = [inner for inner in within if inner.suffix.lower() in SUFFIXES or _any(inner)]
+    usable = [inner for inner in within if inner.suffix.lower() == RECORDING or _any(inner)]
     if usable:
         others = f" or {len(usable) - 1} more in it" if usable[1:] else ""
         raise GraphError(f"{path}: is no data set itself; give {usable[0]}{others}")

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
 from launch.compose import choices_of, compose
 from launch.named_input import with_named_input
@@ -54,6 +55,21 @@ def recording(folder: Path) -> Path:
     return folder / "recording.mcap"
 
 
+def bag_file(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "walk_0.db3").touch()
+    return folder / "walk_0.db3"
+
+
+def bag_of_mcap(folder: Path) -> Path:
+    path = recording(folder)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        writer.finish()
+    return path
+
+
 def within(folder: Path) -> Path:
     write_photos(folder / "images")
     return folder
@@ -65,6 +81,7 @@ def within(folder: Path) -> Path:
         (video, "video"), (write_photos, "images"), (within, "images"), (write_tum, "tum"), (write_replica, "replica"),
         (write_seven_scenes, "seven_scenes"), (lambda path: write_seven_scenes(path) / "seq-01", "seven_scenes"),
         (write_icl_nuim, "icl_nuim"), (bag, "bag"), (recording, "player"),
+        (bag_file, "bag"), (bag_of_mcap, "bag"),
         (write_euroc, "euroc"), (lambda path: write_euroc(path) / "mav0", "euroc"), (write_tum_vi, "euroc"),
         (write_kitti, "kitti"), (write_scannet, "scannet"), (write_kitti_raw, "kitti_raw"),
         (write_tartanair, "tartanair"), (lambda path: write_tartanair(path, "lcam_front"), "tartanair"),
@@ -118,6 +135,7 @@ def test_any_name_reaches_the_reader_as_it_is(name: str, tmp_path: Path) -> None
         ("empty", "is an empty folder"),
         ("texts", "has neither images nor a data set in it, but a.txt"),
         ("sequences", "is no data set itself; give sequences/a or 1 more in it"),
+        ("killed", "is no data set itself; give killed/walk_0.db3"),  # a bag whose recorder wrote no metadata.yaml
         ("photos/photo0.png", "one image makes no map; give the folder that it is in: photos"),
         ("map.ply", "is a map; `mvsgs view map.ply` shows it"),
         ("run", "is the output of a run; `mvsgs view run` shows its map, resume=run goes on"),
@@ -137,6 +155,7 @@ def test_what_cannot_be_told_is_said_in_one_line(
     for name in ("a", "b"):
         write_image(tmp_path / "sequences" / name / "0.png", 3)
     write_replica(write_tum(tmp_path / "both"))
+    bag_file(tmp_path / "killed")
     with pytest.raises(GraphError) as refused:
         meant(word)
     assert said in str(refused.value)

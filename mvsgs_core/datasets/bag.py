@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 
 LAYOUT = Layout(
     "A bag",
-    "a ROS 1 file (.bag) or a ROS 2 folder (metadata.yaml with .db3 or .mcap) with an image topic and its camera_info",
+    "a ROS 1 file (.bag), a ROS 2 folder (metadata.yaml with .db3 or .mcap) or one .db3 or .mcap by itself, with an "
+    "image topic and its camera_info",
     "your own robot (ros2 bag record /camera/image_raw /camera/camera_info), or the bags of TUM RGB-D and many others",
 )
+_SUFFIXES = (".bag", ".db3")  # that only bags have; an .mcap file is one by its content (mcap_file.ROS_2)
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO = "sensor_msgs/msg/CameraInfo"
 _NOT_COLOR = ("depth", "infra", "disparity", "mask")
@@ -49,7 +51,7 @@ class Bag(FileReader):
 
     @staticmethod
     def recognizes(path: Path) -> bool:
-        return path.suffix.lower() == ".bag" if path.is_file() else (path / "metadata.yaml").is_file()
+        return path.suffix.lower() in _SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
 
     def __post_init__(self) -> None:
         super().__post_init__()

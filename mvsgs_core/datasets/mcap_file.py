@@ -10,6 +10,7 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -18,13 +19,14 @@ from typing import BinaryIO
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Message
+from mcap.records import Channel, Chunk, Header, Message
 
 from mvsgs_core.bad_file import BadFileError, brief, reading
 from mvsgs_core.datasets.compression import decompress
 from mvsgs_core.datasets.sequence import Notices
 
 MAGIC = b"\x89MCAP0\r\n"
+ROS_2 = "ros2"  # profile of the bags of ROS 2
 _HEAD = struct.Struct("<BQ")  # opcode, length
 _BESIDE = 2 * 2**20  # bytes of a chunk beside its largest message: writers close a chunk at about one million
 _SMALL = 2**20  # bytes: no index is longer
@@ -39,6 +41,21 @@ class Recorded:
     encoding: str
     sequence: int
     data: bytes
+
+
+def profile_of(path: Path) -> str:
+    """Whose messages an MCAP file holds, as its header says, "" where none is there that can be read.
+
+    Raises OSError for a file that cannot be read.
+    """
+    with path.open("rb") as file:
+        magic, head = file.read(len(MAGIC)), file.read(_HEAD.size)
+        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+        if magic != MAGIC or opcode != Opcode.HEADER or length > _SMALL:
+            return ""
+        with suppress(BadFileError), reading(path, "has no header"):
+            return str(Header.read(ReadDataStream(BytesIO(file.read(length)))).profile)
+    return ""
 
 
 class McapFile:

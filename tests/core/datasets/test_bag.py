@@ -11,9 +11,10 @@ import pytest
 from PIL import Image
 
 from mvsgs_core.bad_file import BadFileError
-from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets import open_dataset, recognized
 from mvsgs_core.datasets.bag_file import opened_bag
 from mvsgs_core.datasets.files import UnreadableImageError
+from mvsgs_core.datasets.mcap_file import ROS_2, profile_of
 from mvsgs_core.datasets.ros import rgb_of
 from tests.support.dataset_folders import huge_png
 
@@ -269,3 +270,16 @@ def test_metadata_that_would_take_its_parser_minutes(tmp_path: Path) -> None:
     (path / "metadata.yaml").write_text("a: " + 10_000 * "[")
     with pytest.raises(BadFileError, match="nested deeper"):
         open_dataset("bag", path=path)
+
+
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_a_file_of_a_bag_by_itself(tmp_path: Path, plugin: StoragePlugin) -> None:
+    ros = Messages(2)
+    kind = "sensor_msgs/msg/Image"
+    with Writer2(tmp_path / "walk", version=9, storage_plugin=plugin) as writer:
+        connection = writer.add_connection("/c/image_raw", kind, typestore=ros.store)
+        writer.write(connection, 1, ros.store.serialize_cdr(ros.image(0, "rgb8", picture(0), 3 * WIDTH), kind))
+    (tmp_path / "walk/metadata.yaml").unlink()
+    (path,) = (tmp_path / "walk").iterdir()
+    assert recognized(path) == ["bag"] or profile_of(path) == ROS_2
+    assert [item.image[0, 0, 0] for item in open_dataset("bag", path=path)] == [20]
