@@ -22,6 +22,7 @@ from launch.outcome import FAILED, REFUSED, Outcome, finished
 from launch.output import Output
 from launch.refusal import GraphError
 from launch.screen import Screen, make_screen
+from launch.settings_file import lasting
 from launch.status import NodeStatus
 from launch.summary import summary
 from launch.supervise import Supervisor
@@ -77,7 +78,7 @@ def _run(job: Job) -> int:
     except GraphError as error:
         return refused(error)
     try:
-        output.begin(graph.resolved, job.command, resumed=job.resumed)
+        output.begin(lasting(graph), job.command, resumed=job.resumed)
         screen = make_screen(graph.settings.screen)
         said: list[Outcome] = []
 

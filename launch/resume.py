@@ -15,12 +15,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
+import msgs
 import nodes
 from launch.compose import CONF, graph_of, parse, prepare, slots_of
 from launch.graph import load_node
 from launch.output import REPORT, read_report
 from launch.refusal import GraphError
 from launch.renamed_parameters import refuse_old_names
+from launch.settings import BUFFER, FROM_SETTINGS, LIVE_BUFFER
 from mvsgs_core.mapping.checkpoints.files import CheckpointInfo, checkpoint_info
 from nodes.parameters import parameter_names
 
@@ -35,13 +37,12 @@ def resumed_config(folder: Path, overrides: Sequence[str], conf: Path = CONF) ->
     Raises GraphError where there is nothing to go on with.
     """
     folder = folder.expanduser().absolute()
-    config = _interrupted(folder)
+    config = _moved(_interrupted(folder), folder)
     _refuse_older(config, folder)
     info = _checkpoint(folder)
     slots = slots_of(conf)
-    for text in prepare(overrides, conf):
+    for text in sorted(prepare(overrides, conf), key=_of_one_slot):
         _apply(config, text, slots, conf)
-    config.output = str(folder)
     if not all(node.replayable for node in _classes(config).values() if nodes.is_source(node)):
         _without_stream(config, folder, conf)
     for slot, node in _classes(config).items():
@@ -92,6 +93,24 @@ def _interrupted(folder: Path) -> DictConfig:
     return config
 
 
+def _moved(config: DictConfig, folder: Path) -> DictConfig:
+    """Where the run's directory has another name now: with that in every path that led into it."""
+    before = str(config.get("output") or folder)
+
+    def moved(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: moved(item) for key, item in value.items()}
+        if isinstance(value, list):
+            return [moved(item) for item in value]
+        inside = isinstance(value, str) and (value == before or value.startswith(f"{before}/"))
+        return f"{folder}{value[len(before) :]}" if inside else value
+
+    found = OmegaConf.create(moved(OmegaConf.to_container(config)))
+    assert isinstance(found, DictConfig)
+    found.output = str(folder)
+    return found
+
+
 def _refuse_older(config: DictConfig, folder: Path) -> None:
     for slot, node in _classes(config).items():
         try:
@@ -118,7 +137,25 @@ def _apply(config: DictConfig, text: str, slots: Sequence[str], conf: Path) -> N
     elif key == "output":
         raise GraphError(f"{text}: a run is resumed in its own directory")
     else:
+        if key in (*FROM_SETTINGS, "device"):
+            _release(config, key)
         OmegaConf.update(config, key, value, force_add=True)
+
+
+def _of_one_slot(text: str) -> bool:
+    """Such overrides come last, so that `mapper.seed=2 seed=1` means what it does in any command."""
+    return "." in parse(text).key_or_group
+
+
+def _release(config: DictConfig, key: str) -> None:
+    """What slots have of a global key is left to that key: config.yaml holds what it was in the run that ended."""
+    for slot, node in _classes(config).items():
+        config[slot].pop(key, None)
+        sent = config[slot].get("best_effort")
+        if key == "realtime" and sent and not node.live:  # at the camera's pace a source of files sends so, too
+            config[slot].best_effort = [name for name in sent if name != msgs.Frame.__name__]
+    if key == "realtime" and config.get("buffer") in (BUFFER, LIVE_BUFFER):
+        config.buffer = None
 
 
 def _classes(config: DictConfig) -> dict[str, type[nodes.Node]]:

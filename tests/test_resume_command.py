@@ -13,8 +13,11 @@ from omegaconf import OmegaConf
 
 from launch.compose import compose, graph_of
 from launch.graph import Graph
+from launch.jobs import _kept
 from launch.refusal import GraphError
 from launch.resume import leave_out_refused, resumed_config
+from launch.settings import BUFFER
+from launch.settings_file import lasting
 from mvsgs_core.mapping.checkpoints.files import state_file, write_state
 from tests.support.shared_data import ROOT
 
@@ -26,7 +29,8 @@ META = {
 def interrupted(folder: Path, *overrides: str, report: str = '{"finished": false}') -> Path:
     """What a run leaves that was killed after its checkpoint of keyframes 0, 5, ..., 95."""
     graph = compose([*overrides, f"output={folder}"])
-    OmegaConf.save(OmegaConf.create(graph.resolved), folder / "config.yaml")
+    folder.mkdir(exist_ok=True)
+    OmegaConf.save(OmegaConf.create(lasting(graph)), folder / "config.yaml")
     (folder / "report.json").write_text(report)
     state = state_file(folder, 3)
     state.parent.mkdir()
@@ -87,6 +91,41 @@ def test_overrides_hold_as_on_any_command_line(tmp_path: Path) -> None:
     ):
         with pytest.raises(GraphError, match=why):
             resumed(tmp_path, wrong)
+
+
+def test_a_global_key_holds_in_every_slot(tmp_path: Path) -> None:
+    """config.yaml has what each slot had of it."""
+    interrupted(tmp_path, "device=cpu", "seed=1", "realtime=true")
+    before = resumed(tmp_path)
+    assert not _kept(before)
+    assert before.slots["mapper"].config["seed"] == 1
+    after = resumed(tmp_path, "mapper.seed=2", "keep_map=true", "seed=3", "realtime=false", "device=auto")
+    assert after.slots["mapper"].config["keep_map"] is True
+    assert _kept(after)
+    assert (after.slots["mapper"].config["seed"], after.settings.seed) == (2, 3)
+    assert after.slots["mapper"].config["realtime"] is False
+    assert after.settings.buffer == BUFFER < before.settings.buffer
+    assert any(edge.best_effort for edge in before.out_of("dataset"))
+    assert not any(edge.best_effort for edge in after.out_of("dataset"))
+    seeded = resumed(tmp_path, "seed=3")
+    assert {slot.config["seed"] for slot in seeded.slots.values() if "seed" in slot.config} == {3}
+
+
+def test_a_run_whose_directory_has_another_name_now_goes_on_in_it(tmp_path: Path) -> None:
+    before = interrupted(tmp_path / "before", "recorder=mcap")
+    after = before.rename(tmp_path / "after")
+    graph = resumed(after)
+    assert str(before) not in OmegaConf.to_yaml(OmegaConf.create(graph.resolved))
+    assert graph.settings.output == graph.slots["tracker"].config["output"] == str(after)
+    assert graph.slots["recorder"].config["path"] == f"{after}/recording.mcap"
+
+
+def test_a_file_of_a_relative_path_is_found_from_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.mcap").touch()
+    monkeypatch.chdir(tmp_path)
+    interrupted(tmp_path / "run", "dataset=player", "dataset.path=a.mcap")
+    monkeypatch.chdir("/")
+    assert resumed(tmp_path / "run").slots["dataset"].config["path"] == str(tmp_path / "a.mcap")
 
 
 def test_what_cannot_be_resumed_is_refused_with_the_reason(tmp_path: Path) -> None:
