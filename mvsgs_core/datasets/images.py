@@ -162,7 +162,7 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None) -> M
     if given is None and (scannetpp := read_scannetpp(images[0].parent, image_size(images))) is not None:
         return scannetpp
     for base in dict.fromkeys((place, images[0].parent, images[0].parent.parent) if given is None else (place,)):
-        transforms = base if base.is_file() else find_transforms(base)
+        transforms = base if base.is_file() else find_transforms(base, place.name)
         colmap = find_colmap(base)
         if colmap is not None:
             return read_colmap(colmap)
@@ -183,11 +183,11 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None) -> M
 
 
 def _from_model(model: Model, folder: Path, images: list[Path], rate: float, notes: list[str]) -> list[Record]:
-    shots = model.lookup(images, folder)
+    shots = model.lookup(images)
     unknown = [image.name for image, shot in zip(images, shots) if shot is None]
     if len(unknown) == len(images):
-        names = ", ".join(list(model.shots)[:3])
-        raise BadFileError(f"the {model.kind} knows none of the images: it names {names}, here is {unknown[0]}")
+        names, here = ", ".join(list(model.shots)[:3]), images[0].relative_to(folder).as_posix()
+        raise BadFileError(f"the {model.kind} knows none of the images: it names {names}, here is {here}")
     common = model.common_lens
     records = []
     for i, (image, shot) in enumerate(zip(images, shots)):

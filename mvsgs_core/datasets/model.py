@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -13,6 +14,7 @@ from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets.files import read_numbers
 from mvsgs_core.datasets.lens import Lens
 
+_ANY = re.compile(r"(images|rgb|input|frames|color)(_\d+)?")  # folders whose name says nothing of what is in them
 _FARTHEST = 1e12  # in the file's own unit: the Earth's radius is 6e9 millimeters
 
 
@@ -32,26 +34,58 @@ class Model:
     kind: str  # for messages: "COLMAP model", ...
     shots: Mapping[str, Shot]
 
-    def lookup(self, images: list[Path], folder: Path) -> list[Shot | None]:
-        """The shot of each image: by the longest end of its path below `folder` that is a name, else by its bare name.
+    def lookup(self, images: list[Path]) -> list[Shot | None]:
+        """The shot of each image: by the longest end of its path that is a name, else by its bare name.
 
-        Names of a model start at another folder than ours, and some leave the suffix out.
+        Names of a model start at another folder than ours, and some leave the suffix out. A shot is of one image: of
+        several that its name would suit, the one that it suits best has it, and of equals none.
         """
-        bare = Counter(_bare(name) for name in self.shots)
-        known = {_bare(name): shot for name, shot in self.shots.items() if bare[_bare(name)] == 1}
-        known |= {_without_suffix(name): shot for name, shot in self.shots.items()}
-        found = []
-        for image in images:
-            parts = _without_suffix(image.relative_to(folder).as_posix()).split("/")
-            ends = ("/".join(parts[i:]) for i in range(len(parts)))
-            found.append(next((known[end] for end in ends if end in known), None))
-        return found
+        names = _Names(self.shots)
+        found = [names.of(image.absolute()) for image in images]
+        counts = Counter(found)
+        best = dict(sorted(match for match in found if match is not None))
+        alone = [match is not None and counts[match] == 1 and best[match[0]] == match[1] for match in found]
+        return [self.shots[match[0]] if match is not None and has else None for match, has in zip(found, alone)]
 
     @property
     def common_lens(self) -> Lens | None:
         """The lens of all shots if they share one: it then holds for images without a pose too."""
         lenses = {shot.lens for shot in self.shots.values()}
         return lenses.pop() if len(lenses) == 1 else None
+
+
+_Fit = tuple[int, bool]  # parts of the path that are the whole name, 0 for a bare one; whether its suffix is the same
+
+
+class _Names:
+    """The names of a model, by what an image may be found under."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        names = list(names)
+        counts = Counter(_bare(name) for name in names)
+        self._bare = {_bare(name): name for name in names if counts[_bare(name)] == 1}
+        self._whole = {_without_suffix(name): name for name in names} | {name: name for name in names}
+        self._folders = {PurePosixPath(name).parent.name for name in names}
+
+    def of(self, image: Path) -> tuple[str, _Fit] | None:
+        """The name of an image, and how well it fits."""
+        parts = image.parts
+        for start in range(len(parts)):
+            end = "/".join(parts[start:])
+            for key in (end, _without_suffix(end)):
+                if key in self._whole:
+                    return self._whole[key], (len(parts) - start, key == end)
+        name = self._bare.get(_bare(image.name))
+        if name is None or self._is_elsewhere(name, image):
+            return None
+        return name, (0, name.endswith(image.suffix))
+
+    def _is_elsewhere(self, name: str, image: Path) -> bool:
+        """Whether a name is of a folder beside the image's: that is there, or the model knows the image's own too."""
+        theirs, ours = PurePosixPath(name).parent.name, image.parent.name
+        if theirs in ("", "..", ours):
+            return False
+        return ours in self._folders or (not _ANY.fullmatch(theirs) and (image.parent.parent / theirs).is_dir())
 
 
 def rigid(matrix: np.ndarray, where: str) -> np.ndarray:

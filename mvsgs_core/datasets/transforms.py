@@ -19,8 +19,10 @@ NAMES = ("transforms.json", "transforms_train.json")
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def find_transforms(folder: Path) -> Path | None:
-    return next((folder / name for name in NAMES if (folder / name).is_file()), None)
+def find_transforms(folder: Path, part: str = "") -> Path | None:
+    """part: the folder of the images in it, such as the test/ of NeRF's own sets, which have a file of each part."""
+    names = (f"transforms_{part}.json", *NAMES)
+    return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def read_transforms(path: Path, image_size: tuple[int, int], masks: Path | None = None) -> Model:
