@@ -50,6 +50,7 @@ class KittiRaw(ImageSequence):
             raise LAYOUT.missing(f"{source / 'data'} has no 0000000000.png, 0000000001.png, ...")
         calibration = LAYOUT.file(_calibration(folder, "calib_cam_to_cam.txt"))
         published, cam0_from_cam = read_projection(calibration, f"P_rect_0{camera}", images)
+        _check_rectified(calibration, camera, source, published.size)
         lens = self._lens(images, published)
         times = _times(LAYOUT.file(source / "timestamps.txt"), last=int(images[-1].stem))
         poses = self._poses(folder, images, cam0_from_cam)
@@ -81,6 +82,22 @@ def _calibration(folder: Path, name: str) -> Path:
     """Of a drive: it lies with the day's, or was copied into the drive's own folder."""
     own = folder / name
     return own if own.is_file() else folder.resolve().parent / name
+
+
+def _check_rectified(calibration: Path, camera: int, source: Path, size: tuple[int, int]) -> None:
+    """Raises ValueError for images of another (height, width) than those that the calibration was rectified to, where
+    it says that one."""
+    name = f"S_rect_0{camera}"
+    with reading(calibration, f"must hold a line `{name}: ` and 2 numbers, width and height"):
+        try:
+            width, height = (int(v) for v in named_numbers(calibration, name, 2))
+        except KeyError:
+            return
+    if size != (height, width):
+        raise ValueError(
+            f"{source} has images of {size[1]}x{size[0]}, and {calibration.name} is for rectified ones of "
+            f"{width}x{height}: take the drive's [synced+rectified data], not [unsynced+unrectified data], nor scale it"
+        )
 
 
 def _times(path: Path, last: int) -> list[float]:

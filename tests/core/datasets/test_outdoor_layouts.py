@@ -49,7 +49,9 @@ def test_kitti_raw_with_less(tmp_path: Path) -> None:
     ("name", "content"),
     [
         ("../calib_cam_to_cam.txt", "P_rect_02: 50 0 31 3 0 51 23 0 0 0 1 0"),  # without R_rect_00
-        ("../calib_cam_to_cam.txt", "P_rect_02: 1 2 3"), ("../calib_velo_to_cam.txt", "R: 1 2 3"),
+        ("../calib_cam_to_cam.txt", "P_rect_02: 1 2 3"),
+        ("../calib_cam_to_cam.txt", "P_rect_02: 50 0 31 3 0 51 23 0 0 0 1 0\nS_rect_02: 64"),
+        ("../calib_velo_to_cam.txt", "R: 1 2 3"),
         ("../calib_velo_to_cam.txt", "R: 1 1 1 1 1 1 1 1 1\nT: 0 0 0"), ("image_02/timestamps.txt", "yesterday"),
         ("image_02/timestamps.txt", "2011-09-26 13:02:25.5"), ("oxts/data/0000000000.txt", "1 2 3"),
         ("oxts/data/0000000000.txt", "nan " * 30), ("oxts/data/0000000000.txt", "90 " * 30),
@@ -59,6 +61,17 @@ def test_a_damaged_file_of_kitti_raw_is_named(name: str, content: str, tmp_path:
     folder = write_kitti_raw(tmp_path)
     (folder / name).write_text(content)
     with pytest.raises(BadFileError, match=Path(name).name):
+        open_dataset("kitti_raw", path=folder)
+
+
+def test_drives_that_are_not_rectified_are_refused(tmp_path: Path) -> None:
+    folder = write_kitti_raw(tmp_path)
+    calibration = folder.parent / "calib_cam_to_cam.txt"
+    text = calibration.read_text()
+    calibration.write_text(text + "S_rect_02: 6.400000e+01 4.800000e+01\n")
+    assert len(open_dataset("kitti_raw", path=folder)) == 3
+    calibration.write_text(text + "S_rect_02: 6.000000e+01 4.000000e+01\n")
+    with pytest.raises(ValueError, match=r"of 64x48, and calib_cam_to_cam\.txt is for .* 60x40: take .*synced\+rect"):
         open_dataset("kitti_raw", path=folder)
 
 
