@@ -15,6 +15,8 @@ from mvsgs_core.datasets.files import IMAGE_SUFFIXES, inside
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.model import Model, Shot, rigid
 
+_FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_PINHOLES = (None, "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")  # with no distortion or OpenCV's
 NAMES = ("transforms.json", "transforms_train.json")
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -30,7 +32,8 @@ def read_transforms(path: Path, image_size: tuple[int, int], masks: Path | None 
 
     image_size (height, width) where the file does not say it; masks: folder that names of masks start at, where it is
     not the file's; one that is not there has none.
-    Raises BadFileError for a malformed file, or a camera or pose in it that cannot be.
+    Raises BadFileError for a malformed file, a camera or pose in it that cannot be, or a camera model that has no
+    counterpart.
     """
     shots = {}
     with reading(path, "is no transforms.json that can be used"):
@@ -60,6 +63,9 @@ def _lens(c: Mapping[str, Any], image_size: tuple[int, int]) -> Lens:
         fx = 0.5 * width / math.tan(0.5 * float(c["camera_angle_x"]))
         fy = 0.5 * height / math.tan(0.5 * float(c["camera_angle_y"])) if "camera_angle_y" in c else fx
     cx, cy = float(c.get("cx", 0.5 * width)) - 0.5, float(c.get("cy", 0.5 * height)) - 0.5
-    fisheye = c.get("camera_model") == "OPENCV_FISHEYE" or bool(c.get("is_fisheye", False))
+    camera = c.get("camera_model")
+    if camera not in _FISHEYES + _PINHOLES:
+        raise ValueError(f"camera_model {camera} is not supported: undistort the images, and write PINHOLE")
+    fisheye = camera in _FISHEYES or bool(c.get("is_fisheye", False))
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     return Lens((fx, fy, cx, cy), (height, width), tuple(float(c.get(name, 0.0)) for name in names), fisheye)

@@ -140,6 +140,25 @@ def test_transforms_json(tmp_path: Path) -> None:
         open_dataset("images", path=tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("model", "fisheye"),
+    [
+        (None, False), ("SIMPLE_PINHOLE", False), ("RADIAL", False), ("SIMPLE_RADIAL_FISHEYE", True),
+        ("OPENCV_FISHEYE", True), ("EQUIRECTANGULAR", None), ("FISHEYE624", None), ("THIN_PRISM_FISHEYE", None),
+    ],
+)  # fmt: skip
+def test_camera_models_of_transforms_json(model: str | None, fisheye: bool | None, tmp_path: Path) -> None:
+    write_photos(tmp_path, 1)
+    frames = [{"file_path": "photo0.png", "transform_matrix": np.eye(4).tolist()}]
+    content = {"camera_model": model, "fl_x": 50.0, "k1": 0.01, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    if fisheye is None:
+        with pytest.raises(ValueError, match=f"camera_model {model} is not supported: undistort the images"):
+            open_dataset("images", path=tmp_path)
+    else:
+        assert open_dataset("images", path=tmp_path).lens.fisheye == fisheye
+
+
 def test_strecha_cameras_are_for_the_full_size(tmp_path: Path) -> None:
     write_photos(tmp_path / "images", 2, ".jpg")
     (tmp_path / "gt_dense_cameras").mkdir()
