@@ -55,7 +55,8 @@ class Video(FileReader):
     """Frames of a video file, undistorted, with the container's timestamps.
 
     intrinsics: [fx, fy, cx, cy] in pixels of the video's frames, or "auto": 65 degrees across the longer side, for the
-    tracker to estimate. A video says nothing of its camera, so null is refused.
+    tracker to estimate, with pixels that are as wide as the container says. A video says nothing of its camera, so
+    null is refused.
     Frames of another shape than the first are left out and counted, those of another size scaled to it. Video turned by
     its metadata is upright, and HDR is brought to the range of a photograph, what is brighter than white clipped (both
     by FFmpeg in OpenCV).
@@ -81,11 +82,21 @@ class Video(FileReader):
         with reading(self._path, "cannot be decoded"):
             read, frame = capture.read()
         count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+        stretch = _stretch(capture)
         capture.release()
         if not read:
             raise BadFileError(f"{self._path} opens but has no frame: it is damaged, or no video")
-        self._lens, notes = lens_from_option(self.intrinsics, self.distortion, (frame.shape[0], frame.shape[1]))
-        self._native = frame.shape[0], frame.shape[1]
+        height, width = self._native = frame.shape[0], frame.shape[1]
+        shown = max(1, round(stretch[0] * height)), max(1, round(stretch[1] * width))
+        square = same_shape(shown, self._native)
+        of = shown if self.intrinsics == "auto" and not square else self._native
+        lens, notes = lens_from_option(self.intrinsics, self.distortion, of)
+        self._lens = lens.at(self._native)
+        if not square:
+            notes.append(
+                f"{self._path.name} has pixels that are not square: its frames of {width}x{height} are shown as "
+                f"{shown[1]}x{shown[0]}, so that fy is {stretch[1] / stretch[0]:.4g} times fx"
+            )
         self._open_mask(self._native)
         self._count = int(count) if 0 < count < _MAX_COUNT else 0
         self._rate = rate if math.isfinite(rate) and 0 < rate < 1000 else _DEFAULT_RATE
@@ -188,6 +199,14 @@ class Video(FileReader):
                 "repair it with untrunc), or a codec that OpenCV was built without (ffmpeg -i FILE out.mp4 converts it)"
             )
         return capture
+
+
+def _stretch(capture: cv2.VideoCapture) -> tuple[float, float]:
+    """What height and width of an upright frame are multiplied by when it is shown, as the container says."""
+    wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    aspect = wide / high if wide > 0 and high > 0 else 1.0  # 0: not said
+    turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90
+    return (aspect, 1.0) if turned else (1.0, aspect)
 
 
 def _sharpness(frame: np.ndarray) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -188,6 +189,25 @@ def test_a_video_turned_by_its_metadata_is_upright(tmp_path: Path) -> None:
     image = next(iter(open_dataset("video", path=path, intrinsics=[80, 80, 31.5, 47.5]))).image
     assert image.shape == (96, 64, 3)
     assert image[60:, :, 0].min() > 200 > 60 > image[:36, :, 0].max(), "what was left is below"
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_pixels_that_are_not_square(turned: bool, tmp_path: Path) -> None:
+    path = tmp_path / "anamorphic.mp4"
+    with av.open(path, "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)  # shown as 128x64
+        stream.set_display_rotation(90 if turned else 0)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((64, 96, 3), np.uint8), format="rgb24")))
+        container.mux(stream.encode())
+    sequence = open_dataset("video", path=path, intrinsics="auto")
+    focal = 64 / np.tan(np.radians(32.5))  # of square pixels, 128 of them across the longer side
+    expected = [focal, 0.75 * focal, 31.5, 47.5] if turned else [0.75 * focal, focal, 47.5, 31.5]
+    np.testing.assert_allclose(next(iter(sequence)).intrinsics, expected, atol=1e-9)
+    assert any("pixels that are not square" in w and "fy is" in w for w in sequence.warnings)
+    given = open_dataset("video", path=path, intrinsics=[80, 81, 31.5, 31.5])
+    np.testing.assert_allclose(next(iter(given)).intrinsics, [80, 81, 31.5, 31.5])
 
 
 def test_the_sharpest_of_each_group(tmp_path: Path) -> None:
