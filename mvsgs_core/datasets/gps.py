@@ -40,7 +40,7 @@ _SRT_ALTITUDE = tuple(  # above the sea, then above the place of the start
 
 @dataclass(frozen=True)
 class GpsTrack:
-    """The places of a file: by frame name, or in the order of time."""
+    """The places of a file: by frame name, else in the order of time."""
 
     by_name: dict[str, np.ndarray]  # lower case, without folders
     seconds: np.ndarray  # (N,) of `places`, ascending
@@ -66,8 +66,9 @@ class GpsTrack:
 
         def place(timestamp: float, name: str) -> np.ndarray | None:
             nonlocal last
-            if self.by_name:
-                return self.by_name.get(name.lower(), self.by_name.get(Path(name).stem.lower()))
+            named = self.by_name.get(name.lower(), self.by_name.get(Path(name).stem.lower()))
+            if named is not None or not len(self.seconds):
+                return named
             now = timestamp + shift
             after = int(np.searchsorted(self.seconds, now))
             before = int(np.searchsorted(self.seconds, now, side="right")) - 1
@@ -157,7 +158,10 @@ def _seconds(text: str) -> float:
 def _gpx(text: str) -> Iterator[_Entry]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("it defines entities, which GPX needs not")
-    points = [e for e in ElementTree.fromstring(text).iter() if e.tag.rpartition("}")[2] in ("trkpt", "wpt", "rtept")]
+    found: dict[str, list[ElementTree.Element]] = {}
+    for element in ElementTree.fromstring(text).iter():
+        found.setdefault(element.tag.rpartition("}")[2], []).append(element)
+    points = found.get("trkpt") or [*found.get("wpt", []), *found.get("rtept", [])]  # beside a track they are marks
     for number, point in enumerate(points, start=1):
         inner = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in point}
         by = inner.get("time") or inner.get("name")

@@ -118,6 +118,31 @@ def test_a_clocks_times_need_the_streams_beginning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "mark", ["<ele>400</ele><name>Home</name>", "<name>Home</name>", "<ele>400</ele>", "<ele>400</ele><time>x</time>"]
+)
+def test_marks_beside_a_track_are_none_of_its_places(mark: str, tmp_path: Path) -> None:
+    write_photos(tmp_path / "photos", 2)
+    points = "".join(
+        f'<trkpt lat="47.{n}" lon="8"><ele>{n}</ele><time>2026-05-01T12:00:0{n}Z</time></trkpt>' for n in range(2)
+    )
+    (tmp_path / "a.gpx").write_text(f'<gpx><wpt lat="47" lon="8">{mark}</wpt><trk>{points}</trk></gpx>')
+    assert read_gps(tmp_path / "a.gpx").warnings == []
+    found = places(tmp_path / "photos", gps=tmp_path / "a.gpx", rate=1.0, gps_start="2026-05-01T12:00:00Z")
+    np.testing.assert_allclose(np.array(found), [[47.0, 8.0, 0.0], [47.1, 8.0, 1.0]])
+
+
+def test_a_frame_that_is_not_named_is_placed_by_its_time(tmp_path: Path) -> None:
+    write_photos(tmp_path / "photos", 2)
+    named = '<wpt lat="46" lon="7"><ele>1</ele><name>photo0.png</name></wpt>'
+    timed = "".join(
+        f'<wpt lat="47.{n}" lon="8"><ele>{n}</ele><time>2026-05-01T12:00:0{n}Z</time></wpt>' for n in range(2)
+    )
+    (tmp_path / "a.gpx").write_text(f"<gpx>{named}{timed}</gpx>")
+    found = places(tmp_path / "photos", gps=tmp_path / "a.gpx", rate=1.0, gps_start="2026-05-01T12:00:00Z")
+    np.testing.assert_allclose(np.array(found), [[46.0, 7.0, 1.0], [47.1, 8.0, 1.0]])
+
+
+@pytest.mark.parametrize(
     ("name", "text", "why"),
     [
         ("a.csv", "time,lat,lon\n0,1,2\n", "its header has no altitude"),
