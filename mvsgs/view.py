@@ -26,7 +26,7 @@ from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.preview import as_bytes, covariances
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes.keyframe_pictures import KeyframePictures, depth_points, difference, pictures
-from nodes.map_page import MapPage
+from nodes.map_page import MapPage, check_address
 from nodes.seen_keyframes import goodness
 
 FIGURES = ("coverage", "error")  # that can color keyframes
@@ -179,6 +179,7 @@ def _outside(means: np.ndarray) -> np.ndarray:
 
 def view(options: argparse.Namespace) -> str:
     """Shows the map until it is closed. Raises ValueError, OSError."""
+    check_address(options.host, options.port, dashes="--")
     final, left_out = read_map(options)
     if not len(final.splats):
         raise ValueError(f"{options.map} has no splats: there is nothing to show")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -18,13 +19,28 @@ _POINT = 0.004  # size of a depth point, page units
 _BEHIND = 0.6, 0.25  # of the page's unit: as far the view stands behind a camera and above it
 
 
+def check_address(host: str, port: int, dashes: str = "") -> None:
+    """Raises ValueError where no page can be: viser would wait for it without a word. dashes: of the option's name."""
+    if not 0 <= port <= 65535:
+        raise ValueError(f"{dashes}port={port}: must be 1 to 65535, or 0 for any that is free")
+    try:
+        family, kind, protocol, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:
+            tried.bind(place)
+    except (OSError, UnicodeError) as error:
+        raise ValueError(
+            f"{dashes}host={host}: must be an address of this machine, 127.0.0.1 or 0.0.0.0 ({error})"
+        ) from error
+
+
 class MapPage:
     """The page. Lengths in it are divided by the `unit` that `begin` finds, so that any map fits the browser's near and
     far planes; what it is given is in the map's own unit, relative to one origin.
     """
 
     def __init__(self, host: str, port: int) -> None:
-        """Listens at `port`, or at the next free one if it is taken."""
+        """Listens at `port`, or at the next free one if it is taken. Raises ValueError, see `check_address`."""
+        check_address(host, port)
         self.server = viser.ViserServer(host=host, port=port, label="MVS-GS", verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         self.unit: float | None = None  # map units in one unit of the page

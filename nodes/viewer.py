@@ -18,7 +18,7 @@ from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.rasterizer.splats import Splats
 from nodes import Node
 from nodes.keyframe_pictures import KeyframePictures, depth_points, pictures
-from nodes.map_page import MapPage
+from nodes.map_page import MapPage, check_address
 from nodes.seen_keyframes import SeenKeyframe, SeenKeyframes
 
 _FIGURES = ("nothing", "coverage", "error")  # that can color keyframes
@@ -43,13 +43,17 @@ class Viewer(Node):
 
     config: Config
 
+    @classmethod
+    def check(cls, config: Config) -> None:
+        check_address(config.host, config.port)
+
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c = self.config
         self.page = MapPage(c.host, c.port)
         self.server, self.url = self.page.server, self.page.url
         self.stats.values["url"] = self.url
-        if self.server.get_port() != c.port:
+        if c.port and self.server.get_port() != c.port:
             self.stats.warn(f"port {c.port} is taken: the viewer is at {self.url}")
         logging.info("viewer at %s", self.url)
         self.closed = threading.Event()

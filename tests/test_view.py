@@ -113,3 +113,17 @@ def test_the_command_says_where_the_page_is_and_ends_by_ctrl_c(tmp_path: Path) -
 def test_what_cannot_be_shown_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert view.main([str(tmp_path / "nothing.ply")]) == 1
     assert capsys.readouterr().err.startswith(f"view: {tmp_path / 'nothing.ply'} is missing: a map is")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--port", "70000"], "view: --port=70000: must be 1 to 65535"),
+        (["--host", "not an address"], "view: --host=not an address: must be an address of this machine"),
+    ],
+)
+def test_a_page_that_cannot_be_is_refused_and_not_waited_for(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert view.main([str(write_tiny_run(tmp_path / "run")), *words]) == 1
+    assert capsys.readouterr().err.startswith(said)

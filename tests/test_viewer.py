@@ -183,6 +183,16 @@ def test_taken_port_is_said() -> None:
         node.server.stop()
 
 
+@pytest.mark.parametrize(
+    ("given", "said"), [({"port": 65536}, "port=65536: must"), ({"host": "no host"}, "host=no host")]
+)
+def test_a_page_that_cannot_be_is_refused_before_a_run_and_by_itself(given: dict[str, Any], said: str) -> None:
+    for refused in (Viewer.check, Viewer):
+        with pytest.raises(ValueError, match=said):
+            refused(Viewer.Config(**given))
+    Viewer.check(Viewer.Config())
+
+
 @pytest.mark.parametrize(("last", "said"), [(90, "**finished**"), (80, "the map went on to 90 iterations")])
 def test_finished_is_said_only_of_the_map_as_the_mapper_left_it(last: int, said: str) -> None:
     node = Viewer(Viewer.Config(port=free_port(), keep_open=True))
