@@ -17,6 +17,7 @@ from msgs import FusedKeyframe, Keyframe, Poses, Preview, Reply, Request, SplatM
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.ply import read_ply
 from mvsgs_core.image_metrics import psnr
+from mvsgs_core.kept_map import STREAM
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.coarse import LATER
 from mvsgs_core.mapping.map_state import PARAMETERS
@@ -282,6 +283,8 @@ def test_splats_are_counted_by_the_keyframe_that_they_came_from() -> None:
     anchors = np.array([3, 3, -2, 7, 7, 7])
     assert splats_by_keyframe(anchors, np.array([-5, -2, 3, 7, 9])).tolist() == [0, 1, 2, 3, 0]
     assert splats_by_keyframe(anchors[:0], np.array([1, 2])).tolist() == [0, 0]
+    before = np.array([-100_000 * STREAM, 4])  # of a map that was continued many times; no room for all in between
+    assert splats_by_keyframe(before.repeat(3), before).tolist() == [3, 3]
 
 
 def test_an_empty_stream_still_ends_with_two_empty_maps() -> None:

@@ -74,9 +74,8 @@ def seen(mapper: OnlineMapper, view: TrainingView) -> dict[str, np.ndarray]:
 
 def splats_by_keyframe(anchors: np.ndarray, keyframes: np.ndarray) -> np.ndarray:
     """(K,) how many of the anchors (N,) are each of the keyframes (K,)."""
-    lowest = int(anchors.min(initial=0))  # those of a kept map are negative
-    counts = np.bincount(anchors - lowest, minlength=int(keyframes.max(initial=0)) - lowest + 1)
-    return counts[np.maximum(keyframes, lowest) - lowest] * (keyframes >= lowest)
+    known, counts = np.unique(np.append(anchors, keyframes), return_counts=True)  # each keyframe once more
+    return np.asarray(counts[np.searchsorted(known, keyframes)] - 1)
 
 
 def covariances(quaternions: torch.Tensor, log_scales: torch.Tensor, unit: float) -> torch.Tensor:
