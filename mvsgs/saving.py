@@ -19,7 +19,8 @@ def save_map(
 ) -> None:  # fmt: skip
     """The mapper's half of a kept map, and beside it what others read. An earlier map there is replaced.
 
-    source: the camera that took the stream. trajectory: of all frames; None: that of the keyframes is written.
+    source: the camera that took the stream. trajectory: of all frames, of which those in the map's
+    part of the stream are written; None: that of the keyframes is.
     Raises OSError; ValueError for a folder with the report of a run, which would be another map's then.
     """
     if (folder / "report.json").exists():
@@ -36,7 +37,8 @@ def save_map(
     write_results(folder, shown, source=source)
     if trajectory is not None:
         with replacing(folder / "trajectory.txt") as aside:
-            write_trajectory(aside, trajectory.timestamp[trajectory.posed], trajectory.world_from_cam[trajectory.posed])
+            mapped = trajectory.main([view.index for view in shown.views])
+            write_trajectory(aside, trajectory.timestamp[mapped], trajectory.world_from_cam[mapped])
 
 
 __all__ = ["save_map"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -61,28 +62,33 @@ class Trajectory:
         place = np.minimum(np.searchsorted(self.index, index), len(self.index) - 1)
         return np.where((self.index[place] == index)[:, None], found[place], np.nan)
 
-    def main(self) -> np.ndarray:
-        """(N,) bool: frames with a pose in the part of the map that has most frames."""
+    def main(self, keyframes: np.ndarray | Sequence[int] = ()) -> np.ndarray:
+        """(N,) bool: frames with a pose in the part that holds most of a map's `keyframes` (K,), by index.
+
+        In that with most frames where none of them is of this stream, or there is no map.
+        """
         posed = self.posed
         if not posed.any():
             return posed
-        segments, counts = np.unique(self.segment[posed], return_counts=True)
+        mapped = posed & np.isin(self.index, keyframes)
+        segments, counts = np.unique(self.segment[mapped if mapped.any() else posed], return_counts=True)
         return np.asarray(posed & (self.segment == segments[np.argmax(counts)]))
 
     def following(self, keyframes: np.ndarray, world_from_cam: np.ndarray) -> Trajectory:
-        """Its main part, moved to where a map has its keyframes (K,), by index: world_from_cam (K, 4, 4).
+        """The part that a map shows, moved to where that has its keyframes (K,), by index: world_from_cam (K, 4, 4).
 
         The frames between two of them move as they do, on the screw from one motion to the other, linear in time;
         those before the first and after the last move as that one.
         """
         order = np.argsort(keyframes)
-        anchors = np.flatnonzero(self.main() & np.isin(self.index, keyframes))
+        shown = self.main(keyframes)
+        anchors = np.flatnonzero(shown & np.isin(self.index, keyframes))
         if not len(anchors):
             return self
         known = world_from_cam[order[np.searchsorted(keyframes, self.index[anchors], sorter=order)]]
         if np.array_equal(known, self.world_from_cam[anchors]):
             return self
-        poses, main = self.world_from_cam.copy(), np.flatnonzero(self.main())
+        poses, main = self.world_from_cam.copy(), np.flatnonzero(shown)
         origin = poses[anchors[0], :3, 3].copy()  # the world's may be far away
         poses[:, :3, 3] -= origin
         target = known.copy()

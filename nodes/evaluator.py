@@ -33,6 +33,8 @@ from nodes.splat_map import snapshot_of
 class Evaluator(Node):
     """GroundTruth, FusedKeyframe, Trajectory and SplatMap -> report files in `output`; sends nothing."""
 
+    reports = True
+
     @dataclass
     class Config:
         output: str | None = None  # folder for report.json, report.html, trajectory.txt; none are written if null
@@ -107,11 +109,11 @@ class Evaluator(Node):
         yield from ()
 
     def _georeference(self) -> Georeference | None:
-        """Where the map's main part lies, where frames have a place; None, and said why, where they do not tell."""
+        """Where the map lies, where frames have a place; None, and said why, where they do not tell."""
         track = self.evaluation.final_trajectory
         if track is None or track.places is None:
             return None
-        placed = track.main() & np.isfinite(track.places).all(axis=1)
+        placed = track.main(self.evaluation.keyframes) & np.isfinite(track.places).all(axis=1)
         try:
             found = georeference(track.world_from_cam[placed], track.places[placed], self.config.camera_up)
         except NoReferenceError as error:
@@ -179,7 +181,8 @@ class Evaluator(Node):
         found = self.evaluation.final_trajectory
         if found is not None:
             with replacing(folder / "trajectory.txt") as aside:
-                write_trajectory(aside, found.timestamp[found.posed], found.world_from_cam[found.posed])
+                shown = found.main(self.evaluation.keyframes)  # other parts have other frames of reference
+                write_trajectory(aside, found.timestamp[shown], found.world_from_cam[shown])
         if comparisons:
             with replacing(folder / "comparison.png") as aside:
                 pictures.write_sheet(aside, comparisons)

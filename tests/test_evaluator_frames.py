@@ -132,3 +132,32 @@ def test_frames_and_the_written_trajectory_follow_the_poses_that_the_map_found(e
     assert evaluator.folder is not None
     written = np.loadtxt(evaluator.folder / "trajectory.txt")
     np.testing.assert_allclose(written[:, 2], poses[:, 1, 3] + 0.05, atol=1e-5)
+
+
+def test_where_tracking_was_lost_all_figures_are_of_the_part_that_the_map_shows(tmp_path: Path) -> None:
+    """Of two parts of six frames the second has more keyframes; the first lies 100 units away."""
+    node, splat_map, poses, index = wall_evaluator(tmp_path), splat_map_of(True), poses_along(), np.arange(N)
+    poses[7:10, :3, 3] += 0.4 * np.eye(3)  # not along a line: so GPS tells how they are turned
+    x, y, z = 50.0 * poses[:, :3, 3].T
+    degree = np.radians(1.0) * 6378137.0
+    poses[:, :3, 3] += ORIGIN
+    poses[:6, :3, 3] += 100.0
+    shown = replace(
+        splat_map, keyframes=np.array([6, 9]), world_from_cam=poses[[6, 9]], scale=np.ones(2),
+        exposures=splat_map.exposures[:2],
+    )  # fmt: skip
+    track = Trajectory(
+        index, index / 30, poses, np.isin(index, [0, 6, 9]), np.zeros(N, np.uint8), (index > 5).astype(np.int32),
+        places=np.stack([z / degree + 1e-7, x / degree, -y], axis=1),
+    )  # fmt: skip
+    list(node.on_trajectory(track))
+    list(node.on_splat_map(shown))
+    list(node.on_end())
+    assert [frame["index"] for frame in node.report["rendering"]["frames"]] == list(range(6, N))
+    assert node.report["rendering"]["all"]["psnr"] > 35
+    assert node.report["trajectory"]["ate_frames"] == node.report["georeference"]["positions"] == 6
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "trajectory.txt")[:, 0], index[6:] / 30, atol=1e-6)
+    assert any(warning.startswith("6 of 12 frames with a pose are of parts that") for warning in node.stats.warnings)
+    path = node.evaluation.aligned_path()
+    assert path is not None
+    assert path.index.tolist() == list(range(6, N))

@@ -88,7 +88,7 @@ class Evaluation:
         notes: list[str] = []
         alignment, trajectory_report = self._score_trajectory(notes)
         rendering = {refined: self._score_renders(refined, notes) for refined in (True, False)}
-        final = self.maps.get(True) or self.maps.get(False)
+        final = self.finished
         wall = None if self.started is None or self.mapped is None else self.mapped - self.started
         keyframes = trajectory_report["keyframes"]
         return {
@@ -112,20 +112,30 @@ class Evaluation:
         }
 
     @property
+    def finished(self) -> Snapshot | None:
+        """The map as it is in the end."""
+        return self.maps.get(True) or self.maps.get(False)
+
+    @property
+    def keyframes(self) -> np.ndarray:
+        """(K,) those of the finished map; none where there is none."""
+        return self.finished.keyframes if self.finished else np.zeros(0, np.int64)
+
+    @property
     def final_trajectory(self) -> Trajectory | None:
         """The tracker's, following the keyframes to where the finished map has them."""
-        finished = self.maps.get(True) or self.maps.get(False)
+        finished = self.finished
         if self.trajectory is None or finished is None:
             return self.trajectory
         return self.trajectory.following(finished.keyframes, finished.world_from_cam)
 
     def scored_frames(self, refined: bool = True) -> list[scoring.ScoredFrame]:
-        """All frames with a pose in the main part of the map whose image is there, in the order of the stream."""
+        """All frames with a pose in the part that the map shows whose image is there, in the order of the stream."""
         finished = self.maps[refined]
         assert self.trajectory is not None
         tracked = self.trajectory.following(finished.keyframes, finished.world_from_cam)
         frames = []
-        main = tracked.main()
+        main = tracked.main(finished.keyframes)
         near = near_plane(finished, finished.world_from_cam[0]) if len(finished.keyframes) else NEAR
         moving = tracked.velocity
         if moving is None:
@@ -157,10 +167,11 @@ class Evaluation:
         return frames
 
     def exposures(self, refined: bool) -> FrameExposures | None:
-        """Of all frames of the track; of those outside of the main part of the map they mean nothing."""
+        """Of all frames of the track; of those outside of the part that the map shows they mean nothing."""
         finished, tracked = self.maps[refined], self.trajectory
         assert tracked is not None
-        mapped, place = np.flatnonzero(tracked.main() & np.isin(tracked.index, finished.keyframes)), _places(finished)
+        main, place = tracked.main(finished.keyframes), _places(finished)
+        mapped = np.flatnonzero(main & np.isin(tracked.index, finished.keyframes))
         affines = finished.exposures[[place[int(i)] for i in tracked.index[mapped]]]
         return frame_exposures(tracked.timestamp, tracked.exposure, mapped, affines)
 
@@ -239,7 +250,13 @@ class Evaluation:
 
     def _score_trajectory(self, notes: list[str]) -> tuple[trajectory_metrics.Alignment | None, dict[str, Any]]:
         trajectory = self.final_trajectory or Trajectory.empty()
-        poses = known_poses(trajectory, self._truth)
+        poses = known_poses(trajectory, self._truth, self.keyframes)
+        posed, shown = int(trajectory.posed.sum()), int(trajectory.main(self.keyframes).sum())
+        if shown < posed:
+            notes.append(
+                f"{posed - shown} of {posed} frames with a pose are of parts that the map does not show: they are "
+                "neither scored nor in trajectory.txt"
+            )
         counts = {**trajectory_metrics.counts(trajectory), "ate_keyframes": int(poses.keyframe.sum())}
         counts["ate_frames"] = len(poses.keyframe)
         try:
@@ -256,17 +273,17 @@ class Evaluation:
         return found, {**metrics.of_all(metrics.TRAJECTORY, poses), **length, **counts}
 
     def aligned_path(self) -> AlignedPath | None:
-        """Of the main part of the map; None where no frame has a pose."""
+        """Of the part that the map shows; None where no frame has a pose."""
         trajectory = self.final_trajectory
-        if trajectory is None or not trajectory.main().any():
+        if trajectory is None or not trajectory.posed.any():
             return None
         alignment, _ = self._score_trajectory([])
-        return trajectory_metrics.aligned_path(trajectory, self._truth, alignment)
+        return trajectory_metrics.aligned_path(trajectory, self._truth, alignment, self.keyframes)
 
     def _score_depths(self, alignment: trajectory_metrics.Alignment | None, notes: list[str]) -> dict[str, Any]:
         """After one scale for the whole run, the median ratio of true to estimated depth, as is usual for monocular
         depth; `scale_ratio` is that over the trajectory's scale, 1 where poses and depth maps of the truth agree."""
-        finished = self.maps.get(True) or self.maps.get(False)
+        finished = self.finished
         now = dict(zip(finished.keyframes.tolist(), finished.scale.tolist())) if finished else {}
         known_frames = None if self.trajectory is None else set(self.trajectory.index.tolist())
 

@@ -146,7 +146,7 @@ def _exposure_plot(evaluation: Evaluation) -> dict[str, str]:
     found = evaluation.exposures(refined) if evaluation.maps and tracked is not None else None
     if found is None or tracked is None:
         return {}
-    main = tracked.main()
+    main = tracked.main(evaluation.maps[refined].keyframes)
     x, y = tracked.index[main].astype(float), gains(found.affines)[main]
     series = [svg.Series(name, x, y[:, k]) for k, name in enumerate(("red", "green", "blue"))]
     return {"Exposure by frame": _plot(series, "frame", "gain against the mean camera")}

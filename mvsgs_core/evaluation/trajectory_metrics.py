@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -93,9 +93,11 @@ class KnownPoses:
         return path_length(self.truth)
 
 
-def known_poses(trajectory: Trajectory, truth: Mapping[int, np.ndarray]) -> KnownPoses:
-    """Those of the main part of the map; truth: poses (4, 4) by frame index."""
-    known = trajectory.main() & np.isin(trajectory.index, list(truth))
+def known_poses(
+    trajectory: Trajectory, truth: Mapping[int, np.ndarray], keyframes: np.ndarray | Sequence[int] = ()
+) -> KnownPoses:
+    """Those of the part with the map's `keyframes`, by index; truth: poses (4, 4) by frame index."""
+    known = trajectory.main(keyframes) & np.isin(trajectory.index, list(truth))
     true = poses_of(truth, trajectory.index[known])
     return KnownPoses(trajectory.world_from_cam[known], true, trajectory.keyframe[known])
 
@@ -113,9 +115,12 @@ class AlignedPath:
     unit: str  # of lengths, in words
 
 
-def aligned_path(trajectory: Trajectory, truth: Mapping[int, np.ndarray], alignment: Alignment | None) -> AlignedPath:
-    """Of the main part of the map; truth: poses (4, 4) by frame index."""
-    main = trajectory.main()
+def aligned_path(
+    trajectory: Trajectory, truth: Mapping[int, np.ndarray], alignment: Alignment | None,
+    keyframes: np.ndarray | Sequence[int] = (),
+) -> AlignedPath:  # fmt: skip
+    """Of the part with the map's `keyframes`, by index; truth: poses (4, 4) by frame index."""
+    main = trajectory.main(keyframes)
     index, poses = trajectory.index[main], trajectory.world_from_cam[main]
     if alignment is None:
         nobody = np.zeros(0, np.int64)

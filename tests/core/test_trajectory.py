@@ -71,3 +71,18 @@ def test_where_no_keyframe_moved_nothing_does() -> None:
     before = tracked()
     assert before.following(KEYFRAMES, before.world_from_cam[KEYFRAMES]) is before
     assert before.following(np.zeros(0, np.int64), np.zeros((0, 4, 4))) is before
+
+
+def test_of_two_parts_the_one_with_the_maps_keyframes_counts_however_few_its_frames() -> None:
+    before = tracked()
+    before = replace(before, segment=(before.index >= 9).astype(np.int32))  # keyframe 10, and three frames beside it
+    parts = {"map": before.main(np.array([10])), "no map": before.main(), "of another stream": before.main([-7, 99])}
+    assert {name: np.flatnonzero(part).tolist() for name, part in parts.items()} == {
+        "map": [9, 10, 11, 12],
+        "no map": list(range(9)),
+        "of another stream": list(range(9)),
+    }
+    target = before.world_from_cam[[10]].copy()
+    target[:, 0, 3] += 0.5
+    moves = before.following(np.array([10]), target).world_from_cam - before.world_from_cam
+    np.testing.assert_allclose(moves[:, 0, 3], np.where(parts["map"], 0.5, 0.0), atol=1e-8)
