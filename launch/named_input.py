@@ -68,7 +68,7 @@ def _meaning(word: str, choices: Sequence[str]) -> list[str]:
         if scheme.lower() not in SCHEMES:
             raise GraphError(f"{word}: no address that is known; there are: {', '.join(f'{s}://' for s in SCHEMES)}")
         return _overrides(SCHEMES[scheme.lower()], word)
-    if word.isdecimal() or re.fullmatch(r"/dev/video\d+", word):
+    if (word.isdecimal() and not _exists(word)) or re.fullmatch(r"/dev/video\d+", word):
         return _overrides("camera", word)
     path = Path(word).expanduser()
     try:

@@ -13,6 +13,7 @@ from launch.named_input import with_named_input
 from launch.refusal import GraphError
 from mvsgs_core.datasets import recognized
 from tests.support.dataset_folders import (
+    colmap_text,
     write_icl_nuim,
     write_image,
     write_photos,
@@ -75,10 +76,18 @@ def within(folder: Path) -> Path:
     return folder
 
 
+def rig(folder: Path) -> Path:
+    for camera in ("left", "right"):
+        write_photos(folder / "images" / camera, 1)
+    colmap_text(folder / "sparse/0", ["left/photo0.png", "right/photo0.png"])
+    return folder
+
+
 @pytest.mark.parametrize(
     ("write", "choice"),
     [
-        (video, "video"), (write_photos, "images"), (within, "images"), (write_tum, "tum"), (write_replica, "replica"),
+        (video, "video"), (write_photos, "images"), (within, "images"), (rig, "images"), (write_tum, "tum"),
+        (write_replica, "replica"),
         (write_seven_scenes, "seven_scenes"), (lambda path: write_seven_scenes(path) / "seq-01", "seven_scenes"),
         (write_icl_nuim, "icl_nuim"), (bag, "bag"), (recording, "player"),
         (bag_file, "bag"), (bag_of_mcap, "bag"),
@@ -106,6 +115,13 @@ def test_addresses_and_numbers_are_cameras_and_robots(word: str, choice: str) ->
     chosen, path = meant(word)
     assert chosen == f"dataset={choice}"
     assert compose([chosen, path]).slots["dataset"].config["path"] == word
+
+
+def test_a_folder_of_a_number_is_no_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_kitti(tmp_path).rename(tmp_path / "sequences/00")
+    monkeypatch.chdir(tmp_path / "sequences")
+    assert meant("00") == ["dataset=kitti", "dataset.path='00'"]
+    assert meant("0") == ["dataset=camera", "dataset.path='0'"]
 
 
 def test_a_choice_is_meant_by_its_name_and_overrides_stay() -> None:

@@ -62,7 +62,10 @@ class Images(ImageSequence):
     @staticmethod
     def recognizes(path: Path) -> bool:
         places = [place for place in _places(path) if place.is_dir()]
-        return any(file.suffix.lower() in IMAGE_SUFFIXES for place in places for file in place.iterdir())
+        if any(file.suffix.lower() in IMAGE_SUFFIXES for place in places for file in place.iterdir()):
+            return True
+        subfolder = any((path / name).is_dir() for name in _SUBFOLDERS)  # with a folder of each camera in it
+        return subfolder and (find_colmap(path) is not None or find_transforms(path) is not None)
 
     def _find(self) -> Found:
         if self.rate <= 0:
