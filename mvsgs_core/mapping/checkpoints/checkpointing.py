@@ -83,11 +83,11 @@ class Checkpointing:
         return write_results(self._output, atlas.current, source=source)
 
     def close(self, atlas: Atlas, *, keep: bool) -> None:
-        """After the map is finished. keep: its checkpoint is made too, and stays alone; else the last one stays, for a
-        run whose report is still to be made. Of a map without splats nothing stays."""
+        """After `finish`. keep: the map's checkpoint is made too, and stays alone; else the last one stays, for a run
+        whose report is still to be made. Of a map without splats nothing stays."""
         mapped = len(atlas.largest.state) > 0
         if keep and mapped:
-            self._writer.submit(atlas.frozen())
+            self._writer.submit(atlas.frozen(), results=False)  # they are there, with the camera that took the stream
         self._writer.wait()
         if keep and mapped:
             self._writer.keep_newest()

@@ -53,11 +53,12 @@ class CheckpointWriter:
             kept = replace(view)  # should it be let go meanwhile
             self._do(lambda: self._write_image(kept, sync=True))
 
-    def submit(self, atlas: Atlas, *, sync: bool = True) -> None:
-        """Begins to write a frozen atlas, after what is being written. sync: wait for the disk."""
+    def submit(self, atlas: Atlas, *, sync: bool = True, results: bool = True) -> None:
+        """Begins to write a frozen atlas, after what is being written. sync: wait for the disk. results: map.ply and
+        what lies beside it, too."""
         with self._changed:
             self._pending += 1
-        self._do(lambda: self._write(atlas, sync))
+        self._do(lambda: self._write(atlas, sync, results))
 
     def write(self, atlas: Atlas) -> None:
         """Writes a frozen atlas's state now, which stays there alone; nothing else is being written. Raises OSError."""
@@ -104,10 +105,11 @@ class CheckpointWriter:
                     self._left -= 1
                     self._changed.notify_all()
 
-    def _write(self, atlas: Atlas, sync: bool) -> None:
+    def _write(self, atlas: Atlas, sync: bool, results: bool) -> None:
         try:
             self._write_state(atlas, sync)
-            write_results(self._output, atlas.largest, sync=sync)
+            if results:
+                write_results(self._output, atlas.largest, sync=sync)
         finally:
             with self._changed:
                 self._pending -= 1

@@ -9,7 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.export.cameras import read_source_camera
 from mvsgs_core.export.ply import read_ply
+from mvsgs_core.export.source_camera import GIVEN, SourceCamera
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpointing import MAX_FRACTION, Checkpointing
 from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_files
@@ -159,9 +162,11 @@ def test_the_checkpoint_of_a_finished_map_is_made_where_wanted(tmp_path: Path) -
     checkpoints = Checkpointing(tmp_path, 30.0, atlas)
     assert times(checkpoints, atlas) == 1
     atlas.stream_ended, atlas.refined = True, 6
-    checkpoints.finish(atlas)
+    source = SourceCamera(Lens((30.0, 30.0, 16.0, 12.0), (24, 32), ()), GIVEN)
+    checkpoints.finish(atlas, source)
     checkpoints.close(atlas, keep=False)
     assert not checkpoint_info(tmp_path).finished  # the one before: its report may still be to be made
     checkpoints.close(atlas, keep=True)
     assert checkpoint_info(tmp_path).finished
     assert (tmp_path / "map.ply").exists()
+    assert read_source_camera(tmp_path / "cameras.json") == source
