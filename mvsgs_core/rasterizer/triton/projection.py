@@ -99,7 +99,7 @@ def motion_of(  # type: ignore[no-untyped-def]
     nearer = by_z * inverse_z + about_x * slope_y - about_y * slope_x
     raw_u = fx * (about_z * slope_y - about_y - by_x * inverse_z + slope_x * nearer)
     raw_v = fy * (about_x - about_z * slope_x - by_y * inverse_z + slope_y * nearer)
-    most_u, most_v = MAX_MOTION * width, MAX_MOTION * height
+    most_u, most_v = width * MAX_MOTION, height * MAX_MOTION
     u = tl.minimum(tl.maximum(raw_u, -most_u), most_u)
     v = tl.minimum(tl.maximum(raw_v, -most_v), most_v)
     stretch = height / (height - v)

@@ -1,0 +1,38 @@
+"""What constraints.txt pins goes together: the build of PyTorch that is tested with may ask for less than another."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from importlib.metadata import PackageNotFoundError
+
+import pytest
+from packaging.requirements import Requirement
+
+from tests.support.shared_data import ROOT
+
+# PyTorch: the Triton that its build for CUDA, PyPI's on Linux, requires; the one for processors alone requires none
+TRITON_OF = {"2.13.0": "3.7.1"}
+
+
+def pinned(name: str) -> str:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    requirements = [Requirement(line) for line in lines if not line.startswith("#")]
+    (found,) = [requirement for requirement in requirements if requirement.name == name]
+    return str(found.specifier).removeprefix("==")
+
+
+def test_triton_is_the_one_that_torch_asks_for() -> None:
+    torch = pinned("torch")
+    assert torch in TRITON_OF, f"look up which triton the metadata of torch {torch} on PyPI requires"
+    assert pinned("triton") == TRITON_OF[torch]
+
+
+def test_the_installed_torch_asks_for_no_other_triton() -> None:
+    try:
+        requires = importlib.metadata.requires("torch") or []
+    except PackageNotFoundError:
+        pytest.skip("torch has no metadata here")
+    asked = [requirement for line in requires if (requirement := Requirement(line)).name == "triton"]
+    if not asked or (asked[0].marker and not asked[0].marker.evaluate()):
+        pytest.skip("this build of torch asks for no triton")
+    assert pinned("triton") in asked[0].specifier
