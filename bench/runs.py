@@ -64,10 +64,9 @@ def fewer_iterations(text: str | None) -> dict[str, tuple[str, ...]]:
         each, colon, last = part.partition(":")
         if not each.isdecimal() or (colon and not last.isdecimal()):
             raise ValueError(f"--fewer {part!r} must be iterations a keyframe and at the end, such as 10:100")
-        name, overrides = f"{each} a keyframe", (f"mapper.iterations={each}",)
-        if colon:
-            name, overrides = f"{name}, {last} at the end", (*overrides, f"mapper.refinement={last}")
-        found[name] = overrides
+        name = f"{each} a keyframe, {last} at the end" if colon else f"{each} a keyframe"
+        end = (f"mapper.refinement={last}",) if colon else ()
+        found[name] = (f"mapper.iterations={each}", *end)
     return found
 
 
