@@ -69,8 +69,10 @@ def removal_cost(
         values = {name: getattr(splats, name) for name in PARAMETERS} | {"opacity_logits": leaf}
         image = render(Splats(**values), view)
         assert image.weight_max is not None
-        counted = torch.ones(view.size, device=state.device) if view.valid is None else view.valid.to(torch.float32)
-        error += float((counted[..., None] * (image.color.detach() - view.target) ** 2).sum(dtype=torch.float64))
+        valid = torch.ones(view.size) if view.valid is None else view.valid
+        counted = valid.to(state.device, torch.float32)
+        photograph = image.color.detach().clamp(0.0, 1.0)  # which is cut off where the color is brighter than white
+        error += float((counted[..., None] * (photograph - view.target) ** 2).sum(dtype=torch.float64))
         seen += image.visible
         weight = torch.maximum(weight, image.weight_max.detach())
         for _ in range(probes):

@@ -158,6 +158,21 @@ def test_pixels_that_are_left_out_do_not_count() -> None:
     assert not cost[torch.isfinite(cost)].any()
 
 
+def test_what_is_brighter_than_white_is_no_error_where_the_photograph_is_white() -> None:
+    splats = wall_with((1.8, 0.6, 0.9))
+    (view, *_) = images(splats)
+
+    def exposed(given: Splats, seen: TrainingView) -> Render:
+        render = photograph(given, seen)
+        render.color = 3.0 * render.color
+        return render
+
+    view.image = (255.0 * exposed(splats, view).color.detach().clamp(0.0, 1.0)).round().to(torch.uint8)
+    assert (view.image == 255).any()
+    _, error = removal_cost(state_of(splats), [view], exposed, torch.Generator().manual_seed(0))
+    assert error < view.image.numel() * (0.5 / 255.0) ** 2
+
+
 def test_an_opaque_splat_is_not_cheap() -> None:
     """Beyond the greatest alpha the color no longer depends on the opacity: it has no gradient there."""
     splats = wall_with((1.8, 0.999999, 0.9))
