@@ -154,8 +154,10 @@ def merge(mapper: OnlineMapper, results: Sequence[Result]) -> None:
         for kind, kept in (("views", VIEWS), ("between", BETWEEN))
         for row in keyframe_rows(Arrays(result.arrays).of(kind), [""] * len(result.arrays[f"{kind}/index"]), kept)
     ]
+    known = {view.index: view for view in (*mapper.views, *mapper.keyframes.between)}  # with and without an image
+    if strange := [row["index"] for row in rows if row["index"] not in known]:
+        raise ValueError(f"a block's result names frame {strange[0]}, which the map does not have")
     mapper.state.become({name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
-    known = {view.index: view for view in mapper.keyframes.trained}
     for row in rows:
         for name in LEARNED:
             value = row[name]

@@ -95,6 +95,26 @@ def test_an_image_has_as_many_iterations_in_each_block_and_the_map_ends_as_well(
     assert psnr[1] > psnr[0] - 0.2
 
 
+def test_keyframes_whose_images_were_let_go_are_merged_too() -> None:
+    config = replace(
+        CONFIG, refinement=0, iterations=4, max_keyframes=6, window=2, refine=RefineConfig(blocks=2, overlap=0.1)
+    )
+    mapper = mapped([rgbd_keyframe(k, pose_on_arc(k / 7), SIZE) for k in range(8)], config)
+    assert sum(view.has_image for view in mapper.views) == 6
+    assert refine(mapper, 8) > 0
+    assert len(mapper.views) == 8
+
+
+def test_a_result_of_another_map_is_refused_before_anything_changes() -> None:
+    mapper, shorter = corridor(blocks=1), corridor(blocks=1, keyframes=6)
+    *_, result = refined(job_of(mapper, parting_of(mapper, 1), 0, 1), mapper.config)
+    assert result is not None
+    before = shorter.state.tensors()["means"].clone()
+    with pytest.raises(ValueError, match="frame 6"):
+        merge(shorter, [result])
+    assert torch.equal(shorter.state.tensors()["means"], before)
+
+
 def test_the_same_blocks_come_out_each_time() -> None:
     first, second = corridor(), corridor()
     refine(first, 8)
