@@ -177,6 +177,8 @@ class Atlas:
             self.parts[segment] = OnlineMapper(
                 before.config, before.log, before.corrections, photometry=before.photometry
             )
+        if self.parts[segment] is not self.current:
+            self.current.keyframes.rest()
         self.current = self.parts[segment]
 
     def join(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable, Iterable
 
@@ -10,7 +11,7 @@ import numpy as np
 from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.owed import Owed
-from mvsgs_core.mapping.resting_images import on_disk
+from mvsgs_core.mapping.resting_images import on_disk, room_of
 from mvsgs_core.stats import Stats
 
 
@@ -49,8 +50,8 @@ class KeyframeStore:
 
     @property
     def image_bytes(self) -> int:
-        """Of the images in memory: what grows with the length of a run, to a bound."""
-        return sum(view.image.numel() for view in self.trained if not view.image_on_disk)
+        """Of the images in memory, and their masks: what grows with the length of a run, to a bound."""
+        return sum(_bytes(view) for view in self.trained if not view.image_on_disk)
 
     @property
     def trained(self) -> list[TrainingView]:
@@ -121,15 +122,29 @@ class KeyframeStore:
                 f"more than {self._max_images} keyframes (max_keyframes): images of "
                 "older ones are thinned out and no longer trained on",
             )
-        self._rest()
+        self._rest(self._in_memory)
         return changed
 
-    def _rest(self) -> None:
-        """The oldest images beyond `in_memory` go to disk; where that is full, they stay."""
-        waking = [view for view in self.trained if not view.image_on_disk]
-        for view in sorted(waking, key=lambda view: view.index)[: max(0, len(waking) - self._in_memory)]:
+    def rest(self) -> None:
+        """All images but those of the newest keyframes go to disk: the stream goes on in another map."""
+        self._rest(self._window)
+
+    def _rest(self, in_memory: int) -> None:
+        """The oldest images beyond go to disk, with their masks, and of a GPU's those beyond its `room_of`; where the
+        disk is full, they stay."""
+        waking = sorted((view for view in self.trained if not view.image_on_disk), key=lambda view: view.index)
+        room, held = room_of(waking[-1].image.device) if waking else math.inf, sum(map(_bytes, waking))
+        for place, view in enumerate(waking):
+            if len(waking) - place <= in_memory and held <= room:
+                return
+            held -= _bytes(view)
             try:
-                view.image, view.image_on_disk = on_disk(view.image), True
+                valid = None if view.valid is None else on_disk(view.valid)
+                view.image, view.valid, view.image_on_disk = on_disk(view.image), valid, True
             except OSError as error:
                 self._log.warn(f"images stay in memory beyond mapper.images_in_memory: {error}")
                 return
+
+
+def _bytes(view: TrainingView) -> int:
+    return view.image.numel() + (0 if view.valid is None else view.valid.numel())

@@ -178,7 +178,8 @@ class Trainer:
 
     def _formation(self, view: TrainingView, exposure: Tensor | None) -> Formation:
         # where it is photographed, white, or black, says that the color is at least, or most, that
-        return Formation(exposure, self._vignetting(view.intrinsics, view.size), view.valid, self._photographed(view))
+        valid = None if view.valid is None else view.valid.to(self.state.device)  # from disk it comes on the CPU
+        return Formation(exposure, self._vignetting(view.intrinsics, view.size), valid, self._photographed(view))
 
     def _photograph_loss(self, view: TrainingView, render: Render, exposure: Tensor | None) -> Tensor:
         return photograph_loss(

@@ -240,6 +240,11 @@ def test_images_on_disk_give_the_same_map(monkeypatch: pytest.MonkeyPatch) -> No
     for name in PARAMETERS:
         assert torch.equal(getattr(memory.state.splats, name), getattr(disk.state.splats, name))
 
+    monkeypatch.setattr(keyframe_store, "room_of", lambda device: 2.5 * 48 * 64 * 3)
+    narrow = mapped(views, config)  # as on a GPU whose memory ends there
+    assert [view.index for view in narrow.views if not view.image_on_disk] == [8, 9]
+    monkeypatch.undo()
+
     def full(image: torch.Tensor) -> torch.Tensor:
         raise OSError("no space left on device")
 
@@ -247,6 +252,18 @@ def test_images_on_disk_give_the_same_map(monkeypatch: pytest.MonkeyPatch) -> No
     stays = mapped(views, replace(config, images_in_memory=3))
     assert stays.keyframes.image_bytes == 10 * 48 * 64 * 3
     assert any("no space left" in text for text in stays.log.warnings)
+
+
+def test_masks_rest_on_disk_with_their_images() -> None:
+    mask = np.ones((48, 64), dtype=bool)
+    mask[:10] = False
+    views = [replace(rgbd_keyframe(k, pose_on_arc(k / 9)), mask=mask) for k in range(10)]
+    config = replace(CONFIG, iterations=4, window=2, refinement=4)
+    memory, disk = (mapped(views, replace(config, images_in_memory=n)) for n in (1000, 3))
+    assert disk.keyframes.image_bytes == 3 * 48 * 64 * 4
+    assert all(torch.equal(a.valid, b.valid) for a, b in zip(memory.views, disk.views))
+    for name in PARAMETERS:
+        assert torch.equal(getattr(memory.state.splats, name), getattr(disk.state.splats, name))
 
 
 def test_gradients_that_are_not_finite_are_counted_and_the_map_stays_finite(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -135,3 +135,16 @@ def test_maps_that_have_no_depth_or_no_keyframe_yet_are_joined() -> None:
     for view, before in zip(empty.views[1:], seen):
         torch.testing.assert_close(on_black(empty, view).color, before, atol=2e-3, rtol=0)
     np.testing.assert_allclose(empty.snapshot().world_from_cam[0], pose_on_arc(0.0), atol=1e-12)
+
+
+def test_images_of_a_part_that_was_left_rest_on_disk() -> None:
+    atlas = Atlas(OnlineMapper(CONFIG))
+    for index in range(6):
+        atlas.add(rgbd_keyframe(index, pose_on_arc(index / 8), SIZE), segment=index // 3)
+    left, current = atlas.parts[0], atlas.parts[1]
+    assert [view.image_on_disk for view in left.views] == [True, False, False]  # the window's stay
+    assert not any(view.image_on_disk for view in current.views)
+    while atlas.current.step():
+        pass
+    atlas.add(rgbd_keyframe(6, pose_on_arc(6 / 8), SIZE), segment=0)
+    assert [view.image_on_disk for view in current.views] == [True, False, False]
