@@ -30,6 +30,10 @@ class DensityControlConfig:
     needless: float = 0.02  # of the keyframes' squared error that splats taken out at the end may add; 0: none are
     max_splats: int = 1_000_000  # no growth beyond
 
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.prune_opacity <= 1.0:
+            raise ValueError(f"mapper.density_control.prune_opacity={self.prune_opacity}: an opacity, from 0 to 1")
+
 
 @dataclass(frozen=True)
 class DensityChange:
@@ -56,7 +60,8 @@ def control(
 
 def removable(state: MapState, config: DensityControlConfig) -> Tensor:
     """(N,) bool: transparent."""
-    return state.splats.opacity_logits < math.log(config.prune_opacity / (1.0 - config.prune_opacity))
+    least = torch.logit(torch.tensor(config.prune_opacity, dtype=torch.float64))  # of 0 and 1: none and all
+    return state.splats.opacity_logits < float(least)
 
 
 def _adapt(

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvsgs_core.mapping.density_control import DensityControlConfig, control
+from mvsgs_core.mapping.density_control import DensityControlConfig, control, removable
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.splats import Splats
 
@@ -67,3 +67,16 @@ def test_none_leaves_everything_alone_and_an_unknown_mode_is_refused() -> None:
     assert torch.equal(before, state.splats.opacity_logits)
     with pytest.raises(ValueError, match="adaptive, none"):
         control(state, DensityControlConfig(mode="sometimes"), 1.0, torch.Generator())
+
+
+@pytest.mark.parametrize(("opacity", "left"), [(0.0, 3), (0.5, 1), (1.0, 0)])
+def test_an_opacity_of_0_removes_none_and_one_of_1_all(opacity: float, left: int) -> None:
+    state = state_of(3)
+    with torch.no_grad():
+        state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.1, 0.4, 0.9]))
+    assert int((~removable(state, DensityControlConfig(prune_opacity=opacity))).sum()) == left
+
+
+def test_what_is_no_opacity_is_refused() -> None:
+    with pytest.raises(ValueError, match="from 0 to 1"):
+        DensityControlConfig(prune_opacity=1.5)
