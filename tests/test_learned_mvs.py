@@ -72,6 +72,15 @@ def test_the_papers_network_runs_untrained_and_says_so(network: str) -> None:
     assert all(np.isfinite(d.depth).all() and (d.confidence >= 0).all() for d in depths)
 
 
+def test_keyframes_of_photographs_come_in_any_order() -> None:
+    config = LearnedMvs.Config(
+        weights="random", network_area=64 * 64, area=48 * 64, device="cpu", threads=1, window=2, lag=1
+    )
+    frames = list(open_dataset("synthetic", frames=8, size=(48, 64)))[::-1]
+    found = _depths(config, [_keyframe(frame) for frame in frames])
+    assert [depth.index for depth in found] == [frame.index for frame in frames]
+
+
 def test_missing_weights_say_what_to_fetch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

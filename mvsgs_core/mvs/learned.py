@@ -89,8 +89,9 @@ class LearnedStereo(OnlineStereo):
         multiple = NETWORKS[self._learned.network].multiple
         height, width = image.shape[:2]
         size = camera.fit_size(height, width, self._learned.network_area, multiple)
+        self._images.pop(index, None)
         self._images[index] = camera.resize_image(image, size)
-        for old in sorted(self._images)[: -(self.config.window + self.config.lag + 2)]:
+        for old in list(self._images)[: -(self.config.window + self.config.lag + 2)]:  # as they came: see photographs
             del self._images[old]
 
     def _estimate(
