@@ -1,7 +1,8 @@
 """The GPU back end: no float atomics, the same result every time.
 
 Project (with the pairs counted), sort by depth, list the pairs, sort by tile, blend; backward: blend, sum up by splat,
-project. The host waits once a view, for the number of pairs.
+project. The host waits once a view, for the number of pairs. Triton launches on the current GPU: it is made that of
+the splats.
 """
 
 from __future__ import annotations
@@ -92,23 +93,24 @@ def forward(settings: RenderSettings, parameters: list[Tensor]) -> tuple[Images,
     means = parameters[0]
     if means.dtype != torch.float32:
         raise ValueError(f"the triton back end takes float32 splats, got {means.dtype}")
-    passed = projected(parameters, settings)
-    lists = passed.lists
-    height, width = settings.size
-    tiles_y, tiles_x = tile_grid(settings.size)
-    color = means.new_empty(height, width, 3)
-    depth, opacity = means.new_empty(2, height, width).unbind(0)
-    weights = means.new_zeros(2, len(lists.pair_splats) if settings.weights else 1)
-    blend[(tiles_y * tiles_x,)](
-        passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
-        weights[1], *settings.background, height, width, tiles_x, EXACT=settings.exact, WEIGHTS=settings.weights,
-        ROW=ROW, **LAUNCH_TILE,
-    )  # fmt: skip
-    weight_sum = weight_max = None
-    if settings.weights:
-        weight_sum = lists.sums(weights[0][:, None])[:, 0]
-        weight_max = lists.sums(weights[1][:, None], maximum=True)[:, 0]
-    return (color, depth, opacity), Rendered(passed.radii, passed.refused, weight_sum, weight_max, passed)
+    with torch.cuda.device_of(means):
+        passed = projected(parameters, settings)
+        lists = passed.lists
+        height, width = settings.size
+        tiles_y, tiles_x = tile_grid(settings.size)
+        color = means.new_empty(height, width, 3)
+        depth, opacity = means.new_empty(2, height, width).unbind(0)
+        weights = means.new_zeros(2, len(lists.pair_splats) if settings.weights else 1)
+        blend[(tiles_y * tiles_x,)](
+            passed.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, color, depth, opacity, weights[0],
+            weights[1], *settings.background, height, width, tiles_x, EXACT=settings.exact, WEIGHTS=settings.weights,
+            ROW=ROW, **LAUNCH_TILE,
+        )  # fmt: skip
+        weight_sum = weight_max = None
+        if settings.weights:
+            weight_sum = lists.sums(weights[0][:, None])[:, 0]
+            weight_max = lists.sums(weights[1][:, None], maximum=True)[:, 0]
+        return (color, depth, opacity), Rendered(passed.radii, passed.refused, weight_sum, weight_max, passed)
 
 
 def backward(
@@ -117,24 +119,25 @@ def backward(
     wants_pose: bool,
 ) -> tuple[Tensor | None, None]:  # fmt: skip
     """See `BackEnd`."""
-    lists, count = kept.lists, len(parameters[0])
-    height, width = settings.size
-    tiles_y, tiles_x = tile_grid(settings.size)
-    sums = on_means2d.new_zeros(len(lists.pair_splats), SUMS)
-    blend_backward[(tiles_y * tiles_x,)](
-        kept.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, *images,
-        *(torch.zeros_like(image) if g is None else g for image, g in zip(images, on_images)), sums, height, width,
-        tiles_x, EXACT=settings.exact, DEPTH=any(g is not None for g in on_images[1:]), SUMS=SUMS, ROW=ROW,
-        **LAUNCH_TILE,
-    )  # fmt: skip
-    programs = triton.cdiv(count, BLOCK)
-    on_pose = torch.zeros(max(1, programs), 12, dtype=torch.float64, device=sums.device)
-    if count:
-        project_backward[(programs,)](
-            *parameters, kept.camera, kept.rows, lists.sums(sums), lists.pairs, *on_splats, on_means2d, on_pose,
-            count, width, height, *settings.intrinsics, *settings.readout, POSE=wants_pose, SUMS=SUMS,
-            **of_projection(settings, parameters[4].shape[1]),
+    with torch.cuda.device_of(on_means2d):
+        lists, count = kept.lists, len(parameters[0])
+        height, width = settings.size
+        tiles_y, tiles_x = tile_grid(settings.size)
+        sums = on_means2d.new_zeros(len(lists.pair_splats), SUMS)
+        blend_backward[(tiles_y * tiles_x,)](
+            kept.rows, lists.pair_splats, lists.pair_slots, lists.tile_begin, *images,
+            *(torch.zeros_like(image) if g is None else g for image, g in zip(images, on_images)), sums, height, width,
+            tiles_x, EXACT=settings.exact, DEPTH=any(g is not None for g in on_images[1:]), SUMS=SUMS, ROW=ROW,
+            **LAUNCH_TILE,
         )  # fmt: skip
-    if not wants_pose:
-        return None, None
-    return torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(settings.pose.device), None
+        programs = triton.cdiv(count, BLOCK)
+        on_pose = torch.zeros(max(1, programs), 12, dtype=torch.float64, device=sums.device)
+        if count:
+            project_backward[(programs,)](
+                *parameters, kept.camera, kept.rows, lists.sums(sums), lists.pairs, *on_splats, on_means2d, on_pose,
+                count, width, height, *settings.intrinsics, *settings.readout, POSE=wants_pose, SUMS=SUMS,
+                **of_projection(settings, parameters[4].shape[1]),
+            )  # fmt: skip
+        if not wants_pose:
+            return None, None
+        return torch.nn.functional.pad(on_pose.sum(dim=0).reshape(3, 4), (0, 0, 0, 1)).to(settings.pose.device), None

@@ -135,17 +135,18 @@ def loss_with_gradient(
     image: Tensor, target: Tensor, pixel_weight: Tensor | None, l1_weight: float, ssim_weight: float
 ) -> tuple[Tensor, Tensor]:
     """Weighted L1 + ssim_weight (1 - SSIM) of images (H, W, 3), a scalar, and its gradient by `image` (H, W, 3)."""
-    height, length = image.shape[0], 3 * image.shape[1]
-    grid = (triton.cdiv(height, ROWS), triton.cdiv(length, COLUMNS))
-    taps = window(image.device)
-    gradient = torch.empty_like(image)
-    on_a, on_p, on_r = image.new_empty(3, height, length).unbind(0)
-    similar, different = image.new_empty(2, grid[0] * grid[1]).unbind(0)
-    block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "enable_fp_fusion": True}
-    similarity[grid](image, target, taps, on_a, on_p, on_r, similar, height, length, **block)
-    per_value = 1.0 / image.numel()
-    loss_gradient[grid](
-        image, target, image if pixel_weight is None else pixel_weight, taps, on_a, on_p, on_r, gradient, different,
-        height, length, l1_weight, per_value, -ssim_weight * per_value, WEIGHTED=pixel_weight is not None, **block,
-    )  # fmt: skip
-    return per_value * different.sum() + ssim_weight * (1.0 - per_value * similar.sum()), gradient
+    with torch.cuda.device_of(image):
+        height, length = image.shape[0], 3 * image.shape[1]
+        grid = (triton.cdiv(height, ROWS), triton.cdiv(length, COLUMNS))
+        taps = window(image.device)
+        gradient = torch.empty_like(image)
+        on_a, on_p, on_r = image.new_empty(3, height, length).unbind(0)
+        similar, different = image.new_empty(2, grid[0] * grid[1]).unbind(0)
+        block = {"ROWS": ROWS, "COLUMNS": COLUMNS, "enable_fp_fusion": True}
+        similarity[grid](image, target, taps, on_a, on_p, on_r, similar, height, length, **block)
+        per_value = 1.0 / image.numel()
+        loss_gradient[grid](
+            image, target, image if pixel_weight is None else pixel_weight, taps, on_a, on_p, on_r, gradient, different,
+            height, length, l1_weight, per_value, -ssim_weight * per_value, WEIGHTED=pixel_weight is not None, **block,
+        )  # fmt: skip
+        return per_value * different.sum() + ssim_weight * (1.0 - per_value * similar.sum()), gradient
