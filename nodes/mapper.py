@@ -219,7 +219,7 @@ class Mapper(Node):
         self._settle_last()
         self.stats.arrived("last keyframe to the map before its refinement", self._last_captured)
         yield splat_map(self.atlas.current.snapshot(), refined=False)
-        while not self._frozen and ((self.config.realtime and self.atlas.make_up()) or self.atlas.refine()):
+        while not self._frozen and (self._made_up() or self.atlas.refine()):
             self._keep()
             if self.config.realtime:
                 yield from self._preview()
@@ -232,6 +232,10 @@ class Mapper(Node):
         if self._checkpoints is not None:
             self._checkpoints.close(self.atlas, keep=self.config.keep_map)
             self._checkpoints = None
+
+    def _made_up(self) -> bool:
+        """A piece of what a live stream left no time for: this one, or that whose map is gone on with."""
+        return (self.config.realtime or len(self.atlas.current.coarse) > 0) and self.atlas.make_up()
 
     def on_abort(self, reason: str) -> None:
         if self._checkpoints is not None:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from msgs import SplatMap
+from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
+from mvsgs_core.mapping.coarse import LATER
+from mvsgs_core.mapping.mapper import NONE_NOW
 from nodes.mapper import LAST_SECONDS, Mapper
 from tests.support.mapper_messages import settings, view_message
 
@@ -53,3 +57,15 @@ def test_a_live_map_is_handed_out_at_falling_rates_and_goes_on_at_full_ones(monk
     assert rates[0] > 0.8
     assert rates[-1] < 0.2
     assert trainer.rate == 1.0
+
+
+def test_what_a_live_map_was_left_without_it_gets_where_a_recording_goes_on_in_it(tmp_path: Path) -> None:
+    live = Mapper(replace(settings(), realtime=True))
+    for k in range(2):
+        live._add(view_message(7 * k, k / 2), NONE_NOW)
+    CheckpointWriter(tmp_path, live.config).write(live.atlas.frozen())
+    recorded = Mapper(settings(map=str(tmp_path)))
+    assert len(recorded.atlas.current.coarse) == 2
+    list(recorded.on_end())
+    assert recorded.stats.counts[LATER] == 2
+    assert len(np.unique(recorded.atlas.current.state.anchors.numpy())) == 2

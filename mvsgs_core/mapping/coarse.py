@@ -4,6 +4,7 @@ that the rest of their splats needs: they get it when there is time."""
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,7 @@ LATER = "keyframes that got the rest of their splats later"
 
 
 @dataclass(frozen=True)
-class _Kept:
+class Kept:
     """A keyframe's depth in half precision, finer than matching is."""
 
     keyframe: RGBDKeyframe  # its arrays float16, depths in units of `unit`
@@ -36,21 +37,30 @@ class CoarseKeyframes:
     """Oldest first; of too many the oldest stay as they are, which is counted."""
 
     def __init__(self, log: Stats) -> None:
-        self._kept: OrderedDict[int, _Kept] = OrderedDict()  # by index
+        self._kept: OrderedDict[int, Kept] = OrderedDict()  # by index
         self._log = log
 
     def __len__(self) -> int:
         return len(self._kept)
 
     @property
+    def kept(self) -> list[Kept]:
+        """Never changed: to be shared with a copy of the map."""
+        return list(self._kept.values())
+
+    def take(self, kept: Iterable[Kept]) -> None:
+        """These wait as they did in another map."""
+        self._kept |= {k.keyframe.index: k for k in kept}
+
+    @property
     def bytes(self) -> int:
         return sum(kept.bytes for kept in self._kept.values())
 
     def wait(self, keyframe: RGBDKeyframe, none: bool = False) -> None:
-        """A keyframe of which the map has coarse splats now, or none; its depths are checked."""
-        known = keyframe.depth[keyframe.depth > 0]
+        """A keyframe of which the map has coarse splats now, or none; its depths may be anything."""
+        known = _known(keyframe.depth)
         if keyframe.unfiltered is not None and not len(known):
-            known = keyframe.unfiltered[keyframe.unfiltered > 0]
+            known = _known(keyframe.unfiltered)
         if not len(known):
             return
         unit = float(known.mean())
@@ -61,7 +71,7 @@ class CoarseKeyframes:
             confidence=None if keyframe.confidence is None else _half(keyframe.confidence),
             normals=None if keyframe.normals is None else _half(keyframe.normals),
         )  # fmt: skip
-        self._kept[keyframe.index] = _Kept(small, unit, none, None if keyframe.photograph is None else keyframe.image)
+        self._kept[keyframe.index] = Kept(small, unit, none, None if keyframe.photograph is None else keyframe.image)
         while self.bytes > MAX_BYTES:
             self._kept.popitem(last=False)
             self._log.skip("keyframes whose splats stay larger than their images ask for")
@@ -85,7 +95,7 @@ class CoarseKeyframes:
         self._kept = OrderedDict(sorted((self._kept | other._kept).items()))
 
 
-def _given(kept: _Kept) -> tuple[RGBDKeyframe, np.ndarray | None]:
+def _given(kept: Kept) -> tuple[RGBDKeyframe, np.ndarray | None]:
     k = kept.keyframe
     found = replace(
         k, depth=_single(k.depth, kept.unit),
@@ -96,10 +106,14 @@ def _given(kept: _Kept) -> tuple[RGBDKeyframe, np.ndarray | None]:
     return found, kept.image
 
 
+def _known(depth: np.ndarray) -> np.ndarray:
+    return depth[(depth > 0) & np.isfinite(depth)]
+
+
 def _half(values: np.ndarray, unit: float = 1.0) -> np.ndarray:
     """(...) float16, 0 for what is beyond them; PyTorch's conversion takes a fifth of the time of NumPy's."""
     scaled = values * np.float32(1.0 / unit)
-    scaled[~(scaled <= _LARGEST)] = 0.0
+    scaled[~(np.abs(scaled) <= _LARGEST)] = 0.0
     return np.asarray(torch.from_numpy(scaled).half().numpy())
 
 
@@ -107,4 +121,4 @@ def _single(values: np.ndarray, unit: float = 1.0) -> np.ndarray:
     return values.astype(np.float32) * np.float32(unit)
 
 
-__all__ = ["LATER", "CoarseKeyframes"]
+__all__ = ["LATER", "CoarseKeyframes", "Kept"]

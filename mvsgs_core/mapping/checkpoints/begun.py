@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from mvsgs_core.kept_map import STREAM
@@ -16,8 +17,9 @@ from mvsgs_core.stats import Stats
 def begin_on(output: Path, config: MapperConfig, log: Stats) -> Atlas:
     """The atlas of a run's output, before the first frame of a new stream.
 
-    Its keyframes are numbered below 0, see `kept_map`; what they are now has scale 1, as the tracker says then. Nothing
-    is pending. Raises ValueError where there is none, or `config` does not fit.
+    Its keyframes are numbered below 0, see `kept_map`; what they are now has scale 1, as the tracker says then. No
+    iteration is pending; keyframes that wait for their splats wait on. Raises ValueError where there is none, or
+    `config` does not fit.
     """
     loaded, _ = load(output, config, log, counted=False)
     parts = {segment: _begun(part, log) for segment, part in loaded.parts.items()}
@@ -42,10 +44,16 @@ def _begun(part: OnlineMapper, log: Stats) -> OnlineMapper:
     for frame in between:
         _renumber(frame, scales[frame.keyframe])
         frame.keyframe -= STREAM
+    waiting = [
+        replace(kept, keyframe=replace(k, index=k.index - STREAM, scale=k.scale / scales[k.index]))
+        for kept in part.coarse.kept
+        for k in [kept.keyframe]
+    ]
     part.state.anchors -= STREAM
     part.schedule.drop()
     found = OnlineMapper(part.config, log, part.corrections, part.state, part.views, between, part.photometry)
     found.frame.origin, found.frame.unit = part.frame.origin, part.frame.unit
+    found.coarse.take(waiting)
     found.trainer.iterations = part.trainer.iterations
     return found
 

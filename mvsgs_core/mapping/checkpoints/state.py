@@ -13,6 +13,8 @@ import torch
 from mvsgs_core.array_file import Arrays
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.mapping.between import BetweenView
+from mvsgs_core.mapping.checkpoints.waiting import INDEX as WAITING
+from mvsgs_core.mapping.checkpoints.waiting import waiting_arrays, waiting_of
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
 from mvsgs_core.mapping.keyframes import TrainingView
@@ -47,7 +49,7 @@ BETWEEN = VIEWS | {  # frames between keyframes, as in BetweenView
     "twist": (np.float64, (6,)),
 }  # fmt: skip
 NEVER_BELOW_0 = ("pose_steps", "visits", "visits_here", "median_depth", "mean_color")
-LATER = ("reads_columns", "mean_color")  # which earlier versions knew nothing of: 0
+LATER = ("reads_columns", "mean_color", WAITING)  # which earlier versions knew nothing of: 0, or none
 MAY_BE_NAN = ("timestamp", "loss_fast", "loss_slow", "loss_before", "measured")
 
 
@@ -80,6 +82,8 @@ def copy_of(
         schedule |= {"local": [], "all": []}  # positions have changed
     _restore(copied, schedule)
     copied.frame.origin, copied.frame.unit = mapper.frame.origin, mapper.frame.unit
+    if splats is None:  # a part of the map gets no more splats
+        copied.coarse.take(mapper.coarse.kept)
     copied.trainer.iterations, copied.trainer.rate = mapper.trainer.iterations, mapper.trainer.rate
     copied.trainer.generator.set_state(mapper.trainer.generator.get_state())
     return copied
@@ -96,6 +100,7 @@ def pack(
     arrays = {f"{prefix}/splats/{name}": value.cpu().numpy() for name, value in mapper.state.tensors().items()}
     arrays |= columns(mapper.views, VIEWS, f"{prefix}/views/")
     arrays |= columns(mapper.keyframes.between, BETWEEN, f"{prefix}/between/")
+    arrays |= {f"{prefix}/{name}": value for name, value in waiting_arrays(mapper.coarse.kept).items()}
     arrays[f"{prefix}/origin"] = np.zeros(0) if frame.origin is None else frame.origin
     arrays[f"{prefix}/generator"] = mapper.trainer.generator.get_state().numpy()
     meta = {
@@ -122,6 +127,7 @@ def unpack(
         raise ValueError("frames between keyframes have no keyframe or no image")
     state = _splats(arrays.of("splats"), (config.sh_degree + 1) ** 2, [view.index for view in views], device)
     mapper = OnlineMapper(config, log, corrections, state, views, between, photometry)
+    mapper.coarse.take(waiting_of(arrays, views))
     _restore(mapper, _object(meta.get("schedule")))
     mapper.trainer.iterations = whole(meta.get("iterations"), "iterations")
     mapper.trainer.rate = _positive(meta.get("rate"))

@@ -119,3 +119,19 @@ def test_depth_is_kept_nearly_as_it_was_and_without_end_is_nothing(monkeypatch: 
     newest = [kept.next() for _ in range(len(kept))]
     assert [found[0].index for found in newest if found is not None] == [3, 4]
     assert log.skipped == {"keyframes whose splats stay larger than their images ask for": 3}
+
+
+def test_a_depth_without_end_costs_no_other_pixel() -> None:
+    """That of a node that is no part of this program."""
+    kept = CoarseKeyframes(Stats())
+    endless = VIEWS[0].depth.copy()
+    endless[0, :2] = np.inf, -np.inf
+    expected = VIEWS[0].depth.copy()
+    expected[0, :2] = 0.0
+    for depth in (endless, np.zeros_like(endless)):
+        kept.wait(replace(VIEWS[0], depth=depth, unfiltered=endless))
+        found = kept.next()
+        assert found is not None
+        assert found[0].unfiltered is not None
+        np.testing.assert_allclose(found[0].unfiltered, expected, rtol=1e-3)
+    np.testing.assert_array_equal(found[0].depth, 0.0)
