@@ -13,7 +13,6 @@ from typing import Any
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-import msgs
 import nodes
 from launch.compose import graph_of
 from launch.graph import Graph
@@ -110,8 +109,8 @@ def refused(error: GraphError) -> int:
 
 
 def _scored(graph: Graph) -> bool:
-    """Whether some node writes the report of a finished run: an observer that takes the map."""
-    return any(edge.message is msgs.SplatMap and edge.reader in graph.observers for edge in graph.edges)
+    """Whether some node writes the report of a finished run."""
+    return any(slot.node.reports for slot in graph.slots.values())
 
 
 def _kept(graph: Graph) -> bool:

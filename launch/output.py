@@ -26,9 +26,10 @@ from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 
 LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
-MAP = ("map.ply", "trajectory.txt", FOLDER)  # what is worth keeping of an earlier run
+MAP = ("map.ply", "trajectory.txt", "localization.csv", FOLDER)  # what is worth keeping of an earlier run
 BESIDE = (  # and what belongs to it
     "report.html", REPORT, "comparison.png", "cameras.json", "transforms.json", "keyframes", "config.yaml",
+    "georeference.json",
 )  # fmt: skip
 RUN_ALL = Path(__file__).resolve().parent / "run_all.py"
 

@@ -67,6 +67,7 @@ class Node:
     # a process of it that is started again in the midst of a run goes on: it needs the newest messages, and what the
     # one before left in `kept_in`
     restartable: ClassVar[bool] = False
+    reports: ClassVar[bool] = False  # writes report.json at the end: without it a run is not finished
     in_stream_order: ClassVar[bool] = True  # keyframes leave in the order of their indices, which resuming relies on
 
     config: Any

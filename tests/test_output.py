@@ -1,0 +1,35 @@
+"""What the launcher does to the directory of a run's results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from launch.compose import compose
+from launch.jobs import _scored
+from launch.outcome import Outcome
+from launch.output import Output, read_report
+
+
+@pytest.fixture
+def output(tmp_path: Path) -> Output:
+    return Output(tmp_path)
+
+
+@pytest.mark.parametrize("names", [["map.ply", "georeference.json"], ["localization.csv"]])
+def test_results_of_an_earlier_run_do_not_pass_for_the_new_ones(output: Output, names: list[str]) -> None:
+    for name in names:
+        (output.path / name).touch()
+    output.begin({}, "mvsgs", resumed=False)
+    assert [name for name in names if (output.path / name).exists()] == []
+    assert {path.name for path in (output.path / "previous").iterdir()} == set(names)
+
+
+def test_only_the_evaluators_report_is_waited_for(output: Output) -> None:
+    graph = compose(["evaluator=off", "viewer=viser", "recorder=mcap"])
+    assert not _scored(graph)
+    output.begin(graph.resolved, "mvsgs", resumed=False)
+    output.settle(Outcome(), scored=_scored(graph))
+    assert read_report(output.path)["finished"] is True
+    assert _scored(compose(["evaluator=external"]))
