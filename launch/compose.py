@@ -47,6 +47,8 @@ def graph_of(config: DictConfig, overrides: Sequence[str], choices: Mapping[str,
     slots = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     own = OmegaConf.merge(DEFAULTS, slots)
     assert isinstance(own, DictConfig)
+    if not isinstance(own.output, str | None):
+        raise GraphError(f"output={own.output}: must be the name of a folder; write output=./NAME")
     own.output = own.output or f"runs/{time.strftime('%Y-%m-%d_%H-%M-%S')}-{choices.get('dataset', 'run')}"
     own.output = str(Path(own.output).expanduser().absolute())
     replaced = _replaced(own, overrides)
@@ -94,6 +96,8 @@ def _prepare(text: str, slots: Mapping[str, list[str]], settings: Sequence[str],
     root, _, rest = key.partition(".")
     if root == "hydra" or root.startswith("hydra/") or override.type is not OverrideType.CHANGE:
         return text
+    if key == "output" and isinstance(override.value(), int | float):  # a folder may have such a name
+        return f"++output=./{text.partition('=')[2]}"
     if root in settings:
         return f"++{text}"
     if root not in slots:

@@ -187,8 +187,6 @@ def _build_slot(
     given = {key: getattr(settings, key) for key in FROM_SETTINGS if key in accepted} | given
     built = build(node.Config, given, name)
     parameters = plain_values(built) | _completed(name, node, built)
-    if parameters.get("device") == "auto":
-        parameters["device"] = device.resolved
     typed: dict[type, str] = {}
     unused = node.unused_inputs(built)
     for message, sender in reads.items():
@@ -199,6 +197,8 @@ def _build_slot(
         if msgs.TYPES[message] not in unused:
             typed[msgs.TYPES[message]] = sender
     placed = build(Placement, placement, name)
+    if parameters.get("device") == "auto":  # who is started elsewhere finds out there what there is
+        parameters["device"] = device.wanted if placed.external else device.resolved
     if settings.realtime and nodes.is_source(node) and msgs.Frame.__name__ not in placed.best_effort:
         placed = replace(placed, best_effort=[*placed.best_effort, msgs.Frame.__name__])
     return Slot(name, node, parameters, typed, placed)
@@ -379,17 +379,17 @@ class _Device:
         kind, _, number = wanted.partition(":")
         if kind not in ("auto", "cpu", "cuda") or (number and not number.isdigit()):
             raise GraphError(f"device={wanted}: must be auto, cpu, cuda or cuda:<number>")
-        self._wanted = wanted
+        self.wanted = wanted
 
     @cached_property
     def resolved(self) -> str:
-        if self._wanted == "cpu":
+        if self.wanted == "cpu":
             return "cpu"
         import torch
 
-        if self._wanted == "auto":
+        if self.wanted == "auto":
             return "cuda" if torch.cuda.is_available() else "cpu"
         there = torch.cuda.device_count()
-        if int(self._wanted.partition(":")[2] or 0) >= there:
-            raise GraphError(f"device={self._wanted}: this machine has {there} CUDA devices; use device=cpu")
-        return self._wanted
+        if int(self.wanted.partition(":")[2] or 0) >= there:
+            raise GraphError(f"device={self.wanted}: this machine has {there} CUDA devices; use device=cpu")
+        return self.wanted

@@ -14,6 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import nodes
+from launch.checks import check
 from launch.compose import graph_of
 from launch.graph import Graph
 from launch.inline import run_inline
@@ -72,7 +73,7 @@ def run(job: Job) -> int:
 def _run(job: Job) -> int:
     try:
         graph = graph_of(job.config, job.overrides, job.choices)
-        _check_nodes(graph)
+        check(graph)
         output = Output(Path(graph.settings.output))
     except GraphError as error:
         return refused(error)
@@ -116,29 +117,6 @@ def _scored(graph: Graph) -> bool:
 def _kept(graph: Graph) -> bool:
     """Whether the checkpoint is to stay after a complete run."""
     return any(slot.config.get("keep_map") for slot in graph.slots.values())
-
-
-def _check_nodes(graph: Graph) -> None:
-    """What nodes that run here already know they lack. Raises GraphError."""
-    for name, slot in graph.slots.items():
-        if slot.placement.external:
-            continue
-        _check_device(name, slot.config.get("device"))
-        try:
-            slot.node.check(slot.parameters)
-        except (OSError, ValueError) as error:
-            raise GraphError(f"{name}: {error}") from error
-
-
-def _check_device(slot: str, device: Any) -> None:
-    """A GPU that a slot asks for by itself, not by the global `device`, must be there."""
-    if not isinstance(device, str) or not device.startswith("cuda"):
-        return
-    import torch  # takes a second to load
-
-    there, number = torch.cuda.device_count(), device.partition(":")[2] or "0"
-    if not number.isdigit() or int(number) >= there:
-        raise GraphError(f"{slot}.device={device}: this machine has {there} CUDA devices; use {slot}.device=cpu")
 
 
 def _run_inline(graph: Graph, screen: Screen) -> Outcome:

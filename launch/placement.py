@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 import msgs
-from launch.graph import Graph
+from launch.graph import Graph, Slot
 from mvsgs_core.machine import available_cores
 
 # Share of the cores by work per keyframe; a slot that is not named counts as 1.
@@ -35,8 +35,14 @@ def thread_plan(graph: Graph, cores: int | None = None) -> dict[str, int]:
         if name == heaviest:
             share = max(share, math.ceil(cores * HEAVIEST_SHARE))
         pinned = len(slot.placement.cpu) if slot.placement.cpu else share
-        plan[name] = slot.placement.threads or slot.config.get("threads") or min(share, pinned)
+        plan[name] = own_threads(slot) or min(share, pinned)
     return plan
+
+
+def own_threads(slot: Slot) -> int | None:
+    """What was said of its threads; where nothing was, whoever starts on another host takes all cores of that host."""
+    threads: int | None = slot.placement.threads or slot.config.get("threads")
+    return threads
 
 
 def niceness(graph: Graph, name: str) -> int:

@@ -25,7 +25,7 @@ class RunDirectory:
 
     def __init__(self, graph: Graph) -> None:
         """Raises GraphError where no directory has a name short enough for a socket's address."""
-        self.path = _create(max((len(topic_of(edge)) for edge in graph.edges), default=0))
+        self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base_directory(graph)))
         aside = self.path / f"{LOCK}.new"
         self._lock = os.open(aside, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._lock, fcntl.LOCK_EX)
@@ -71,10 +71,13 @@ def _bases() -> list[Path]:
     return [Path(base) for base in dict.fromkeys((tempfile.gettempdir(), "/tmp")) if Path(base).is_dir()]
 
 
-def _create(longest_topic: int) -> Path:
+def base_directory(graph: Graph) -> Path:
+    """Where run directories are made. Raises GraphError where its name is too long for a socket's address."""
+    topics = [topic_of(edge) for edge in graph.edges] if graph.settings.transport == "ipc" else []
+    longest = max(map(len, topics), default=0)
     for base in _bases():
-        if len(os.fsencode(base)) + len(f"/{PREFIX}12345678/") + longest_topic <= LONGEST_SOCKET_PATH:
-            return Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))
+        if len(os.fsencode(base)) + len(f"/{PREFIX}12345678/") + longest <= LONGEST_SOCKET_PATH:
+            return base
     raise GraphError(
         f"the path of a socket in {tempfile.gettempdir()} would be longer than {LONGEST_SOCKET_PATH} bytes: "
         "set TMPDIR to a shorter one, or transport=tcp"

@@ -16,25 +16,50 @@ from nodes.runtime.addresses import TransportError, load_keys
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
-def addresses(graph: Graph, directory: Path) -> dict[str, str]:
-    """Topic (`slot.MessageType`) -> address. Raises GraphError for a host that may not be listened on, or bad keys."""
-    if graph.settings.keys is not None:
+def check_addresses(graph: Graph) -> None:
+    """Raises GraphError for bad keys, a host that may not be listened on, or ports that there are not."""
+    settings = graph.settings
+    if settings.keys is not None:
         try:
-            load_keys(Path(graph.settings.keys))
+            load_keys(Path(settings.keys))
         except TransportError as error:
-            raise GraphError(f"keys={graph.settings.keys}: {error}") from error
-    topics = list(dict.fromkeys(topic_of(edge) for edge in graph.edges))
+            raise GraphError(f"keys={settings.keys}: {error}") from error
+    if settings.transport == "ipc":
+        return
+    topics = _topics(graph)
+    for topic in topics:
+        host = _host(graph, topic)
+        if host not in LOOPBACK and settings.keys is None:
+            raise GraphError(
+                f"{topic} at {host}: beyond loopback only with keys=DIR (CURVE keys), which docs/guides/node.md says "
+                "how to make"
+            )
+    if settings.port is not None and not 1 <= settings.port <= 65536 - len(topics):
+        raise GraphError(
+            f"port={settings.port}: the run takes {len(topics)} ports from there on, of 1 to 65535; best below 32768"
+        )
+
+
+def addresses(graph: Graph, directory: Path) -> dict[str, str]:
+    """Topic (`slot.MessageType`) -> address."""
+    topics = _topics(graph)
     if graph.settings.transport == "ipc":
         return {topic: f"ipc://{directory}/{topic}" for topic in topics}
-    found = {}
     first = graph.settings.port
     ports = [first + i for i in range(len(topics))] if first is not None else free_ports(len(topics))
-    for topic, port in zip(topics, ports, strict=True):
-        host = graph.slots[topic.partition(".")[0]].placement.host or graph.settings.host
-        if host not in LOOPBACK and graph.settings.keys is None:
-            raise GraphError(f"{topic} at {host}: beyond loopback only with keys=DIR (CURVE keys); see the README")
-        found[topic] = f"tcp://{host}:{port}"
-    return found
+    hosts = [_host(graph, topic) for topic in topics]
+    at = [f"[{host}]" if ":" in host else host for host in hosts]  # an address of IPv6 has colons of its own
+    return {topic: f"tcp://{host}:{port}" for topic, host, port in zip(topics, at, ports, strict=True)}
+
+
+def _topics(graph: Graph) -> list[str]:
+    return list(dict.fromkeys(topic_of(edge) for edge in graph.edges))
+
+
+def _host(graph: Graph, topic: str) -> str:
+    """Where a topic's publisher is reached."""
+    host = graph.slots[topic.partition(".")[0]].placement.host or graph.settings.host
+    return host.removeprefix("[").removesuffix("]")
 
 
 def new_token(graph: Graph) -> str:
@@ -43,7 +68,7 @@ def new_token(graph: Graph) -> str:
 
 
 def spec(
-    graph: Graph, name: str, address: dict[str, str], threads: int, status_fd: int | None, token: str = ""
+    graph: Graph, name: str, address: dict[str, str], threads: int | None, status_fd: int | None, token: str = ""
 ) -> dict[str, Any]:
     """The JSON that `python -m nodes` runs a node from."""
     slot = graph.slots[name]

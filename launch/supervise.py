@@ -26,7 +26,7 @@ import psutil
 from launch.children import Child, python_environment
 from launch.graph import Graph
 from launch.outcome import BY_SIGNAL, FAILED, Failure, Outcome, finished
-from launch.placement import thread_environment, thread_plan
+from launch.placement import own_threads, thread_environment, thread_plan
 from launch.run_directory import RunDirectory, remove_orphans
 from launch.screen import Screen
 from launch.specs import addresses, new_token, spec, write_spec
@@ -86,7 +86,7 @@ class Supervisor:
         for name, slot in self._graph.slots.items():
             path = directory.path / f"{name}.json"
             if slot.placement.external:
-                write_spec(spec(self._graph, name, address, plan[name], None, token), path)
+                write_spec(spec(self._graph, name, address, own_threads(slot), None, token), path)
                 statuses[name].state = "external"
                 command = shlex.join([sys.executable, "-m", "nodes", str(path)])
                 environment = " ".join(f"{key}={shlex.quote(value)}" for key, value in python_environment().items())

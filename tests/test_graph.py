@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,9 @@ from hypothesis import strategies as st
 from launch.compose import CONF, compose, slots_of
 from launch.graph import Edge, Graph
 from launch.inline import run_inline
-from launch.placement import niceness, thread_plan
+from launch.placement import niceness, own_threads, thread_plan
 from launch.refusal import GraphError
+from launch.specs import addresses, spec
 from msgs import Frame, GroundTruth, Keyframe, Poses
 from nodes.parameters import ParameterError, convert
 from tests.support.fake_graph.stages import Relay, Sink
@@ -218,6 +220,23 @@ def test_inline_is_depth_first_and_deterministic(tmp_path: Path) -> None:
 def test_inline_lets_an_exception_through(tmp_path: Path) -> None:
     with pytest.raises(ArithmeticError, match="frame 1 cannot be relayed"):
         run_inline(fake(f"output={tmp_path}", "relay.fail_at=1"))
+
+
+def test_addresses_of_ipv6_have_brackets(tmp_path: Path) -> None:
+    for host in ("::1", "[::1]"):
+        graph = fake("transport=tcp", f"host='{host}'", "port=17000")
+        assert addresses(graph, tmp_path)["source.Frame"] == "tcp://[::1]:17000"
+
+
+def test_who_is_started_elsewhere_finds_out_there_what_there_is() -> None:
+    graph = fake("source=external", "source.device=auto", "relay=external", "relay.threads=3")
+    specs = {
+        name: spec(graph, name, defaultdict(str), own_threads(graph.slots[name]), None) for name in ("source", "relay")
+    }
+    assert (specs["source"]["config"]["device"], specs["source"]["threads"]) == ("auto", None)
+    assert specs["relay"]["threads"] == 3
+    assert fake("source=external", "source.device=auto", "device=cpu").slots["source"].config["device"] == "cpu"
+    assert fake("source.device=auto").slots["source"].config["device"] in ("cpu", "cuda")
 
 
 @pytest.mark.parametrize("cores", [1, 2, 3, 4, 8, 16, 64])

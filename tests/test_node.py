@@ -8,12 +8,15 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from launch.ports import free_ports
-from nodes.runtime.spec import gone_file
+from mvsgs_core.machine import available_cores
+from nodes.runtime.process import parameters
+from nodes.runtime.spec import Spec, gone_file
 from nodes.runtime.transport import create_keys
 from tests.support.patience import LONG, Stopwatch, until
 from tests.support.processes import ENVIRONMENT, graph
@@ -307,6 +310,13 @@ def test_a_file_that_is_no_specification_is_refused(tmp_path: Path) -> None:
         done = subprocess.run([sys.executable, "-m", "nodes", path], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode == 2
         assert error in done.stderr
+
+
+def test_without_a_word_about_threads_a_node_has_all_cores() -> None:
+    spec = Spec("left", "x.Left", {"threads": None}, (), ())
+    assert parameters(spec) == {"threads": available_cores()}
+    assert parameters(replace(spec, threads=3)) == {"threads": None}
+    assert parameters(replace(spec, config={"delay": 1})) == {"delay": 1}
 
 
 def test_cores_threads_and_niceness_are_set() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from launch import run_directory
 from launch.compose import choices_of, compose
 from launch.jobs import Job, refused, run
 from launch.named_input import with_named_input
@@ -81,6 +82,16 @@ def fill(folder: Path) -> None:
         (["photos", "video"], "photos and video: one input at a time"),
         (["photos", "dataset.path=x"], "the input is given twice"),
         (["77"], "camera 77: /dev/video77 does not exist"),
+        (["photos", "mapper.cpu=[0,999]"], "mapper.cpu=[0, 999]: must be cores that this program may use, which are 0"),
+        (["photos", "mapper.cpu=[]"], "mapper.cpu=[]: must be cores"),
+        (["photos", "mapper.threads=0"], "mapper.threads=0: must be 1 or more"),
+        (["photos", "viewer=viser", "viewer.threads=-2"], "viewer.threads=-2: must be 1 or more"),
+        (
+            ["photos", "dataset.best_effort=[Frames]"],
+            "best_effort=Frames: no such message (did you mean Frame?)",
+        ),
+        (["photos", "transport=tcp", "port=65534"], "ports from there on, of 1 to 65535"),
+        (["photos", "output=[2024]"], "output=[2024]: must be the name of a folder; write output=./NAME"),
         (["photos", "viewer"], "a parameter is written slot.parameter=value"),
     ],
 )
@@ -88,6 +99,33 @@ def test_it_is_said_in_one_line(words: list[str], answer: str, tmp_path: Path, s
     fill(tmp_path)
     assert answer in said(*words)
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("words", [["host=0.0.0.0"], ["keys=nowhere"], ["port=0"]])
+def test_what_is_refused_leaves_the_results_that_are_there(
+    words: list[str], tmp_path: Path, said: Callable[..., str]
+) -> None:
+    fill(tmp_path)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "map.ply").touch()
+    said("photos", "transport=tcp", "output=out", *words)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["map.ply"]
+
+
+def test_a_socket_path_that_is_too_long_leaves_the_results_too(
+    tmp_path: Path, said: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(tmp_path)
+    monkeypatch.setattr(run_directory, "LONGEST_SOCKET_PATH", 20)
+    assert "set TMPDIR to a shorter one" in said("photos", "output=out")
+    assert not (tmp_path / "out").exists()
+    run_directory.base_directory(compose(["transport=tcp", "port=1"]))  # has no such path
+
+
+@pytest.mark.parametrize("name", ["2024", "2024_01_01", "true", "1.50"])
+def test_a_folder_may_be_named_like_a_number(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert compose([f"output={name}"]).settings.output == str(tmp_path / name)
 
 
 def test_an_output_in_use_is_refused(tmp_path: Path, said: Callable[..., str]) -> None:

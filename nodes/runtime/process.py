@@ -76,6 +76,16 @@ def load_node(target: str) -> type[Node]:
     return found
 
 
+def parameters(spec: Spec) -> dict[str, Any]:
+    """The node's, as given; where nobody says how many threads, its kernels have all cores of this host."""
+    found = dict(spec.config)
+    if spec.threads is None and found.get("threads", 0) is None:
+        from mvsgs_core.machine import available_cores  # loads the kernels
+
+        found["threads"] = available_cores()
+    return found
+
+
 @dataclass
 class _Step:
     """What the main thread is at, for whoever asks whether the work goes on."""
@@ -107,7 +117,7 @@ class _Process:
         node_type = load_node(self._spec.target)
         self._is_source = is_source(node_type)
         self._seed()
-        config = build(node_type.Config, self._spec.config, self._spec.name)
+        config = build(node_type.Config, parameters(self._spec), self._spec.name)
         runner = self._runner = Runner(self._spec.name, node_type(config))
         runner.node.rest, runner.node.waiting = self._rest, self._waiting
         runner.node.kept_in = self._spec.kept_in()

@@ -58,7 +58,7 @@ class Spec:
     returns: bool = False  # it may be started again in the midst of a run
     buffer: int = 4  # messages
     seed: int = 0
-    threads: int | None = None
+    threads: int | None = None  # None: all cores of this host
     cpu: tuple[int, ...] | None = None  # cores; None: all
     nice: int = 0  # by how much it gives way to other processes
     keys: str | None = None

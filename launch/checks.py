@@ -1,0 +1,69 @@
+"""What of a graph cannot run is refused before anything is written, or moved aside, in its output."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import msgs
+from launch.graph import Graph, Slot
+from launch.refusal import GraphError
+from launch.run_directory import base_directory
+from launch.specs import check_addresses
+from nodes.parameters import did_you_mean
+
+
+def check(graph: Graph) -> None:
+    """Raises GraphError, which says what to do."""
+    for slot in graph.slots.values():
+        _check_placement(slot)
+    for name, slot in graph.slots.items():  # what nodes that run here already know they lack
+        if slot.placement.external:
+            continue
+        _check_device(name, slot.config.get("device"))
+        try:
+            slot.node.check(slot.parameters)
+        except (OSError, ValueError) as error:
+            raise GraphError(f"{name}: {error}") from error
+    if not graph.settings.inline:
+        check_addresses(graph)
+        base_directory(graph)
+
+
+def _check_placement(slot: Slot) -> None:
+    for kind in slot.placement.best_effort:
+        if kind not in msgs.TYPES:
+            raise GraphError(
+                f"{slot.name}.best_effort={kind}: no such message{did_you_mean(kind, msgs.TYPES)}; "
+                f"there are: {', '.join(msgs.TYPES)}"
+            )
+    for threads in (slot.placement.threads, slot.config.get("threads")):
+        if isinstance(threads, int) and threads < 1:
+            raise GraphError(f"{slot.name}.threads={threads}: must be 1 or more, or null for a share of the cores")
+    cores = slot.placement.cpu
+    if cores is None or slot.placement.external or not hasattr(os, "sched_getaffinity"):
+        return
+    there = os.sched_getaffinity(0)
+    if not cores or not there.issuperset(cores):
+        raise GraphError(
+            f"{slot.name}.cpu={cores}: must be cores that this program may use, which are {_ranges(there)}; "
+            "null: all of them"
+        )
+
+
+def _ranges(numbers: set[int]) -> str:
+    """As in 0-3, 8."""
+    first = [number for number in sorted(numbers) if number - 1 not in numbers]
+    last = [number for number in sorted(numbers) if number + 1 not in numbers]
+    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in zip(first, last, strict=True))
+
+
+def _check_device(slot: str, device: Any) -> None:
+    """A GPU that a slot asks for by itself, not by the global `device`, must be there."""
+    if not isinstance(device, str) or not device.startswith("cuda"):
+        return
+    import torch  # takes a second to load
+
+    there, number = torch.cuda.device_count(), device.partition(":")[2] or "0"
+    if not number.isdigit() or int(number) >= there:
+        raise GraphError(f"{slot}.device={device}: this machine has {there} CUDA devices; use {slot}.device=cpu")
