@@ -79,7 +79,8 @@ class GaussianMap:
         without a suffix, the folder of a COLMAP model.
 
         voxel: edge of the mesh's grid in median depths. images: folder of the keyframes' images, for a model or
-        transforms. observations: a COLMAP model's points say which images show them.
+        transforms, which are without keyframes whose image is not there. observations: a COLMAP model's points say
+        which images show them.
         Raises ValueError for another name, or where keyframes are needed and not known; OSError.
         """
         out = Path(path).expanduser()

@@ -60,7 +60,12 @@ def colmap(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
         raise ValueError("--images are those of the keyframes, of which a --trajectory knows nothing")
     images = options.map.with_name(keyframe_images.FOLDER) if options.images is BESIDE else options.images
     written = write_colmap(out, final, posed_cameras(options), images, options.observations)
-    return f"{written.images} images, {written.points} points, {written.observations} observations"
+    said = f"{written.images} images, {written.points} points, {written.observations} observations"
+    return f"{said}{_left_out(written.left_out, images)}"
+
+
+def _left_out(count: int, images: Path | None) -> str:
+    return f"; {count} keyframes without an image in {images} were left out" if count else ""
 
 
 def transforms(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
@@ -68,8 +73,9 @@ def transforms(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     images = options.images if given else options.map.with_name(keyframe_images.FOLDER)
     cameras = posed_cameras(options)
     there = write_transforms(out, cameras, images)
-    missing = "" if there == len(cameras) else f", of which {there} have their image in {images}"
-    return f"{len(cameras)} cameras{missing}"
+    if not there:
+        return f"{len(cameras)} cameras, of which 0 have their image in {images}"
+    return f"{there} cameras{_left_out(len(cameras) - there, images)}"
 
 
 def cameras(out: Path, final: Snapshot, options: argparse.Namespace) -> str:

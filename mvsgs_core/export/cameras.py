@@ -29,6 +29,10 @@ class Cameras:
     def __len__(self) -> int:
         return len(self.keyframes)
 
+    def chosen(self, which: np.ndarray | slice) -> Cameras:
+        """Copies of some of them."""
+        return Cameras(**{name: value[which].copy() for name, value in vars(self).items()})
+
 
 def write_cameras(path: Path, cameras: Cameras, source: SourceCamera | None = None) -> None:
     """Replaces `path` atomically: what stood there stays until the new file is whole. Raises OSError.

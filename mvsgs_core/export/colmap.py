@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.export.cameras import Cameras
-from mvsgs_core.export.keyframe_images import image_name
+from mvsgs_core.export.keyframe_images import image_name, there
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 
@@ -25,6 +25,7 @@ class Written:
     images: int
     points: int
     observations: int  # 0 where none were asked for
+    left_out: int = 0  # keyframes without an image
 
 
 def write_colmap(
@@ -38,12 +39,17 @@ def write_colmap(
     """`folder`/sparse/0 with cameras.txt, images.txt and points3D.txt, and `folder`/images with what they refer to.
 
     images: a folder with the keyframes' images, as mapper.save_images=true writes them, to be copied; None: the model
-    only has their names, which are the same. observations: each point's track names the images in which it is seen, at
-    the pixels it projects to: they are of this map, not measured. Hidden is what lies `BEHIND` the rendered depth.
-    Splats of less than `min_opacity` make no point. COLMAP's pixel (0, 0) is the corner of the first pixel, ours its
-    center. Raises ValueError where an image is missing or of another size than its camera.
+    only has their names, which are the same. Those of a stream before, whose images another run has, are left out then.
+    observations: each point's track names the images in which it is seen, at the pixels it projects to: they are of
+    this map, not measured. Hidden is what lies `BEHIND` the rendered depth. Splats of less than `min_opacity` make no
+    point. COLMAP's pixel (0, 0) is the corner of the first pixel, ours its center. Raises ValueError where an image of
+    this stream is missing, or one is of another size than its camera.
     """
+    given = len(cameras)
     if images is not None:
+        cameras = cameras.chosen((cameras.keyframes >= 0) | there(images, cameras.keyframes))
+        if given and not len(cameras):
+            raise ValueError(f"no keyframe's image is in {images}: run with mapper.save_images=true")
         _copy(images, folder / "images", cameras)
     model = folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
@@ -72,7 +78,7 @@ def write_colmap(
     for k, ((x, y, z), (r, g, b), track) in enumerate(zip(world, colors.tolist(), tracks, strict=True)):
         text.append(" ".join([f"{k + 1} {x!r} {y!r} {z!r} {r} {g} {b} 0", *track]))
     _write(model / "points3D.txt", text)
-    return Written(len(cameras), len(means), tracks.count)
+    return Written(len(cameras), len(means), tracks.count, given - len(cameras))
 
 
 _NOTHING = np.zeros(0, dtype=np.int64), np.zeros((0, 2))

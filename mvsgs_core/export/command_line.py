@@ -141,6 +141,6 @@ def cameras_of_map(options: argparse.Namespace) -> Cameras:
         found = replace(
             found, intrinsics=np.tile(intrinsics, (len(found), 1)), sizes=np.tile(np.array(size), (len(found), 1))
         )
-    chosen = Cameras(**{name: value[:: options.every].copy() for name, value in vars(found).items()})
+    chosen = found.chosen(slice(None, None, options.every))
     chosen.world_from_cam[:, :3, 3] *= options.scale
     return chosen

@@ -17,6 +17,11 @@ def image_name(index: int) -> str:
     return f"{index:06d}.png"
 
 
+def there(folder: Path, keyframes: np.ndarray) -> np.ndarray:
+    """(K,) bool: keyframes (K,) whose image is there. Those of a stream before have theirs in that run's output."""
+    return np.array([(folder / image_name(index)).is_file() for index in keyframes.tolist()], dtype=bool)
+
+
 def write_image(folder: Path, index: int, image: np.ndarray) -> None:
     """Writes an (H, W, 3) uint8 RGB image without loss. Raises OSError where it cannot be written."""
     folder.mkdir(parents=True, exist_ok=True)

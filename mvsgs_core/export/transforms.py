@@ -10,22 +10,24 @@ import numpy as np
 
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.export.cameras import Cameras
-from mvsgs_core.export.keyframe_images import image_name
+from mvsgs_core.export.keyframe_images import image_name, there
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_transforms(path: Path, cameras: Cameras, images: Path) -> int:
-    """Replaces `path`; returns how many of the `images` it names are there. Raises OSError.
+    """Replaces `path`; returns how many of the keyframes have their image. Raises OSError.
 
     images: the folder of the keyframes' images, as mapper.save_images=true leaves it, named relative to the file.
-    Images are undistorted, so there are no distortion parameters.
+    Keyframes without one are left out, as readers open them all; not where none is there yet. Images are undistorted,
+    so there are no distortion parameters.
     """
     folder = Path(os.path.relpath(images.absolute(), path.absolute().parent)).as_posix()
-    frames, there = [], 0
+    frames, known = [], there(images, cameras.keyframes)
+    if known.any():
+        cameras = cameras.chosen(known)
     for k, index in enumerate(cameras.keyframes.tolist()):
         name = image_name(index)
-        there += (images / name).is_file()
         fx, fy, cx, cy = cameras.intrinsics[k].tolist()
         height, width = cameras.sizes[k].tolist()
         frames.append(
@@ -37,4 +39,4 @@ def write_transforms(path: Path, cameras: Cameras, images: Path) -> int:
         )  # fmt: skip
     text = json.dumps({"camera_model": "OPENCV", "frames": frames}, allow_nan=False)
     replace_text(path, text.replace(' {"file_path"', '\n{"file_path"') + "\n")  # a frame a line
-    return there
+    return int(known.sum())

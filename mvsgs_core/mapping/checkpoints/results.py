@@ -17,6 +17,8 @@ from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.trajectory_file import write_trajectory
 
+NOT_THERE = "keyframes without an image in keyframes/, left out of transforms.json"
+
 
 def write_results(output: Path, mapper: OnlineMapper, *, source: SourceCamera | None = None, sync: bool = True) -> int:
     """Replaces them by what the mapper has now; the bytes of map.ply. Raises OSError.
@@ -35,7 +37,9 @@ def write_results(output: Path, mapper: OnlineMapper, *, source: SourceCamera | 
     cameras = cameras_of(final, mapper.views)
     write_cameras(output / "cameras.json", cameras, source)
     if (output / keyframe_images.FOLDER).is_dir():
-        write_transforms(output / "transforms.json", cameras, output / keyframe_images.FOLDER)
+        there = write_transforms(output / "transforms.json", cameras, output / keyframe_images.FOLDER)
+        if 0 < there < len(cameras):
+            mapper.log.skip(NOT_THERE, len(cameras) - there)
     with replacing(output / "map.ply", sync=sync) as aside:
         write_ply(aside, final)
         return aside.stat().st_size

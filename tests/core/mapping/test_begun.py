@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.kept_map import STREAM
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.begun import begin_on
+from mvsgs_core.mapping.checkpoints.results import NOT_THERE, write_results
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.stats import Stats
@@ -85,6 +88,17 @@ def test_of_parts_that_stay_apart_the_stream_is_shown_where_it_was(tmp_path: Pat
     assert atlas.current is atlas.parts[7]
     assert any("was not found in the map" in warning for warning in log.warnings)
     assert len(atlas.parts[0].views) > 1, "the other part stays in what is kept"
+
+
+def test_its_images_are_not_named_where_only_the_new_streams_are_kept(tmp_path: Path) -> None:
+    kept(tmp_path / "before")
+    atlas, log = begin_on(tmp_path / "before", PLAIN, log := Stats()), log
+    atlas.add(view(0), 0)
+    write_image(tmp_path / "keyframes", 0, view(0).image)
+    write_results(tmp_path, atlas.current)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["keyframes/000000.png"]
+    assert log.skipped[NOT_THERE] == len(atlas.current.views) - 1
 
 
 def test_nothing_to_begin_on_is_refused(tmp_path: Path) -> None:
