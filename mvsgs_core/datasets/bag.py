@@ -66,6 +66,7 @@ class Bag(FileReader):
                 given = "auto" if self.intrinsics is None else self.intrinsics
                 lens, notes = lens_from_option(given, self.distortion, _first_size(bag, self._topic))
                 self.warnings += notes
+            self._check_distortion(lens)
             self._lens = lens
         self._open_mask(lens.size)
         self.warnings += self._framing.notice(lens.size)

@@ -63,11 +63,21 @@ def lens_for_images(
     lens = read_exif_lens(images[0]) if intrinsics == "auto" else None
     if lens is None or lens.size != size:
         return lens_from_option(intrinsics, distortion, size)
+    return with_distortion(lens, distortion), [exif_notice(lens, distortion)]
+
+
+def with_distortion(lens: Lens, distortion: Sequence[float | str]) -> Lens:
+    """The lens with the distortion of the option, where one is given. Raises ValueError for what can be none."""
     coefficients, fisheye = _model(distortion)
-    return replace(lens, distortion=coefficients, fisheye=fisheye), [
-        f"intrinsics are from EXIF: focal length {lens.intrinsics[0]:.0f} pixels for {size[1]}x{size[0]}, good to a "
-        f"few percent, distortion {'as given' if len(distortion) else 'unknown'}"
-    ]
+    return replace(lens, distortion=coefficients, fisheye=fisheye) if len(distortion) else lens
+
+
+def exif_notice(lens: Lens, distortion: Sequence[float | str]) -> str:
+    """What to say of a lens whose focal length is EXIF's."""
+    return (
+        f"intrinsics are from EXIF: focal length {lens.intrinsics[0]:.0f} pixels for {lens.size[1]}x{lens.size[0]}, "
+        f"good to a few percent, distortion {'as given' if len(distortion) else 'unknown'}"
+    )
 
 
 def image_size(images: Iterable[Path]) -> tuple[int, int]:

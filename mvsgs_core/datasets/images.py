@@ -10,7 +10,7 @@ import numpy as np
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import dataset
-from mvsgs_core.datasets.calibration import image_size, lens_from_option
+from mvsgs_core.datasets.calibration import exif_notice, image_size, lens_from_option, with_distortion
 from mvsgs_core.datasets.colmap import find_colmap, read_colmap
 from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens, read_exif_place
 from mvsgs_core.datasets.files import (
@@ -96,14 +96,11 @@ class Images(ImageSequence):
             where = f"{images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal lengths"
             self.warnings += [f"no calibration for {where} were found", *warnings]
             return [lens] * len(images)
-        self.warnings.append(
-            f"intrinsics are from EXIF: focal length {known[0].intrinsics[0]:.0f} pixels for "
-            f"{known[0].size[1]}x{known[0].size[0]}, good to a few percent, distortion unknown"
-        )
+        self.warnings.append(exif_notice(known[0], self.distortion))
         if len(known) < len(images):
             without = len(images) - len(known)
             self.warnings.append(f"images without an EXIF focal length, which take the first one's: {without}")
-        return [lens if lens is not None else known[0] for lens in found]
+        return [with_distortion(lens if lens is not None else known[0], self.distortion) for lens in found]
 
     def _exposure(self, record: Record) -> float:
         return read_exif_exposure(record.image)

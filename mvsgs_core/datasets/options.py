@@ -53,7 +53,7 @@ class FileOptions(SizedSelection):
     path: str | Path | None = None  # folder or file
     # [fx, fy, cx, cy] in pixels of the original image; auto: the tracker estimates them; null: the data set's own
     intrinsics: Sequence[float] | str | None = None
-    # with intrinsics, as in OpenCV: [k1, k2, p1, p2(, k3, ...)], or [fisheye, k1, k2, k3, k4]
+    # with intrinsics, or EXIF's, as in OpenCV: [k1, k2, p1, p2(, k3, ...)], or [fisheye, k1, k2, k3, k4]
     distortion: Sequence[float | str] = field(default_factory=list)
     # places of the frames by time or name: .csv with a header, .gpx, or .srt as DJI writes it; null: EXIF's
     gps: str | Path | None = None

@@ -12,7 +12,7 @@ import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item
-from mvsgs_core.datasets.calibration import lens_for_images
+from mvsgs_core.datasets.calibration import lens_for_images, with_distortion
 from mvsgs_core.datasets.files import UnreadableImageError, read_depth, read_image
 from mvsgs_core.datasets.framing import Framing, same_shape
 from mvsgs_core.datasets.gps import CLOCK, clock_time, read_gps
@@ -122,6 +122,14 @@ class FileReader(FileOptions):
             self.warnings.append(f"no frame has a place in {self.gps}: neither their names nor their times are in it")
         self._places, self._placed = None, 0  # of a second pass
 
+    def _check_distortion(self, lens: Lens) -> None:
+        """Raises ValueError where the data has a lens of its own, and the distortion that was given is not used."""
+        if self.intrinsics is None and with_distortion(lens, self.distortion) != lens:
+            raise ValueError(
+                "dataset.distortion is not used beside the calibration that the data has: give "
+                "dataset.intrinsics=[fx,fy,cx,cy], or auto, too, which replaces it"
+            )
+
     def _open_mask(self, size: tuple[int, int]) -> None:
         """Of images (height, width). Raises FileNotFoundError and ValueError for a mask that cannot be theirs."""
         if self.mask is not None:
@@ -153,6 +161,7 @@ class ImageSequence(FileReader, ABC):
         if not self.records:
             count = len(found.records)
             raise ValueError(f"no frame left: the sequence has {count}, wanted from {self.start} to {self.stop}")
+        self._check_distortion(self.lens)
         self._depth_format, self._turn_upright = found.depth_format, found.turn_upright
         self._find_masks()
         self._opening_warnings = len(self.warnings)

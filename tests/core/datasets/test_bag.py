@@ -114,6 +114,8 @@ def test_raw_images_with_their_calibration(tmp_path: Path, ros: Messages) -> Non
         np.testing.assert_allclose(item.intrinsics[2:], [15.5, 11.5])
     given = next(iter(open_dataset("bag", path=path, intrinsics=[44, 45, 16, 12])))
     np.testing.assert_allclose(given.intrinsics, [44, 45, 16, 12])
+    with pytest.raises(ValueError, match=r"dataset\.distortion is not used"):
+        open_dataset("bag", path=path, distortion=[0.3, 0, 0, 0])
     with pytest.raises(ValueError, match="no images at /else; it has them at: /camera/color/image_raw, /camera/depth"):
         open_dataset("bag", path=path, topic="/else")
     with pytest.raises(ValueError, match="no frame left"):

@@ -16,6 +16,7 @@ from mvsgs_core.datasets import open_dataset
 from mvsgs_core.datasets.colmap import lens_of, read_colmap
 from mvsgs_core.geometry import inverse, quaternion_from_rotation
 from tests.support.dataset_folders import POSES, colmap_text, truncate, write_image, write_photos
+from tests.support.slam_folders import write_kitti
 
 PHOTO = Path(__file__).parents[2] / "support" / "photo.heic"
 
@@ -200,6 +201,28 @@ def test_focal_length_from_exif(tmp_path: Path) -> None:
     for item in sequence:
         np.testing.assert_allclose(item.intrinsics, [72, 72, 31.5, 23.5])
     assert "images without an EXIF focal length, which take the first one's: 1" in sequence.warnings
+
+
+BENT = [-0.2, 0.05, 0.0, 0.0]
+
+
+def test_a_given_distortion_is_of_lenses_from_exif(tmp_path: Path) -> None:
+    save_photo(tmp_path / "a.jpg", {0xA405: 26})
+    write_image(tmp_path / "b.jpg", 5)
+    sequence = open_dataset("images", path=tmp_path, distortion=BENT)
+    assert [record.lens.distortion for record in sequence.records] == 2 * [tuple(BENT)]  # type: ignore[attr-defined]
+    assert "distortion as given" in sequence.warnings[0]
+
+
+def test_a_given_distortion_beside_another_calibration_is_refused(tmp_path: Path) -> None:
+    write_kitti(tmp_path / "kitti")
+    write_photos(tmp_path / "photos/images", 1)
+    colmap_text(tmp_path / "photos/sparse/0", ["photo0.png"])
+    for name, path in (("kitti", tmp_path / "kitti/sequences/07"), ("images", tmp_path / "photos")):
+        with pytest.raises(ValueError, match=r"dataset.distortion is not used .*: give dataset.intrinsics=\[fx"):
+            open_dataset(name, path=path, distortion=BENT)
+        sequence = open_dataset(name, path=path, distortion=BENT, intrinsics=[50, 50, 31.5, 23.5])
+        assert sequence.lens.distortion == tuple(BENT)
 
 
 def test_exposure_from_exif(tmp_path: Path) -> None:
