@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import threading
 import time
@@ -57,10 +58,11 @@ class Camera(LiveSource):
     def check(cls, config: Config) -> None:
         lens_from_option(config.intrinsics, config.distortion, (480, 640))
         camera_mask(config.mask)
-        device = Path(f"/dev/video{config.path}")
+        number = device_number(config.path)
+        device = Path(f"/dev/video{number}")
         if Path(config.path).is_file():
             raise CameraError(f"{config.path} is a file and no camera: use dataset=video dataset.path={config.path}")
-        if config.path.isdecimal() and sys.platform == "linux" and not device.exists():
+        if number is not None and sys.platform == "linux" and not device.exists():
             there = sorted(str(path) for path in device.parent.glob("video*"))
             found = f"there is {', '.join(there)}" if there else "no camera is connected"
             raise CameraError(f"camera {config.path}: {device} does not exist; {found}")
@@ -168,11 +170,18 @@ class _Feed:
                 self._capture = _open(replace(self._config, resolution=size))
 
 
+def device_number(path: str) -> int | None:
+    """Of a camera of this machine: 2 for 2 and /dev/video2. None for an address."""
+    found = re.fullmatch(r"(?:/dev/video)?([0-9]+)", path)
+    return None if found is None else int(found[1])
+
+
 def _open(config: Camera.Config) -> cv2.VideoCapture:
     if Path(config.path).is_file():
         raise CameraError(f"{config.path} is a file and no camera: use dataset=video dataset.path={config.path}")
-    if config.path.isdecimal():
-        capture = cv2.VideoCapture(int(config.path))
+    number = device_number(config.path)
+    if number is not None:
+        capture = cv2.VideoCapture(number)  # by its name with limits of time, as below, OpenCV does not open it
         hint = "is it connected, free of other programs, and may you read it (ls -l /dev/video*)?"
     else:
         milliseconds = int(1000 * min(config.timeout, ANSWER))

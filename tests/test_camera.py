@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -91,6 +92,31 @@ def test_a_slow_reader_gets_the_newest_picture_and_the_rest_is_counted(capture: 
     assert camera.stats.counts["frames"] == 5
     assert max(lag) <= 2  # never an old picture, although some 15 were taken meanwhile
     assert camera.stats.counts["dropped"] >= seen - 5 > 10
+
+
+@pytest.mark.parametrize(("path", "asked"), [("2", (2,)), ("/dev/video2", (2,)), ("rtsp://host/2", ("rtsp://host/2",))])
+def test_a_device_is_opened_by_its_number(
+    path: str, asked: tuple[object, ...], capture: type[FakeCapture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenCV opens none by its name where it is given limits of time."""
+    opened: list[tuple[object, ...]] = []
+    begin = capture.__init__
+
+    def noted(self: FakeCapture, *arguments: object) -> None:
+        opened.append(arguments)
+        begin(self, *arguments)
+
+    monkeypatch.setattr(capture, "__init__", noted)
+    assert list(Camera(Camera.Config(path=path, stop=1)).run())
+    assert opened[0][:1] == asked
+    assert (len(opened[0]) == 1) == isinstance(asked[0], int)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="devices have other names")
+def test_a_device_that_does_not_exist_is_named() -> None:
+    for path in ("77", "/dev/video77"):
+        with pytest.raises(CameraError, match=f"camera {path}: /dev/video77 does not exist"):
+            Camera.check(Camera.Config(path=path))
 
 
 def told(camera: Camera, text: str) -> list[str]:
