@@ -19,10 +19,13 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-import cv2
-import numpy as np
+try:
+    import cv2
+    import numpy as np
 
-from mvsgs import Mapping
+    from mvsgs import Mapping
+except ModuleNotFoundError as error:
+    sys.exit(f"error: {error}: run `make setup` once, then .venv/bin/python examples/camera_loop.py")
 
 
 class NewestFrame:

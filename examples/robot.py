@@ -25,38 +25,46 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-import numpy as np
+try:
+    import numpy as np
 
-from msgs import Frame, GroundTruth
-from mvsgs_core.datasets import open_dataset
-from mvsgs_core.datasets.ros import camera_info_topic
-from nodes.camera import Camera
-from nodes.ros2 import forms
-from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, check_installed
-from nodes.ros2.messages import CameraInfo, Image
-from nodes.runtime.addresses import TransportError, load_keys
-from nodes.runtime.transport import LivePublisher
+    from msgs import Frame, GroundTruth
+    from mvsgs_core.datasets import Sequence, check, open_dataset
+    from mvsgs_core.datasets.ros import camera_info_topic
+    from nodes.camera import Camera
+    from nodes.ros2 import forms
+    from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, check_installed
+    from nodes.ros2.messages import CameraInfo, Image
+    from nodes.runtime.addresses import TransportError, load_keys
+    from nodes.runtime.transport import LivePublisher
+except ModuleNotFoundError as error:
+    sys.exit(f"error: {error}: run `make setup` once, then .venv/bin/python examples/robot.py")
 
 GUESSED = "the intrinsics are a guess, and the frames say so: the tracker estimates the focal length (--intrinsics)"
 
 
-def frames(arguments: argparse.Namespace) -> Iterator[Frame]:
-    """Frames of whatever the command line names, at the rate at which they were or are taken."""
+def opened(arguments: argparse.Namespace) -> Iterator[Frame]:
+    """Frames of whatever the command line names. Raises ValueError or OSError at once where it cannot be read."""
     intrinsics = arguments.intrinsics or "auto"
     if arguments.camera is not None:
-        camera = Camera(Camera.Config(path=arguments.camera, intrinsics=intrinsics))
-        yield from (message for message in camera.run() if not isinstance(message, GroundTruth))
-        return
+        config = Camera.Config(path=arguments.camera, intrinsics=intrinsics)
+        Camera.check(config)
+        return (message for message in Camera(config).run() if not isinstance(message, GroundTruth))
     if arguments.video is not None:
-        sequence = open_dataset("video", path=arguments.video, intrinsics=intrinsics)
+        name, options = "video", {"path": arguments.video, "intrinsics": intrinsics}
     else:
-        name, path = arguments.dataset
-        sequence = open_dataset(name, path=path)
+        name, options = arguments.dataset[0], {"path": arguments.dataset[1]}
+    check(name, **options)
+    return frames(open_dataset(name, **options), arguments.fast)
+
+
+def frames(sequence: Sequence, fast: bool) -> Iterator[Frame]:
+    """At the rate at which they were taken, or as fast as they can be read."""
     began: float | None = None
     for item in sequence:
         now = time.monotonic()
         began = now - item.timestamp if began is None else began
-        if not arguments.fast:
+        if not fast:
             time.sleep(max(0.0, began + item.timestamp - now))
         guessed, exposure = item.intrinsics_guessed, item.exposure
         yield Frame(item.index, item.timestamp, item.image, item.intrinsics, guessed, exposure)
@@ -126,13 +134,16 @@ def main() -> None:
     arguments = parse()
     publisher: LivePublisher | Ros2Camera
     try:
+        keys = None if arguments.keys is None else load_keys(arguments.keys)
         if arguments.ros2 is not None:
             check_installed()
-            publisher = Ros2Camera(arguments.ros2, arguments.interface)
-        else:
-            keys = None if arguments.keys is None else load_keys(arguments.keys)
-            publisher = LivePublisher(arguments.address, keys=keys)
-    except (TransportError, ValueError) as error:
+        images = opened(arguments)
+        publisher = (
+            LivePublisher(arguments.address, keys=keys)
+            if arguments.ros2 is None
+            else Ros2Camera(arguments.ros2, arguments.interface)
+        )
+    except (TransportError, ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # `kill` and systemd end it as Ctrl-C does
     sent = 0
@@ -142,13 +153,15 @@ def main() -> None:
             publisher.wait_for_reader()
         else:
             wait_for_reader(publisher, arguments.keys)
-        for frame in frames(arguments):
+        for frame in images:
             if frame.intrinsics_guessed and not sent:
                 say(f"warning: {GUESSED}")
             publisher.send(frame)
             sent += 1
     except KeyboardInterrupt:
         pass
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
     finally:
         publisher.close()  # tells the readers that this is the end
         print(f"{sent} frames sent")

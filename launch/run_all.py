@@ -24,23 +24,26 @@ from pathlib import Path
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # before a run there is nothing to finish: no traceback of an import
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+try:
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import DictConfig
 
-from launch.advice import advised
-from launch.children import python_environment
-from launch.comparison import comparison_page, comparison_text, has_figures
-from launch.compose import CONF, choices_of, graph_of, prepare
-from launch.graph_text import graph_text
-from launch.help_text import help_text
-from launch.jobs import Job, refused, run
-from launch.named_input import SLOT, with_named_input
-from launch.refusal import GraphError
-from launch.resume import WORD as RESUME
-from launch.resume import leave_out_refused, resumed_config
-from launch.sweep import check_launcher, swept
-from mvsgs_core.atomic_file import replace_text
+    from launch.advice import advised
+    from launch.children import python_environment
+    from launch.comparison import comparison_page, comparison_text, has_figures
+    from launch.compose import CONF, choices_of, graph_of, prepare
+    from launch.graph_text import graph_text
+    from launch.help_text import help_text
+    from launch.jobs import Job, refused, run
+    from launch.named_input import SLOT, with_named_input
+    from launch.refusal import GraphError
+    from launch.resume import WORD as RESUME
+    from launch.resume import leave_out_refused, resumed_config
+    from launch.sweep import check_launcher, swept
+    from mvsgs_core.atomic_file import replace_text
+except ModuleNotFoundError as error:
+    sys.exit(f"error: {error}: run `make setup` once, then .venv/bin/mvsgs, or .venv/bin/python launch/run_all.py")
 
 COMPARISON = "comparison.html"  # of a sweep
 GRAPH = "--graph"
