@@ -19,6 +19,7 @@ import torch
 
 from mvsgs import WORKSPACE
 from mvsgs_core import machine, native, weights
+from mvsgs_core.devices import lacks_for_gpu
 from mvsgs_core.named_modules import is_installed
 
 KERNELS = ("rasterizer", "mapping", "tracking", "mvs", "fusion", "scene")
@@ -100,7 +101,9 @@ def _gpu() -> tuple[str, bool]:
     if not names:
         built = "PyTorch sees none" if torch.version.cuda else "this PyTorch is built for processors alone"
         return f"none: {built}; runs use the processor", True
-    return f"{', '.join(names)}, CUDA {torch.version.cuda}; device=cpu leaves it alone", True
+    lacking = lacks_for_gpu()
+    use = f"not used: {lacking}" if lacking else "device=cpu leaves it alone"
+    return f"{', '.join(names)}, CUDA {torch.version.cuda}; {use}", True
 
 
 def _version(package: str) -> str | None:
