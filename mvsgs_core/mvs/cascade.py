@@ -30,7 +30,7 @@ class OnlineStereoConfig:
     window: int = 8  # keyframes before the reference that may be neighbors
     neighbors: NeighborConfig = field(default_factory=NeighborConfig)  # which of them a reference is matched with
     ranges: RangeConfig = field(default_factory=RangeConfig)  # of depth, from the tracker's
-    device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
+    device: str = "auto"  # auto (CUDA if there is one), cpu, cuda or cuda:0
     threads: int | None = None  # of the kernels; null: all
     realtime: bool = False  # less effort, see `efforts`, where keyframes come faster than their depth
     share: float = 0.75  # of a core's time that stereo may take then
@@ -40,6 +40,10 @@ class OnlineStereoConfig:
 @dataclass(frozen=True)
 class CascadeConfig(StereoConfig, OnlineStereoConfig):
     """Online stereo by the plane sweep."""
+
+    # Whatever a GPU takes over of a keyframe, PyTorch's paths go row by row, in hundreds of thousands of short steps:
+    # C++ on two cores needs a tenth of a second.
+    device: str = "cpu"  # cpu (C++), cuda or cuda:0 (PyTorch), torch (PyTorch on the CPU), auto (CUDA if there is one)
 
 
 @dataclass(frozen=True)

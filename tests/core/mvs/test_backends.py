@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from mvsgs_core.mvs.backend import NativeBackend
+from mvsgs_core.mvs.cascade import Cascade
 from mvsgs_core.mvs.interface import TILE, Backend, ChooseOptions, MatchingImages, SmoothingConfig, SurfaceEstimate
+from mvsgs_core.mvs.learned import LearnedStereoConfig
 from mvsgs_core.mvs.matching_cost import COSTS, CostConfig
 from mvsgs_core.mvs.torch_backend import TorchBackend
 from mvsgs_core.native import load
@@ -17,6 +20,12 @@ from tests.support.stereo_problems import SIZE, Problem, problem
 
 COST = CostConfig(top_k=2)
 SMOOTH = SmoothingConfig()
+
+
+def test_the_plane_sweep_stays_with_the_kernels_beside_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert isinstance(Cascade()._backend, NativeBackend)
+    assert LearnedStereoConfig().device == "auto"  # of networks a GPU takes a fraction of the time
 
 
 def swept(
