@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mvsgs_core import weights
 from mvsgs_core.fusion.learned import LearnedOnlineFusion, VFuseConfig
 from mvsgs_core.networks.checkpoints import RANDOM
 from nodes.depth_fusion import FusionNode
@@ -17,6 +18,11 @@ class LearnedFusion(FusionNode):
         pass
 
     config: Config
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        if config.weights != RANDOM:
+            weights.find("vfuse", config.weights)
 
     def _make_core(self) -> LearnedOnlineFusion:
         if self.config.weights == RANDOM:

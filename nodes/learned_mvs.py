@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mvsgs_core.mvs.learned import LearnedStereo, LearnedStereoConfig
+from mvsgs_core import weights
+from mvsgs_core.mvs.learned import NETWORKS, LearnedStereo, LearnedStereoConfig
 from mvsgs_core.networks.checkpoints import RANDOM
 from nodes.mvs import StereoNode
 
@@ -17,6 +18,11 @@ class LearnedMvs(StereoNode):
         resume_after: int | None = None  # keyframes up to this frame are in a resumed map: neighbors of others only
 
     config: Config
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        if config.weights != RANDOM:
+            weights.find(NETWORKS[config.network].weights, config.weights)
 
     def _make_core(self) -> LearnedStereo:
         c = self.config

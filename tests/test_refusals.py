@@ -167,3 +167,23 @@ def test_a_sweep_on_slurm_needs_its_launcher(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("launch.sweep.importlib.util.find_spec", lambda name: name)
     check_launcher(words)
     check_launcher(["-m", "mapper.iterations=1,2"])
+
+
+@pytest.mark.parametrize(
+    ("choice", "weights", "answer"),
+    [
+        ("mvs=itermvs", "mvs", "mvs: no weights of IterMVS"),
+        ("tracker=droid", "tracker", "tracker: no weights of DROID-SLAM (droid.pth) in"),
+        ("depth_fusion=vfuse", "depth_fusion", "depth_fusion: no weights of V-FUSE"),
+    ],
+)
+def test_a_network_needs_its_weights(
+    choice: str, weights: str, answer: str, tmp_path: Path, said: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(tmp_path)
+    monkeypatch.delenv("MVSGS_WEIGHTS", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert answer in said("photos", choice)
+    assert f"{weights}: weights of " in said("photos", choice, f"{weights}.weights=nothing.pth")
+    slot = compose([choice, f"{weights}.weights=random"]).slots[weights]
+    slot.node.check(slot.parameters)
