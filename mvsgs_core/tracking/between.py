@@ -6,16 +6,16 @@ better ones. So the frames wait for that keyframe. Held-out frames never go out.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Container, Mapping, Set
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photometry import compose, inverse
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver
-from mvsgs_core.tracking.frames import FrameRecord, solve_trajectory
+from mvsgs_core.tracking.frames import FrameRecord, place_of, solve_trajectory
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.photometer import Photometer, Seen
@@ -115,10 +115,7 @@ def spared(frames: Mapping[int, TrackingImage]) -> int:
 
 def _with_neighbors(records: list[FrameRecord], indices: Set[int]) -> list[FrameRecord]:
     """Of these frames, of those before and after them, and of what these did not move against."""
-
-    def place(index: int) -> int:
-        return bisect_left(records, index, key=lambda record: record.index)
-
+    place = partial(place_of, records)
     near = {n for index in indices for n in range(max(place(index) - 1, 0), min(place(index) + 2, len(records)))}
     near |= {place(origin) for origin in (records[n].same_as for n in near) if origin is not None}
     return [records[n] for n in sorted(near)]

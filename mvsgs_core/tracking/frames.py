@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,6 +91,16 @@ def _relative(record: FrameRecord) -> np.ndarray:
     return np.vstack([np.frombuffer(record.cam_from_reference).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
 
 
+def place_of(records: list[FrameRecord], index: int) -> int:
+    """Of a frame's record, or of the next one's: they are in the order of their indices, and may be those of hours."""
+    return bisect_left(records, index, key=lambda record: record.index)
+
+
+def record_of(records: list[FrameRecord], index: int) -> FrameRecord:
+    """Of a frame that was seen."""
+    return records[place_of(records, index)]
+
+
 def seen_pose(records: list[FrameRecord], k: int, graph: KeyframeGraph) -> tuple[np.ndarray, int] | None:
     """Pose (4, 4) world_from_cam of a frame as it was followed, on its keyframe as that is now, and its segment.
 
@@ -97,7 +108,7 @@ def seen_pose(records: list[FrameRecord], k: int, graph: KeyframeGraph) -> tuple
     """
     record = records[k]
     if record.same_as is not None:
-        record = next(r for r in reversed(records[:k]) if r.index == record.same_as)
+        record = record_of(records, record.same_as)
     own = graph.keyframes.get(record.index)
     if own is not None:
         return graph.world_from_cam(record.index), own.segment
@@ -147,4 +158,4 @@ def solve_trajectory(records: list[FrameRecord], graph: KeyframeGraph, solver: S
     )
 
 
-__all__ = ["FrameRecord", "followed_pose", "seen_pose", "solve_trajectory"]
+__all__ = ["FrameRecord", "followed_pose", "place_of", "record_of", "seen_pose", "solve_trajectory"]

@@ -23,8 +23,7 @@ from mvsgs_core.tracking.back_end import BackEnd
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.diagnosis import Diagnosis
 from mvsgs_core.tracking.estimation.calibration import Calibration
-from mvsgs_core.tracking.estimation.focal import FocalConfig
-from mvsgs_core.tracking.frames import FrameRecord
+from mvsgs_core.tracking.frames import FrameRecord, record_of
 from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
@@ -147,11 +146,16 @@ class Session:
         return self._track(frame, step, record) if followed else self._lose(frame, record)
 
     def _stand_still(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
+        """It shows what the frame that was followed last does, whatever came between: a hand before the lens."""
         self.stats.skip("frames that did not move")
-        last = self.records[-2]
-        record.state, record.same_as = last.state, last.index if last.same_as is None else last.same_as
+        assert self.front_end.last is not None
+        same = record_of(self.records, self.front_end.last.index)
+        record.state, record.same_as = same.state, same.index
         if self.phase is not Phase.INITIALIZING:
             record.light = observed(self.graph, step.reference, frame, step.matches)  # the light may have changed
+            if same.state != TrackingState.LOST:
+                self.phase = Phase.TRACKING
+                self.relocalizer.found()
         return Update(record.state)
 
     def _follow_beside_work(self, frame: TrackingImage, step: Step | None, record: FrameRecord) -> Update:
@@ -216,7 +220,7 @@ class Session:
         """One more keyframe to solve all from, which takes longer than a frame: this one has no pose as it comes."""
         yield from timed(self.stats, "start", self.initializer.adding(frame, self.segment, step.matches))
         waiting = list(self.initializer.waiting)
-        if (yield from timed(self.stats, "start", self.initializer.initializing(focal=self._unknown_focal()))):
+        if (yield from timed(self.stats, "start", self.initializer.initializing(focal=self.calibration.sought))):
             return (yield from self._begin_tracking(waiting, record))
         place = self.relocalizer.relocalize(frame) if self.segment > 0 else None
         return Update(record.state) if place is None else self._resume(frame, record, place)
@@ -257,9 +261,9 @@ class Session:
             self.initializer.add(frame, self.segment, step.matches)
         waiting = list(self.initializer.waiting)
         self.waiting.end()
-        if self.initializer.initialize(True, self._unknown_focal()):
+        if self.initializer.initialize(True, self.calibration.sought):
             self.stats.warn(f"the start was forced at the end of the stream: {self.initializer.reason}")
-            yield whole(self._begin_tracking(waiting, self._record(frame.index)))
+            yield whole(self._begin_tracking(waiting, record_of(self.records, frame.index)))
         else:
             self.initializer.abandon()
 
@@ -314,7 +318,7 @@ class Session:
         last = newest(tail)
         if last is not None:
             self.waiting.end()
-            yield whole(self._add_keyframe(*tail[last], self._record(last)))
+            yield whole(self._add_keyframe(*tail[last], record_of(self.records, last)))
 
     # LOST and RELOCALIZING
 
@@ -389,12 +393,6 @@ class Session:
         """Keyframes that were held back, with the focal length as far as it is known."""
         self.calibration.settle(list(self.publisher.held))
         return self.publisher.publish_all([], self.calibration.settled)
-
-    def _unknown_focal(self) -> FocalConfig | None:
-        return None if self.calibration.settled else self.config.focal
-
-    def _record(self, index: int) -> FrameRecord:
-        return next(record for record in reversed(self.records) if record.index == index)
 
 
 __all__ = ["Session"]

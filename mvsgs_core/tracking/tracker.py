@@ -22,7 +22,7 @@ from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.assessment import tell_what_moves, warn_of_few_matches, warn_of_gaps
 from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, check_device
-from mvsgs_core.tracking.frames import seen_pose, solve_trajectory
+from mvsgs_core.tracking.frames import record_of, seen_pose, solve_trajectory
 from mvsgs_core.tracking.frozen_session import FrozenSession
 from mvsgs_core.tracking.going_on import go_on
 from mvsgs_core.tracking.graph import Keyframe
@@ -150,7 +150,7 @@ class Tracker:
         same_part = before is not None and before[1] == seen[1]
         record = session.records[newest]
         if record.same_as is not None:
-            record = next(r for r in reversed(session.records) if r.index == record.same_as)
+            record = record_of(session.records, record.same_as)
         return NewestPose(*seen, before[0] if before is not None and same_part else None, record.found_percent / 100)
 
     def trajectory(self) -> Trajectory:

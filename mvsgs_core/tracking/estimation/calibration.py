@@ -60,6 +60,11 @@ class Calibration:
         """On the focal length that came with the frames."""
         return float(self.graph.intrinsics[0] / self.given[0])
 
+    @property
+    def sought(self) -> FocalConfig | None:
+        """How the focal length is found; None where it is known."""
+        return None if self.settled else self.config
+
     def refine(self, members: list[int]) -> None:
         """With one more keyframe: the focal length again, until it is certain or has to do."""
         if self.settled:
