@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 from mvsgs_core import camera, geometry
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.keyframe_images import image_name, there
+from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 
@@ -112,9 +113,10 @@ class _Tracks:
 def _seen(final: Snapshot, means: np.ndarray, cameras: Cameras, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (M,) of `means` (N, 3), relative to the origin, that camera k sees, and where (M, 2), in our pixels."""
     height, width = cameras.sizes[k].tolist()
-    render = final.render(cameras.world_from_cam[k], cameras.intrinsics[k], (height, width))
+    pose = cameras.world_from_cam[k]
+    render = final.render(pose, cameras.intrinsics[k], (height, width), near=near_plane(final, pose))
     surface = torch.where(render.opacity >= 0.5, render.depth, torch.inf).numpy()
-    cam_from_map = geometry.inverse(final.relative_pose(cameras.world_from_cam[k]))
+    cam_from_map = geometry.inverse(final.relative_pose(pose))
     in_camera = means @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
     ahead = np.flatnonzero(in_camera[:, 2] > 0)
     pixels = camera.project(in_camera[ahead], cameras.intrinsics[k])

@@ -10,6 +10,7 @@ import torch
 from mvsgs_core import camera
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.glb import write_glb
+from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.open3d_loader import open3d
 
@@ -26,7 +27,7 @@ def write_mesh(
     o3d = open3d()
     views = []
     for pose, intrinsics, size in zip(cameras.world_from_cam, cameras.intrinsics, cameras.sizes.tolist()):
-        render = final.render(pose, intrinsics, (size[0], size[1]))
+        render = final.render(pose, intrinsics, (size[0], size[1]), near=near_plane(final, pose))
         depth = torch.where(render.opacity >= min_opacity, render.depth, 0.0)
         views.append((final.relative_pose(pose), intrinsics, depth.numpy(), render.color.clamp(0.0, 1.0).numpy()))
     seen = [depth[depth > 0] for _, _, depth, _ in views if (depth > 0).any()]
