@@ -20,7 +20,6 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
-from rich.table import Table
 
 from .cache_folder import cache_folder
 
@@ -113,11 +112,14 @@ def find(name: str, file: str | Path | None = None) -> Path:
 
 def missing(weights: Weights) -> str:
     """What to do about weights that are not there."""
-    searched = ", ".join(str(f) for f in folders()) or "no folder (MVSGS_WEIGHTS is not set, and there is no home)"
     return (
-        f"no weights of {weights.network} ({weights.files[0]}) in {searched}: {remedy(weights.name)}, "
+        f"no weights of {weights.network} ({weights.files[0]}) in {_searched()}: {remedy(weights.name)}, "
         "or set MVSGS_WEIGHTS to the folder that holds them"
     )
+
+
+def _searched() -> str:
+    return ", ".join(str(f) for f in folders()) or "no folder (MVSGS_WEIGHTS is not set, and there is no home)"
 
 
 def remedy(name: str) -> str:
@@ -214,15 +216,16 @@ def _entry(name: str) -> Weights:
 
 
 def _show() -> None:
-    table = Table("name", "network", "license", "MB", "found at", "from")
+    """What can be copied, places and addresses, has lines of its own that nothing cuts or folds."""
     for weights in REGISTRY.values():
         try:
             place = str(find(weights.name))
         except FileNotFoundError:
-            place = "-"
-        size = f"{weights.size / 1e6:.2f}" if weights.size else "?"
-        table.add_row(weights.name, weights.network, weights.license, size, place, weights.url or weights.page)
-    Console().print(table)
+            place = "not found"
+        size = f"{weights.size / 1e6:.2f} MB" if weights.size else "size unknown"
+        print(f"{weights.name}: {weights.network}; {weights.license}; {size}")
+        print(f"  here: {place}\n  from: {weights.url or weights.page}")
+    print(f"looked for in {_searched()}; MVSGS_WEIGHTS adds folders")
 
 
 def main(words: list[str] | None = None, prog: str = "python -m mvsgs_core.weights") -> int:

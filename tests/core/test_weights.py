@@ -167,7 +167,7 @@ def test_a_file_that_is_gone_from_the_server(
 def test_the_list_says_where_each_is_found_and_where_it_can_be_had(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "400")
+    monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path))
     (tmp_path / "droid.pth").write_bytes(b"x")
@@ -177,7 +177,8 @@ def test_the_list_says_where_each_is_found_and_where_it_can_be_had(
         assert entry.name in out
         assert entry.license in out
         assert (entry.url or entry.page) in out
-    assert str(tmp_path / "droid.pth") in out
+    assert f"here: {tmp_path / 'droid.pth'}\n" in out
+    assert f"looked for in {tmp_path}, " in out
 
 
 def test_loading_says_what_to_fetch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
