@@ -37,7 +37,7 @@ def test_a_model_knows_as_well_what_is_hidden(tmp_path: Path) -> None:
     """Half of it: each wall stands there a second time, behind itself."""
     values = {name: torch.cat([value, value]) for name, value in WHOLE.splats.tensors().items()}
     values["means"][len(WHOLE.splats) :] *= 1.5
-    doubled = replace(WHOLE, splats=Splats(**values))
+    doubled = replace(WHOLE, splats=Splats(**values), anchors=np.tile(WHOLE.anchors, 2))
     whole = write_colmap(tmp_path / "whole", doubled, cameras(1.0), observations=True)
     small = write_colmap(tmp_path / "small", doubled.scaled(UNIT), cameras(UNIT), observations=True)
     assert whole.observations > 500
