@@ -103,13 +103,13 @@ def _of_file(path: Path) -> str:
 
 
 def _of_folder(path: Path) -> str:
+    if (path / "config.yaml").is_file() and any((path / name).exists() for name in ("report.json", "map.ply")):
+        raise GraphError(f"{path}: is the output of a run; `mvsgs view {path}` shows its map, resume={path} goes on")
     found = recognized(path)
     if len(found) == 1:
         return found[0]
     if found:
         raise GraphError(f"{path}: is in the layouts of {' and '.join(found)}; say which with {SLOT}={found[0]}")
-    if (path / "config.yaml").is_file() and any((path / name).exists() for name in ("report.json", "map.ply")):
-        raise GraphError(f"{path}: is the output of a run; `mvsgs view {path}` shows its map, resume={path} goes on")
     within = sorted(path.iterdir())
     if not within:
         raise GraphError(f"{path}: is an empty folder")

@@ -165,7 +165,7 @@ def test_what_cannot_be_told_is_said_in_one_line(
     monkeypatch.chdir(tmp_path)
     for folder in ("empty", "texts", "run"):
         (tmp_path / folder).mkdir()
-    for file in ("walk.mp4", "map.ply", "texts/a.txt", "run/config.yaml", "run/map.ply"):
+    for file in ("walk.mp4", "map.ply", "texts/a.txt", "run/config.yaml", "run/map.ply", "run/comparison.png"):
         (tmp_path / file).touch()
     write_photos(tmp_path / "photos", 2)
     for name in ("a", "b"):

@@ -86,6 +86,8 @@ def check(name: str, **options: Any) -> None:
     """
     reader = _reader(name, options)
     if "path" not in inspect.signature(reader).parameters:
+        if checked := getattr(reader, "checked", None):
+            checked(**options)
         return
     try:
         sequence: Sequence = reader(**options)

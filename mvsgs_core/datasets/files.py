@@ -20,16 +20,7 @@ from mvsgs_core.bad_file import BadFileError, brief, reading
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".avif", ".heic", ".heif")
 _HEIF = (".heic", ".heif")  # as phones take them
 MAX_PIXELS = 2**27  # of one image: 134 million, more than cameras of 100 million have
-_FORMATS = (
-    "JPEG",
-    "PNG",
-    "BMP",
-    "TIFF",
-    "WEBP",
-    "PPM",
-    "AVIF",
-    "HEIF",
-)  # of these suffixes; Pillow knows 40 more
+_FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP", "PPM", "AVIF")  # of these suffixes; Pillow knows 40 more
 _ORIENTATION = 0x0112  # EXIF tag
 
 Image.MAX_IMAGE_PIXELS = MAX_PIXELS  # Pillow's own bound, of what it decodes inside of other formats, is the same
@@ -82,10 +73,12 @@ def opened_image(source: Path | BinaryIO, name: str) -> Iterator[Image.Image]:
     try:
         if isinstance(source, Path) and source.exists() and not source.is_file():
             raise UnreadableImageError(f"{name}: is no file")  # a pipe would be waited for
+        formats: tuple[str, ...] = _FORMATS
         if isinstance(source, Path) and source.suffix.lower() in _HEIF:
             pi_heif = importlib.import_module("pi_heif")  # loads a library, which few need
             pi_heif.register_heif_opener()
-        with Image.open(source, formats=_FORMATS) as image:
+            formats = (*_FORMATS, "HEIF")  # which Pillow does not know before
+        with Image.open(source, formats=formats) as image:
             width, height = image.size
             if not 0 < width * height <= MAX_PIXELS:
                 raise UnreadableImageError(f"{name}: {width}x{height} pixels, more than {MAX_PIXELS}: scale it down")

@@ -45,22 +45,8 @@ class Synthetic:
 
     def __init__(self, **options: Any) -> None:
         """options: the fields of `Film` and of `Difficulties`. Raises ValueError for a bad one, with the valid ones."""
-        own, known = ({f.name for f in fields(kind)} for kind in self.OPTIONS)
-        unknown = sorted(options.keys() - own - known)
-        if unknown:
-            there = ", ".join(f.name for kind in self.OPTIONS for f in fields(kind))
-            raise ValueError(f"synthetic: no option {', '.join(unknown)}; there are: {there}")
-        film = Film(**{k: v for k, v in options.items() if k in own})
+        film, self.difficulties = self.checked(**options)
         scene, frames, seed, loop = film.scene, film.frames, film.seed, film.loop
-        if scene not in SCENES:
-            raise ValueError(f"synthetic: no scene {scene!r}; there are: {', '.join(SCENES)}")
-        if frames < 1 or film.stride < 1 or film.start < 0 or len(film.size) != 2 or min(film.size) < 8:
-            raise ValueError(
-                "synthetic: frames and stride at least 1, start at least 0, size two numbers of at least 8"
-            )
-        if film.streets < 2 or film.streets % 2:
-            raise ValueError("synthetic: streets must be an even number, so that the outer ones make a ring")
-        self.difficulties = Difficulties(**{k: v for k, v in options.items() if k in known and v is not None})
         self.warnings: list[str] = []
         self.size = (int(film.size[0]), int(film.size[1]))
         self.seed = seed
@@ -78,6 +64,28 @@ class Synthetic:
         self.sensor = Sensor(d, seed)
         lost = np.random.default_rng([seed, 5]).random(frames) < d.drop
         self.numbers = [n for n in range(frames)[film.start : film.stop : film.stride] if not lost[n]]
+
+    @classmethod
+    def checked(cls, **options: Any) -> tuple[Film, Difficulties]:
+        """What is filmed and what makes it hard, with nothing made yet. Raises what making it does."""
+        own, known = ({f.name for f in fields(kind)} for kind in cls.OPTIONS)
+        unknown = sorted(options.keys() - own - known)
+        if unknown:
+            there = ", ".join(f.name for kind in cls.OPTIONS for f in fields(kind))
+            raise ValueError(
+                f"synthetic, the scene that is mapped where no input is given: no option {', '.join(unknown)}; "
+                f"there are: {there}"
+            )
+        film = Film(**{k: v for k, v in options.items() if k in own})
+        if film.scene not in SCENES:
+            raise ValueError(f"synthetic: no scene {film.scene!r}; there are: {', '.join(SCENES)}")
+        if film.frames < 1 or film.stride < 1 or film.start < 0 or len(film.size) != 2 or min(film.size) < 8:
+            raise ValueError(
+                "synthetic: frames and stride at least 1, start at least 0, size two numbers of at least 8"
+            )
+        if film.streets < 2 or film.streets % 2:
+            raise ValueError("synthetic: streets must be an even number, so that the outer ones make a ring")
+        return film, Difficulties(**{k: v for k, v in options.items() if k in known and v is not None})
 
     @property
     def lens(self) -> Lens:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core import camera, geometry
-from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets import check, open_dataset
 from mvsgs_core.datasets.synthetic import FPS, Synthetic
 from mvsgs_core.datasets.write_tum import main as write_tum
 from mvsgs_core.scene import materials
@@ -347,7 +347,7 @@ def test_moving_object_is_seen_in_image_and_depth_and_moves() -> None:
 )
 def test_bad_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
-        Synthetic(**options)
+        check("synthetic", **options)  # before a run
 
 
 def test_unknown_option_lists_the_valid_ones() -> None:

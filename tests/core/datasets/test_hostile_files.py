@@ -6,6 +6,8 @@ import bz2
 import json
 import resource
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -43,6 +45,15 @@ def test_what_pillow_knows_beyond_photographs_is_not_opened(tmp_path: Path) -> N
     (tmp_path / "a.gif").rename(tmp_path / "a.png")
     with pytest.raises(UnreadableImageError, match=r"a\.png"):
         read_image(tmp_path / "a.png")
+
+
+def test_what_is_no_image_is_said_to_be_none(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_text("no image")
+    code = "import sys; from pathlib import Path; from mvsgs_core.datasets.files import read_image; "
+    code += "read_image(Path(sys.argv[1]))"  # in a process of its own: no HEIF image was read there before
+    command = [sys.executable, "-c", code, str(tmp_path / "a.jpg")]
+    said = subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    assert "UnreadableImageError: a.jpg: cannot identify image file" in said
 
 
 def test_depth_that_is_no_number_is_unknown(tmp_path: Path) -> None:
