@@ -18,10 +18,11 @@ from nodes.playback import Playback
 from nodes.recorder import ENCODING
 
 PLAYED = (Frame, GroundTruth)
+MOST_EARLY = 256  # ground truths that wait for their frames, at most: the edges to a recorder hold fewer
 
 
 class Player(Node):
-    """An MCAP recording -> its Frame and GroundTruth messages, in the order of their recording.
+    """An MCAP recording -> its Frame messages in the order of their recording, and their GroundTruth.
 
     Damaged parts are left out, counted and warned of. Raises BadFileError where nothing is left to play.
     """
@@ -49,36 +50,50 @@ class Player(Node):
     def run(self) -> Iterator[Frame | GroundTruth]:
         c = self.config
         self.check(c)
-        recording = self._recording()
+        recording, pairs = self._recording(), _Pairs()
         playback, due = Playback(), 0.0
-        last = -1
         try:
-            for record in self._records(recording):
-                place = record.sequence  # in its topic: the nth ground truth belongs to the nth frame, wherever it is
-                last = max(last, place)
-                if c.has(place):
-                    message = self._decoded(record, recording)
-                    if message is not None:
-                        if c.realtime and isinstance(message, Frame):
-                            due = playback.wait(message.timestamp)
-                        self.stats.count("frames", isinstance(message, Frame))
-                        yield replace(message, captured=due)  # not when it was recorded
+            for message in self._wanted(recording, pairs):
+                if c.realtime and isinstance(message, Frame):
+                    due = playback.wait(message.timestamp)
+                self.stats.count("frames", isinstance(message, Frame))
+                yield replace(message, captured=due)  # not when it was recorded
         finally:  # also when the run is interrupted
             for warning in recording.warnings:
                 self.stats.warn(warning)
-        if last < c.start:
-            raise ValueError(f"{c.path} has {last + 1} frames: start={c.start} is beyond its end")
+            if pairs.alone:
+                self.stats.warn(
+                    f"{c.path} lacks the frames of {pairs.alone} ground truths, which are left out: the recorder of a "
+                    "live camera takes the newest frame and passes over others"
+                )
+        if pairs.frames <= c.start:
+            raise ValueError(f"{c.path} has {pairs.frames} frames: start={c.start} is beyond its end")
         if not self.stats.counts.get("frames"):
             raise _nothing_played(recording, c)
+
+    def _wanted(self, recording: McapFile, pairs: _Pairs) -> Iterator[Frame | GroundTruth]:
+        """The frames of the selection, which counts those that were recorded, and their ground truths."""
+        c, truths = self.config, GroundTruth.__name__
+        for record in self._records(recording):
+            if record.topic != truths:
+                pairs.frames = max(pairs.frames, record.sequence + 1)
+            message = self._decoded(record, recording)
+            if isinstance(message, Frame):
+                yield from pairs.of_frame(message, c.has(record.sequence))
+            elif message is not None:
+                yield from pairs.of_truth(message)
+            past = c.stop is not None and pairs.frames >= c.stop
+            if past and recording.indexed and (truths not in recording.indexed or pairs.complete):
+                return
+        pairs.end()
 
     def _recording(self) -> McapFile:
         assert self.config.path is not None
         return McapFile(Path(self.config.path), MAX_MESSAGE_BYTES)
 
     def _records(self, recording: McapFile) -> Iterator[Recorded]:
-        """Those of the topics that are played, until each has passed `stop`."""
+        """Those of the topics that are played."""
         names = {t.__name__ for t in PLAYED}
-        passed: set[str] = set()
         for record in recording.messages():
             if record.topic not in names:
                 continue
@@ -86,10 +101,6 @@ class Player(Node):
                 held = brief(ValueError(record.encoding))
                 raise BadFileError(f"{self.config.path} holds {held} messages: play recorder=mcap's")
             yield record
-            if self.config.stop is not None and record.sequence >= self.config.stop - 1:
-                passed.add(record.topic)
-                if passed == names & recording.indexed:
-                    return
 
     def _decoded(self, record: Recorded, recording: McapFile) -> Frame | GroundTruth | None:
         try:
@@ -106,6 +117,58 @@ class Player(Node):
             recording.leave_out(f"{record.topic} {record.sequence}: {brief(error)}")
             return None
         return message
+
+
+class _Pairs:
+    """Ground truths of the frames that are played: those of the same index. A live recording lacks frames, not truths,
+    and the two topics reach the recorder in any order."""
+
+    def __init__(self) -> None:
+        self.frames = 0  # that were recorded, so far
+        self.alone = 0  # truths whose frame was not recorded
+        self._indices: set[int] = set()  # of the frames so far
+        self._open: set[int] = set()  # of those that are played, whose truth did not come yet
+        self._early: dict[int, GroundTruth] = {}  # truths whose frame may still come
+        self._newest_frame = self._newest_truth = self._newest_played = -1  # indices
+
+    @property
+    def complete(self) -> bool:
+        """Whether the truths of all frames that were played have come."""
+        return self._newest_truth >= self._newest_played
+
+    def end(self) -> None:
+        """No frame comes any more."""
+        self.alone += len(self._early)
+
+    def of_frame(self, frame: Frame, wanted: bool) -> Iterator[Frame | GroundTruth]:
+        """What is played once it has come; `wanted`: of the selection."""
+        self._indices.add(frame.index)
+        self._newest_frame = max(self._newest_frame, frame.index)
+        truth = self._early.pop(frame.index, None)
+        for index in [index for index in self._early if index < self._newest_frame]:
+            del self._early[index]
+            self.alone += 1
+        if not wanted:
+            return
+        self._newest_played = max(self._newest_played, frame.index)
+        yield frame
+        if truth is not None:
+            yield truth
+        else:
+            self._open.add(frame.index)
+
+    def of_truth(self, truth: GroundTruth) -> Iterator[GroundTruth]:
+        self._newest_truth = max(self._newest_truth, truth.index)
+        if truth.index in self._open:
+            self._open.remove(truth.index)
+            yield truth
+        elif truth.index > self._newest_frame:
+            self._early[truth.index] = truth
+            if len(self._early) > MOST_EARLY:
+                del self._early[next(iter(self._early))]
+                self.alone += 1
+        elif truth.index not in self._indices:
+            self.alone += 1
 
 
 def _nothing_played(recording: McapFile, config: Player.Config) -> BadFileError:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from mcap.writer import CompressionType, Writer
 
-from msgs import TYPES, Message
+from msgs import TYPES, Frame, GroundTruth, Message
 from msgs.codec import ArraySpec, array_specs, encode
 from nodes import Node
 from nodes.foxglove_view import READ, FoxgloveView, Seen, nanoseconds
@@ -55,6 +55,7 @@ class Recorder(Node):
         self._file: BufferedWriter | None = None
         self._channels: dict[str, int] = {}  # by topic
         self._counts: Counter[str] = Counter()
+        self._indices: dict[type, set[int]] = {Frame: set(), GroundTruth: set()}  # that were recorded
         self._time = 0  # ns, of the last message that had one
         self._view = FoxgloveView() if self.config.foxglove else None
 
@@ -66,6 +67,8 @@ class Recorder(Node):
         if name not in self.config.only_shown:
             with self.stats.time("record"):
                 self._record(name, message)
+            if isinstance(message, Frame | GroundTruth):
+                self._indices[type(message)].add(message.index)
             self.stats.count("recorded")
         if self._view is not None:
             with self.stats.time("foxglove"):
@@ -73,6 +76,12 @@ class Recorder(Node):
                     self._show(seen)
 
     def on_end(self) -> Iterator[Any]:
+        frames, truths = self._indices[Frame], self._indices[GroundTruth]
+        if frames and (missed := len(truths - frames)):  # every frame has a ground truth, which none passes over
+            self.stats.warn(
+                f"{self.config.path} lacks {missed} of {len(truths | frames)} frames: of a live camera the recorder "
+                "takes the newest one, and others came while it was busy"
+            )
         self._finish()
         yield from ()
 

@@ -81,6 +81,35 @@ def test_ground_truth_may_come_before_its_frame(tmp_path: Path) -> None:
     ]
 
 
+def test_ground_truth_is_that_of_its_frame_where_a_live_recording_lacks_frames(tmp_path: Path) -> None:
+    recorder = Recorder(Recorder.Config(str(tmp_path / "a.mcap")))
+    image = np.ones((4, 4, 3), np.uint8)
+    for index in range(11):
+        truth = GroundTruth(index, 0.0, image, np.ones(4), None, None)
+        if index in (3, 9):  # the truth comes first
+            recorder.on_message(truth)
+        if index in (0, 3, 4, 7, 9):
+            recorder.on_message(Frame(index, 0.0, image, np.ones(4)))
+        if index not in (3, 9):
+            recorder.on_message(truth)
+    list(recorder.on_end())
+    assert [text for text in recorder.stats.warnings if "a.mcap lacks 6 of 11 frames" in text]
+
+    def indices(**config: Any) -> list[tuple[str, int]]:
+        player, again = played(tmp_path / "a.mcap", **config)
+        if not config:
+            assert any("lacks the frames of 6 ground truths" in text for text in player.stats.warnings)
+        return [(type(message).__name__, message.index) for message in again]
+
+    def pairs(*wanted: int) -> list[tuple[str, int]]:
+        return [(name, index) for index in wanted for name in ("Frame", "GroundTruth")]
+
+    assert indices() == pairs(0, 3, 4, 7, 9)
+    assert indices(start=1, stop=4, stride=2) == pairs(3, 7)
+    assert indices(stop=2) == pairs(0, 3)
+    assert indices(start=4) == pairs(9)
+
+
 @pytest.mark.parametrize("kept", [0.95, 0.5])
 def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(tmp_path: Path, kept: float) -> None:
     path = tmp_path / "a.mcap"
