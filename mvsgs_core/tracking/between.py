@@ -52,7 +52,7 @@ class FramesBetween:
         if self.limit == 0 or is_held_out(frame.index):
             return
         self._newest[frame.index] = (frame.bare(), record)
-        if len(self._newest) > self.limit:
+        while len(self._newest) > self.limit:  # by more than one where it was reopened
             del self._newest[spared({index: image for index, (image, _) in self._newest.items()})]
 
     def end(self) -> None:
@@ -63,6 +63,10 @@ class FramesBetween:
     def forget(self) -> None:
         """The keyframes that they are between are given up."""
         self._complete, self._newest, self._ended = {}, {}, {}
+
+    def forget_before(self, keyframe: int) -> None:
+        """The keyframes before this one are given up."""
+        self._complete = {index: frame for index, frame in self._complete.items() if index > keyframe}
 
     def reopen(self) -> None:
         """What was to be a keyframe is none: the frames wait for the next one."""

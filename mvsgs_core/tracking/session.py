@@ -222,6 +222,7 @@ class Session:
         waiting = list(self.initializer.waiting)
         if (yield from timed(self.stats, "start", self.initializer.initializing(focal=self.calibration.sought))):
             return (yield from self._begin_tracking(waiting, record))
+        self.waiting.forget_before(self.initializer.waiting[0])
         place = self.relocalizer.relocalize(frame) if self.segment > 0 else None
         return Update(record.state) if place is None else self._resume(frame, record, place)
 

@@ -39,6 +39,10 @@ class WaitingFrames:
         """A keyframe, which is still to be solved; frames that come before that is done wait for the next one."""
         self._between.end()
 
+    def forget_before(self, keyframe: int) -> None:
+        """The keyframes before this one are given up: what came between them can be seen from none."""
+        self._between.forget_before(keyframe)
+
     def reopen(self) -> None:
         """It is none after all."""
         self._between.reopen()
