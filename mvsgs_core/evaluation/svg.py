@@ -8,7 +8,8 @@ from html import escape
 import cv2
 import numpy as np
 
-_COLORS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
+_COLORS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5", "#c53030", "#319795", "#d53f8c", "#4a5568")
+_SLOT, _LETTER = 130, 7  # pixels of a name in the legend, at least, and of a letter
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,14 @@ def plot(
     x0, x1 = _range(np.concatenate([s.x for s in series]))
     y0, y1 = _range(np.concatenate([s.y for s in series]))
     longest = max(len(f"{tick:g}") for tick in (*_ticks(y0, y1), 0.0))
-    left, right, top, bottom = 30 + 8 * max(longest, 4), 12 if valued is None else 70, 26, 42
-    plot_w, plot_h = width - left - right, height - top - bottom
+    left, right, bottom = 30 + 8 * max(longest, 4), 12 if valued is None else 70, 42
+    plot_w = width - left - right
+    names = [s.name for s in series if s.values is None]
+    slot = max([_SLOT, *(30 + _LETTER * len(name) for name in names)])
+    in_row = max(1, plot_w // slot)
+    more = 16 * (max(0, len(names) - 1) // in_row)  # pixels of the legend's further rows, which the plot is higher by
+    top, height = 26 + more, height + more
+    plot_h = height - top - bottom
     if equal:
         unit = max((x1 - x0) / plot_w, (y1 - y0) / plot_h)
         x0, x1 = (x0 + x1) / 2 - unit * plot_w / 2, (x0 + x1) / 2 + unit * plot_w / 2
@@ -57,6 +64,7 @@ def plot(
     for tick in _ticks(y0, y1):
         parts.append(f'<line x1="{left}" x2="{left + plot_w}" y1="{py(tick):.1f}" y2="{py(tick):.1f}" class="grid"/>')
         parts.append(f'<text x="{left - 6}" y="{float(py(tick)) + 4:.1f}" text-anchor="end">{tick:g}</text>')
+    named = 0
     for k, s in enumerate(series):
         color = _COLORS[k % len(_COLORS)]
         if s.values is not None:
@@ -68,9 +76,10 @@ def plot(
         else:
             way = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(px(s.x), py(s.y)))
             parts.append(f'<polyline points="{way}" fill="none" stroke="{color}" stroke-width="1.6"/>')
-        legend_x = left + 8 + k * 130
-        parts.append(f'<rect x="{legend_x}" y="8" width="10" height="10" fill="{color}"/>')
-        parts.append(f'<text x="{legend_x + 14}" y="17">{escape(s.name)}</text>')
+        legend_x, legend_y = left + 8 + named % in_row * slot, 8 + named // in_row * 16
+        parts.append(f'<rect x="{legend_x}" y="{legend_y}" width="10" height="10" fill="{color}"/>')
+        parts.append(f'<text x="{legend_x + 14}" y="{legend_y + 9}">{escape(s.name)}</text>')
+        named += 1
     parts.append(f'<text x="{left + plot_w / 2}" y="{height - 8}" text-anchor="middle">{escape(x_label)}</text>')
     middle = top + plot_h / 2
     parts.append(
