@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from bench import networks
+from mvsgs_core.droid.config import DroidConfig
 from mvsgs_core.fusion.fusion import FusionConfig, OnlineFusion
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpoint import load, save
@@ -24,6 +25,7 @@ from mvsgs_core.mapping.preview import preview_arrays
 from mvsgs_core.mvs.interface import SmoothingConfig
 from mvsgs_core.mvs.matching_cost import CostConfig
 from mvsgs_core.mvs.torch_backend import TorchBackend
+from mvsgs_core.networks.correlation import CorrelationVolume, OnTheFlyCorrelation
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.bundle_adjustment import Solver, adjust
 from tests.support.depth_views import view
@@ -59,6 +61,28 @@ def test_networks(name: str) -> None:
     with torch.no_grad(), PretendDevice():
         _, work = networks.CASES[name](64, 64, DEVICE)
         work()
+
+
+@pytest.mark.parametrize("kind", [CorrelationVolume, OnTheFlyCorrelation])
+def test_a_lookup_of_correlation_copies_nothing_to_the_device(
+    kind: type[CorrelationVolume | OnTheFlyCorrelation],
+) -> None:
+    g = torch.Generator().manual_seed(0)
+    source, target = torch.randn(2, 1, 8, 16, 20, generator=g)
+    coords = 20 * torch.rand(1, 16, 20, 2, generator=g)
+    here = kind(source, target)(coords)
+    with PretendDevice():
+        correlation, at = kind(source.to(DEVICE), target.to(DEVICE)), coords.to(DEVICE)
+    with PretendDevice() as device:
+        there = correlation(at)
+        assert device.copied == 0
+        np.testing.assert_array_equal(there.cpu(), here)
+        torch.ones(3).to(DEVICE)
+        assert device.copied == 1
+
+
+def test_the_global_adjustment_takes_the_fast_correlation_everywhere() -> None:
+    assert DroidConfig().global_correlation == "volume"
 
 
 @pytest.mark.slow

@@ -70,7 +70,7 @@ class DroidConfig:
     constants: dict[str, Constant] = field(default_factory=dict)  # instead of the preset's, as constants.stride=1
     area: int = 384 * 512  # pixels of the image that the networks see, aspect kept
     correlation: CorrelationKind = "volume"  # of the frontend: volume (fast) or on_the_fly (little memory)
-    global_correlation: CorrelationKind | None = None  # of the backend; null: on_the_fly on a GPU, volume on the CPU
+    global_correlation: CorrelationKind = "volume"  # of the backend, which holds that of one edge at a time
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
     device: str = "auto"  # auto (CUDA if there is one), cpu, cuda:0
     threads: int | None = None  # of the bundle adjustment; null: 1

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.devices import resolve_device
+from mvsgs_core.devices import torch_device
 from mvsgs_core.droid.backend import adjust_globally
 from mvsgs_core.droid.confidence import Coarse, coarse_map, consistent_fraction
 from mvsgs_core.droid.config import DroidConfig
@@ -39,9 +39,8 @@ class DroidSlam:
         self.config = config or DroidConfig()
         self.constants = self.config.chosen
         self.threads = self.config.threads or 1
-        device = resolve_device(self.config.device)
-        self.global_correlation = self.config.global_correlation or ("volume" if device == "cpu" else "on_the_fly")
-        self.networks = Networks(load(self.config.weights) if net is None else net, torch.device(device))
+        device = torch.device(torch_device(self.config.device))
+        self.networks = Networks(load(self.config.weights) if net is None else net, device)
         self.stats = Stats()
         if net is None and self.config.weights == RANDOM:
             self.stats.warn("DROID-SLAM runs on random weights: its poses and depths are noise")
@@ -159,9 +158,8 @@ class DroidSlam:
     def _adjust_globally(self, steps: tuple[int, ...]) -> None:
         with self.stats.time("global bundle adjustment"):
             for count in steps:
-                adjust_globally(
-                    self.video, self.networks, self.constants, count, self.global_correlation, self.threads, self.stats
-                )
+                kind = self.config.global_correlation
+                adjust_globally(self.video, self.networks, self.constants, count, kind, self.threads, self.stats)
 
     def _fill(self) -> dict[int, np.ndarray]:
         """cam_from_world of every frame."""

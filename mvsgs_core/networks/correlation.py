@@ -20,9 +20,10 @@ def _offsets(radius: int, like: Tensor) -> Tensor:
 def _sample(maps: Tensor, xy: Tensor) -> Tensor:
     """Bilinear values of maps (N, C, h, w) at pixels xy (N, a, b, 2), 0 outside."""
     h, w = maps.shape[-2:]
-    # in units of pixels times 2/(size-1): a one-pixel axis has no extent to divide by
-    scale = xy.new_tensor([2.0 / max(w - 1, 1), 2.0 / max(h - 1, 1)])
-    return F.grid_sample(maps, xy * scale - 1.0, align_corners=True, padding_mode="zeros")
+    # In units of pixels times 2/(size-1): a one-pixel axis has no extent to divide by. No tensor of the two factors is
+    # made: a GPU would wait for each.
+    x, y = (xy[..., axis] * (2.0 / max(size - 1, 1)) - 1.0 for axis, size in enumerate((w, h)))
+    return F.grid_sample(maps, torch.stack([x, y], dim=-1), align_corners=True, padding_mode="zeros")
 
 
 class CorrelationVolume:

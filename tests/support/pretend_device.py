@@ -52,7 +52,11 @@ def _tensor(data: Any, **options: Any) -> Tensor:
 
 
 class PretendDevice(TorchDispatchMode):
-    """While it is active, DEVICE is the pretended one."""
+    """While it is active, DEVICE is the pretended one; `copied`: tensors of the CPU that were copied to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.copied = 0
 
     def __enter__(self) -> Self:
         torch.tensor = _tensor  # it fills its memory without being dispatched
@@ -63,7 +67,10 @@ class PretendDevice(TorchDispatchMode):
         super().__exit__(*error)
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None) -> Any:
-        return _run(func, args, kwargs or {})
+        result, name = _run(func, args, kwargs or {}), func._schema.name
+        if name in _COPIES and isinstance(result, _Elsewhere):
+            self.copied += not isinstance(args[1 if name == "aten::copy_" else 0], _Elsewhere)
+        return result
 
 
 def _run(func: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
