@@ -45,6 +45,7 @@ COMMANDS = {
     "render": Command("MAP PATH OUT.mp4", "a video along a trajectory", "mvsgs_core.export.render_path"),
     "doctor": Command("", "what this machine has for a run, and a self-test of ten seconds", "mvsgs.doctor"),
     "weights": Command("list", "network weights: where they are found and had", "mvsgs_core.weights"),
+    "keys": Command("DIR", "makes the keys that hosts know each other by", "mvsgs.keys"),
     "graph": Command("...", "what a command line composes", words=("--graph",)),
     "parameters": Command("...", "all slots, choices and parameters of a command line", words=("--help",)),
 }

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from mvsgs import keys
 from nodes.runtime.addresses import KEY_FILE, TransportError, load_keys
 from nodes.runtime.transport import create_keys
 
@@ -25,7 +26,7 @@ def piped(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda f: (f / KEY_FILE).unlink(), "no keys at .*create_keys"),
+        (lambda f: (f / KEY_FILE).unlink(), "no keys at .*mvsgs keys"),
         (lambda f: (f / KEY_FILE).chmod(0o640), "read by other users: chmod 600"),
         (lambda f: f.chmod(0o777), "written by other users.*chmod go-w"),
         (lambda f: f.chmod(0o720), "written by other users.*chmod go-w"),
@@ -39,8 +40,8 @@ def test_keys_that_others_have_a_hand_in_are_refused(
     tmp_path: Path, change: Callable[[Path], object], match: str
 ) -> None:
     folder = tmp_path / "keys"
-    keys = create_keys(folder)
-    assert load_keys(folder) == keys
+    made = create_keys(folder)
+    assert load_keys(folder) == made
     change(folder)
     with pytest.raises(TransportError, match=match):
         load_keys(folder)
@@ -67,3 +68,14 @@ def test_another_users_keys_are_refused_whoever_runs(tmp_path: Path, monkeypatch
     else:
         with pytest.raises(TransportError, match="another user"):
             load_keys(folder)
+
+
+def test_the_command_makes_keys_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "keys"
+    assert keys.main([str(folder)]) == 0
+    made = load_keys(folder)
+    assert keys.main([str(folder)]) == 1
+    assert (
+        capsys.readouterr().err == f"error: {folder}/graph.key is there already: copy it, or delete it for new keys\n"
+    )
+    assert load_keys(folder) == made

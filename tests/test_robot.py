@@ -364,7 +364,7 @@ def test_a_reader_with_other_keys_is_named_at_both_ends(address: str, video: Pat
 
 
 def test_the_launcher_refuses_a_robot_without_its_keys(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="create_keys"):
+    with pytest.raises(ValueError, match="mvsgs keys"):
         Robot.check(Robot.Config(keys=str(tmp_path)))
     with pytest.raises(ValueError, match="is no address"):
         Robot.check(Robot.Config(path="localhost:5555"))

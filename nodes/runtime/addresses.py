@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import shlex
 import stat
 from pathlib import Path
 from typing import NamedTuple
@@ -38,10 +39,7 @@ def load_keys(folder: Path) -> Keys:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
-        raise TransportError(
-            f"no keys at {path}: make them with "
-            f'python -c "from nodes.runtime.transport import create_keys; create_keys({str(folder)!r})"'
-        ) from None
+        raise TransportError(f"no keys at {path}: make them with `mvsgs keys {shlex.quote(str(folder))}`") from None
     except OSError as error:
         what = "is a link: put the file itself there" if path.is_symlink() else f"cannot be read: {error.strerror}"
         raise TransportError(f"{path} {what}") from None
@@ -72,9 +70,12 @@ def _check_private(path: Path, file: os.stat_result, folder: os.stat_result) -> 
 
 
 def save_keys(folder: Path, keys: Keys) -> None:
-    """To a file that only its owner can read. Raises FileExistsError rather than replace keys."""
+    """To a file that only its owner can read. Raises FileExistsError rather than replace keys, and OSError."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    descriptor = os.open(folder / KEY_FILE, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        descriptor = os.open(folder / KEY_FILE, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        raise FileExistsError(f"{folder / KEY_FILE} is there already: copy it, or delete it for new keys") from None
     with os.fdopen(descriptor, "wb") as file:
         file.write(keys.public + b"\n" + keys.secret + b"\n")
 
