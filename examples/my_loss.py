@@ -1,6 +1,6 @@
 """A loss of your own, in a file outside the repository: what the mapper minimizes in place of L1 and SSIM.
 
-    python launch/run_all.py dataset=tum dataset.path=... mapper.training.loss_function=my_loss.robust
+    mvsgs dataset=tum dataset.path=DIR mapper.training.loss_function=my_loss.robust
 
 or in a program: `Mapping(loss=robust)`. It is called once an iteration, and what it returns is differentiated: for the
 rasterizer's outputs (`inputs.render`: color (H, W, 3), depth and opacity (H, W)) and the map's splats.

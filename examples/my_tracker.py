@@ -1,6 +1,6 @@
 """A tracker of your own, in a file outside the repository:
 
-    python launch/run_all.py dataset=tum dataset.path=... tracker._target_=my_tracker.Strided tracker.stride=8
+    mvsgs dataset=tum dataset.path=DIR tracker._target_=my_tracker.Strided tracker.stride=8
 
 It is visual odometry as in textbooks: corners followed by Lucas-Kanade, a start from the essential matrix, then PnP
 against triangulated points. It is small, and it is honest about what that means: sparse depth, a fixed stride of

@@ -3,12 +3,12 @@
     python examples/robot.py --camera 0 --intrinsics 610 610 320 240
     python examples/robot.py --video walk.mp4
     python examples/robot.py --dataset tum ../shared/data/tum_fr1_xyz
-    python launch/run_all.py dataset=robot dataset.path=tcp://127.0.0.1:5555
+    mvsgs dataset=robot dataset.path=tcp://127.0.0.1:5555
 
 With --ros2 it stands for a camera of ROS 2, as far as dataset=ros2 is concerned (pip install cyclonedds):
 
     python examples/robot.py --video walk.mp4 --ros2 /camera/image_raw
-    python launch/run_all.py dataset=ros2 dataset.path=/camera/image_raw
+    mvsgs dataset=ros2 dataset.path=/camera/image_raw
 
 Otherwise this uses the project's own transport. A robot in another language writes the same bytes to a ZeroMQ XPUB or
 PUB socket: msgs/WIRE.md has them. Beyond this machine (--address tcp://0.0.0.0:5555) keys are required, see --keys.
