@@ -24,7 +24,7 @@ from mvsgs_core.mapping.keyframe_store import KeyframeStore
 from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView, median_of_known, training_view
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.schedule import Schedule
-from mvsgs_core.mapping.self_check import SelfCheck, check
+from mvsgs_core.mapping.self_check import SelfCheck, Shown, check
 from mvsgs_core.mapping.snapshot import snapshot
 from mvsgs_core.mapping.trainer import Trainer
 from mvsgs_core.rasterizer.rasterize import Render
@@ -354,12 +354,10 @@ class OnlineMapper:
         views = images[:: -(-len(images) // max_keyframes) or 1]
         return check(self._beside(view) for view in views)
 
-    def _beside(self, view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
-        """Render and image (H, W, 3) of a keyframe; where a pixel is left out the image is the render."""
-        color, image = self.render(view).color.clamp(0.0, 1.0), view.target
-        if view.valid is not None:
-            image = torch.where(view.valid[..., None], image, color)
-        return color.cpu().numpy(), image.cpu().numpy()
+    def _beside(self, view: TrainingView) -> Shown:
+        """Render and image (H, W, 3) of a keyframe, and which pixels count."""
+        color, valid = self.render(view).color.clamp(0.0, 1.0), view.valid
+        return color.cpu().numpy(), view.target.cpu().numpy(), None if valid is None else valid.cpu().numpy()
 
     def snapshot(self) -> Snapshot:
         """The map in world units, relative to its origin."""

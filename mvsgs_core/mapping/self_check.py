@@ -15,6 +15,7 @@ MIN_PSNR = 25.0  # dB; a static map of sharp, steady images is above this
 MAX_EXPOSURE_GAIN = 1.5  # dB that one gain and offset an image and channel may bring before exposure is to blame
 MIN_STEADY_PSNR = 22.0  # dB that they must reach: a render of something else gains by them, too
 MAX_NOISE = 6.0  # of 255; sharp and steady images without noise read 0.5 to 3.1, small and textured ones the most
+Shown = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # render, image (H, W, 3), pixels (H, W) that count; None: all
 _SECOND_DERIVATIVE = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
 
 
@@ -59,9 +60,13 @@ class SelfCheck:
         )
 
 
-def check(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> SelfCheck | None:
-    """Of (render, image) pairs, (H, W, 3) float in 0..1, one after the other; None without any."""
-    found = [(psnr(render, image), psnr(_fitted(render, image), image), noise_of(image)) for render, image in pairs]
+def check(pairs: Iterable[Shown]) -> SelfCheck | None:
+    """Of renders and images, float in 0..1, one after the other; None without any of which a pixel counts."""
+    found = [
+        (psnr(render, image, mask), psnr(_fitted(render, image, mask), image, mask), noise_of(image, mask))
+        for render, image, mask in pairs
+        if mask is None or mask.any()
+    ]
     return SelfCheck(*np.median(found, axis=0).tolist()) if found else None
 
 
@@ -81,21 +86,26 @@ def why_nothing(log: Stats) -> str:
     )
 
 
-def noise_of(image: np.ndarray) -> float:
-    """Standard deviation of an image's noise, of 255.
+def noise_of(image: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Standard deviation of an image's noise, of 255; mask: (H, W) bool, pixels that count, 0 where none is among such.
 
     The second derivative in both directions leaves noise and hardly any structure; the median of its size looks past
     the corners that remain (after Immerkaer, "Fast noise variance estimation", 1996).
     """
     residual = cv2.filter2D(image.astype(np.float32), cv2.CV_32F, _SECOND_DERIVATIVE)[1:-1, 1:-1]
+    if mask is not None:
+        residual = residual[cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0]
+    if not residual.size:
+        return 0.0
     return float(255.0 * np.median(np.abs(residual)) / (0.6745 * np.sqrt((_SECOND_DERIVATIVE**2).sum())))
 
 
-def _fitted(render: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """The render under the gain and offset of each channel that bring it closest to the image."""
+def _fitted(render: np.ndarray, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """The render under the gain and offset of each channel that bring it closest to the image where pixels count."""
+    counts = slice(None) if mask is None else mask
     fitted = np.empty_like(render)
     for channel in range(3):
-        x, y = render[..., channel].ravel().astype(np.float64), image[..., channel].ravel().astype(np.float64)
+        x, y = (values[..., channel][counts].ravel().astype(np.float64) for values in (render, image))
         spread = x.var()
         gain = float(((x - x.mean()) * (y - y.mean())).mean() / spread) if spread > 0.0 else 0.0
         fitted[..., channel] = gain * (render[..., channel] - x.mean()) + y.mean()
