@@ -73,7 +73,8 @@ class RayCluster:
 
         No job is made before a machine is free for it. What a machine that is lost had is given to another one.
         """
-        config = replace(config, threads=self.cpus)
+        # The mapper's own device is this machine's. Of a worker's GPUs, Ray shows it the one that it asked for.
+        config = replace(config, threads=self.cpus, device="auto" if self.gpus else "cpu")
         numbered = enumerate(jobs)
         running: dict[Any, int] = {}
         try:

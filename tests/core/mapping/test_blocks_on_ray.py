@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from mvsgs_core.mapping.blocks.config import RefineConfig
+from mvsgs_core.mapping.blocks.job import Job
+from mvsgs_core.mapping.blocks.ray_cluster import RayCluster
 from mvsgs_core.mapping.blocks.refinement import refined_in_blocks
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.named_modules import is_installed
 from tests.support.small_maps import CONFIG, mapped
@@ -40,6 +44,27 @@ def test_a_cluster_of_two_nodes_refines_as_one_process_does() -> None:
     assert (there.log.values["machines"], there.log.values["blocks"]) == (2, 2)
     assert there.iterations == here.iterations
     assert all(torch.equal(value, there.state.tensors()[name]) for name, value in here.state.tensors().items())
+
+
+@pytest.mark.parametrize(("gpus", "device"), [(0, "cpu"), (1, "auto")])
+def test_a_worker_takes_its_own_device(gpus: int, device: str) -> None:
+    given: list[MapperConfig] = []
+
+    def sent(job: Job, config: MapperConfig) -> int:
+        given.append(config)
+        return len(given)
+
+    cluster = RayCluster(RefineConfig(by="ray", address="head:6379"))
+    cluster.machines, cluster.cpus, cluster.gpus = 1, 3, gpus
+    cluster._ray = SimpleNamespace(
+        remote=lambda **asked: lambda function: SimpleNamespace(remote=sent),
+        wait=lambda running, timeout: (running, []),
+        get=lambda reference: reference,
+        exceptions=SimpleNamespace(RayError=RuntimeError),
+    )
+    job = Job({}, {}, {})
+    assert list(cluster.refined([job, job], replace(CONFIG, device="cuda:1"))) == [{0: 1}, {1: 2}]
+    assert [(config.device, config.threads) for config in given] == [(device, 3)] * 2
 
 
 def test_a_cluster_that_is_not_there_is_said_and_the_map_refined_here(monkeypatch: pytest.MonkeyPatch) -> None:
