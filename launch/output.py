@@ -17,13 +17,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from launch.outcome import Outcome
 from launch.refusal import GraphError
+from launch.settings_file import write_settings
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+from nodes.passwords import without_passwords
 
 LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
 MAP = ("map.ply", "trajectory.txt", "localization.csv", FOLDER)  # what is worth keeping of an earlier run
@@ -63,8 +63,7 @@ class Output:
             if not resumed:
                 self._move_previous()
             self.write_report({"finished": False, "reason": "still running, or killed with its launcher"})
-            settings = OmegaConf.to_yaml(OmegaConf.create(dict(config)))
-            replace_text(self.path / "config.yaml", f"# {' '.join(command.split())}\n{settings}")
+            write_settings(self.path / "config.yaml", config, command)
         except OSError as error:
             raise GraphError(f"output={self.path}: {error.strerror or error}") from error
 
@@ -107,7 +106,7 @@ class Output:
     def write_report(self, content: Mapping[str, Any]) -> None:
         """Raises OSError."""
         stamp = {"written": time.strftime("%Y-%m-%d %H:%M:%S %z")}
-        replace_text(self.path / REPORT, json.dumps({**content, **stamp}, indent=1) + "\n")
+        replace_text(self.path / REPORT, json.dumps(without_passwords({**content, **stamp}), indent=1) + "\n")
 
     def _resume_command(self) -> str | None:
         """What goes on with an unfinished run; None where it left no checkpoint."""

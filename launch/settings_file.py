@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
+
 from launch.graph import Graph
+from mvsgs_core.atomic_file import replacing
+from nodes.passwords import without_passwords
 
 FILES = ("path", "mask", "gps")  # parameters of sources that name a file or folder
 
@@ -17,6 +22,15 @@ def lasting(graph: Graph) -> dict[str, Any]:
         if graph.slots[source].node.replayable:
             found[source] = {key: _found(value) if key in FILES else value for key, value in found[source].items()}
     return found
+
+
+def write_settings(file: Path, config: Mapping[str, Any], command: str) -> None:
+    """Under the command that composed it. Only its owner may read a file with a camera's password. Raises OSError."""
+    settings = OmegaConf.to_yaml(OmegaConf.create(dict(config)))
+    secret = without_passwords(settings) != settings
+    with replacing(file) as aside:
+        aside.touch(0o600 if secret else 0o666)  # less what the user's mask takes away
+        aside.write_text(f"# {without_passwords(' '.join(command.split()))}\n{settings}", encoding="utf-8")
 
 
 def _found(value: Any) -> Any:

@@ -20,6 +20,7 @@ from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource, camera_mask
+from nodes.passwords import without_passwords
 from nodes.stream_frames import StreamFrames
 from nodes.stream_presence import Presence, pauses
 
@@ -50,9 +51,9 @@ class Camera(LiveSource):
         super().__init__(config)
         self._framing = Framing(self.config.size, self.config.crop)
         self._lens: Lens | None = None
-        sender = f"camera {self.config.path}"
-        self._frames = StreamFrames(self.stats, sender, stamped=False)
-        self._presence = Presence(self.stats, sender, self.config.timeout)
+        self._called = _called(self.config)
+        self._frames = StreamFrames(self.stats, self._called, stamped=False)
+        self._presence = Presence(self.stats, self._called, self.config.timeout)
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -90,8 +91,8 @@ class Camera(LiveSource):
         silence = f"gave no usable picture for {self.config.timeout:g} s"
         if first:
             said = f": {self.stats.warnings[-1]}" if self.stats.warnings else ""
-            raise CameraError(f"camera {self.config.path} {silence}{said}")
-        self.stats.warn(f"camera {self.config.path} {silence}: the stream ends here")
+            raise CameraError(f"{self._called} {silence}{said}")
+        self.stats.warn(f"{self._called} {silence}: the stream ends here")
         return None
 
     def _lens_of(self, picture: np.ndarray) -> Lens:
@@ -170,6 +171,11 @@ class _Feed:
                 self._capture = _open(replace(self._config, resolution=size))
 
 
+def _called(config: Camera.Config) -> str:
+    """The camera in messages, which reports and logs show."""
+    return f"camera {without_passwords(config.path)}"
+
+
 def device_number(path: str) -> int | None:
     """Of a camera of this machine: 2 for 2 and /dev/video2. None for an address."""
     found = re.fullmatch(r"(?:/dev/video)?([0-9]+)", path)
@@ -190,7 +196,7 @@ def _open(config: Camera.Config) -> cv2.VideoCapture:
         hint = "is the address right (ffplay shows the same one), and does the network let it through?"
     if not capture.isOpened():
         capture.release()
-        raise CameraError(f"camera {config.path} cannot be opened: {hint}")
+        raise CameraError(f"{_called(config)} cannot be opened: {hint}")
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # drivers that queue pictures would deliver old ones
     if config.resolution is not None:
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.resolution[0])

@@ -27,6 +27,7 @@ from mvsgs_core.georeference import Georeference, NoReferenceError, georeference
 from mvsgs_core.held_out import HELD_OUT_EVERY
 from mvsgs_core.trajectory_file import write_trajectory
 from nodes import Node
+from nodes.passwords import without_passwords
 from nodes.splat_map import snapshot_of
 
 
@@ -101,6 +102,7 @@ class Evaluator(Node):
         self._add_statistics()
         for note in self.report["notes"]:
             self.stats.warn(note)
+        self.report = without_passwords(self.report)
         if self.folder:
             self._write(self.folder)
             if found is not None:

@@ -119,6 +119,16 @@ def test_a_device_that_does_not_exist_is_named() -> None:
             Camera.check(Camera.Config(path=path))
 
 
+def test_a_password_is_in_no_message(capture: type[FakeCapture]) -> None:
+    capture.dead_after = 1
+    camera = Camera(Camera.Config(path="rtsp://me:secret@host/2", timeout=0.3))
+    list(camera.run())
+    assert any("camera rtsp://host/2 gave no usable picture" in text for text in camera.stats.warnings)
+    with pytest.raises(CameraError, match="camera rtsp://host/2 cannot be opened"):
+        list(camera.run())
+    assert "secret" not in "".join(camera.stats.warnings)
+
+
 def told(camera: Camera, text: str) -> list[str]:
     return [warning for warning in camera.stats.warnings if text in warning]
 

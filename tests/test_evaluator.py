@@ -139,11 +139,14 @@ def test_without_truth_the_figures_are_null(tmp_path: Path) -> None:
 
 
 def test_a_run_that_never_made_a_map_still_reports(tmp_path: Path) -> None:
-    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off", input="camera rtsp://me:secret@host/2"))
+    (tmp_path / "config.yaml").write_text("# mvsgs camera\npath: rtsp://me:secret@host/2\n")
     list(node.on_end())
+    assert not [path for path in tmp_path.glob("report.*") if "secret" in path.read_text()]
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["rendering"]["all"] == {"psnr": None, "ssim": None, "lpips": None, "count": 0}
     assert report["map"]["splats"] == 0
+    assert report["input"] == "camera rtsp://host/2"
     assert any("no trajectory" in note for note in report["notes"])
 
 

@@ -26,6 +26,21 @@ def test_results_of_an_earlier_run_do_not_pass_for_the_new_ones(output: Output, 
     assert {path.name for path in (output.path / "previous").iterdir()} == set(names)
 
 
+def test_a_cameras_password_is_in_no_report_and_its_settings_are_their_owners(output: Output) -> None:
+    secret, shown = "rtsp://me:p@ss:1@host/stream", "rtsp://host/stream"
+    graph = compose(["dataset=camera", f"dataset.path='{secret}'"])
+    output.begin(graph.resolved, f"mvsgs {secret} seed=1", resumed=False)
+    text = (output.path / "config.yaml").read_text()
+    assert text.startswith(f"# mvsgs {shown} seed=1\n")
+    assert f"path: {secret}" in text  # to go on with it
+    assert (output.path / "config.yaml").stat().st_mode & 0o077 == 0
+    output.settle(Outcome(1, f"dataset failed: {secret} is gone"))
+    assert read_report(output.path)["reason"] == f"dataset failed: {shown} is gone"
+    output.begin(compose([]).resolved, "mvsgs", resumed=False)
+    (output.path / "plain").touch()
+    assert (output.path / "config.yaml").stat().st_mode == (output.path / "plain").stat().st_mode
+
+
 def test_only_the_evaluators_report_is_waited_for(output: Output) -> None:
     graph = compose(["evaluator=off", "viewer=viser", "recorder=mcap"])
     assert not _scored(graph)
