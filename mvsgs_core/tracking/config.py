@@ -25,6 +25,7 @@ class KeyframeTrackingConfig:
     area: int = 320 * 240
     flow: str = "lucas_kanade"  # lucas_kanade, dis, features, raft_small, or module:Class
     threads: int | None = None  # of the C++ kernels; null: 1
+    min_texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
     frames_between: int = 8  # frames between two keyframes, at most, that the map is trained on, too; 0: none
     keyframe_choice: KeyframeChoiceConfig = field(default_factory=KeyframeChoiceConfig)
     local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
@@ -58,7 +59,6 @@ class TrackerConfig(KeyframeTrackingConfig):
     # cores', at most 0.9
     share: float | None = None
     tolerance: float = 0.002  # of depth, radians, scale: smaller corrections are not sent
-    min_texture: float = 0.05  # fraction of the cells that must be textured for an image to be of any use
     min_matches: int = 150  # of a pair of keyframes, median: fewer, and the map may be bent, which is warned of
     device: str = "cpu"  # of bundle adjustment: cpu (C++), cuda or cuda:0 (PyTorch), auto (CUDA if there is one)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)

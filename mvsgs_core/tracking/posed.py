@@ -23,6 +23,9 @@ from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.photometer import FrameLight, Photometer, observed
 
 FIRST_RATIO = 0.1  # of the depth: how far the first two keyframes are taken to be apart where no match says it
+PARALLAX = 1.0  # pixels by which a depth explains the matches better than none: less may be errors of the given poses
+STAYED = 0.003  # of the depth, or radians: as far as a camera that stands may be from where it was, about a pixel
+DEPTHS = 0.3  # of a keyframe's textured points: so many triangulated, and depths are known
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class PosedTracker:
         self.photometer = Photometer(self.graph, self.stats)
         self._lights: list[FrameLight] = []  # of all frames
         self.unit = 1.0  # of the given poses' units, one of the graph's
-        self._undecided = True  # about the unit: no two keyframes have given the first depth yet
+        self._undecided = True  # about the unit: no two keyframes have given a depth yet
         self._complete: list[int] = []  # keyframes not given out yet
         self._tail: dict[int, tuple[TrackingImage, np.ndarray, Step]] = {}  # the last two frames since
         self._between: dict[int, dict[int, _Waiting]] = {}  # by the keyframe that they were followed from
@@ -82,7 +85,7 @@ class PosedTracker:
         with self.stats.time("front end"):
             step = self.front_end.follow(frame, with_pose=False)
         if self.front_end.is_lost(step):
-            return self._insert(frame, pose, {})
+            return self._insert(frame, pose, {}) if self._shows_another_place(frame, pose) else []
         self._lights[-1] = FrameLight(index, observed(self.graph, step.reference, frame, step.matches))
         if not self.choice.wants(index, step, frame.size[1], self.config.keyframe_choice.max_flow):
             if self._complete == [step.reference] and is_held_out(step.reference) and not is_held_out(index):
@@ -140,6 +143,17 @@ class PosedTracker:
             return {}
         return {light.index: affine for light, affine in zip(self._lights, known) if np.isfinite(affine).all()}
 
+    def _shows_another_place(self, frame: TrackingImage, pose: np.ndarray) -> bool:
+        """Whether a frame that can't be followed is worth a keyframe: not in the dark, nor where the last one was, and
+        not one that is held out, as the next one is as good."""
+        assert self.front_end.reference is not None
+        if is_held_out(frame.index) or frame.cells.textured.mean() < self.config.min_texture:
+            return False
+        last = self.front_end.reference.index
+        if self._undecided:  # how far anything is
+            return not np.array_equal(pose, self.graph.keyframes[last].cam_from_world)
+        return bool(np.abs(pose @ self.graph.world_from_cam(last) - np.eye(4)).max() > STAYED)
+
     def _wait(self, reference: int, frame: _Waiting) -> None:
         if self.config.frames_between == 0 or is_held_out(frame.image.index):
             return
@@ -167,6 +181,9 @@ class PosedTracker:
         self.local_map.release_images(0)
         self.front_end.refer_to(frame)
         self.stats.count("keyframes")
+        if self._undecided:
+            known = self.graph.keyframes[frame.index].triangulated
+            self._undecided = bool(known.mean() <= DEPTHS * frame.cells.textured.mean())
         complete, self._complete, self._tail = self._complete, [frame.index], {}
         return complete
 
@@ -179,35 +196,50 @@ class PosedTracker:
         return []
 
     def _decide_unit(self, pose: np.ndarray, matches: dict[int, Matches]) -> np.ndarray:
-        """From the first two keyframes that are apart: the depth that explains the flow between them is the unit.
+        """From two keyframes that are apart: the depth that explains the flow between them is the unit.
 
-        pose (4, 4): of the second; returned in the new unit, as all keyframes' are from then on.
+        pose (4, 4): of the second; returned in the unit as it is then. Without matches that is a guess for a start.
+        While the camera only turns no depth explains anything, and the next two are asked.
         """
         assert self.front_end.reference is not None
         first = self.graph.keyframes[self.front_end.reference.index]
         baseline = float(np.linalg.norm((pose @ self.graph.world_from_cam(first.index))[:3, 3]))
         if baseline <= 0.0:
             return pose
-        best = (np.inf, FIRST_RATIO)
+        ratio = FIRST_RATIO
         for found in matches.values():
-            for ratio in np.geomspace(1e-3, 3.0, 40):
-                pixels, _ = reproject(
-                    np.stack([first.cam_from_world, pose]),
-                    np.full_like(first.inverse_depth, ratio / baseline)[None],
-                    first.points.T[None].astype(np.float64),
-                    self.graph.intrinsics,
-                    np.array([0]),
-                    np.array([1]),
-                )
-                error = np.linalg.norm(pixels[0].T - found.target, axis=1)[found.alive]
-                best = min(best, (float(np.median(error)), float(ratio)))
-        self._undecided, self.unit = False, baseline / best[1]
+            ratios = [0.0, *np.geomspace(1e-3, 3.0, 40).tolist()]  # the first one: infinitely far
+            errors = [self._error(first, pose, found, each / baseline) for each in ratios]
+            best = int(np.argmin(errors))
+            if errors[best] > errors[0] - PARALLAX:
+                return pose
+            ratio, self._undecided = ratios[best], False
+        scale = baseline / ratio
+        self.unit *= scale
         for keyframe in self.graph.keyframes.values():
-            keyframe.cam_from_world = keyframe.cam_from_world.copy()
-            keyframe.cam_from_world[:3, 3] /= self.unit
-        pose = pose.copy()
-        pose[:3, 3] /= self.unit
-        return pose
+            keyframe.cam_from_world = _scaled(keyframe.cam_from_world, scale)
+            keyframe.inverse_depth = np.ones_like(keyframe.inverse_depth)  # none was known
+            keyframe.information = np.zeros_like(keyframe.information)
+        return _scaled(pose, scale)
+
+    def _error(self, first: Keyframe, pose: np.ndarray, found: Matches, inverse_depth: float) -> float:
+        """Pixels, median, by which matches miss a camera at this pose (4, 4), had all points this inverse depth."""
+        pixels, _ = reproject(
+            np.stack([first.cam_from_world, pose]),
+            np.full_like(first.inverse_depth, inverse_depth)[None],
+            first.points.T[None].astype(np.float64),
+            self.graph.intrinsics,
+            np.array([0]),
+            np.array([1]),
+        )
+        return float(np.median(np.linalg.norm(pixels[0].T - found.target, axis=1)[found.alive]))
+
+
+def _scaled(pose: np.ndarray, unit: float) -> np.ndarray:
+    """A pose (4, 4) in another unit."""
+    scaled = pose.copy()
+    scaled[:3, 3] /= unit
+    return scaled
 
 
 __all__ = ["PosedTracker"]

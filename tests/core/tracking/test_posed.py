@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
+
+import cv2
 import numpy as np
 import pytest
 
@@ -76,3 +79,67 @@ def test_frames_between_keyframes_have_their_given_poses_and_no_held_out_one_is_
     assert tracker.pending == set()
     with pytest.raises(ValueError, match=r"tracker\.frames_between=-1"):
         PosedConfig(frames_between=-1)
+
+
+HEIGHT, WIDTH, FOCAL, DISTANCE = 240, 320, 300.0, 3.0
+INTRINSICS = np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])
+
+
+@cache
+def wall() -> np.ndarray:
+    """Noise in octaves, 1200 pixels high and 2400 wide: at DISTANCE before the camera, as fine as its pixels."""
+    random, found = np.random.default_rng(0), np.zeros((1200, 2400), np.float32)
+    for size in (4, 8, 16, 40):
+        noise = random.normal(size=(1200 // size, 2400 // size)).astype(np.float32)
+        found += cv2.resize(noise, (2400, 1200), interpolation=cv2.INTER_CUBIC) * size**0.5
+    return np.asarray(cv2.cvtColor(np.clip(128 + 18 * found, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2RGB))
+
+
+def pose(yaw: float, x: float) -> np.ndarray:
+    """(4, 4) world_from_cam."""
+    found = np.eye(4)
+    found[:3, :3] = cv2.Rodrigues(np.array([0.0, yaw, 0.0]))[0]
+    found[0, 3] = x
+    return found
+
+
+def view(world_from_cam: np.ndarray) -> np.ndarray:
+    """The wall from there."""
+    on_wall = np.array([[DISTANCE / FOCAL, 0, -4 * DISTANCE], [0, DISTANCE / FOCAL, -2 * DISTANCE], [0, 0, DISTANCE]])
+    camera = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    seen = camera @ world_from_cam[:3, :3].T @ (on_wall - np.outer(world_from_cam[:3, 3], [0, 0, 1]))
+    return np.asarray(cv2.warpPerspective(wall(), seen, (WIDTH, HEIGHT)))
+
+
+@pytest.mark.parametrize(("factor", "error"), [(1.0, 0.0), (1.0, 1e-6), (1000.0, 1e-3)])
+def test_a_camera_that_turns_before_it_moves_gives_depths_once_it_moves(factor: float, error: float) -> None:
+    """error: of the given positions, as tracked ones have it, over the distance of what is seen."""
+    random, tracker, complete = np.random.default_rng(0), PosedTracker(PosedConfig(), (HEIGHT, WIDTH), INTRINSICS), []
+    ways = [*((0.01 * n, 0.0) for n in range(18)), *((0.17, 0.03 * n) for n in range(1, 20))]
+    for index, (yaw, x) in enumerate(ways, 1):
+        true = pose(yaw, x)
+        given = true.copy()
+        given[:3, 3] = factor * (true[:3, 3] + [1.7, -2.3, 0.9] + error * DISTANCE * random.normal(size=3))
+        complete += tracker.add(index, index / 30.0, view(true), given)
+    last = tracker.keyframe([*complete, *tracker.finish()][-1])
+    assert tracker.unit == pytest.approx(factor * DISTANCE, rel=0.1)
+    assert last.triangulated.mean() > 0.8
+    assert last.median_depth == pytest.approx(factor * DISTANCE, rel=0.06)
+
+
+@pytest.mark.parametrize("decided", [False, True], ids=["at the start", "later"])
+def test_frames_that_can_not_be_followed_are_keyframes_where_they_show_another_place(decided: bool) -> None:
+    tracker = PosedTracker(PosedConfig(), (HEIGHT, WIDTH), INTRINSICS)
+    for index, x in enumerate(0.06 * np.arange(8 if decided else 1), 1):
+        tracker.add(index, index / 30.0, view(pose(0.0, x)), pose(0.0, x))
+    assert tracker._undecided != decided
+    before = len(tracker.graph.keyframes)
+    standing = np.linalg.inv(tracker.keyframe(max(tracker.graph.keyframes)).cam_from_world)
+    gone = standing @ pose(0.0, 2.0)
+    dark, hand = np.full((HEIGHT, WIDTH, 3), 12, np.uint8), np.ascontiguousarray(view(pose(0.0, 2.0))[::-1])
+    for index, image, where in [(31, dark, standing), (32, dark, gone), (33, hand, standing), (35, hand, gone)]:
+        assert tracker.add(index, index / 30.0, image, where) == []
+        assert len(tracker.graph.keyframes) == before
+    tracker.add(36, 36 / 30.0, hand, gone)
+    assert max(tracker.graph.keyframes) == 36
+    assert len(tracker.graph.keyframes) == before + 1
