@@ -102,6 +102,8 @@ def export(options: argparse.Namespace) -> str:
     """Does what the command line asks; returns one line that says what was written. Raises ValueError, OSError."""
     if not (math.isfinite(options.scale) and options.scale > 0):
         raise ValueError("--scale must be positive")
+    if not (math.isfinite(options.voxel) and options.voxel > 0):
+        raise ValueError("--voxel must be positive")
     out: Path = options.out
     write = mesh if options.mesh else FORMATS.get(out.suffix)
     if write is None:

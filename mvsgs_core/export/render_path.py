@@ -43,6 +43,8 @@ def frames_along(
 
 def render_path(options: argparse.Namespace) -> str:
     """Does what the command line asks; returns one line that says what was written. Raises ValueError, OSError."""
+    if not options.trajectory.is_file():
+        raise FileNotFoundError(f"{options.trajectory} is missing: a path is poses, as in a run's trajectory.txt")
     final, left_out = read_map(options)
     _, poses = read_trajectory(options.trajectory)
     if not len(poses):

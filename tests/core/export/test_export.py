@@ -136,6 +136,7 @@ def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, content: bytes, m
         (["folder", "--trajectory", "trajectory.txt", "--images"], "of which a --trajectory knows nothing"),
         (["map.xyz"], "no format '.xyz'"),
         (["map.splat", "--scale", "0"], "--scale must be positive"),
+        (["map.glb", "--voxel", "-1"], "--voxel must be positive"),
         (["folder", "--cameras", "none.json"], "none.json"),
     ],
 )

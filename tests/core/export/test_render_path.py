@@ -139,9 +139,11 @@ def test_what_cannot_be_written_is_said(
 
 
 def test_without_a_camera_nothing_is_rendered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_poses(tmp_path / "trajectory.txt", [0.0, 1.0])
     write_ply(tmp_path / "map.ply", final_map())
     words = [str(tmp_path / name) for name in ("map.ply", "trajectory.txt", "flight.mp4")]
+    assert render_path.main(words) == 1
+    assert "trajectory.txt is missing: a path is poses" in capsys.readouterr().err
+    write_poses(tmp_path / "trajectory.txt", [0.0, 1.0])
     assert render_path.main(words) == 1
     assert "there is no cameras.json beside" in capsys.readouterr().err
     (tmp_path / "trajectory.txt").write_text("# none\n")
