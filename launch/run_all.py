@@ -35,12 +35,13 @@ try:
     from launch.compose import CONF, choices_of, graph_of, prepare
     from launch.graph_text import graph_text
     from launch.help_text import help_text
-    from launch.jobs import Job, refused, run
+    from launch.jobs import Job, RunFailed, refused, run
     from launch.named_input import SLOT, with_named_input
+    from launch.outcome import FAILED
     from launch.refusal import GraphError
     from launch.resume import WORD as RESUME
     from launch.resume import leave_out_refused, resumed_config
-    from launch.sweep import check_launcher, swept
+    from launch.sweep import check_jobs, check_launcher, check_single, swept
     from mvsgs_core.atomic_file import replace_text
 except ModuleNotFoundError as error:
     sys.exit(f"error: {error}: run `make setup` once, then .venv/bin/mvsgs, or .venv/bin/python launch/run_all.py")
@@ -61,6 +62,8 @@ def main(arguments: Sequence[str]) -> int:
         return refused(error)
     os.environ |= python_environment()  # Hydra's launchers start workers that need the workspace too
     codes: list[int] = []
+    failed: list[str] = []
+    here = os.getpid()
 
     @hydra.main(version_base="1.3", config_path="conf", config_name="config")
     def job(config: DictConfig) -> None:
@@ -68,12 +71,20 @@ def main(arguments: Sequence[str]) -> int:
         one, notes = advised(one)
         for note in notes:
             print(f"note: {note}", flush=True)
-        codes.append(run(one) if shown is None else show(one, shown))
+        try:
+            codes.append(run(one) if shown is None else show(one, shown))
+        except RunFailed as failure:
+            if os.getpid() != here:
+                raise  # in a worker, whose launcher hands it back
+            failed.append(str(failure))
 
     try:
         job()
     finally:  # also where a job of a sweep has failed: Hydra exits then
         side_by_side(swept() if shown is None else [])
+    if failed:
+        print(f"error: {', '.join(failed)}", file=sys.stderr)
+        return FAILED
     return codes[-1] if codes else 0
 
 
@@ -128,7 +139,11 @@ def hydra_arguments(arguments: Sequence[str]) -> list[str]:
     overrides = [word for word in words if "=" in word and not word.startswith("-")]
     elsewhere = _option(words, "--config-dir", "-cd") or any(word.startswith("hydra.searchpath") for word in overrides)
     prepared = prepare(overrides, conf, all_choices_known=not elsewhere)
-    if {"-m", "--multirun"} & set(words):
+    if not {"-m", "--multirun"} & set(words):
+        check_single(overrides)
+    else:
+        if not elsewhere and not any(word.startswith(("hydra/", "--config-name", "-cn")) for word in words):
+            check_jobs(overrides, conf)
         # each job's output is a numbered directory in the one that was asked for
         prepared += [f"hydra.sweep.dir={text.partition('=')[2]}" for text in overrides if text.startswith("output=")]
     return [word for word in words if word not in overrides] + prepared

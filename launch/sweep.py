@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.types import ValueType
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from launch.checks import check
+from launch.compose import compose, parse
 from launch.refusal import GraphError
 
 SUBMITIT = "hydra_plugins.hydra_submitit_launcher"
@@ -31,6 +37,32 @@ def check_launcher(words: Sequence[str]) -> None:
     for word in words:
         if word.startswith("hydra/launcher=submitit") and importlib.util.find_spec(SUBMITIT) is None:
             raise GraphError(f"{word} needs Hydra's launcher for Slurm: pip install 'mvsgs[slurm]'")
+        if word == "hydra/launcher=submitit_slurm" and shutil.which("srun") is None:
+            raise GraphError(f"{word}: Slurm's srun is not on this machine; hydra/launcher=submitit_local does without")
+
+
+def check_single(overrides: Sequence[str]) -> None:
+    """Raises GraphError for several values of one parameter: without -m that is no sweep, and no list either."""
+    for override in map(parse, overrides):
+        if override.is_sweep_override():
+            text, key = str(override.input_line), override.key_or_group
+            plain = override.value_type is ValueType.SIMPLE_CHOICE_SWEEP
+            written = f"a list is written {key}=[{text.partition('=')[2]}], and " if plain else ""
+            raise GraphError(f"{text}: {written}a sweep over several values takes -m")
+
+
+def check_jobs(overrides: Sequence[str], conf: Path) -> None:
+    """Raises GraphError where a job of a sweep on this machine cannot run, before the first one does."""
+    own = [override for override in map(parse, overrides) if not override.key_or_group.startswith("hydra")]
+    try:
+        jobs = BasicSweeper.split_arguments(own, None)[0]
+    except HydraException:
+        return  # Hydra refuses it itself, or needs to know the choices: glob(*)
+    for number, words in enumerate(jobs):
+        try:
+            check(compose(words, conf))
+        except GraphError as error:
+            raise GraphError(f"job {number} of the sweep: {error}") from error
 
 
 def swept() -> list[Path]:

@@ -256,5 +256,8 @@ def test_a_sweep_on_a_cluster_does_the_same(launch: type[Launch]) -> None:
 
 def test_a_sweep_goes_on_after_a_failure_and_says_so_at_the_end(launch: type[Launch]) -> None:
     run = launch("-m", "relay.fail_at=1,null", "source.count=4")
-    assert run.finish()[0] == 1
+    code, _, err = run.finish()
+    assert code == 1
+    assert err.endswith("\nerror: job 0 ended with code 1\n")
+    assert "RunFailed" not in err
     assert sink(run.output / "1")["keyframes"] == [0, 1, 2, 3]

@@ -165,8 +165,36 @@ def test_a_sweep_on_slurm_needs_its_launcher(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(GraphError, match=r"pip install 'mvsgs\[slurm\]'"):
         check_launcher(words)
     monkeypatch.setattr("launch.sweep.importlib.util.find_spec", lambda name: name)
+    monkeypatch.setattr("launch.sweep.shutil.which", lambda name: None)
+    with pytest.raises(GraphError, match="srun is not on this machine"):
+        check_launcher(words)
+    check_launcher(["-m", "hydra/launcher=submitit_local", "mapper.iterations=1,2"])
+    monkeypatch.setattr("launch.sweep.shutil.which", lambda name: name)
     check_launcher(words)
     check_launcher(["-m", "mapper.iterations=1,2"])
+
+
+@pytest.mark.parametrize(
+    ("words", "answer"),
+    [
+        (["dataset.size=240,320"], "dataset.size=240,320: a list is written dataset.size=[240,320], and a sweep over"),
+        (["mapper.iterations=range(1,9)"], "mapper.iterations=range(1,9): a sweep over several values takes -m"),
+        (["-m", "mapper.iterations=3,many"], "job 1 of the sweep: mapper.iterations=many: must be int"),
+        (["-m", "dataset=images", "dataset.path=photos,nowhere"], "job 1 of the sweep: dataset: nowhere"),
+    ],
+)
+def test_several_values_are_a_list_or_a_sweep_of_jobs_that_can_all_run(
+    words: list[str], answer: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from launch.run_all import hydra_arguments  # which puts the path in order
+
+    fill(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(GraphError) as refusal:
+        hydra_arguments(words)
+    assert str(refusal.value).startswith(answer)
+    hydra_arguments(["-m", "hydra/launcher=submitit_local", "mapper.iterations=3,many"])  # is for others to say
+    hydra_arguments(["dataset.size=[240,320]"])
 
 
 @pytest.mark.parametrize(
