@@ -133,7 +133,11 @@ def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) ->
         slots = {name: _without_requests(slot) for name, slot in slots.items()}
     edges, warnings = connect(slots, list(sections))
     names = order(slots, edges)
-    warnings += unanswered
+    warnings += unanswered + [
+        f"{name}.{key}: not used, as there is no {name}; --help lists what {name}= may be"
+        for name in sections.keys() - slots.keys()
+        for key in sorted(sections[name].keys() - {"_target_"})
+    ]
     if asking is not None:  # against the stream: nobody waits for a request
         edges += [Edge(msgs.Request, asking, name, False) for name in names if nodes.is_source(slots[name].node)]
     resolved: dict[str, Any] = plain_values(settings)

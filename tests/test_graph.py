@@ -193,6 +193,11 @@ def test_corrections_are_not_lost_in_silence() -> None:
         compose(["mapper.reads.Poses=evaluator"])
 
 
+def test_a_parameter_of_a_slot_that_is_off_is_not_taken_in_silence() -> None:
+    (warning,) = compose(["viewer.port=8000"]).warnings
+    assert warning == "viewer.port: not used, as there is no viewer; --help lists what viewer= may be"
+
+
 def test_external_keeps_the_choice() -> None:
     assert fake("relay=external").slots["relay"].placement.external
     assert fake("relay=external").slots["relay"].node is Relay
