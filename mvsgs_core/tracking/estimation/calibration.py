@@ -20,6 +20,7 @@ BENT_LENS = "the lens bends, and the focal length makes up for it"
 UNKNOWN_LENS = "these images hardly tell a focal length from a lens that bends"
 CONTRADICTION = 2.0  # standard deviations by which the matches contradict a calibration that was given
 FEW = 128  # keyframes, the first ones, that a given calibration is checked with
+MANY = 300  # keyframes, the first ones, that a guess is: their adjustment takes the square of their number in memory
 REESTIMATED_AT = (10, 20, 40)  # keyframes of the map at which the readout time is estimated again
 
 
@@ -101,7 +102,7 @@ class Calibration:
         )
 
     def check(self, members: list[int]) -> None:
-        """At the end: whether the whole stream agrees with the focal length that the keyframes went out with."""
+        """At the end: whether the stream agrees with the focal length that the keyframes went out with."""
         if len(members) < self.config.min_keyframes:
             return
         with self.stats.time("calibration"):
@@ -112,6 +113,8 @@ class Calibration:
         if not self.guessed:
             self._check_given(members[:FEW])
             return
+        who = f"the first {MANY} keyframes" if len(members) > MANY else "all keyframes together"
+        members = members[:MANY]
         factor = focal_of_all(self.graph, members, self.threads)
         if factor is None:
             return
@@ -123,9 +126,9 @@ class Calibration:
         if "focal_sigma_percent" in self.stats.values:
             self._report_radial(estimate_radial(lens_problem(self.graph, members), self.threads), sigma)
         if abs(np.log(factor)) > max(self.config.drift, sigma):
-            self.stats.values["focal_doubt"] = f"all keyframes together want {factor:.4f} times as much"
+            self.stats.values["focal_doubt"] = f"{who} want {factor:.4f} times as much"
             self.stats.warn(
-                f"all keyframes together want a focal length of {self._told(factor * used)}, give or take "
+                f"{who} want a focal length of {self._told(factor * used)}, give or take "
                 f"{100 * sigma:.1f} %, and {used:.0f} px was used: run again with dataset.intrinsics=[fx,fy,cx,cy] set "
                 "to it"
             )
