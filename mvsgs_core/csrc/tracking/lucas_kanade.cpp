@@ -19,11 +19,10 @@ struct Window {
 // Corner of a window around (u, v), or null where it leaves the padded image.
 const float* corner(const Level& level, int border, float u, float v, int margin, float& fu, float& fv) {
     const float x = u - kCenter + border, y = v - kCenter + border;
-    if (!(x >= margin && y >= margin)) return nullptr;
+    const int taken = kWindow + margin + 1 - 2 * border;
+    // A guess may be any number: none is cast before it is seen to lie inside.
+    if (!(x >= margin && y >= margin && x < level.width - taken && y < level.height - taken)) return nullptr;
     const int ix = static_cast<int>(x), iy = static_cast<int>(y);
-    if (ix + kWindow + margin + 1 >= level.width + 2 * border || iy + kWindow + margin + 1 >= level.height + 2 * border) {
-        return nullptr;
-    }
     fu = x - ix;
     fv = y - iy;
     return level.data + static_cast<size_t>(iy) * level.stride + ix;

@@ -64,7 +64,7 @@ class LucasKanade:
                 a=a.pyramid,
                 b=b.pyramid,
                 points=np.ascontiguousarray(points, dtype=np.float32),
-                guess=np.ascontiguousarray(np.nan_to_num(guess, nan=-1e6), dtype=np.float32),
+                guess=np.ascontiguousarray(np.clip(np.nan_to_num(guess, nan=-1e6), -1e6, 1e6), dtype=np.float32),
                 border=BORDER,
                 start_level=self.start_level,
                 iterations=self.iterations,

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mvsgs_core.tracking.image import TrackingImage
+from mvsgs_core import native
+from mvsgs_core.tracking.image import BORDER, TrackingImage
 from mvsgs_core.tracking.matching.flow import (
     DenseInverseSearch,
     FeatureFlow,
@@ -66,11 +67,38 @@ def test_another_image_is_not_found() -> None:
 
 def test_points_that_leave_the_image_or_have_no_guess_are_lost() -> None:
     a, b = shifted(texture(), 0.0, 0.0), shifted(texture(), 30.0, 0.0)
-    points = np.array([[310.0, 120.0], [100.0, 100.0], [100.0, 100.0]])
-    guess = np.array([[340.0, 120.0], [np.nan, np.nan], [130.0, 100.0]])
+    points = np.array([[310.0, 120.0], *[[100.0, 100.0]] * 8])
+    wild = [
+        [np.nan, np.nan],
+        [3e9, 100.0],
+        [100.0, 1e38],
+        [-1e38, 100.0],
+        [np.inf, 100.0],
+        [100.0, -np.inf],
+        [1e300, 0],
+    ]
+    guess = np.array([[340.0, 120.0], *wild, [130.0, 100.0]])
     matches = LucasKanade().match(a, b, points, guess)
-    np.testing.assert_array_equal(matches.alive, [False, False, True])
-    assert np.isnan(matches.target[:2]).all()
+    np.testing.assert_array_equal(matches.alive, [False] * 8 + [True])
+    assert np.isnan(matches.target[:8]).all()
+
+
+@pytest.mark.parametrize("far", [3e9, 1e38, np.inf, -np.inf, np.nan])
+def test_the_kernel_reads_nothing_outside_an_image_for_any_guess(far: float) -> None:
+    image = shifted(texture(), 0.0, 0.0)
+    found = native.load("tracking").lucas_kanade(
+        a=image.pyramid,
+        b=image.pyramid,
+        points=np.full((2, 2), 100.0, np.float32),
+        guess=np.array([[far, 100.0], [100.0, far]], np.float32),
+        border=BORDER,
+        start_level=2,
+        iterations=10,
+        window_sigma=4.0,
+        min_eigenvalue=1.0,
+        threads=1,
+    )
+    assert np.isinf(found[:, 2]).all(), "lost"
 
 
 def test_flat_cells_are_not_textured() -> None:
