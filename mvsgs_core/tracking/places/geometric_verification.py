@@ -21,6 +21,8 @@ from mvsgs_core.tracking.places.localization import Localization, localize
 from mvsgs_core.tracking.places.pose_criteria import PoseCriteria
 from mvsgs_core.tracking.steps import Steps, whole
 
+ROWS = 256  # queries whose distances to all points are in memory at once
+
 
 @dataclass(frozen=True)
 class PlaceMatch:
@@ -79,13 +81,22 @@ def relative_scale(graph: KeyframeGraph, place: PlaceMatch, index: int) -> float
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)])
     z = relative[2, :3] @ rays / seen.inverse_depth[usable] + relative[2, 3]
     at = place.matches.target[usable]
-    distance = np.linalg.norm(at[:, None] - here.points[own][None], axis=-1)
-    nearest = np.argmin(distance, axis=1)
-    near = (distance[np.arange(len(at)), nearest] < 8.0) & (z > 0)
+    nearest, distance = _nearest(at, here.points[own])
+    near = (distance < 8.0) & (z > 0)
     if near.sum() < 20:
         return None
     ratio = (1.0 / here.inverse_depth[own][nearest] / z)[near]
     return float(np.median(ratio))
+
+
+def _nearest(queries: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of points (M, 2) the one nearest to each query (N, 2), N > 0: its number and how far it is, some rows at once."""
+    numbers, distances = [], []
+    for start in range(0, len(queries), ROWS):
+        distance = np.linalg.norm(queries[start : start + ROWS, None] - points[None], axis=-1)
+        numbers.append(np.argmin(distance, axis=1))
+        distances.append(distance.min(axis=1))
+    return np.concatenate(numbers), np.concatenate(distances)
 
 
 __all__ = ["PlaceMatch", "relative_scale", "verify_place", "verifying_place"]
