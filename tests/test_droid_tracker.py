@@ -25,7 +25,7 @@ from tests.support.sequences import synthetic
 
 COUNT = 9
 # the least size that the networks take, so that noise costs little
-TRIAL = DroidTracker.Config(weights="random", area=64 * 86, constants={"stride": 1, "warmup": 5})
+TRIAL = DroidTracker.Config(weights="random", area=64 * 86, constants={"stride": 1, "warmup": 5}, device="cpu")
 
 
 def run(config: DroidTracker.Config, count: int = COUNT) -> tuple[DroidTracker, list[msgs.Message], list[Frame]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from mvsgs_core.datasets import open_dataset
 from nodes.learned_fusion import LearnedFusion
 
 pytestmark = pytest.mark.slow
+
+RANDOM: dict[str, Any] = {"weights": "random", "confidence": 0.0, "relative": 0.05, "device": "cpu"}
 
 
 def _depths(scale: float) -> list[Depth]:
@@ -28,7 +31,7 @@ def _depths(scale: float) -> list[Depth]:
 
 @pytest.mark.parametrize("center", ["conf", "mean"])
 def test_untrained_it_runs_and_says_so(center: str) -> None:
-    node = LearnedFusion(LearnedFusion.Config(weights="random", center=center, confidence=0.0, relative=0.05))
+    node = LearnedFusion(LearnedFusion.Config(center=center, **RANDOM))
     depths = _depths(1.0)
     views = [v for d in depths for v in node.on_depth(d)] + list(node.on_end())
     assert [v.index for v in views] == [d.index for d in depths]
@@ -43,7 +46,7 @@ def test_untrained_it_runs_and_says_so(center: str) -> None:
 def test_the_worlds_scale_does_not_matter() -> None:
     kept = []
     for scale in (1e-3, 1.0):
-        node = LearnedFusion(LearnedFusion.Config(weights="random", confidence=0.0, relative=0.05))
+        node = LearnedFusion(LearnedFusion.Config(**RANDOM))
         views = [v for d in _depths(scale) for v in node.on_depth(d)] + list(node.on_end())
         kept.append(views[2].depth / scale)
     both = (kept[0] > 0) & (kept[1] > 0)
@@ -54,8 +57,7 @@ def test_the_worlds_scale_does_not_matter() -> None:
 def test_the_confidence_is_chosen_by_name() -> None:
     confidences = []
     for mode in ("swr", "pkrn"):
-        config = LearnedFusion.Config(weights="random", confidence_mode=mode, confidence=0.0, relative=0.05)
-        node = LearnedFusion(config)
+        node = LearnedFusion(LearnedFusion.Config(confidence_mode=mode, **RANDOM))
         views = [v for d in _depths(1.0) for v in node.on_depth(d)] + list(node.on_end())
         assert all((v.confidence >= 0).all() and (v.confidence <= 1).all() for v in views)
         confidences.append(views[2].confidence)

@@ -36,7 +36,7 @@ def _depths(config: LearnedMvs.Config, keyframes: list[Keyframe]) -> list[Depth]
 def test_itermvs_with_published_weights_finds_the_room() -> None:
     weights = str(shared("weights/itermvs_blendedmvs.ckpt"))
     frames = list(open_dataset("synthetic", frames=25, stride=6))
-    config = LearnedMvs.Config(weights=weights, network_area=320 * 256, area=160 * 120)
+    config = LearnedMvs.Config(weights=weights, network_area=320 * 256, area=160 * 120, device="cpu")
     depths = _depths(config, [_keyframe(f) for f in frames])
     assert [d.index for d in depths] == [f.index for f in frames]
     found, frame = depths[2], frames[2]
@@ -64,7 +64,7 @@ def test_a_calibration_keeps_the_order_and_the_range() -> None:
 @pytest.mark.parametrize("network", ["mvsformer", "mvsformer_p"])
 def test_the_papers_network_runs_untrained_and_says_so(network: str) -> None:
     frames = list(open_dataset("synthetic", frames=13, stride=6, size=(120, 160)))
-    config = LearnedMvs.Config(network=network, weights="random", network_area=128 * 128, area=80 * 60)
+    config = LearnedMvs.Config(network=network, weights="random", network_area=128 * 128, area=80 * 60, device="cpu")
     node = LearnedMvs(config)
     assert any("its depth is noise" in w for w in node.stats.warnings)
     depths = [d for f in frames for d in node.on_keyframe(_keyframe(f))] + list(node.on_end())

@@ -135,7 +135,7 @@ def test_the_frozen_map_is_shown_with_the_camera_in_it(tmp_path: Path) -> None:
     assert writer.wait(LONG)
     tracker_file(tmp_path).touch()
     given = view(3)
-    node = FrozenMapper(FrozenMapper.Config(map=str(tmp_path), threads=1))
+    node = FrozenMapper(FrozenMapper.Config(map=str(tmp_path), threads=1, device="cpu"))
     splats = len(node.atlas.parts[0].state)
     list(node.on_frame(Frame(7, 0.7, np.asarray(given.image), given.intrinsics)))
     (shown,) = node.on_camera_pose(CameraPose(7, 0.7, given.world_from_cam, 0, None, 0.9))

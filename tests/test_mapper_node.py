@@ -316,7 +316,7 @@ def test_unfiltered_depth_reaches_the_map() -> None:
 def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
     from omegaconf import OmegaConf
 
-    small = {"iterations": 30, "refinement": 10, "output": str(tmp_path), "seed": 0, "threads": 1}
+    small = {"iterations": 30, "refinement": 10, "output": str(tmp_path), "seed": 0, "threads": 1, "device": "cpu"}
     small["density_control"] = {"every": 100}  # no round: losses rise after it, and are passed over as converged
     chosen: dict[str, Any] = {str(k): v for k, v in OmegaConf.merge(OmegaConf.load(path), small).items()}
     config = build(Mapper.Config, {k: v for k, v in chosen.items() if k not in ("_target_", "reads")})

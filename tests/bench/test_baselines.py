@@ -29,6 +29,7 @@ from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.rasterizer.splats import Splats
 
 NOTHING = np.zeros(0)
+ON_CPU = MapperConfig(threads=1, device="cpu")
 NO_MODEL = Model(NOTHING, NOTHING, NOTHING, NOTHING, {"mapping": 5.0}, 9.0)
 
 
@@ -154,7 +155,7 @@ def room(every: int, gain: Any = None) -> tuple[list[Posed], list[Posed], np.nda
 @pytest.mark.slow
 def test_offline_splatting_of_sparse_points_gets_better() -> None:
     views, _, points, colors = room(4)
-    fitted = SparseMap(views, points, colors, SparseConfig(iterations=120, mapper=MapperConfig(threads=1)))
+    fitted = SparseMap(views, points, colors, SparseConfig(iterations=120, mapper=ON_CPU))
 
     def error() -> float:
         return float(np.mean([(fitted.render(v) - v.image / 255.0) ** 2 for v in views]))
@@ -175,7 +176,7 @@ def test_what_only_waits_is_not_counted_as_their_time(monkeypatch: pytest.Monkey
     monkeypatch.setattr(SparseMap, "_step", lambda *args: (seen.append(torch.get_num_threads()), step(*args))[1])
     try:
         torch.set_num_threads(2)
-        SparseMap(views, points, colors, SparseConfig(iterations=2, mapper=MapperConfig(threads=1))).optimize()
+        SparseMap(views, points, colors, SparseConfig(iterations=2, mapper=ON_CPU)).optimize()
     finally:
         torch.set_num_threads(before)
     assert seen == [1, 1]
@@ -196,8 +197,7 @@ def test_a_known_exposure_is_of_use_to_the_offline_map() -> None:
             exposure = np.eye(3, 4) * gain(round(view.timestamp / 0.1)) if known else None
             return Posed(view.index, view.image, view.intrinsics, view.world_from_cam, view.timestamp, exposure)
 
-        mapper = MapperConfig(threads=1)
-        fitted = SparseMap([posed(v) for v in training], points, colors, SparseConfig(iterations=150, mapper=mapper))
+        fitted = SparseMap([posed(v) for v in training], points, colors, SparseConfig(iterations=150, mapper=ON_CPU))
         fitted.optimize()
         psnr[known], _ = offline.score((posed(v), fitted.render(posed(v))) for v in between)
     assert psnr[True] > psnr[False] + 1.0

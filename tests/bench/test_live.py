@@ -90,7 +90,7 @@ def test_the_slow_stages_slow_what_they_are_paced_by(monkeypatch: pytest.MonkeyP
     """Else the governor would not see it."""
     monkeypatch.setattr("bench.live.slow.time.sleep", lambda seconds: None)
     stereo = SlowStereo(SlowStereo.Config(realtime=True, threads=1))
-    fusion = SlowFusion(SlowFusion.Config(realtime=True, threads=1))
+    fusion = SlowFusion(SlowFusion.Config(realtime=True, threads=1, device="cpu"))
     mapper = SlowMapper(SlowMapper.Config(realtime=True, threads=1, device="cpu"))
     mapped = (mapper._add, mapper.atlas.step, mapper.atlas.begin_late)
     for slow in (stereo._core._estimate, fusion._core._fuse, *mapped):

@@ -8,7 +8,7 @@ from mvsgs_core.mapping.config import MapperConfig
 
 def test_a_pass_says_whether_quality_was_judged() -> None:
     views = [box_view(k, 0.2 * k) for k in range(2)]
-    config = MapperConfig(iterations=2, threads=1)
+    config = MapperConfig(iterations=2, threads=1, device="cpu")
     finite = mapped("finite", views, config)
     assert finite.met
     assert "quality not judged" in finite.goal

@@ -17,7 +17,7 @@ from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 SIZE = (24, 32)
 
 
-PLAIN = MapperConfig(iterations=10, refinement=6, window=2, threads=1)
+PLAIN = MapperConfig(iterations=10, refinement=6, window=2, threads=1, device="cpu")
 
 
 VIGNETTING = np.array([-0.05, 0.0, 0.01], np.float32)

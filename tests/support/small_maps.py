@@ -15,7 +15,7 @@ from mvsgs_core.rasterizer.splats import Splats
 
 FINE = InsertionConfig(price=0.02)  # of images so small that a rectangle of 8 pixels is a tenth of them
 RARE = DensityControlConfig(every=100)  # maps of some 60 iterations have no round: it would leave them unsettled
-CONFIG = MapperConfig(iterations=16, refinement=20, threads=1, insertion=FINE, density_control=RARE)
+CONFIG = MapperConfig(iterations=16, refinement=20, threads=1, insertion=FINE, density_control=RARE, device="cpu")
 
 
 def empty_map() -> Splats:

@@ -40,7 +40,7 @@ def test_cameras_come_back_to_the_bit(tmp_path: Path, count: int) -> None:
 
 
 def test_a_map_knows_its_cameras_at_the_size_of_the_images_also_where_these_are_gone() -> None:
-    mapper = OnlineMapper(MapperConfig(max_pixels=12 * 16, max_keyframes=2, window=1, iterations=2))
+    mapper = OnlineMapper(MapperConfig(max_pixels=12 * 16, max_keyframes=2, window=1, iterations=2, device="cpu"))
     views = [rgbd_keyframe(5 * k, pose_on_arc(k / 3), (24, 32), origin=100.0) for k in range(4)]
     for view in views:
         mapper.add_keyframe(view)

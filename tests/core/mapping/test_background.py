@@ -80,9 +80,8 @@ def test_no_splat_is_drawn_over_what_it_shows_already() -> None:
 def test_what_is_seen_is_opaque_all_the_same() -> None:
     """Images of about one color: over a background that is always that, splats could stay half transparent."""
     views = [replace(view, image=np.round(0.1 * view.image + 110.0).astype(np.uint8)) for view in arc()]
-    mapper = mapped(
-        views, MapperConfig(iterations=120, refinement=200, threads=1, insertion=InsertionConfig(price=0.005))
-    )
+    insertion = InsertionConfig(price=0.005)
+    mapper = mapped(views, MapperConfig(iterations=120, refinement=200, threads=1, insertion=insertion, device="cpu"))
     assert mapper.render(mapper.views[1]).opacity.mean() > 0.9
 
 

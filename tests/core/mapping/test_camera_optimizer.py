@@ -24,7 +24,7 @@ def views(unit: float = 1.0) -> list[RGBDKeyframe]:
 
 
 def mapped(given: list[RGBDKeyframe], training: TrainingConfig, exposure_rate: float = 0.0) -> OnlineMapper:
-    mapper = OnlineMapper(MapperConfig(iterations=25, refinement=0, training=training))
+    mapper = OnlineMapper(MapperConfig(iterations=25, refinement=0, training=training, device="cpu"))
     mapper.trainer.exposure_rate = exposure_rate
     for view in given:
         mapper.add_keyframe(view)
@@ -79,7 +79,7 @@ def test_a_correction_keeps_what_was_refined_in_the_new_scale() -> None:
 
 
 def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
-    mapper = OnlineMapper(MapperConfig())
+    mapper = OnlineMapper(MapperConfig(device="cpu"))
     mapper.add_keyframe(views()[0])
     view = mapper.views[0]
     assert not step_pose(view, np.array([0, 0, np.nan, 0, 0, 0.0]), 1e-3, 1e-3)

@@ -25,7 +25,7 @@ SIZE = (60, 80)
 AFFINE = np.array([[1.3, 0, 0, -0.05], [0, 1.2, 0, 0.02], [0, 0, 0.8, 0.03]], np.float32)
 DIM = np.array([[0.6, 0, 0, 0.01], [0, 0.55, 0, 0.0], [0, 0, 0.65, 0.02]], np.float32)
 DARK = np.array([-0.4, 0.1, -0.2], np.float32)
-CONFIG = MapperConfig(iterations=30, refinement=0, threads=1, insertion=FINE)
+CONFIG = MapperConfig(iterations=30, refinement=0, threads=1, insertion=FINE, device="cpu")
 
 
 def photographed(
@@ -51,7 +51,7 @@ def error(mapper: OnlineMapper, k: int) -> float:
 
 
 def test_the_mean_exposure_becomes_the_maps_and_renders_stay() -> None:
-    mapper = OnlineMapper(MapperConfig(iterations=5, refinement=0, sh_degree=1, threads=1))
+    mapper = OnlineMapper(MapperConfig(iterations=5, refinement=0, sh_degree=1, threads=1, device="cpu"))
     view = rgbd_keyframe(0, pose_on_arc(0.0))
     mapper.add_keyframe(view)
     splats = mapper.snapshot().splats

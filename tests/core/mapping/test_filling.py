@@ -30,7 +30,8 @@ def with_hole(index: int, t: float, hole: slice = HOLE) -> RGBDKeyframe:
 
 def mapper_with(doubtful: bool, iterations: int = 30) -> OnlineMapper:
     insertion = InsertionConfig(doubtful=doubtful)
-    return OnlineMapper(MapperConfig(iterations=iterations, threads=1, insertion=insertion, density_control=RARE))
+    config = MapperConfig(iterations=iterations, threads=1, insertion=insertion, density_control=RARE, device="cpu")
+    return OnlineMapper(config)
 
 
 def test_a_hole_of_the_filters_is_covered_sparsely() -> None:

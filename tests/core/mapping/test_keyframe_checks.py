@@ -15,7 +15,7 @@ from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.small_maps import mapped
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
-CONFIG = MapperConfig(iterations=2, refinement=0, threads=1)
+CONFIG = MapperConfig(iterations=2, refinement=0, threads=1, device="cpu")
 VIEWS = [
     replace(rgbd_keyframe(k, pose_on_arc(k / 4), (24, 32)), confidence=np.ones((24, 32), np.float32)) for k in range(4)
 ]

@@ -27,6 +27,7 @@ CONFIG = MapperConfig(
     window=2,
     max_keyframes=5,
     sh_degree=1,
+    device="cpu",
     training=TrainingConfig(refine_poses=True, pose_visits=1),
 )
 AWAY = geometry.se3_exp(np.array([0.0, 0.0, -60.0, 0.0, np.pi, 0.0]))  # behind the back of the other's cameras

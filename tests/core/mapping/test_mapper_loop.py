@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 DRIFT = 0.25  # share by which lengths have shrunk at the end
 REFINEMENT = 240
 DENSE = InsertionConfig(price=3e-4)  # so many splats that what is left of the drift is what limits the map
-CONFIG = MapperConfig(iterations=12, refinement=0, threads=1, insertion=DENSE, density_control=RARE)
+CONFIG = MapperConfig(iterations=12, refinement=0, threads=1, insertion=DENSE, density_control=RARE, device="cpu")
 
 
 def arc() -> list[RGBDKeyframe]:

@@ -31,7 +31,7 @@ def coarse(index: int, t: float, known: slice = slice(None), **changes: object) 
 
 @pytest.fixture
 def mapper() -> OnlineMapper:
-    mapper = OnlineMapper(MapperConfig(threads=1))
+    mapper = OnlineMapper(MapperConfig(threads=1, device="cpu"))
     mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.0)))
     return mapper
 
