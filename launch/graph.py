@@ -14,6 +14,7 @@ from typing import Any
 
 import msgs
 import nodes
+from launch.global_device import GlobalDevice
 from launch.refusal import GraphError
 from launch.renamed_parameters import refuse_old_names
 from launch.requests import MESSAGES as REQUESTS
@@ -120,7 +121,7 @@ def build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced] | No
 def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) -> Graph:
     settings, sections = _settings(config)
     settings = _paced(settings, sections)
-    device = _Device(settings.device)
+    device = GlobalDevice(settings.device)
     slots: dict[str, Slot] = {}
     for name, section in sections.items():
         if section.get("_target_") is not None:
@@ -133,11 +134,11 @@ def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) ->
         slots = {name: _without_requests(slot) for name, slot in slots.items()}
     edges, warnings = connect(slots, list(sections))
     names = order(slots, edges)
-    warnings += unanswered + [
-        f"{name}.{key}: not used, as there is no {name}; --help lists what {name}= may be"
-        for name in sections.keys() - slots.keys()
-        for key in sorted(sections[name].keys() - {"_target_"})
-    ]
+    warnings += device.warnings
+    warnings += unanswered
+    for name in sections.keys() - slots.keys():
+        for key in sorted(sections[name].keys() - {"_target_"}):
+            warnings.append(f"{name}.{key}: not used, as there is no {name}; --help lists what {name}= may be")
     if asking is not None:  # against the stream: nobody waits for a request
         edges += [Edge(msgs.Request, asking, name, False) for name in names if nodes.is_source(slots[name].node)]
     resolved: dict[str, Any] = plain_values(settings)
@@ -175,7 +176,7 @@ def _paced(settings: Settings, sections: Mapping[str, Mapping[str, Any]]) -> Set
 
 
 def _build_slot(
-    name: str, section: Mapping[str, Any], replaced: Replaced | None, settings: Settings, device: _Device
+    name: str, section: Mapping[str, Any], replaced: Replaced | None, settings: Settings, device: GlobalDevice
 ) -> Slot:
     node = load_node(name, str(section["_target_"]))
     inputs, accepted = _handlers(name, node), parameter_names(node.Config)
@@ -374,26 +375,3 @@ def _section(slot: Slot) -> dict[str, Any]:
     placement = {key: value for key, value in vars(slot.placement).items() if value != getattr(Placement(), key)}
     reads = {message.__name__: sender for message, sender in slot.reads.items()}
     return {"_target_": slot.target, **({"reads": reads} if reads else {}), **placement, **slot.config}
-
-
-class _Device:
-    """The global `device`; torch, which knows what there is, is loaded only for a node that needs to know."""
-
-    def __init__(self, wanted: str) -> None:
-        kind, _, number = wanted.partition(":")
-        if kind not in ("auto", "cpu", "cuda") or (number and not number.isdigit()):
-            raise GraphError(f"device={wanted}: must be auto, cpu, cuda or cuda:<number>")
-        self.wanted = wanted
-
-    @cached_property
-    def resolved(self) -> str:
-        if self.wanted == "cpu":
-            return "cpu"
-        import torch
-
-        if self.wanted == "auto":
-            return "cuda" if torch.cuda.is_available() else "cpu"
-        there = torch.cuda.device_count()
-        if int(self.wanted.partition(":")[2] or 0) >= there:
-            raise GraphError(f"device={self.wanted}: this machine has {there} CUDA devices; use device=cpu")
-        return self.wanted

@@ -23,7 +23,7 @@ from launch.settings_file import write_settings
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
-from nodes.passwords import without_passwords
+from mvsgs_core.passwords import without_passwords
 
 LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
 MAP = ("map.ply", "trajectory.txt", "localization.csv", FOLDER)  # what is worth keeping of an earlier run

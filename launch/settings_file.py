@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from launch.graph import Graph
 from mvsgs_core.atomic_file import replacing
-from nodes.passwords import without_passwords
+from mvsgs_core.passwords import without_passwords
 
 FILES = ("path", "mask", "gps")  # parameters of sources that name a file or folder
 

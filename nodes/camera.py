@@ -19,8 +19,8 @@ from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.framing import Framing
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.export.source_camera import LENS, lens_values
+from mvsgs_core.passwords import without_passwords
 from nodes.live import LiveSource, camera_mask
-from nodes.passwords import without_passwords
 from nodes.stream_frames import StreamFrames
 from nodes.stream_presence import Presence, pauses
 

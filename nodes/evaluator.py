@@ -25,9 +25,9 @@ from mvsgs_core.evaluation.origin import origin
 from mvsgs_core.georeference import FILE as GEOREFERENCE
 from mvsgs_core.georeference import Georeference, NoReferenceError, georeference, values_of, write_georeference
 from mvsgs_core.held_out import HELD_OUT_EVERY
+from mvsgs_core.passwords import without_passwords
 from mvsgs_core.trajectory_file import write_trajectory
 from nodes import Node
-from nodes.passwords import without_passwords
 from nodes.splat_map import snapshot_of
 
 

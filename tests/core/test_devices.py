@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import sysconfig
 from pathlib import Path
 
 import pytest
 import torch
 
+from launch.global_device import GlobalDevice
+from launch.refusal import GraphError
 from mvsgs import doctor
 from mvsgs_core import devices, machine
 from mvsgs_core.devices import resolve_device, torch_device
@@ -81,3 +84,19 @@ def test_doctor_says_why_a_gpu_is_not_used(
     take_away("compiler", complete, monkeypatch)
     doctor.main(["--no-test"])
     assert "; not used: Triton finds no C compiler: sudo apt install gcc\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("what", ["triton", "compiler", "headers"])
+def test_a_run_is_launched_on_the_cpu_then_and_says_why(
+    what: str, complete: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    assert GlobalDevice("auto").resolved == "cuda"
+    assert GlobalDevice("cuda:0").resolved == "cuda:0"
+    remedy = take_away(what, complete, monkeypatch)
+    device = GlobalDevice("auto")
+    assert device.resolved == "cpu"
+    (warning,) = device.warnings
+    assert re.search(remedy, warning)
+    with pytest.raises(GraphError, match=remedy):
+        _ = GlobalDevice("cuda:0").resolved
