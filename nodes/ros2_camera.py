@@ -191,7 +191,7 @@ class Ros2Camera(LiveSource):
             self.stats.count("before_calibration")
         else:
             if LENS not in self.stats.values:
-                for note in self._framing.notice(self._lens.size):
+                for note in self._framing.notice(native):
                     self.stats.warn(note)
             self.stats.values[LENS] = lens_values(self._lens)
         return self._lens
@@ -228,7 +228,7 @@ class Ros2Camera(LiveSource):
     def _framed(self, frame: Frame) -> Frame:
         assert self._lens is not None
         native = frame.image.shape[0], frame.image.shape[1]
-        size = self._framing.size_of(self._lens.size)
+        size = self._framing.size_of(native)
         lens = self._lens.at(native)
         image, intrinsics = self._framing.image(frame.image, lens, size)
         mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, lens, size)

@@ -59,15 +59,15 @@ class Bag(FileReader):
         with opened_bag(self._path) as bag:
             self._topic = _image_topic(bag, self.topic)
             self._count = sum(c.msgcount for c in bag.connections if c.topic == self._topic)
-            lens = None
+            lens, native = None, _first_size(bag, self._topic)
             if self.intrinsics is None:
                 lens = _recorded_lens(bag, self._topic, self.info_topic, self._notices)
             if lens is None:
                 given = "auto" if self.intrinsics is None else self.intrinsics
-                lens, notes = lens_from_option(given, self.distortion, _first_size(bag, self._topic))
+                lens, notes = lens_from_option(given, self.distortion, native)
                 self.warnings += notes
             self._check_distortion(lens)
-            self._lens = lens
+            self._lens = lens.at(native) if same_shape(native, lens.size) else lens  # of another shape: one left out
         self._open_mask(lens.size)
         self.warnings += self._framing.notice(lens.size)
         if self.start >= self._count:

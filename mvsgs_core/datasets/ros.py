@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from mvsgs_core.bad_file import brief
+from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.datasets.files import MAX_PIXELS, UnreadableImageError, read_image
 from mvsgs_core.datasets.lens import Lens
 
@@ -91,18 +92,34 @@ def calibrated(info: Any) -> bool:
 
 
 def lens_of(info: Any, rectified: bool) -> Lens:
-    """The lens of a `calibrated` sensor_msgs CameraInfo; `rectified` is for images that ROS has undistorted already.
+    """The lens, for images as they come, of a `calibrated` sensor_msgs CameraInfo.
 
-    Raises ValueError if its distortion model is unknown, or its numbers are no camera's.
+    rectified: ROS has undistorted them already. Raises ValueError if the distortion model is unknown, or the numbers
+    are no camera's.
     """
     d, k, p = (np.asarray(getattr(info, name, getattr(info, name.upper(), None)), dtype=np.float64) for name in "dkp")
-    size = int(info.height), int(info.width)
     if rectified:
-        fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if p[0] > 0 else (k[0], k[4], k[2], k[5])
-        return Lens((float(fx), float(fy), float(cx), float(cy)), size)
+        of_sensor = (p[0], p[5], p[2], p[6]) if p[0] > 0 else (k[0], k[4], k[2], k[5])
+        return Lens(*_in_view(info, of_sensor))
     if info.distortion_model not in (*_RADIAL, *_FISHEYE):
         raise ValueError(
             f"distortion model {info.distortion_model!r} is unknown; known are {(*_RADIAL[:2], *_FISHEYE)}"
         )
-    intrinsics = float(k[0]), float(k[4]), float(k[2]), float(k[5])
+    intrinsics, size = _in_view(info, (k[0], k[4], k[2], k[5]))
     return Lens(intrinsics, size, tuple(float(v) for v in d), info.distortion_model in _FISHEYE)
+
+
+def _in_view(info: Any, intrinsics: tuple[float, ...]) -> tuple[tuple[float, float, float, float], tuple[int, int]]:
+    """Intrinsics and size of the images where (fx, fy, cx, cy) are the whole sensor's: of its pixels they have the
+    region of interest, all for one of width 0, with `binning` of them in one."""
+    fx, fy, cx, cy = intrinsics
+    height, width = int(info.height), int(info.width)
+    region = info.roi
+    if region.width > 0:
+        left, top = int(region.x_offset), int(region.y_offset)
+        if left + int(region.width) > width or top + int(region.height) > height:
+            raise ValueError(f"its region of interest is not inside the {width}x{height} pixels that it is for")
+        cx, cy, height, width = cx - left, cy - top, int(region.height), int(region.width)
+    bins = max(1, int(info.binning_y)), max(1, int(info.binning_x))
+    fx, fy, cx, cy = scale_intrinsics(np.array([fx, fy, cx, cy]), bins, (1, 1)).tolist()
+    return (fx, fy, cx, cy), (height // bins[0], width // bins[1])

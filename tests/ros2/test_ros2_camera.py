@@ -248,6 +248,14 @@ def test_a_calibration_that_no_camera_has_is_refused(peer: Peer, camera: str, ch
     assert refused or any("is empty" in text for text in node.stats.warnings)
 
 
+def test_images_smaller_than_their_calibration_keep_their_size(camera: str) -> None:
+    node = Ros2Camera(config(camera))
+    node._lens = Lens((50.0, 50.0, 31.5, 23.5), (48, 64))
+    shown = node._framed(Frame(0, 1.0, np.zeros((*SIZE, 3), np.uint8), np.array([25.0, 25.0, 15.5, 11.5])))
+    assert shown.image.shape == (*SIZE, 3)
+    assert shown.intrinsics == pytest.approx([25.0, 25.0, 15.5, 11.5])
+
+
 def test_intrinsics_that_are_given_hold(peer: Peer, camera: str) -> None:
     send = sender(peer, camera, [picture(i) for i in range(9)])
     frames, _ = received(config(camera, intrinsics=[40.0, 41.0, 15.0, 11.0]), send, frames=1)

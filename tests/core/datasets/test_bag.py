@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import numpy as np
@@ -134,6 +135,19 @@ def test_compressed_and_rectified_images(tmp_path: Path, ros: Messages) -> None:
         assert len(sequence.warnings) == 1
         assert sequence.warnings[0].startswith("images left out because they could not be read: 1")
     np.testing.assert_allclose(items[0].intrinsics, [50, 51, 16.5, 12.5])  # the projection matrix, no distortion
+
+
+def test_images_of_a_part_of_the_sensor_and_smaller_ones_stay_of_their_size(tmp_path: Path, ros: Messages) -> None:
+    part, smaller, topic = ros.info(), ros.info(), "/front/image_rect"
+    part.height, part.width = smaller.height, smaller.width = 2 * HEIGHT, 2 * WIDTH
+    part.roi.height, part.roi.width, part.roi.x_offset, part.roi.y_offset = HEIGHT, WIDTH, 4, 2
+    frame = ros.image(0, "rgb8", picture(0), 3 * WIDTH)
+    for info, intrinsics in ((part, [50, 51, 12.5, 10.5]), (smaller, [25, 25.5, 8, 6])):
+        path = ros.write(bag_path(tmp_path, ros), [("/front/camera_info", 1.0, info), (topic, 1.0, frame)])
+        item = next(iter(open_dataset("bag", path=path)))
+        assert item.image.shape == (HEIGHT, WIDTH, 3)
+        np.testing.assert_allclose(item.intrinsics, intrinsics)
+        path.unlink() if path.is_file() else rmtree(path)
 
 
 def test_what_is_missing_is_said(tmp_path: Path, ros: Messages) -> None:
