@@ -192,6 +192,7 @@ class Mapper(Node):
         replies: list[Preview | Reply] = list(self._replies())
         deadline = time.perf_counter() + _SLICE
         if self._frozen or not self._piece():
+            self._keep()
             return replies or None
         while time.perf_counter() < deadline and self._piece():
             pass
@@ -266,9 +267,8 @@ class Mapper(Node):
             if request.asked == Asked.SAVE_MAP or len(self.atlas.largest.state):
                 return replace(reply, success=False, message=str(error))
             saved = None
-        before = (
-            "there was nothing to keep of the one before" if saved is None else f"the one before is in {saved.what}"
-        )
+        kept = "there was nothing to keep of the one before"
+        before = kept if saved is None else f"the one before is in {saved.what}"
         if request.asked == Asked.RESET:
             self._go_on_with(Atlas(OnlineMapper(self.config, self.stats)))
             self._frozen = False  # a new map has to grow

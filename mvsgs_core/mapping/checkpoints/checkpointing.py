@@ -22,7 +22,8 @@ LAST = 2.5  # seconds for the last checkpoint of a run that ends early
 class Checkpointing:
     """Saves an atlas every `period` seconds of the stream or of the clock, and as soon as there is a map.
 
-    Less often where that would take more than `MAX_FRACTION` of the time, or the disk is still writing the last one.
+    Less often where that would take more than `MAX_FRACTION` of the time, or the disk is still writing the last one; a
+    map that stays as it is, once.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class Checkpointing:
         self._began = self._saved_at = clock()
         self._saved_stream = atlas.stream_seconds
         self._never = resumed is None  # saved
+        self._saved: tuple[object, ...] = ()  # what changes with the map, as it was then
         self._held = self._last = 0.0  # seconds that copying took: all, the last one
 
     def keep(self, atlas: Atlas) -> None:
@@ -49,6 +51,7 @@ class Checkpointing:
             log.count("checkpoints")
             self._writer.submit(atlas.frozen())
         self._saved_at, self._saved_stream, self._never = self._clock(), atlas.stream_seconds, False
+        self._saved = _mark(atlas)
         self._last = self._saved_at - start
         self._held += self._last
 
@@ -103,8 +106,16 @@ class Checkpointing:
             return True
         if self._held + self._last > MAX_FRACTION * (now - self._began):
             return False
-        return max(now - self._saved_at, abs(atlas.stream_seconds - self._saved_stream)) >= self._period
+        passed = max(now - self._saved_at, abs(atlas.stream_seconds - self._saved_stream))
+        return passed >= self._period and _mark(atlas) != self._saved
 
     def _pass_problems_on(self, log: Stats) -> None:
         while not self._writer.problems.empty():
             log.refuse("checkpoints", 1, self._writer.problems.get())
+            self._saved = ()  # it is to be saved still
+
+
+def _mark(atlas: Atlas) -> tuple[object, ...]:
+    """Another one wherever the map is another one."""
+    parts = [(part.iterations, len(part.state), len(part.keyframes.trained)) for part in atlas.parts.values()]
+    return atlas.newest_view, atlas.revision, atlas.stream_ended, atlas.refined, *parts

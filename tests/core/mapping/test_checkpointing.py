@@ -58,6 +58,7 @@ def test_the_period_is_of_the_stream_or_of_the_clock(tmp_path: Path) -> None:
     atlas, clock = begun(PLAIN), Clock()
     checkpoints = Checkpointing(tmp_path, 30.0, atlas, clock=clock)
     assert times(checkpoints, atlas) == 1
+    atlas.revision += 1
     clock.now += 29.0
     assert times(checkpoints, atlas) == 1
     clock.now += 2.0
@@ -70,11 +71,24 @@ def test_the_period_is_of_the_stream_or_of_the_clock(tmp_path: Path) -> None:
     assert times(checkpoints, atlas) == 3
 
 
+def test_a_map_that_stays_as_it_is_is_saved_once(tmp_path: Path) -> None:
+    atlas, clock = begun(PLAIN), Clock()
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas, clock=clock)
+    assert times(checkpoints, atlas) == 1
+    clock.now += 1000.0
+    assert times(checkpoints, atlas) == 1
+    atlas.step()
+    assert times(checkpoints, atlas) == 2
+    clock.now += 1000.0
+    assert times(checkpoints, atlas) == 2
+
+
 def test_the_period_grows_where_checkpoints_would_take_too_much_of_the_time(tmp_path: Path) -> None:
     atlas, clock = begun(PLAIN), Clock(look=1.0)  # two looks in each: a second a checkpoint
     checkpoints = Checkpointing(tmp_path, 10.0, atlas, clock=clock)
     began, made = clock.now, []
     while clock.now < began + 1000.0:
+        atlas.revision += 1
         if times(checkpoints, atlas) > len(made):
             made.append(clock.now - began)
     assert made[0] < 5.0
