@@ -68,8 +68,8 @@ class Bag(FileReader):
                 self.warnings += notes
             self._check_distortion(lens)
             self._lens = lens.at(native) if same_shape(native, lens.size) else lens  # of another shape: one left out
-        self._open_mask(lens.size)
-        self.warnings += self._framing.notice(lens.size)
+        self._open_mask(self._lens.size)
+        self.warnings += self._framing.notice(self._lens.size)
         if self.start >= self._count:
             raise ValueError(f"no frame left: {self._topic} has {self._count}, wanted from {self.start}")
         self._opening_warnings = len(self.warnings)

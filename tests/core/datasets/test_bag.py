@@ -144,7 +144,9 @@ def test_images_of_a_part_of_the_sensor_and_smaller_ones_stay_of_their_size(tmp_
     frame = ros.image(0, "rgb8", picture(0), 3 * WIDTH)
     for info, intrinsics in ((part, [50, 51, 12.5, 10.5]), (smaller, [25, 25.5, 8, 6])):
         path = ros.write(bag_path(tmp_path, ros), [("/front/camera_info", 1.0, info), (topic, 1.0, frame)])
-        item = next(iter(open_dataset("bag", path=path)))
+        sequence = open_dataset("bag", path=path)
+        assert sequence.lens.size == (HEIGHT, WIDTH)
+        item = next(iter(sequence))
         assert item.image.shape == (HEIGHT, WIDTH, 3)
         np.testing.assert_allclose(item.intrinsics, intrinsics)
         path.unlink() if path.is_file() else rmtree(path)
