@@ -28,8 +28,11 @@ class Time:
 
     @classmethod
     def of(cls, seconds: float) -> Time:
-        """The time nearest to so many seconds; those that ROS 2 cannot say are its first or last."""
-        nanoseconds = min(max(round(seconds * 1e9), 0), 2**31 * 10**9 - 1)
+        """The time nearest to so many seconds, in whole microseconds: a float of today's times has no nanoseconds.
+
+        Those that ROS 2 cannot say are its first or last.
+        """
+        nanoseconds = min(max(1000 * round(seconds * 1e6), 0), 2**31 * 10**9 - 1)
         return cls(nanoseconds // 10**9, nanoseconds % 10**9)
 
     @property
