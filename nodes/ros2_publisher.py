@@ -17,7 +17,7 @@ from nodes import Node
 from nodes.odometry import Odometry
 from nodes.ros2 import forms
 from nodes.ros2.connection import DEFAULT, LATCHED, TF, Connection, Quality, check_installed
-from nodes.ros2.messages import CameraInfo, Image, Message, Path, PointCloud2, PoseStamped, TFMessage
+from nodes.ros2.messages import CameraInfo, Header, Image, Message, Path, PointCloud2, PoseStamped, TFMessage
 from nodes.ros2_services import Names, Services
 
 if TYPE_CHECKING:
@@ -110,9 +110,10 @@ class Ros2Publisher(Node):
         self._tf_static = self._writer(topics.tf_static, TFMessage, LATCHED)
         self._maps = FilePath(c.maps or FilePath(c.output or ".") / "maps").expanduser().absolute()
         self._services: Services | None = None  # once it is known whether anybody hears
+        self._odometry = Odometry()  # goes on through all maps
         self._begin()
         self._newest = float("-inf")  # timestamp of a pose
-        self._by_frame = False  # the tracker sends CameraPose
+        self._awaited = self._replied = 0  # numbers of the last request for another map, and of the last reply
         self._write(self._tf_static, self._static_transform())
         where = f"domain {c.number} on interface={c.interface}"
         self.stats.values["ros2"] = where
@@ -120,7 +121,7 @@ class Ros2Publisher(Node):
 
     def _begin(self) -> None:
         """A map."""
-        self._odometry = Odometry()
+        self._by_frame = False  # the tracker sends CameraPose
         self._keyframes: dict[int, _Placed] = {}
         self._sent: dict[int, None] = {}  # frames with their transforms, the newest last
         self._shown: tuple[int, int] | None = None  # keyframe and iterations of the map that is published
@@ -142,6 +143,7 @@ class Ros2Publisher(Node):
         return self._services.new(self._maps, self.config.load) or None
 
     def on_reply(self, reply: Reply) -> Iterator[None]:
+        self._replied = max(self._replied, reply.number)
         if self._services is not None:
             self._services.reply(reply)
         yield from ()
@@ -150,6 +152,9 @@ class Ros2Publisher(Node):
         """From the tracker, in its place among the poses: those that follow are of another map."""
         if not request.problem and request.asked in (Asked.RESET, Asked.LOAD_MAP):
             self._begin()
+            self._awaited = request.number
+            nothing = np.zeros((0, 3))
+            self._write(self._points, forms.point_cloud(self._at_map(0), nothing, nothing.astype(np.uint8)))
         yield from ()
 
     def on_end(self) -> Iterator[None]:
@@ -212,8 +217,9 @@ class Ros2Publisher(Node):
         yield from ()
 
     def on_preview(self, preview: Preview) -> Iterator[None]:
+        """Until the mapper has replied to the request for another map, previews are of the one before."""
         state = preview.index, preview.iterations
-        if self._points is not None and state != self._shown:
+        if self._points is not None and state != self._shown and self._replied >= self._awaited:
             self._shown = state
             self._write(self._points, self._cloud(preview))
         yield from ()
@@ -256,8 +262,11 @@ class Ros2Publisher(Node):
         seen = seen[:: max(1, -(-len(seen) // c.max_points))]
         means = preview.means[seen].astype(np.float64)
         world = means if preview.origin is None else means + preview.origin
-        at = forms.header(max(self._newest, 0.0), self._map(segment))
-        return forms.point_cloud(at, c.unit * world @ forms.BODY_FROM_OPTICAL[:3, :3].T, preview.colors[seen])
+        points = c.unit * world @ forms.BODY_FROM_OPTICAL[:3, :3].T
+        return forms.point_cloud(self._at_map(segment), points, preview.colors[seen])
+
+    def _at_map(self, segment: int) -> Header:
+        return forms.header(max(self._newest, 0.0), self._map(segment))
 
     def _stamped(self, timestamps: list[float], world: str, world_from_cam: np.ndarray) -> list[PoseStamped]:
         """Of poses (N, 4, 4)."""

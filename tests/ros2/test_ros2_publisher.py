@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msgs import CameraPose, FusedKeyframe, Keyframe, Poses, Preview
+from msgs import Asked, CameraPose, FusedKeyframe, Keyframe, Poses, Preview, Reply, Request
 from mvsgs_core import geometry
 from nodes.odometry import Odometry
 from nodes.ros2_publisher import Frames, Ros2Publisher
@@ -259,6 +259,31 @@ def test_the_map_as_points_when_it_changes_and_for_late_readers(peer: Peer) -> N
     assert graph.taken("points")[0]["width"] == 4
     peer.subscribe(graph.topic("points"), TYPES["points"], transient_local=True, depth=1)
     assert graph.taken("points")[0]["width"] == 4
+
+
+@pytest.mark.parametrize("asked", [Asked.RESET, Asked.LOAD_MAP])
+def test_another_map_takes_the_points_away_and_odometry_goes_on(peer: Peer, asked: Asked) -> None:
+    graph = Graph(peer)
+    means, opacities = np.ones((4, 3)), np.ones(4)
+    send(graph.node.on_camera_pose(seen(0, at(), None)))
+    send(graph.node.on_camera_pose(seen(1, at(z=2.0), at())))
+    send(graph.node.on_preview(preview(means, opacities)))
+    send(graph.node.on_request(Request(7, asked)))
+    assert [cloud["width"] for cloud in graph.taken("points", 2)] == [4, 0]
+    send(graph.node.on_preview(preview(means, opacities, iterations=2)))  # of the map before
+    graph.none("points")
+    send(graph.node.on_keyframe(keyframe(2, at(x=5.0))))  # its CameraPose did not come
+    send(graph.node.on_camera_pose(seen(3, at(x=5.0, z=1.0), at(x=5.0))))
+    chains = [chain(message) for message in graph.taken("tf", 4)]
+    assert [odom[0, 3] for _, odom in chains] == pytest.approx([0.0, 2.0, 2.0, 3.0])
+    assert chains[2][0][:2, 3] == pytest.approx([-2.0, -5.0])
+    send(graph.node.on_reply(Reply(7, True, "")))
+    send(graph.node.on_preview(preview(means, opacities, iterations=3)))
+    assert graph.taken("points")[0]["width"] == 4
+    send(graph.node.on_reply(Reply(8, True, "")))  # before the request itself came from the tracker
+    send(graph.node.on_request(Request(8, asked)))
+    send(graph.node.on_preview(preview(means, opacities)))
+    assert [cloud["width"] for cloud in graph.taken("points", 2)] == [0, 4]
 
 
 def test_topics_that_are_not_wanted_are_not_there(peer: Peer) -> None:
