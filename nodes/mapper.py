@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,6 +35,7 @@ from nodes import Node
 from nodes.once import Once
 from nodes.runtime.freed_memory import return_large_blocks
 from nodes.runtime.status import rss
+from nodes.saved_maps import SavedMaps
 from nodes.splat_map import splat_map
 
 _SLICE = 0.05  # seconds of optimization in one on_idle
@@ -45,6 +45,7 @@ EFFORTS = (  # one by the number of halvings of the image
     Effort("new splats as of half the image's size", 0.5),
     Effort("no new splats for now", 0.1, telling=False),
 )
+ABORT, WRITTEN = 2.8, 60.0  # s for maps that are being saved, where the run ends early and where it does not
 LAST_SECONDS = 2.0  # after the last keyframe of a live stream the map is handed out, before its refinement
 
 
@@ -95,7 +96,7 @@ class Mapper(Node):
         if self.config.output is not None:
             self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.atlas, resumed)
         self._frozen = False  # frames are only found in the map
-        self._saving: deque[tuple[SavedMap, Reply]] = deque()  # that are being written, and what is replied then
+        self._saved = SavedMaps(self.stats)
         self._last_preview = self._preview_seconds = 0.0
         self._provisional = Provisional(self.config.preview_splats)
 
@@ -189,7 +190,7 @@ class Mapper(Node):
             yield reply
 
     def on_idle(self) -> list[Preview | Reply] | None:
-        replies: list[Preview | Reply] = list(self._replies())
+        replies: list[Preview | Reply] = list(self._saved.replies())
         deadline = time.perf_counter() + _SLICE
         if self._frozen or not self._piece():
             self._keep()
@@ -212,7 +213,7 @@ class Mapper(Node):
         return self.config.realtime and self._last_captured > 0.0
 
     def on_end(self) -> Iterator[SplatMap | Preview | Reply]:
-        yield from self._replies(wait=True)
+        yield from self._saved.replies(wait=True)
         if self._replay is None:
             self._once.report_missing()
         self._settle_last()
@@ -233,14 +234,17 @@ class Mapper(Node):
         if self._checkpoints is not None:
             self._checkpoints.close(self.atlas, keep=self.config.keep_map)
             self._checkpoints = None
+        self._saved.close(WRITTEN)
 
     def _made_up(self) -> bool:
         """A piece of what a live stream left no time for: this one, or that whose map is gone on with."""
         return (self.config.realtime or len(self.atlas.current.coarse) > 0) and self.atlas.make_up()
 
     def on_abort(self, reason: str) -> None:
+        until = time.monotonic() + ABORT
         if self._checkpoints is not None:
             self._checkpoints.last(self.atlas)
+        self._saved.close(until - time.monotonic())
 
     def _add(self, fused: FusedKeyframe, halvings: int) -> TrainingView | None:
         return self.atlas.add(
@@ -279,7 +283,7 @@ class Mapper(Node):
             reply = replace(reply, message=saved.what)
         if saved is None:
             return reply
-        self._saving.append((saved, reply))
+        self._saved.begin(saved, reply, last=request.asked != Asked.SAVE_MAP)
         return None
 
     def _load(self, folder: str, before: str, reply: Reply) -> Reply:
@@ -291,14 +295,6 @@ class Mapper(Node):
             what = f"the camera is looked for in {folder}, but its splats cannot be taken up ({error}); {before}"
             return replace(reply, success=False, message=what)
         return replace(reply, message=f"the camera is looked for in {folder}; {before}")
-
-    def _replies(self, wait: bool = False) -> Iterator[Reply]:
-        """Of the maps that are written by now, in the order in which they were asked for."""
-        while self._saving and (wait or self._saving[0][0].done):
-            saved, reply = self._saving.popleft()
-            saved.wait()
-            problem = saved.problem
-            yield replace(reply, success=False, message=f"{reply.message}: {problem}") if problem else reply
 
     def _go_on_with(self, atlas: Atlas) -> None:
         """Another map; what is counted goes on."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from msgs import Asked, Reply, Request
 from mvsgs_core.kept_map import tracker_file
+from mvsgs_core.mapping.checkpoints.files import state_files
 from mvsgs_core.stats import Stats
 from nodes.ros2.cdr import CdrError
 from nodes.ros2.connection import Connection
@@ -88,9 +89,9 @@ class Services:
 
 
 def newest(maps: Path) -> str:
-    """The map in that folder that was saved last. Raises ValueError where there is none."""
-    files = [tracker_file(folder) for folder in maps.iterdir()] if maps.is_dir() else []
-    there = [file for file in files if file.is_file()]
+    """The map in that folder that was saved last, with both its halves. Raises ValueError where there is none."""
+    folders = [folder for folder in maps.iterdir() if state_files(folder)] if maps.is_dir() else []
+    there = [file for folder in folders if (file := tracker_file(folder)).is_file()]
     if not there:
         raise ValueError(f"{maps} has no map: save one, or set publisher.load=DIR to the output of a keep_map=true run")
     return str(max(there, key=lambda file: file.stat().st_mtime_ns).parent.parent)

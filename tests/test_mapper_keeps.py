@@ -2,13 +2,48 @@
 
 from __future__ import annotations
 
+import os
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+import pytest
+
+from msgs import Reply, Request
+from mvsgs_core.kept_map import tracker_file
+from mvsgs_core.mapping.checkpoints.files import checkpoint_info, state_file
+from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from nodes.mapper import Mapper
+from nodes.ros2_services import newest
+from tests.support.full_disk import full_after
 from tests.support.mapper_messages import settings, view_message
-from tests.support.patience import LONG
+from tests.support.patience import LONG, until
+
+
+def mapped() -> Mapper:
+    node = Mapper(settings())
+    for k in range(2):
+        list(node.on_fused_keyframe(view_message(7 * k, k / 2)))
+    return node
+
+
+def tracker_half(folder: Path) -> Path:
+    """What a request that reaches the mapper finds there."""
+    file = tracker_file(folder)
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"as the tracker left it")
+    return file
+
+
+def asked_on_a_full_disk(node: Mapper, request: Request) -> Reply:
+    with full_after(5_000):
+        replies: list[Reply] = [m for m in node.on_request(request) if isinstance(m, Reply)]
+        replies += list(node._saved.replies(wait=True))
+    (reply,) = replies
+    assert not reply.success
+    assert "make room" in reply.message
+    return reply
 
 
 def test_a_stream_that_pauses_is_saved_though_there_is_nothing_to_do(tmp_path: Path) -> None:
@@ -26,3 +61,55 @@ def test_a_stream_that_pauses_is_saved_though_there_is_nothing_to_do(tmp_path: P
         assert checkpoints._writer.wait(LONG)
     assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 7, 14, 21]
     assert node.stats.counts["checkpoints"] == 2, "the first, and one of the map at rest"
+
+
+def test_a_map_that_another_takes_the_place_of_stays_until_it_is_written(tmp_path: Path) -> None:
+    node, half = mapped(), tracker_half(tmp_path / "kept")
+    reply = asked_on_a_full_disk(node, Request(1, "reset", kept=str(tmp_path / "kept")))
+    assert "in memory until it can be written" in reply.message
+    assert not node.atlas.current.views, "tracker, stereo and fusion have another map by now"
+    clock = node._saved._clock
+    node._saved._clock = lambda: clock() + 3600.0
+
+    def written() -> bool:
+        node.on_idle()
+        return not node._saved._left
+
+    until(written)
+    assert checkpoint_info(tmp_path / "kept").keyframes.tolist() == [0, 7]
+    assert half.is_file()
+    assert "there was room at last" in node.stats.warnings[-1]
+
+
+def test_of_a_map_that_was_not_saved_no_half_stays(tmp_path: Path) -> None:
+    node = mapped()
+    tracker_half(tmp_path / "saved")
+    asked_on_a_full_disk(node, Request(1, "save_map", folder=str(tmp_path / "saved")))
+    assert list(tmp_path.rglob("*.npz")) == []
+    assert len(node.atlas.current.views) == 2
+    tracker_half(tmp_path / "kept")
+    asked_on_a_full_disk(node, Request(2, "reset", kept=str(tmp_path / "kept")))
+    with full_after(5_000):
+        node.on_abort("the run was stopped")
+    assert list(tmp_path.rglob("*.npz")) == []
+    assert "is not whole" in node.stats.warnings[-1]
+
+
+def test_a_run_that_ends_early_waits_for_the_map_that_is_being_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write: Callable[..., None] = CheckpointWriter._write
+    monkeypatch.setattr(CheckpointWriter, "_write", lambda *given: (time.sleep(0.5), write(*given)))
+    node = mapped()
+    assert list(node.on_request(Request(1, "reset", kept=str(tmp_path)))) == []
+    node.on_abort("the run was stopped")
+    assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 7]
+
+
+def test_the_newest_map_has_both_halves(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="has no map"):
+        newest(tmp_path)
+    whole, half = tracker_half(tmp_path / "whole"), tracker_half(tmp_path / "half")
+    state_file(tmp_path / "whole", 1).touch()
+    os.utime(whole, ns=(0, half.stat().st_mtime_ns - 10**9))
+    assert newest(tmp_path) == str(tmp_path / "whole")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 from pathlib import Path
 
-from mvsgs_core.kept_map import NOTHING_MAPPED, drop_tracker_half
+from mvsgs_core.kept_map import FOLDER, NOTHING_MAPPED, drop_tracker_half
 from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, state_files
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.config import MapperConfig
 
@@ -20,12 +23,18 @@ class SavedMap:
             drop_tracker_half(folder)
             raise ValueError(NOTHING_MAPPED)
         self.what = f"{folder}: {splats} splats, {len(atlas.largest.views)} keyframes"
-        self._writer = CheckpointWriter(folder, config)
-        self._writer.submit(atlas.frozen())
+        self._copy, self._config, self._folder = atlas.frozen(), config, folder
+        self.write()
+
+    def write(self) -> None:
+        """Begins to write the copy, another time where there was no room."""
+        self._writer, self._problem = CheckpointWriter(self._folder, self._config), ""
+        self._writer.submit(self._copy)
         self._writer.close()
 
-    def wait(self) -> None:
-        self._writer.wait()
+    def wait(self, seconds: float | None = None) -> bool:
+        """Whether it is done by then, be it with a problem. None: however long it takes."""
+        return self._writer.wait(seconds)
 
     @property
     def done(self) -> bool:
@@ -34,7 +43,16 @@ class SavedMap:
     @property
     def problem(self) -> str:
         """Why it could not be written; empty where it was. To be asked once it is done."""
-        return "" if self._writer.problems.empty() else self._writer.problems.get()
+        if not self._writer.problems.empty():
+            self._problem = self._writer.problems.get()
+        return self._problem
+
+    def drop(self) -> None:
+        """It could not be written: no half of a map stays."""
+        with contextlib.suppress(OSError):
+            if not state_files(self._folder):
+                shutil.rmtree(self._folder / FOLDER / KEYFRAMES, ignore_errors=True)
+                drop_tracker_half(self._folder)
 
 
 __all__ = ["SavedMap"]
