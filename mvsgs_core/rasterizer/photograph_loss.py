@@ -25,6 +25,14 @@ class Formation:
     valid: Tensor | None = None  # (H, W) bool, False where the photograph says nothing; None: it does everywhere
     clipped: bool = False  # the photograph ends at black and white where the image does not
 
+    def check(self, size: tuple[int, int]) -> None:
+        """Raises ValueError where a part is not of an image (H, W)."""
+        wanted = {"exposure": (3, 4), "factor": (*size, 1), "valid": size}
+        for name, shape in wanted.items():
+            part: Tensor | None = getattr(self, name)
+            if part is not None and part.shape != shape:
+                raise ValueError(f"{name} is {tuple(part.shape)}: expected {shape}")
+
     def image(self, color: Tensor) -> Tensor:
         """Of the map's colors (H, W, 3), not clipped."""
         image = color if self.exposure is None else exposed(color, self.exposure.to(color.dtype))
@@ -54,11 +62,12 @@ def photograph_loss(
     "cpu" for "auto" where it can be and no exposure is trained. Raises ValueError if shapes differ or the photograph is
     not of bytes.
     """
-    if color.shape != photograph.shape or photograph.dtype != torch.uint8:
+    if color.shape != photograph.shape or photograph.dtype != torch.uint8 or color.dim() != 3 or color.shape[2] != 3:
         raise ValueError(
             f"color is {tuple(color.shape)}, photograph {tuple(photograph.shape)} {photograph.dtype}: expected two "
             "(H, W, 3), the photograph uint8"
         )
+    formation.check((color.shape[0], color.shape[1]))
     trained = formation.exposure is not None and formation.exposure.requires_grad
     if (chosen_backend(color) if backend == "auto" else backend) == "cpu" and not trained:
         return loss_with_gradient(color, *_fused(color, photograph, formation, l1_weight, ssim_weight, threads or 0))

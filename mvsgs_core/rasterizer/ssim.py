@@ -79,8 +79,8 @@ def image_loss(
     backend: "cpu", "triton", "reference" or "auto", see `chosen_backend`. Raises ValueError if shapes differ or the
     back end has no such name, ImportError if a GPU is asked for without triton.
     """
-    if image.shape != target.shape or image.dim() != 3:
-        raise ValueError(f"image is {tuple(image.shape)}, target {tuple(target.shape)}: expected two (H, W, C)")
+    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != 3:
+        raise ValueError(f"image is {tuple(image.shape)}, target {tuple(target.shape)}: expected two (H, W, 3)")
     if pixel_weight is not None and pixel_weight.shape != image.shape[:2]:
         raise ValueError(f"pixel_weight is {tuple(pixel_weight.shape)}: expected {tuple(image.shape[:2])}")
     weight = None if pixel_weight is None else pixel_weight.detach().to(image.dtype).contiguous()

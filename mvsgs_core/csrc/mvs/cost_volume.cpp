@@ -18,8 +18,6 @@
 namespace mvs {
 namespace {
 
-constexpr int kMaxBest = 8;
-
 // Rows are as long as the windows' blocks together.
 int padded_width(int width) { return (width + Windows::kBlock - 1) / Windows::kBlock * Windows::kBlock; }
 
@@ -137,7 +135,7 @@ struct Hypotheses {
 void sweep(const Images& images, const Hypotheses& h, int count, const std::uint8_t* needed, const CostOptions& o,
            float* cost) {
     const int height = images.height, width = images.width, views = images.views;
-    const int best = std::min({o.top_k, views, kMaxBest});
+    const int best = std::min(o.top_k, views);
     const float mean = 1.0f / static_cast<float>(best);
     const int bands = (height + kBand - 1) / kBand, tiles = (width + kTileColumns - 1) / kTileColumns;
     const int padded = padded_width(width);

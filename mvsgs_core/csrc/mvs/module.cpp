@@ -76,7 +76,7 @@ nb::tuple semi_global(Stack cost, Image reference, Image first, Image step, cons
     same_size(reference, first);
     same_size(reference, step);
     const std::size_t h = cost.shape(0), d = cost.shape(1), w = cost.shape(2);
-    require(h == reference.shape(0) && w == reference.shape(1), "cost must be (H, D, W)");
+    require(h == reference.shape(0) && w == reference.shape(1) && d >= 1, "cost must be (H, D, W)");
     require(options.paths == 4 || options.paths == 8, "paths must be 4 or 8");
     require(options.edge > 0 && options.temperature > 0, "edge and temperature must be positive");
     auto index = allocate<float>({h, w}), probability = allocate<float>({h, w}), margin = allocate<float>({h, w});

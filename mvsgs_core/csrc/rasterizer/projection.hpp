@@ -42,7 +42,7 @@ struct Projection {
 // bit of what is returned is set unless the number is finite.
 template <class Bits>
 SPLATS_INLINE Bits not_finite(const Bits& bits) {
-    return (bits & 0x7f800000) + 0x00800000;
+    return 0x7f7fffff - (bits & 0x7f800000);
 }
 SPLATS_INLINE bool finite(const float* values, int64_t count) {
     uint32_t bad = 0;

@@ -71,6 +71,22 @@ def test_a_part_of_the_cost_is_the_difference_of_gray_level() -> None:
             swept(backend, p, 1, replace(COST, intensity_weight=1.5))
 
 
+def test_a_cost_of_no_hypothesis_is_refused() -> None:
+    p = problem()
+    with pytest.raises(ValueError, match="H, D, W"):
+        smoothed(NativeBackend(1), np.zeros((SIZE[0], 0, SIZE[1]), np.float32), p)
+
+
+def test_the_mean_may_be_of_more_than_eight_views() -> None:
+    p = problem()
+    neighbors, warps = (np.repeat(each, 6, axis=0) for each in (p.images.neighbors, p.images.warps))
+    many = replace(p.images, neighbors=neighbors, warps=warps)
+    assert len(many.neighbors) > 10
+    options = replace(COST, top_k=len(many.neighbors))
+    native, twin = (swept(b, replace(p, images=many), 9, options) for b in (NativeBackend(1), TorchBackend("cpu")))
+    assert np.mean(np.abs(native - twin) > 1e-3) < 2e-3
+
+
 def test_a_cost_that_there_is_not_is_refused_with_those_that_there_are() -> None:
     for backend in (NativeBackend(1), TorchBackend("cpu")):
         with pytest.raises(ValueError, match=r"no matching cost 'ncc'; there are: .*zncc"):

@@ -88,3 +88,22 @@ def test_what_a_camera_cuts_off_pulls_in_one_direction() -> None:
 def test_two_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="expected two"):
         loss(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3, dtype=torch.uint8), Formation())
+
+
+@pytest.mark.parametrize(
+    ("part", "formation"),
+    [
+        ("valid", Formation(valid=torch.ones(2, 2, dtype=torch.bool))),
+        ("factor", Formation(factor=torch.ones(4, 1, 1))),
+        ("exposure", Formation(exposure=torch.eye(3))),
+    ],
+)
+def test_parts_of_another_size_are_refused(part: str, formation: Formation) -> None:
+    with pytest.raises(ValueError, match=part):
+        loss(torch.zeros(4, 5, 3), torch.zeros(4, 5, 3, dtype=torch.uint8), formation)
+
+
+@pytest.mark.parametrize("shape", [(4, 5, 1), (4, 5, 4), (4, 3)])
+def test_what_has_not_three_colors_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="expected two"):
+        loss(torch.zeros(shape), torch.zeros(shape, dtype=torch.uint8), Formation())

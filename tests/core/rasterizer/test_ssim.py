@@ -91,6 +91,8 @@ def test_shapes_that_do_not_fit() -> None:
     image, target = pair(8, 9)
     with pytest.raises(ValueError, match="expected two"):
         ssim.ssim(image, target[:7])
+    with pytest.raises(ValueError, match="expected two"):
+        ssim.ssim(image[..., :1], target[..., :1])
     with pytest.raises(ValueError, match="pixel_weight"):
         ssim.image_loss(image, target, l1_weight=1.0, ssim_weight=0.0, pixel_weight=torch.ones(9, 8))
 
