@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -32,10 +32,11 @@ from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
 from mvsgs_core.mapping.self_check import why_nothing
 from mvsgs_core.pace import Effort, Pace
 from nodes import Node
+from nodes.last_seconds import LastSeconds
 from nodes.once import Once
 from nodes.runtime.freed_memory import return_large_blocks
 from nodes.runtime.status import rss
-from nodes.saved_maps import SavedMaps
+from nodes.saved_maps import ABORT, SavedMaps
 from nodes.splat_map import splat_map
 
 _SLICE = 0.05  # seconds of optimization in one on_idle
@@ -45,8 +46,6 @@ EFFORTS = (  # one by the number of halvings of the image
     Effort("new splats as of half the image's size", 0.5),
     Effort("no new splats for now", 0.1, telling=False),
 )
-ABORT, WRITTEN = 2.8, 60.0  # s for maps that are being saved, where the run ends early and where it does not
-LAST_SECONDS = 2.0  # after the last keyframe of a live stream the map is handed out, before its refinement
 
 
 class Mapper(Node):
@@ -82,6 +81,7 @@ class Mapper(Node):
         self._pace.waiting = lambda: self.waiting(FusedKeyframe)
         self._once = Once(self.stats)
         self._last_captured = 0.0  # of the keyframes that came
+        self._last_seconds = LastSeconds()
         self._efforts = 0, 0  # that stereo and fusion made for the newest keyframe
         self._shown = -1  # newest keyframe that a preview showed
         self._unseen: dict[int, float] = {}  # keyframes that no preview showed yet: when they were captured
@@ -216,10 +216,12 @@ class Mapper(Node):
         yield from self._saved.replies(wait=True)
         if self._replay is None:
             self._once.report_missing()
+        just_ended = self._last_seconds.running
         self._settle_last()
         self.atlas.finish()
         self._settle_last()
-        self.stats.arrived("last keyframe to the map before its refinement", self._last_captured)
+        if just_ended:
+            self.stats.arrived("last keyframe to the map before its refinement", self._last_captured)
         yield splat_map(self.atlas.current.snapshot(), refined=False)
         while not self._frozen and (self._made_up() or self.atlas.refine()):
             self._keep()
@@ -234,17 +236,17 @@ class Mapper(Node):
         if self._checkpoints is not None:
             self._checkpoints.close(self.atlas, keep=self.config.keep_map)
             self._checkpoints = None
-        self._saved.close(WRITTEN)
+        self._saved.close()
 
     def _made_up(self) -> bool:
         """A piece of what a live stream left no time for: this one, or that whose map is gone on with."""
         return (self.config.realtime or len(self.atlas.current.coarse) > 0) and self.atlas.make_up()
 
     def on_abort(self, reason: str) -> None:
-        until = time.monotonic() + ABORT
+        began = time.monotonic()
         if self._checkpoints is not None:
             self._checkpoints.last(self.atlas)
-        self._saved.close(until - time.monotonic())
+        self._saved.close(began + ABORT - time.monotonic())
 
     def _add(self, fused: FusedKeyframe, halvings: int) -> TrainingView | None:
         return self.atlas.add(
@@ -317,9 +319,10 @@ class Mapper(Node):
 
     def _settle_last(self) -> None:
         """The stream has ended: the pending iterations; of a live one those that its last frame may wait for."""
-        start, until = time.time(), self._last_captured + LAST_SECONDS if self._last_captured else math.inf
-        while not self._frozen and (now := time.time()) < until:
-            rate = FINAL_RATE ** ((now - start) / (until - start))  # what the last images pulled at would show
+        if self._frozen:
+            return
+        for passed in self._last_seconds.passed() if self._last_captured else itertools.repeat(0.0):
+            rate = FINAL_RATE**passed  # what the last images pulled at would show
             if self._live:
                 done = self.atlas.begin_late() or self.atlas.make_up(splats=False, rate=rate)
             else:
@@ -332,6 +335,7 @@ class Mapper(Node):
         """Of a live stream, whose latencies are measured."""
         if keyframe.captured > 0.0:
             self._last_captured = max(self._last_captured, keyframe.captured)
+            self._last_seconds.came(keyframe.captured)
             if self._previewing and keyframe.index > self._shown:
                 self._unseen[keyframe.index] = keyframe.captured
 

@@ -16,6 +16,7 @@ from mvsgs_core.mapping.checkpoints.saved_map import SavedMap
 from mvsgs_core.stats import Stats
 
 AGAIN = 10.0  # s between two tries to write a map that found no room
+ABORT, END = 2.8, 60.0  # s for what is being written, where the run ends early and where it does not
 
 
 class SavedMaps:
@@ -44,7 +45,7 @@ class SavedMaps:
             yield replace(reply, success=False, message=f"{reply.message}: {problem}") if problem else reply
         self._look_after(again=self._clock() - self._tried >= AGAIN)
 
-    def close(self, seconds: float) -> None:
+    def close(self, seconds: float = END) -> None:
         """The run ends: what is being written has so long, and what found no room is tried a last time."""
         until = time.monotonic() + seconds
         self._look_after(again=True)
@@ -69,4 +70,4 @@ class SavedMaps:
                 self._tried = self._clock()
 
 
-__all__ = ["AGAIN", "SavedMaps"]
+__all__ = ["ABORT", "AGAIN", "END", "SavedMaps"]

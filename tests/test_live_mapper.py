@@ -14,7 +14,8 @@ from msgs import SplatMap
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.coarse import LATER
 from mvsgs_core.mapping.mapper import NONE_NOW
-from nodes.mapper import LAST_SECONDS, Mapper
+from nodes.last_seconds import LAST_SECONDS, LastSeconds
+from nodes.mapper import Mapper
 from tests.support.mapper_messages import settings, view_message
 
 
@@ -41,7 +42,8 @@ def test_a_live_map_is_handed_out_at_falling_rates_and_goes_on_at_full_ones(monk
     """At full rates it shows most what the last few images pulled at."""
     node = Mapper(replace(settings(iterations=1000, refinement=3), realtime=True))
     now = iter(np.linspace(100.0, 100.0 + LAST_SECONDS, 21))  # no clock that others' load could hold up
-    list(node.on_fused_keyframe(replace(view_message(0, 0.5), captured=100.0)))
+    node._last_seconds = LastSeconds(clock=lambda: float(next(now, 1e9)))
+    list(node.on_fused_keyframe(replace(view_message(0, 0.5), captured=time.time() + 60.0)))  # a host's that is ahead
     trainer, rates = node.atlas.current.trainer, []
     step = trainer.step
 
@@ -50,13 +52,24 @@ def test_a_live_map_is_handed_out_at_falling_rates_and_goes_on_at_full_ones(monk
         step(*given, **more)
 
     monkeypatch.setattr(trainer, "step", noted)
-    monkeypatch.setattr("nodes.mapper.time.time", lambda: float(next(now, 1e9)))
+    monkeypatch.setattr("nodes.last_seconds.time.time", lambda: 0.0)  # and set back, to 1970
     before = next(m for m in node.on_end() if isinstance(m, SplatMap))
     assert before.iterations == len(rates) > 5
     assert rates == sorted(rates, reverse=True)
     assert rates[0] > 0.8
     assert rates[-1] < 0.2
     assert trainer.rate == 1.0
+
+
+def test_what_a_camera_that_stood_still_waited_is_no_latency() -> None:
+    now = [100.0]
+    for waited, told in ((0.5, True), (60.0, False)):
+        node = Mapper(replace(settings(), realtime=True))
+        node._last_seconds = LastSeconds(clock=lambda: now[0])
+        list(node.on_fused_keyframe(replace(view_message(0, 0.5), captured=time.time())))
+        now[0] += waited
+        list(node.on_end())
+        assert ("last keyframe to the map before its refinement" in node.stats.values["latency"]) == told
 
 
 def test_what_a_live_map_was_left_without_it_gets_where_a_recording_goes_on_in_it(tmp_path: Path) -> None:
