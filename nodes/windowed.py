@@ -16,7 +16,8 @@ from mvsgs_core.pace import Pace
 from nodes import Node
 from nodes.once import Once
 
-CLOSING = (Asked.RESET, Asked.LOAD_MAP, Asked.LOCALIZE)  # requests after which the map gets none of the next keyframes
+# requests before which the map gets each keyframe that the tracker had sent
+CLOSING = (Asked.SAVE_MAP, Asked.RESET, Asked.LOAD_MAP, Asked.LOCALIZE)
 PATIENCE = 0.5  # s that a live keyframe waits for later ones
 
 
@@ -108,7 +109,7 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
             yield frame
 
     def on_request(self, request: Request) -> Iterator[Sent | Request]:
-        """Passed on, in its place: before a map is closed, the keyframes that wait for later ones go without them."""
+        """Passed on, in its place: before a map is saved or closed, keyframes that wait for later ones go without."""
         if not self._once.request(request):
             return
         if not request.problem and request.asked in CLOSING:

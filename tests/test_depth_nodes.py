@@ -61,9 +61,9 @@ def test_every_keyframe_becomes_one_view_in_order_and_is_right() -> None:
     assert mvs.stats.skipped["hypotheses outside the range"] > 0
 
 
-def test_before_a_map_is_closed_no_keyframe_waits_and_the_next_are_matched_with_none_of_it() -> None:
-    mvs, depth_fusion = stereo(), fusion()
-    for asked, closes in (("save_map", False), ("reset", True)):
+def test_before_a_map_is_saved_or_closed_no_keyframe_waits_and_the_next_are_matched_with_none_of_it() -> None:
+    for asked, closes in (("pause", False), ("save_map", True), ("reset", True)):
+        mvs, depth_fusion = stereo(), fusion()
         sent = [d for i in range(4) for d in mvs.on_keyframe(keyframe(i))]
         (*late, request) = mvs.on_request(Request(1, asked))
         assert [d.index for d in (*sent, *late)] == ([0, 1, 2, 3] if closes else [0, 1])
@@ -71,7 +71,6 @@ def test_before_a_map_is_closed_no_keyframe_waits_and_the_next_are_matched_with_
         (*late, passed) = depth_fusion.on_request(request)
         assert [v.index for v in (*fused, *late)] == ([0, 1, 2, 3] if closes else [])
         assert passed == Request(1, asked)
-        mvs, depth_fusion = (mvs, depth_fusion) if closes else (stereo(), fusion())
     before = mvs.stats.counts["neighbors"]
     list(mvs.on_keyframe(keyframe(5)))
     list(mvs.on_end())
