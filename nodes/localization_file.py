@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TextIO
+from typing import Literal, TextIO
 
 from msgs import Frame
 from mvsgs_core.geometry import quaternion_from_rotation
@@ -22,6 +22,11 @@ class LocalizationFile:
         self._path = None if output is None else Path(output) / FILE
         self._stats = stats
         self._file: TextIO | None = None
+        self._mode: Literal["w", "a"] = "w"
+
+    def go_on(self) -> None:
+        """In a file that an earlier process of the run may have begun."""
+        self._mode = "a"
 
     def add(self, frame: Frame, found: NewestPose | None) -> None:
         """A frame, and where it was found. A disk that is full costs lines, which is said, and no pose."""
@@ -34,8 +39,9 @@ class LocalizationFile:
         try:
             if self._file is None:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = self._path.open("w", buffering=1)
-                self._file.write(f"{HEADER}\n")
+                self._file = self._path.open(self._mode, buffering=1)
+                if self._file.tell() == 0:
+                    self._file.write(f"{HEADER}\n")
             self._file.write(f"{frame.index},{frame.timestamp:.6f},{shown},{found.confidence:.3f},{found.segment}\n")
         except OSError as error:
             self._stats.warn(f"{self._path} cannot be written: {error.strerror or error}")

@@ -34,6 +34,8 @@ class Returning:
         self.newest = -1  # keyframe that the earlier process sent
         self._sent: set[int] = set()  # keyframes of the map that it had
         self._log = folder / "sent"
+        self.returned = self._log.exists()  # in an earlier process's place
+        self.another = False  # map than the run began on was asked for
         for line in self._log.read_text().splitlines() if self._log.exists() else ():
             kind, _, number = line.removesuffix(";").partition(" ")
             if not line.endswith(";"):
@@ -49,12 +51,15 @@ class Returning:
                 self.frozen = bool(int(number))
             elif kind == ANOTHER:
                 self._sent.clear()
+                self.another = True
 
     def known(self) -> KnownMap | None:
         """The map as the earlier process saved it last; None: there was none. Raises ValueError for a damaged file."""
         if not self._file.exists():
             if self._sent:
                 raise ValueError("this tracker was killed before it had saved its map, and cannot go on in it")
+            if self.another:
+                self._stats.warn("the tracker was started again: it begins another map, as was asked for before")
             return None
         known = known_map.load(self._file)
         orphans = self._sent - {keyframe.index for keyframe in known.keyframes}

@@ -84,9 +84,15 @@ class Tracker(TrackerNode):
         if self.kept_in is None or self._returning is not None:
             return
         returning = self._returning = Returning(self.kept_in, self.stats)
+        self._revision = returning.revision
+        if returning.returned:
+            self._localized.go_on()
         if (known := returning.known()) is not None:
-            self._revision = returning.revision
             self.core = CoreTracker(self.config, known=known, frozen=returning.frozen)
+        elif returning.another:
+            self.core = CoreTracker(self.config)
+        elif returning.frozen:
+            self.core.freeze()
 
     def on_request(self, request: Request) -> Iterator[Keyframe | Poses | TrackedFrame | Request]:
         """Between two frames: what is saved is the map as it is there, and what is begun begins there."""
@@ -166,6 +172,7 @@ class Tracker(TrackerNode):
         self.core = core
         if self._returning is not None:
             self._returning.forget()
+            self._returning.note_mode(core.frozen)
             self._returning.save(core)
         self._frames.clear()
         self._readout_times.clear()
