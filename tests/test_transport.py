@@ -342,7 +342,7 @@ def test_keys_let_in_only_those_who_have_them(tmp_path: Path, opened: Callable) 
 
 
 def test_keys_that_others_can_read_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(TransportError, match="create_keys"):
+    with pytest.raises(TransportError, match="mvsgs keys"):
         load_keys(tmp_path)
     create_keys(tmp_path)
     with pytest.raises(FileExistsError):
