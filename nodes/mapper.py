@@ -83,6 +83,7 @@ class Mapper(Node):
         self._last_captured = 0.0  # of the keyframes that came
         self._last_seconds = LastSeconds()
         self._efforts = 0, 0  # that stereo and fusion made for the newest keyframe
+        self._unshown = False  # a map that was begun on and that no preview showed yet
         self._shown = -1  # newest keyframe that a preview showed
         self._unseen: dict[int, float] = {}  # keyframes that no preview showed yet: when they were captured
         self.atlas, resumed = Atlas(OnlineMapper(self.config, self.stats)), None
@@ -91,7 +92,7 @@ class Mapper(Node):
             self.atlas, resumed = checkpoint.load(Path(self.config.resume), self.config, self.stats)
             self._replay = Replay(self.atlas)
         elif self.config.map is not None:
-            self.atlas = begin_on(Path(self.config.map), self.config, self.stats)
+            self.atlas, self._unshown = begin_on(Path(self.config.map), self.config, self.stats), True
         self._checkpoints: Checkpointing | None = None
         if self.config.output is not None:
             self._checkpoints = Checkpointing(Path(self.config.output), self.config.checkpoint, self.atlas, resumed)
@@ -178,15 +179,12 @@ class Mapper(Node):
         """In its place among the keyframes; the reply to what is written to a disk comes when it is there."""
         if not self._once.request(request):
             return
-        reply = None if request.problem else Reply(request.number, True, "")
-        if reply is None:
-            reply = Reply(request.number, False, request.problem)
-        elif request.asked == Asked.PAUSE:
-            reply = replace(reply, message="paused" if request.on else "the stream goes on")
-        else:
-            self._settle_last() if request.asked == Asked.LOCALIZE else self._settle()
-            reply = self._meet(request, reply)
-        if reply is not None:
+        if request.problem or request.asked == Asked.PAUSE:
+            paused = "paused" if request.on else "the stream goes on"
+            yield Reply(request.number, not request.problem, request.problem or paused)
+            return
+        self._settle_last() if request.asked == Asked.LOCALIZE else self._settle()
+        if (reply := self._meet(request, Reply(request.number, True, ""))) is not None:
             yield reply
 
     def on_idle(self) -> list[Preview | Reply] | None:
@@ -194,7 +192,7 @@ class Mapper(Node):
         deadline = time.perf_counter() + _SLICE
         if self._frozen or not self._piece():
             self._keep()
-            return replies or None
+            return [*replies, *(self._preview(due=True) if self._unshown else ())] or None
         while time.perf_counter() < deadline and self._piece():
             pass
         self._keep()
@@ -292,6 +290,7 @@ class Mapper(Node):
         """Goes on in a map in which the tracker looks for the camera already."""
         try:
             self._go_on_with(begin_on(Path(folder), self.config, self.stats))
+            self._unshown = True
         except ValueError as error:
             self._go_on_with(Atlas(OnlineMapper(self.config, self.stats)))
             what = f"the camera is looked for in {folder}, but its splats cannot be taken up ({error}); {before}"
@@ -380,7 +379,7 @@ class Mapper(Node):
         due |= now - self._last_preview >= period
         if not self._previewing or not due or not mapper.views or not len(mapper.state):
             return
-        self._last_preview = now
+        self._last_preview, self._unshown = now, False
         with self.stats.time("provisional"):
             provisional = self._provisional.splats(mapper, self.atlas.segments)
         live = self.stats.latency("keyframe to map", "keyframe to preview") if self._last_captured else None

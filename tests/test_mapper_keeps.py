@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from msgs import Reply, Request
+from msgs import Preview, Reply, Request
 from mvsgs_core.kept_map import tracker_file
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info, state_file
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
@@ -113,3 +113,19 @@ def test_the_newest_map_has_both_halves(tmp_path: Path) -> None:
     state_file(tmp_path / "whole", 1).touch()
     os.utime(whole, ns=(0, half.stat().st_mtime_ns - 10**9))
     assert newest(tmp_path) == str(tmp_path / "whole")
+
+
+def test_a_map_that_is_begun_on_is_shown_before_a_keyframe_comes(tmp_path: Path) -> None:
+    CheckpointWriter(tmp_path, settings()).write(mapped().atlas.frozen())
+
+    def shown(node: Mapper) -> list[int]:
+        previews = [m for _ in range(3) for m in node.on_idle() or () if isinstance(m, Preview)]
+        return [len(preview.keyframes) for preview in previews]
+
+    begun = Mapper(settings(map=str(tmp_path), preview_period=1.0))
+    assert shown(begun) == [2]
+    other = Mapper(settings(preview_period=1.0))
+    (reply,) = other.on_request(Request(1, "load_map", folder=str(tmp_path), kept=str(tmp_path / "kept")))
+    assert isinstance(reply, Reply)
+    assert reply.success
+    assert shown(other) == [2]
