@@ -48,6 +48,8 @@ class _Image:
     intrinsics: Annotated[np.ndarray, "float64 4"]
     # when it came from the camera, seconds since 1970 by the host's clock; 0: it is of no live stream
     captured: float = field(default=0.0, kw_only=True)
+    # nanoseconds by the clock of who took it, wherever that was set to, for headers alone; 0: `timestamp` is all of it
+    stamp: int = field(default=0, kw_only=True)
     # of the image, and of its photograph: False where a pixel is not of the scene, as a person's; None: all are
     mask: Annotated[np.ndarray, "bool H W"] | None = field(default=None, kw_only=True)
 
@@ -177,6 +179,7 @@ class CameraPose:
     segment: int  # part of the map, see Keyframe
     world_from_previous: Annotated[np.ndarray, "float64 4 4"] | None = None  # the frame before; None: it has no pose
     confidence: float = 0.0  # of the map's points that this pose lets one keyframe show, the fraction that is seen
+    stamp: int = 0  # of its Frame
 
 
 @dataclass(frozen=True)

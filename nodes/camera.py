@@ -83,9 +83,10 @@ class Camera(LiveSource):
             if shot is None:
                 self._presence.wait(began)
                 continue
-            picture, timestamp = shot
+            picture, timestamp, stamp = shot
             lens = self._lens_of(picture)
-            usable = self._frames.accept(Frame(0, timestamp, picture, np.array(lens.intrinsics), lens.guessed))
+            frame = Frame(0, timestamp, picture, np.array(lens.intrinsics), lens.guessed, stamp=stamp)
+            usable = self._frames.accept(frame)
             if usable is not None:
                 return usable
         silence = f"gave no usable picture for {self.config.timeout:g} s"
@@ -126,14 +127,14 @@ class _Feed:
         self._config = config
         self._closing = threading.Event()
         self._fresh = threading.Condition()
-        self._newest: tuple[np.ndarray, float] | None = None
+        self._newest: tuple[np.ndarray, float, int] | None = None
         self._began = time.time() - time.monotonic()  # times go on evenly even if the clock is set
         self._capture: cv2.VideoCapture | None = _open(config)
         self._thread = threading.Thread(target=self._read, name="camera", daemon=True)
         self._thread.start()
 
-    def newest(self, timeout_s: float) -> tuple[np.ndarray, float] | None:
-        """The newest picture that was not taken yet and its time; None when none comes in time."""
+    def newest(self, timeout_s: float) -> tuple[np.ndarray, float, int] | None:
+        """The newest picture that was not taken yet, its time and stamp; None when none comes in time."""
         with self._fresh:
             self._fresh.wait_for(lambda: self._newest is not None, timeout_s)
             shot, self._newest = self._newest, None
@@ -156,7 +157,7 @@ class _Feed:
             self._presence.came()
             with self._fresh:
                 self.dropped += self._newest is not None
-                self._newest = picture, self._began + time.monotonic()
+                self._newest = picture, self._began + time.monotonic(), time.time_ns()
                 self._fresh.notify()
         if self._capture is not None:
             self._capture.release()

@@ -88,6 +88,7 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             exposure=message.exposure,
             vignetting=message.vignetting,
             captured=message.captured,
+            stamp=message.stamp,
             mask=message.mask,
             effort=message.effort,
             fusion_effort=found.effort,

@@ -52,5 +52,6 @@ class DroidTracker(TrackerNode):
             inverse_depth_weight=coarse.weight,
             segment=0,
             captured=frame.captured,
+            stamp=frame.stamp,
             mask=frame.mask,
         )

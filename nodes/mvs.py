@@ -92,6 +92,7 @@ def depth_message(keyframe: Keyframe, depth: np.ndarray, confidence: np.ndarray)
         readout_time=keyframe.readout_time,
         reads_columns=keyframe.reads_columns,
         captured=keyframe.captured,
+        stamp=keyframe.stamp,
         mask=keyframe.mask,
     )
 

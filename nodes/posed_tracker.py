@@ -168,6 +168,7 @@ class PosedTracker(Node):
             readout_time=0.0 if velocity is None else readout_time,
             reads_columns=reads_columns,
             captured=frame.captured,
+            stamp=frame.stamp,
             mask=rectified_mask(frame.mask, keyframe.image, readout_time, reads_columns),
         )
 

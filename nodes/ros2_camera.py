@@ -180,8 +180,10 @@ class Ros2Camera(LiveSource):
                 f"images left out because their calibration is for another aspect ratio: {native} for {lens.size}"
             )
             return None
-        stamp = message.header.stamp.seconds
-        return Frame(0, stamp if stamp > 0 else time.time(), image, np.array(lens.at(native).intrinsics), lens.guessed)
+        stamp = message.header.stamp.nanoseconds
+        stamp = stamp if stamp > 0 else time.time_ns()
+        intrinsics = np.array(lens.at(native).intrinsics)
+        return Frame(0, stamp / 10**9, image, intrinsics, lens.guessed, stamp=stamp)
 
     def _lens_for(self, native: tuple[int, int]) -> Lens | None:
         """The lens of the stream; None as long as its CameraInfo is waited for."""

@@ -17,7 +17,7 @@ from nodes import Node
 from nodes.odometry import Odometry
 from nodes.ros2 import forms
 from nodes.ros2.connection import DEFAULT, LATCHED, TF, Connection, Quality, check_installed
-from nodes.ros2.messages import CameraInfo, Header, Image, Message, Path, PointCloud2, PoseStamped, TFMessage
+from nodes.ros2.messages import CameraInfo, Header, Image, Message, Path, PointCloud2, PoseStamped, TFMessage, Time
 from nodes.ros2_services import Names, Services
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Topics:
 class _Placed:
     """A keyframe as it is now."""
 
-    timestamp: float | None  # None: only a correction came so far
+    stamp: Time | None  # None: only a correction came so far
     world_from_cam: np.ndarray
     scale: float
     segment: int | None
@@ -112,7 +112,7 @@ class Ros2Publisher(Node):
         self._services: Services | None = None  # once it is known whether anybody hears
         self._odometry = Odometry()  # goes on through all maps
         self._begin()
-        self._newest = float("-inf")  # timestamp of a pose
+        self._newest, self._newest_stamp = float("-inf"), Time(0, 0)  # timestamp of a pose
         self._awaited = self._replied = 0  # numbers of the last request for another map, and of the last reply
         self._write(self._tf_static, self._static_transform())
         where = f"domain {c.number} on interface={c.interface}"
@@ -171,16 +171,16 @@ class Ros2Publisher(Node):
     def on_camera_pose(self, message: CameraPose) -> Iterator[None]:
         self._by_frame = True
         odom_from_cam = self._odometry.follow(message.world_from_cam, message.world_from_previous)
-        self._send_pose(message.index, message.timestamp, message.segment, message.world_from_cam, odom_from_cam)
+        self._send_pose(message, message.segment, message.world_from_cam, odom_from_cam)
         yield from ()
 
     def on_keyframe(self, message: Keyframe) -> Iterator[None]:
-        before = max((k for k, placed in self._keyframes.items() if placed.timestamp is not None), default=None)
+        before = max((k for k, placed in self._keyframes.items() if placed.stamp is not None), default=None)
         placed = self._keyframes.get(message.index)
         if placed is None:
             placed = _Placed(None, message.world_from_cam.copy(), message.scale, message.segment)
             self._keyframes[message.index] = placed
-        placed.timestamp = message.timestamp
+        placed.stamp = _stamp(message)
         placed.segment = message.segment if placed.segment is None else placed.segment
         if message.index not in self._sent:
             pose = placed.world_from_cam
@@ -190,7 +190,7 @@ class Ros2Publisher(Node):
                 last = None if before is None else self._keyframes[before]
                 known = last is not None and last.segment == placed.segment
                 odom_from_cam = self._odometry.follow(pose, last.world_from_cam if last and known else None)
-            self._send_pose(message.index, message.timestamp, placed.segment, pose, odom_from_cam)
+            self._send_pose(message, placed.segment, pose, odom_from_cam)
         self._send_path(placed.segment)
         yield from ()
 
@@ -211,7 +211,7 @@ class Ros2Publisher(Node):
         scale = self.config.unit * (1.0 if placed is None else placed.scale / fused.scale)
         size = fused.depth.shape[0], fused.depth.shape[1]
         intrinsics = scale_intrinsics(fused.intrinsics, fused.image.shape[:2], size)
-        at = forms.header(fused.timestamp, self.config.frames.optical)
+        at = forms.header(_stamp(fused), self.config.frames.optical)
         self._write(self._info, forms.camera_info(at, intrinsics, size))
         self._write(self._depth, forms.depth_image(at, np.float32(scale) * fused.depth))
         yield from ()
@@ -225,23 +225,23 @@ class Ros2Publisher(Node):
         yield from ()
 
     def _send_pose(
-        self, index: int, timestamp: float, segment: int, world_from_cam: np.ndarray, odom_from_cam: np.ndarray
+        self, message: CameraPose | Keyframe, segment: int, world_from_cam: np.ndarray, odom_from_cam: np.ndarray
     ) -> None:
         """Its transforms, and its pose if it is the newest: of an earlier frame nobody asks where the camera is."""
         frames, unit = self.config.frames, self.config.unit
-        world = self._map(segment)
+        world, stamp = self._map(segment), _stamp(message)
         map_from_odom = forms.body_pose(self._odometry.map_from_odom, unit)
         transforms = [
-            forms.transform(timestamp, world, frames.odom, map_from_odom),
-            forms.transform(timestamp, frames.odom, frames.camera, forms.body_pose(odom_from_cam, unit)),
+            forms.transform(stamp, world, frames.odom, map_from_odom),
+            forms.transform(stamp, frames.odom, frames.camera, forms.body_pose(odom_from_cam, unit)),
         ]
         self._write(self._tf, TFMessage(transforms))
-        self._sent[index] = None
+        self._sent[message.index] = None
         while len(self._sent) > _REMEMBERED:
             del self._sent[next(iter(self._sent))]
-        if timestamp > self._newest:
-            self._newest = timestamp
-            (stamped,) = self._stamped([timestamp], world, world_from_cam[None])
+        if message.timestamp > self._newest:
+            self._newest, self._newest_stamp = message.timestamp, stamp
+            (stamped,) = self._stamped([stamp], world, world_from_cam[None])
             self._write(self._pose, stamped)
 
     def _send_path(self, segment: int) -> None:
@@ -249,8 +249,8 @@ class Ros2Publisher(Node):
         if self._path is None or not self._path.readers:
             return
         world = self._map(segment)
-        placed = [p for _, p in sorted(self._keyframes.items()) if p.segment == segment and p.timestamp is not None]
-        stamps = [p.timestamp for p in placed if p.timestamp is not None]
+        placed = [p for _, p in sorted(self._keyframes.items()) if p.segment == segment and p.stamp is not None]
+        stamps = [p.stamp for p in placed if p.stamp is not None]
         poses = self._stamped(stamps, world, np.stack([p.world_from_cam for p in placed]))
         self._write(self._path, Path(poses[-1].header, poses))
 
@@ -266,12 +266,12 @@ class Ros2Publisher(Node):
         return forms.point_cloud(self._at_map(segment), points, preview.colors[seen])
 
     def _at_map(self, segment: int) -> Header:
-        return forms.header(max(self._newest, 0.0), self._map(segment))
+        return forms.header(self._newest_stamp, self._map(segment))
 
-    def _stamped(self, timestamps: list[float], world: str, world_from_cam: np.ndarray) -> list[PoseStamped]:
+    def _stamped(self, stamps: list[Time], world: str, world_from_cam: np.ndarray) -> list[PoseStamped]:
         """Of poses (N, 4, 4)."""
         poses = forms.poses(forms.body_pose(world_from_cam, self.config.unit))
-        return [PoseStamped(forms.header(t, world), pose) for t, pose in zip(timestamps, poses, strict=True)]
+        return [PoseStamped(forms.header(t, world), pose) for t, pose in zip(stamps, poses, strict=True)]
 
     def _static_transform(self) -> TFMessage:
         frames = self.config.frames
@@ -291,3 +291,8 @@ class Ros2Publisher(Node):
                 self.stats.count("published")
             else:
                 self.stats.skip("messages that a reader was too slow for")
+
+
+def _stamp(message: CameraPose | Keyframe | FusedKeyframe) -> Time:
+    """By the clock of who took the image; where that is not known, the time in the stream."""
+    return Time.at(message.stamp) if message.stamp else Time.of(message.timestamp)

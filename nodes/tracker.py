@@ -259,12 +259,13 @@ class Tracker(TrackerNode):
             readout_time=0.0 if velocity is None else self._readout_time,
             reads_columns=self._reads_columns,
             captured=frame.captured,
+            stamp=frame.stamp,
             mask=rectified_mask(frame.mask, keyframe.image, self._readout_time, self._reads_columns),
         )
 
     def _camera_pose(self, frame: Frame) -> CameraPose | None:
         found = self.core.newest_pose()
-        return None if found is None else CameraPose(frame.index, frame.timestamp, **found._asdict())
+        return None if found is None else CameraPose(frame.index, frame.timestamp, stamp=frame.stamp, **found._asdict())
 
     def _between(self, found: Between) -> TrackedFrame:
         frame, velocity = self._frames[found.index], found.velocity if self.config.rectify_rolling_shutter else None

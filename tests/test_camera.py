@@ -66,8 +66,10 @@ def capture(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[FakeCapture]]:
 
 def test_camera_delivers_frames_with_guessed_intrinsics(capture: type[FakeCapture]) -> None:
     camera = Camera(Camera.Config(start=2, stop=8, stride=2, size=[24, 32]))
+    began = time.time_ns()
     messages = list(camera.run())
     assert [type(m) for m in messages] == [Frame, GroundTruth] * 3
+    assert all(began <= m.stamp <= time.time_ns() for m in messages[::2])
     assert [m.index for m in messages] == [0, 0, 1, 1, 2, 2]
     assert messages[0].image.shape == (24, 32, 3)
     assert messages[0].image[0, 0, 1] == 0  # RGB

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from msgs import CameraPose, Frame
+from msgs import CameraPose, Frame, Keyframe
 from mvsgs_core import geometry
 from nodes.tracker import Tracker
 from tests.support.sequences import synthetic
@@ -16,13 +16,14 @@ from tests.support.sequences import synthetic
 @pytest.mark.slow
 def test_the_cameras_pose_comes_with_each_frame() -> None:
     items = synthetic(frames=80)[:45]
-    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in items]
+    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics, stamp=1000 + i.index) for i in items]
     node = Tracker()
     poses: dict[int, CameraPose] = {}
     for frame in frames:
         sent = list(node.on_frame(frame))
         found = [message for message in sent if isinstance(message, CameraPose)]
         assert len(found) <= 1
+        assert all(m.stamp == frames[m.index].stamp for m in sent if isinstance(m, Keyframe))
         poses |= {pose.index: pose for pose in found}
     trajectory = list(node.on_end())[-1]
     tracked = [int(i) for i in trajectory.index if i in poses]
@@ -33,6 +34,7 @@ def test_the_cameras_pose_comes_with_each_frame() -> None:
         assert np.linalg.norm(poses[index].world_from_cam[:3, 3] - final[:3, 3]) < 0.05 * scale
         assert poses[index].segment == trajectory.segment[index]
         assert poses[index].timestamp == frames[index].timestamp
+        assert poses[index].stamp == frames[index].stamp
     true = [item.world_from_cam for item in items]
     for before, index in itertools.pairwise(tracked):
         previous = poses[index].world_from_previous

@@ -70,6 +70,8 @@ def test_a_default_is_left_out_and_comes_back() -> None:
     plain, guessed = frame(), replace(frame(), intrinsics_guessed=True)
     assert b"intrinsics_guessed" not in bytes(encode(plain))
     assert b"intrinsics_guessed" in bytes(encode(guessed))
+    assert b"stamp" not in bytes(encode(plain)).replace(b"timestamp", b"")  # recordings of before have none
+    assert decode(encode(replace(plain, stamp=2**62 + 1))).message.stamp == 2**62 + 1
     for message in (plain, guessed):
         assert decode(encode(message)).message.intrinsics_guessed == message.intrinsics_guessed
     preview = example(msgs.Preview, absent=True)

@@ -155,8 +155,10 @@ def test_coarse_depth_passes_the_grid_on() -> None:
 
 def test_passthrough_sends_depth_as_it_came() -> None:
     node = fusion(lag=0, window=0, refine=False, check=False, confidence=0.0)
-    depth = next(iter(CoarseDepth(CoarseDepth.Config(area=SIZE[0] * SIZE[1])).on_keyframe(keyframe(0))))
+    stamped = replace(keyframe(0), stamp=1_790_000_000_000_000_001)
+    depth = next(iter(CoarseDepth(CoarseDepth.Config(area=SIZE[0] * SIZE[1])).on_keyframe(stamped)))
     (view,) = node.on_depth(depth)
+    assert view.stamp == stamped.stamp
     np.testing.assert_array_equal(view.depth, depth.depth)
     np.testing.assert_array_equal(view.confidence, depth.confidence)
 

@@ -29,7 +29,9 @@ TRIAL = DroidTracker.Config(weights="random", area=64 * 86, constants={"stride":
 
 
 def run(config: DroidTracker.Config, count: int = COUNT) -> tuple[DroidTracker, list[msgs.Message], list[Frame]]:
-    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in synthetic(frames=80)[:count]]
+    frames = [
+        Frame(i.index, i.timestamp, i.image, i.intrinsics, stamp=1000 + i.index) for i in synthetic(frames=80)[:count]
+    ]
     node = DroidTracker(config)
     return node, [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end()), frames
 
@@ -54,6 +56,7 @@ def test_noise_gives_honest_finite_messages() -> None:
     for message in sent[:-1]:
         if isinstance(message, Keyframe):
             assert message.image is frames[message.index].image
+            assert message.stamp == frames[message.index].stamp
             assert message.scale == 1.0
             assert np.isfinite(message.world_from_cam).all()
             assert np.isfinite(message.inverse_depth).all()

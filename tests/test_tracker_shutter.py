@@ -27,7 +27,7 @@ def of_type(sent: list[msgs.Message], kind: type) -> list:  # type: ignore[type-
 def rolling_messages(count: int, kind: str = "rolling_shutter") -> tuple[list[Frame], list[GroundTruth]]:
     rolling = Synthetic(threads=1, **{kind: 0.5})
     items = [rolling[n] for n in range(count)]
-    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics) for i in items]
+    frames = [Frame(i.index, i.timestamp, i.image, i.intrinsics, stamp=1000 + i.index) for i in items]
     return frames, [GroundTruth(i.index, i.timestamp, i.image, i.intrinsics, i.world_from_cam, None) for i in items]
 
 
@@ -110,6 +110,7 @@ def test_so_are_those_of_a_camera_that_reads_columns(kind: type[Tracker] | type[
     check_global_shutter(keyframes, frames)
     check_photographs(keyframes, frames)
     assert all(k.reads_columns for k in keyframes)
+    assert all(k.stamp == frames[k.index].stamp for k in keyframes)
     assert all(b.reads_columns for b in of_type(sent, TrackedFrame))
     assert all(t.reads_columns and t.readout_time == 0.5 / FPS for t in of_type(sent, Trajectory))
     if kind is Tracker:

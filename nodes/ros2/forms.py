@@ -37,8 +37,9 @@ def body_pose(world_from_cam: np.ndarray, unit: float) -> np.ndarray:
     return np.asarray(turned)
 
 
-def header(seconds: float, frame: str) -> Header:
-    return Header(Time.of(seconds), frame)
+def header(at: Time | float, frame: str) -> Header:
+    """at: seconds, where no stamp is known."""
+    return Header(at if isinstance(at, Time) else Time.of(at), frame)
 
 
 def poses(parent_from_child: np.ndarray) -> list[Pose]:
@@ -48,10 +49,10 @@ def poses(parent_from_child: np.ndarray) -> list[Pose]:
     return [Pose(Point(*position), Quaternion(*orientation)) for position, orientation in zip(positions, orientations)]
 
 
-def transform(seconds: float, parent: str, child: str, parent_from_child: np.ndarray) -> TransformStamped:
+def transform(at: Time | float, parent: str, child: str, parent_from_child: np.ndarray) -> TransformStamped:
     w, x, y, z = quaternion_from_rotation(parent_from_child[:3, :3]).tolist()
     moved = Transform(Vector3(*parent_from_child[:3, 3].tolist()), Quaternion(x, y, z, w))
-    return TransformStamped(header(seconds, parent), child, moved)
+    return TransformStamped(header(at, parent), child, moved)
 
 
 def rgb_image(at: Header, image: np.ndarray) -> Image:

@@ -28,12 +28,18 @@ class Time:
 
     @classmethod
     def of(cls, seconds: float) -> Time:
-        """The time nearest to so many seconds, in whole microseconds: a float of today's times has no nanoseconds.
+        """The time nearest to so many seconds, in whole microseconds: a float of today's times has no nanoseconds."""
+        return cls.at(1000 * round(seconds * 1e6))
 
-        Those that ROS 2 cannot say are its first or last.
-        """
-        nanoseconds = min(max(1000 * round(seconds * 1e6), 0), 2**31 * 10**9 - 1)
+    @classmethod
+    def at(cls, nanoseconds: int) -> Time:
+        """Those that ROS 2 cannot say are its first or last."""
+        nanoseconds = min(max(nanoseconds, 0), 2**31 * 10**9 - 1)
         return cls(nanoseconds // 10**9, nanoseconds % 10**9)
+
+    @property
+    def nanoseconds(self) -> int:
+        return self.sec * 10**9 + self.nanosec
 
     @property
     def seconds(self) -> float:

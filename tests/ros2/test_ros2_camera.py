@@ -262,6 +262,21 @@ def test_intrinsics_that_are_given_hold(peer: Peer, camera: str) -> None:
     assert frames[0].intrinsics == pytest.approx([40.0, 41.0, 15.0, 11.0])
 
 
+def test_stamps_stay_the_senders_where_its_clock_is_set(camera: str) -> None:
+    node = Ros2Camera(config(camera, intrinsics=[25.0, 25.0, 15.5, 11.5]))
+    node._open()
+    times = [*range(1_790_000_000, 1_790_000_010), *range(1_000_000_000, 1_000_000_010)]
+    taken = []
+    for number, seconds in enumerate(times):
+        header = messages.Header(messages.Time(seconds, 123_456_789), "camera")
+        frame = node._frame(encode(messages.Image(header, 24, 32, "mono8", 0, 32, np.full(24 * 32, number, np.uint8))))
+        assert frame is not None
+        if (usable := node._frames.accept(frame)) is not None:
+            taken.append(usable)
+            assert usable.stamp == seconds * 10**9 + 123_456_789
+    assert taken[-1].stamp < taken[0].stamp < 10**9 * taken[-1].timestamp  # the stream's time goes on
+
+
 def test_what_is_false_is_counted_and_the_stream_goes_on(peer: Peer, camera: str) -> None:
     good = [picture(i) for i in range(40)]
     header = messages.Header(messages.Time(1000, 500_000_000), "camera")

@@ -220,6 +220,22 @@ def test_parts_without_a_common_frame_have_maps_of_their_own_until_they_are_join
     assert (path["header"]["frame_id"], len(path["poses"])) == ("map", 3)
 
 
+def test_stamps_are_of_the_senders_clock_where_it_is_known(peer: Peer) -> None:
+    graph = Graph(peer)
+    stamp, told = 1_790_000_000_123_456_789, {"sec": 1_790_000_000, "nanosec": 123_456_789}
+    send(graph.node.on_camera_pose(replace(seen(0, at(), None), stamp=stamp)))
+    send(graph.node.on_keyframe(replace(keyframe(0, at()), stamp=stamp)))
+    send(graph.node.on_fused_keyframe(replace(fused(0, np.ones((2, 3), np.float32)), stamp=stamp)))
+    send(graph.node.on_preview(preview(np.ones((4, 3)), np.ones(4))))
+    (transforms,) = graph.taken("tf")
+    assert [transform["header"]["stamp"] for transform in transforms["transforms"]] == [told] * 2
+    (path,) = graph.taken("path")
+    assert path["poses"][0]["header"]["stamp"] == told
+    for name in ("pose", "path", "depth/image", "depth/camera_info", "points"):
+        (message,) = graph.taken(name) if name != "path" else (path,)
+        assert message["header"]["stamp"] == told
+
+
 def test_depth_is_in_meters_and_nan_where_it_is_not_known(peer: Peer) -> None:
     graph = Graph(peer, unit=10.0, frames=Frames(optical="left_optical"))
     depth = np.array([[0.0, 1.5], [2.0, 0.0], [0.25, 3.0]], np.float32)
