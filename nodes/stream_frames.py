@@ -13,6 +13,7 @@ from nodes.stream_times import LATEST, StreamTimes
 
 FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye and a telescope nothing can be tracked
 MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
+CLOCKS_END = 2.0**31  # seconds: what ROS 2 can say
 
 
 class StreamFrames:
@@ -47,7 +48,7 @@ class StreamFrames:
             self.refuse(placed)
             return None
         self.native, self._newest = (frame.image.shape[0], frame.image.shape[1]), frame
-        return replace(frame, timestamp=placed)
+        return replace(frame, timestamp=placed, stamp=frame.stamp or _stamp(frame.timestamp))
 
     def refuse(self, why: str) -> None:
         """One that was left out."""
@@ -93,3 +94,9 @@ class StreamFrames:
         if not in_view or not np.all(np.abs(center) <= 2 * side):
             return f"frames without valid intrinsics were left out, such as {frame.intrinsics.tolist()} for {native}"
         return None
+
+
+def _stamp(timestamp: float) -> int:
+    """Nanoseconds, in whole microseconds, of the sender's own time, which the one in the stream may be off from; 0:
+    of a time that is none of a clock."""
+    return 1000 * round(1e6 * timestamp) if 0.0 < timestamp < CLOCKS_END else 0
