@@ -136,7 +136,7 @@ def _build_graph(config: Mapping[str, Any], replaced: Mapping[str, Replaced]) ->
     names = order(slots, edges)
     warnings += device.warnings
     warnings += unanswered
-    for name in sections.keys() - slots.keys():
+    for name in (name for name in sections if name not in slots):
         for key in sorted(sections[name].keys() - {"_target_"}):
             warnings.append(f"{name}.{key}: not used, as there is no {name}; --help lists what {name}= may be")
     if asking is not None:  # against the stream: nobody waits for a request
