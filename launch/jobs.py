@@ -20,6 +20,7 @@ from launch.graph import Graph
 from launch.inline import run_inline
 from launch.outcome import FAILED, REFUSED, Outcome, finished
 from launch.output import Output
+from launch.printing import say
 from launch.refusal import GraphError
 from launch.screen import Screen, make_screen
 from launch.settings_file import lasting
@@ -61,7 +62,7 @@ def run(job: Job) -> int:
     """Runs one job and returns its exit code. In a sweep a failure is raised instead: RunFailed, after which the sweep
     goes on, or SystemExit where the user stopped it."""
     if job.number is not None:
-        print(f"job {job.number}: {' '.join(text.lstrip('+') for text in job.overrides)}", flush=True)
+        say(f"job {job.number}: {' '.join(text.lstrip('+') for text in job.overrides)}")
     code = _run(job)
     if job.number is not None and code:
         if code > 128:
@@ -105,7 +106,7 @@ def _run(job: Job) -> int:
 
 def refused(error: GraphError) -> int:
     """Says why nothing runs, in one line; the exit code."""
-    print(f"error: {' '.join(line.strip() for line in str(error).splitlines())}", file=sys.stderr)
+    say(f"error: {' '.join(line.strip() for line in str(error).splitlines())}", sys.stderr)
     return REFUSED
 
 
@@ -143,7 +144,7 @@ def _say(outcome: Outcome, screen: Screen, output: Output) -> None:
     """What a run reached, what failed, and what can be done about it: last on the screen."""
     for failure in (*outcome.observers, *([outcome.failed] if outcome.failed else [])):
         lines = [f"\n{failure.node} failed: {failure.error}", f"log: {failure.log}", failure.traceback]
-        print("\n".join(filter(None, lines)), file=sys.stderr, flush=True)
+        say("\n".join(filter(None, lines)), sys.stderr)
     if not outcome.whole:
         if outcome.failed is None:
             screen.note(outcome.reason)

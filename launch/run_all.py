@@ -38,6 +38,7 @@ try:
     from launch.jobs import Job, RunFailed, refused, run
     from launch.named_input import SLOT, with_named_input
     from launch.outcome import FAILED
+    from launch.printing import flush, say
     from launch.refusal import GraphError
     from launch.resume import WORD as RESUME
     from launch.resume import leave_out_refused, resumed_config
@@ -70,7 +71,7 @@ def main(arguments: Sequence[str]) -> int:
         one = Job.of(config, HydraConfig.get())
         one, notes = advised(one)
         for note in notes:
-            print(f"note: {note}", flush=True)
+            say(f"note: {note}")
         try:
             codes.append(run(one) if shown is None else show(one, shown))
         except RunFailed as failure:
@@ -83,7 +84,7 @@ def main(arguments: Sequence[str]) -> int:
     finally:  # also where a job of a sweep has failed: Hydra exits then
         side_by_side(swept() if shown is None else [])
     if failed:
-        print(f"error: {', '.join(failed)}", file=sys.stderr)
+        say(f"error: {', '.join(failed)}", sys.stderr)
         return FAILED
     return codes[-1] if codes else 0
 
@@ -93,13 +94,13 @@ def side_by_side(outputs: Sequence[Path]) -> None:
     scored = [output for output in outputs if has_figures(output)]
     if len(scored) < 2:
         return
-    print(f"\n{comparison_text(scored)}", flush=True)
+    say(f"\n{comparison_text(scored)}")
     file = Path(os.path.commonpath([output.absolute() for output in scored])) / COMPARISON
     try:
         replace_text(file, comparison_page(scored))
-        print(f"{file}: the same with pictures", flush=True)
+        say(f"{file}: the same with pictures")
     except (ValueError, OSError) as error:
-        print(f"{file} could not be written: {error}", flush=True)
+        say(f"{file} could not be written: {error}")
 
 
 def show(job: Job, shown: str) -> int:
@@ -109,11 +110,11 @@ def show(job: Job, shown: str) -> int:
     except GraphError as error:
         return refused(error)
     if shown == GRAPH:
-        print(graph_text(graph, job.choices))
+        text = graph_text(graph, job.choices)
     else:
         sources = HydraConfig.get().runtime.config_sources
-        print(help_text(graph, job.choices, [Path(source.path) for source in sources if source.schema == "file"]))
-    return 0
+        text = help_text(graph, job.choices, [Path(source.path) for source in sources if source.schema == "file"])
+    return 0 if say(text) else FAILED
 
 
 def resumed_job(arguments: Sequence[str]) -> Job:
@@ -126,7 +127,7 @@ def resumed_job(arguments: Sequence[str]) -> Job:
             raise GraphError(f"{word}: {RESUME}{folder} takes slot=choice, slot.parameter=value and --inline only")
     config = resumed_config(folder, overrides)
     for note in leave_out_refused(config):
-        print(f"note: {note}", flush=True)
+        say(f"note: {note}")
     return Job(config, overrides, {}, None, resumed=True)
 
 
@@ -159,8 +160,8 @@ def _option(words: Sequence[str], *names: str) -> str | None:
 
 if __name__ == "__main__":
     code = main(sys.argv[1:])
-    sys.stdout.flush()
-    sys.stderr.flush()
+    flush(sys.stdout)
+    flush(sys.stderr)
     os._exit(
         code
     )  # the interpreter takes seconds to take down libraries of which only the nodes' parameters were asked

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 
 import psutil
 from rich.console import Console
@@ -12,17 +14,23 @@ from rich.live import Live
 from rich.table import Table
 
 from launch.graph import Graph
+from launch.printing import discard, say
 from launch.status import NodeStatus, total
 
 PLAIN_SECONDS = 5.0  # between two lines
 FOLLOWED = ("frames", "keyframes", "views", "splats", "iterations")
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        raise  # as any other error of writing: by itself rich ends the process here
+
+
 class Screen:
-    """Shows nothing but notes and warnings: the base of the others."""
+    """Shows nothing but notes and warnings: the base of the others. The run goes on where nothing can be shown."""
 
     def __init__(self, console: Console | None = None) -> None:
-        self.console = console or Console(highlight=False)
+        self.console = console or _Console(highlight=False)
         self._noted: set[str] = set()
         self._nodes: dict[str, NodeStatus] = {}
 
@@ -49,7 +57,15 @@ class Screen:
             self.note(text)
 
     def note(self, text: str) -> None:
-        self.console.print(text, markup=False, soft_wrap=True)
+        self._show(partial(self.console.print, text, markup=False, soft_wrap=True))
+
+    def _show(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except OSError as error:
+            discard(self.console.file)
+            why = error.strerror or error
+            say(f"warning: nothing more can be shown ({why}); the run goes on, and its report says how", sys.stderr)
 
     def stop(self) -> None:
         pass
@@ -63,9 +79,9 @@ class PlainScreen(Screen):
     """A line every few seconds, with the nodes that have got further, for logs and pipes."""
 
     def start(self, graph: Graph, nodes: dict[str, NodeStatus], processes: dict[str, psutil.Process]) -> None:
-        super().start(graph, nodes, processes)
         self._next = PLAIN_SECONDS
         self._printed: set[str] = set()
+        super().start(graph, nodes, processes)
 
     def refresh(self) -> None:
         super().refresh()
@@ -85,16 +101,16 @@ class LiveScreen(Screen):
     def start(self, graph: Graph, nodes: dict[str, NodeStatus], processes: dict[str, psutil.Process]) -> None:
         super().start(graph, nodes, processes)
         self._live = Live(self._table(), console=self.console, auto_refresh=False)
-        self._live.start()
+        self._show(self._live.start)
 
     def refresh(self) -> None:
         super().refresh()
         if self._live:
-            self._live.update(self._table(), refresh=True)
+            self._show(partial(self._live.update, self._table(), refresh=True))
 
     def stop(self) -> None:
         if self._live:
-            self._live.stop()
+            self._show(self._live.stop)
             self._live = None
 
     def _table(self) -> Table:
@@ -133,7 +149,7 @@ class LiveScreen(Screen):
 
 def make_screen(kind: str, console: Console | None = None) -> Screen:
     """The screen of `screen=auto|live|plain|off`: auto is live on a terminal, plain elsewhere."""
-    console = console or Console(highlight=False)
+    console = console or _Console(highlight=False)
     if kind == "auto":
         kind = "live" if console.is_terminal else "plain"
     return {"live": LiveScreen, "plain": PlainScreen, "off": Screen}[kind](console)
