@@ -16,7 +16,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-BIG, LITTLE = b"\0\0\0\0", b"\0\1\0\0"  # the header of a message: representation and options
+BIG, LITTLE = b"\0\0", b"\0\1"  # the header of a message begins with its representation
+OPTIONS = b"\0\0"  # behind it; XTypes writers say there how many bytes of padding follow the message
+HEADER = len(LITTLE + OPTIONS)  # bytes
 PADDING = 3  # bytes that DDS may add behind a message: to a multiple of four
 MAX_STRING = 2**16  # bytes: names of frames and encodings are short
 
@@ -89,9 +91,9 @@ def encode(message: Any, big: bool = False) -> bytes:
 
 def decode(message_type: type[T], data: bytes) -> T:
     """The message in `data`, whose arrays are views of it. Raises CdrError."""
-    if data[:4] not in (BIG, LITTLE):
-        raise CdrError(f"header {data[:4].hex()} is not that of plain CDR")
-    reader = _Reader(memoryview(data)[4:], ">" if data[:4] == BIG else "<")
+    if len(data) < HEADER or data[:2] not in (BIG, LITTLE):
+        raise CdrError(f"header {data[:HEADER].hex()} is not that of plain CDR")
+    reader = _Reader(memoryview(data)[HEADER:], ">" if data[:2] == BIG else "<")
     message = reader.message(message_type)
     if len(reader.data) - reader.at > PADDING:
         raise CdrError(f"{len(reader.data) - reader.at} bytes too many for {message_type.__name__}")
@@ -100,7 +102,7 @@ def decode(message_type: type[T], data: bytes) -> T:
 
 class _Writer:
     def __init__(self, order: str) -> None:
-        self.parts: list[bytes | memoryview] = [BIG if order == ">" else LITTLE]
+        self.parts: list[bytes | memoryview] = [(BIG if order == ">" else LITTLE) + OPTIONS]
         self._order = order
         self._size = 0  # behind the header: from there alignment counts
 

@@ -71,6 +71,14 @@ def test_other_representations_are_refused() -> None:
             decode(messages.Time, header + data[4:])
 
 
+@pytest.mark.parametrize("padding", range(4))
+def test_options_that_count_the_padding_are_no_other_representation(padding: int) -> None:
+    """As writers of XTypes say it, in the last bits of the header."""
+    for big in (False, True):
+        data = encode(messages.Time(1, 2), big)
+        assert decode(messages.Time, data[:2] + bytes([0, padding]) + data[4:] + bytes(padding)) == messages.Time(1, 2)
+
+
 @given(st.data())
 def test_a_changed_message_is_refused_or_one(data: st.DataObject) -> None:
     message_type = data.draw(st.sampled_from(TYPES))
