@@ -136,6 +136,8 @@ class Light:
         except (np.linalg.LinAlgError, ValueError) as error:
             self.stats.warn(f"exposures could not be solved for: {error}")
             return
+        if self._calibration.warning:
+            self.stats.warn(self._calibration.warning)
         self._lights = {int(index): light for index, light in zip(members, self._calibration.lights)}
 
     def _attach(self, index: int, moments: Mapping[tuple[int, int], np.ndarray]) -> None:

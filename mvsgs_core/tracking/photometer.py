@@ -163,6 +163,8 @@ class Photometer:
         except (np.linalg.LinAlgError, ValueError) as error:
             self.stats.warn(f"exposures could not be solved for: {error}")
             return
+        if p.warning:
+            self.stats.warn(p.warning)
         self.graph.vignetting = p.vignetting
         lights = dict(zip(order, p.lights))
         if p.varies and not at_the_end:

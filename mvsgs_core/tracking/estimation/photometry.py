@@ -26,7 +26,8 @@ from mvsgs_core.tracking.estimation.response import affine, change, vignetting_c
 EDGE_SIGMA = 0.005  # what an edge is off, as a log ratio, before the edges tell it; it counts as ...
 _PRIOR_EDGES = 10  # ... so many of them
 STEP = 2.0 / 255.0  # gray levels, root mean square: less is no change, texture that is resampled differs by as much
-KNOWN_SIGMA = 0.02  # of a known exposure's logarithm: shutters and apertures are rounded
+KNOWN_SIGMA = 0.02  # of a known exposure's logarithm: shutters and apertures are rounded; the images may tell more
+CONTRADICTED = 0.06  # root mean square of what gains are off from known exposures: more is no rounding
 _EXPONENT, _EXPONENT_SIGMA = 0.5, 0.25  # of gray levels over exposure: gamma-coded images have about 1 / 2.2
 WHITE_SIGMA = 0.1  # by which channels may differ between two images, log ratio: taken out of what they say together
 _CONTRASTS = np.array([[1.0, 1.0], [0.0, -2.0], [-1.0, 1.0]]) / np.sqrt([2.0, 6.0])  # of the channels, (3, 2)
@@ -56,6 +57,7 @@ class PhotometricCalibration:
     response: float  # of the exposures: the sensor's
     own_lifts: bool  # lifts are the images' own: more than the response says
     edge_sigma: tuple[float, float]  # of u and w, log ratios
+    known_off: float = 0.0  # root mean square of what gains are off from known exposures; 0: none is known
 
     @staticmethod
     def steady(count: int) -> PhotometricCalibration:
@@ -67,6 +69,16 @@ class PhotometricCalibration:
     @cached_property
     def varies(self) -> bool:
         return bool(np.any(self.gains) or np.any(self.white))
+
+    @property
+    def warning(self) -> str:
+        """What a user should know of the known exposures; empty: nothing."""
+        if self.known_off <= CONTRADICTED:
+            return ""
+        return (
+            "the exposures that came with the images (EXIF, or the stream's) do not fit what the images show, so that "
+            "they count less: the light changed, or they are wrong"
+        )
 
     @property
     def lights(self) -> np.ndarray:
@@ -108,6 +120,8 @@ class _Solver:
         self.moments = _pooled(_square(edges.moments, 0.0))
         self.known = np.flatnonzero(np.isfinite(known))
         self.logs = known[self.known] - known[self.known].mean() if len(self.known) else known[:0]
+        # Edges speak first: known exposures that they contradict would make them all look wrong.
+        self.known_weights = np.ones(len(self.known))
         self.trust = np.ones(len(self.moments))
         self.effects = np.array([EDGE_SIGMA**2, EDGE_SIGMA**2])  # variances of u and w
         self.solution = np.zeros(0)
@@ -221,12 +235,22 @@ class _Solver:
         inner, right_of = self._marginal()
         self.scores = right_of + (inner @ rest[:, :5, None])[:, :, 0]
         self.trust = 1.0 / (1.0 + distance / 8.0)
+        if len(self.known):
+            square = self.known_off**2
+            variance = max(KNOWN_SIGMA**2, float(np.median(square)) / 0.4549)
+            self.known_weights = 1.0 / (variance + square / 4.0)
+
+    @property
+    def known_off(self) -> np.ndarray:
+        """What the gains are off from those that the known exposures give."""
+        exponent, unit = self.solution[-2:]
+        return np.asarray(self.solution[self.known] - exponent * self.logs - unit)
 
     def _add_known(self, information: np.ndarray, right: np.ndarray) -> None:
-        """gain = exponent * log exposure + unit, to a few percent."""
+        """gain = exponent * log exposure + unit, each as far as the edges bear it out (Cauchy)."""
         rows = np.zeros((len(self.known), len(right)))
         rows[range(len(rows)), self.known], rows[:, -2], rows[:, -1] = 1.0, -self.logs, -1.0
-        information += rows.T @ rows / KNOWN_SIGMA**2
+        information += rows.T @ (self.known_weights[:, None] * rows)
         information[-2, -2] += _EXPONENT_SIGMA**-2
         right[-2] += _EXPONENT / _EXPONENT_SIGMA**2
 
@@ -257,8 +281,9 @@ def solve_photometry(edges: PhotometricEdges, count: int, known: np.ndarray | No
     white = _white_balance(edges, first, (gains, lifts), vignetting, response)
     u, w = np.sqrt(solver.effects)
     sigma = np.sqrt(np.diag(np.linalg.inv(_centered(information[:count, :count]))))
+    known_off = float(np.sqrt(np.mean(solver.known_off**2))) if len(solver.known) else 0.0
     found = PhotometricCalibration(
-        gains, lifts, white, sigma, vignetting, follows, response, own_lifts, (float(u), float(w))
+        gains, lifts, white, sigma, vignetting, follows, response, own_lifts, (float(u), float(w)), known_off
     )
     if not all(np.isfinite(v).all() for v in (gains, lifts, white, sigma, vignetting)):
         raise ValueError("the photometric solution is not finite")

@@ -94,6 +94,16 @@ def test_a_robots_exposures_say_what_the_exponent_is() -> None:
     assert len(keyframes) > 3
 
 
+def test_exposures_that_the_images_contradict_are_said_and_change_nothing() -> None:
+    tracker = Tracker()
+    for item in synthetic(frames=80, exposure=1.0)[:30]:
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics, exposure=0.01)
+    list(tracker.finish())
+    found = tracker.trajectory()
+    assert np.median(errors(found, Sensor(Difficulties(exposure=1.0), 0), found.keyframe)) < 0.01
+    assert any("exposures that came with the images" in warning for warning in tracker.stats.warnings)
+
+
 @pytest.mark.parametrize(
     "options", [{}, {"noise": 3.0, "motion_blur": 0.5, "stop": 30, "size": (120, 160)}], ids=["clean", "noise"]
 )

@@ -166,6 +166,27 @@ def test_known_exposures_hold_what_few_matches_leave_open() -> None:
     assert np.abs(alone.gains - camera.gains).max() > 0.03
 
 
+@pytest.mark.parametrize("abrupt", [False, True])
+def test_known_exposures_that_the_images_contradict_leave_them_alone(abrupt: bool) -> None:
+    """Clouds pass while the camera's exposure stays; abrupt: one is over a third of the stream."""
+    camera, n = Camera(count=30), np.arange(30)
+    cloud = np.where((n >= 10) & (n < 20), 0.35, 0.0) if abrupt else 0.2 * np.sin(2.0 * np.pi * n / 30)
+    camera.gains = cloud - cloud.mean()
+    found = solve_photometry(camera.edges(), camera.count, np.full(30, np.log(0.01)))
+    assert found.varies
+    assert np.abs(found.gains - camera.gains).max() < 0.01
+    assert "do not fit what the images show" in found.warning
+
+
+def test_rounded_exposures_are_no_contradiction() -> None:
+    camera = Camera(gain=0.3)
+    exposures = np.round(camera.gains / 0.45 * 6.0) / 6.0
+    found = solve_photometry(camera.edges(), camera.count, exposures)
+    assert np.abs(found.gains - camera.gains).max() < 0.01
+    assert 0.0 < found.known_off < 0.03
+    assert found.warning == ""
+
+
 def test_no_edges_say_nothing() -> None:
     nothing = PhotometricEdges(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3, 9, 9)))
     assert not solve_photometry(nothing, 5).varies
