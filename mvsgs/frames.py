@@ -12,8 +12,8 @@ from msgs import Frame, GroundTruth
 from mvsgs_core.datasets.framing import Framing, Size
 from mvsgs_core.datasets.lens import Lens, guess_lens
 from mvsgs_core.mapping.keyframe_checks import is_pose
+from mvsgs_core.stream_times import LATEST
 from nodes.stream_frames import MAX_SIDE, MIN_SIDE
-from nodes.stream_times import LATEST
 
 SAME = 1e-3  # intrinsics that differ by less are those of one camera
 

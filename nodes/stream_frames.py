@@ -9,7 +9,7 @@ import numpy as np
 
 from msgs import Frame
 from mvsgs_core.stats import Stats
-from nodes.stream_times import LATEST, StreamTimes
+from mvsgs_core.stream_times import LATEST, StreamTimes
 
 FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye and a telescope nothing can be tracked
 MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side

@@ -21,11 +21,11 @@ import zmq
 from bench.faults.frame_mutations import frame as false_frame
 from msgs import End, Frame
 from msgs.codec import NEWEST, encode
+from mvsgs_core.stream_times import StreamTimes
 from nodes.robot import Robot
 from nodes.runtime.addresses import TransportError
 from nodes.runtime.transport import create_keys
 from nodes.runtime.transport.live import LivePublisher, LiveReader
-from nodes.stream_times import StreamTimes
 from tests.support.patience import until
 from tests.support.ports import tcp_address
 from tests.support.shared_data import ROOT

@@ -18,6 +18,7 @@ from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.ros import calibrated, lens_of, rectified, rgb_of
 from mvsgs_core.datasets.sequence import FileReader, Notices
+from mvsgs_core.stream_times import StreamTimes
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -38,7 +39,8 @@ _NOT_COLOR = ("depth", "infra", "disparity", "mask")
 @dataset
 @dataclass(kw_only=True, eq=False)
 class Bag(FileReader):
-    """Images of one topic, undistorted, with the time stamps of their headers.
+    """Images of one topic, undistorted, with the time stamps of their headers; where these stand still, go back or
+    leap, as a clock that is set makes them, time goes on by the bag's own.
 
     intrinsics (or "auto") and distortion replace its calibration; where there is none, or an empty one, the lens is the
     guess of "auto", for the tracker to estimate.
@@ -86,7 +88,8 @@ class Bag(FileReader):
     def __iter__(self) -> Iterator[Item]:
         self._notices.truncate(self._opening_warnings)
         wanted = range(self._count)[self.wanted]
-        index = 0
+        index, received = 0, 0.0
+        times = StreamTimes(lambda: received)
         with opened_bag(self._path) as bag:
             connections = [c for c in bag.connections if c.topic == self._topic]
             for number, (connection, nanoseconds, data) in enumerate(messages(bag, connections, self._notices)):
@@ -104,18 +107,28 @@ class Bag(FileReader):
                     what = "images left out because their calibration is for another aspect ratio"
                     self._notices.tally(what, f"{native} for {self._lens.size}")
                     continue
-                yield self._item(index, seconds, image)
+                received, repaired = 1e-9 * nanoseconds, times.repaired
+                shown = times.accept(seconds)
+                if shown is None:
+                    what = "images left out because their time stamps are from before, or hours after, those before"
+                    self._notices.tally(what, f"{seconds:.3f} s")
+                    continue
+                if times.repaired > repaired:
+                    what = "places where time stamps stood still, went back or leapt: there the bag's times were taken"
+                    self._notices.tally(what, f"at the stamp {seconds:.3f} s")
+                yield self._item(index, shown, image, seconds)
                 index += 1
         self._end_places()
         if index == 0:
             raise BadFileError(f"no image of {self._topic} could be read: " + "; ".join(self.warnings))
 
-    def _item(self, index: int, seconds: float, image: np.ndarray) -> Item:
+    def _item(self, index: int, seconds: float, image: np.ndarray, stamp: float) -> Item:
+        """stamp: by the camera's clock, as GPS has it, which the time in the stream may be off from."""
         native = image.shape[0], image.shape[1]
         lens, size = self._lens.at(native), self._framing.size_of(self._lens.size)
         framed, intrinsics = self._framing.image(image, lens, size)
         mask = None if self._camera_mask is None else self._camera_mask.framed(self._framing, lens, size)
-        place, guessed = self._place(seconds), self._lens.guessed
+        place, guessed = self._place(stamp), self._lens.guessed
         return Item(index, seconds, framed, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask)
 
 

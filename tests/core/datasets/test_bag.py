@@ -123,6 +123,34 @@ def test_raw_images_with_their_calibration(tmp_path: Path, ros: Messages) -> Non
         open_dataset("bag", path=path, start=6)
 
 
+@pytest.mark.parametrize("step", [-50.0, 1.7e9])
+def test_a_camera_whose_clock_was_set_goes_on_by_the_bags_times(tmp_path: Path, ros: Messages, step: float) -> None:
+    messages = []
+    for i in range(20):
+        image = ros.image(i, "rgb8", picture(i), 3 * WIDTH)
+        image.header.stamp.sec += int(step) if i >= 10 else 0
+        messages.append(("/camera/image_raw", 1000 + i / 10, image))
+    sequence = open_dataset("bag", path=ros.write(bag_path(tmp_path, ros), messages))
+    for _ in range(2):
+        items = list(sequence)
+        numbers = [int(item.image[0, 0, 0]) - 20 for item in items]
+        assert numbers == [*range(10), *range(14, 20)]  # as many are needed to tell a clock from a late image
+        np.testing.assert_allclose([item.timestamp for item in items], [100 + i / 10 for i in numbers], atol=1e-6)
+        assert any("time stamps stood still, went back or leapt" in warning for warning in sequence.warnings)
+        assert any("those before: 4" in warning for warning in sequence.warnings)
+
+
+def test_stamps_that_stand_still_are_replaced_and_a_late_image_is_left_out(tmp_path: Path, ros: Messages) -> None:
+    still = [("/camera/image_raw", 7 + i / 10, ros.image(0, "rgb8", picture(i), 3 * WIDTH)) for i in range(4)]
+    sequence = open_dataset("bag", path=ros.write(bag_path(tmp_path, ros), still))
+    np.testing.assert_allclose([item.timestamp for item in sequence], [100.0, 100.1, 100.2, 100.3], atol=1e-6)
+    (tmp_path / "late").mkdir()
+    order = [0, 1, 3, 2, 4]
+    late = [("/camera/image_raw", 7 + i / 10, ros.image(n, "rgb8", picture(n), 3 * WIDTH)) for i, n in enumerate(order)]
+    sequence = open_dataset("bag", path=ros.write(bag_path(tmp_path / "late", ros), late))
+    assert [round(item.timestamp, 6) for item in sequence] == [100.0, 100.1, 100.3, 100.4]
+
+
 def test_compressed_and_rectified_images(tmp_path: Path, ros: Messages) -> None:
     topic = "/front/image_rect_color/compressed"
     contents = [png(picture(0)), png(picture(1))[:-40], png(picture(2))]

@@ -22,6 +22,7 @@ class StreamTimes:
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """clock: by which a frame comes, seconds; of a recording, the recorder's."""
         self.repaired = 0
         self._clock = clock
         self._shift = 0.0  # s added to the sender's times
