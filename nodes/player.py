@@ -51,7 +51,7 @@ class Player(Node):
         c = self.config
         self.check(c)
         recording, pairs = self._recording(), _Pairs()
-        playback, due = Playback(), 0.0
+        playback, due = Playback(self.stats.warn), 0.0
         try:
             for message in self._wanted(recording, pairs):
                 if c.realtime and isinstance(message, Frame):

@@ -65,7 +65,7 @@ class Reader(Node):
         self.stats.values["frames_expected"] = len(sequence)
         self.stats.values[LENS] = lens_values(sequence.lens)
         self._pass_warnings_on(sequence)  # those that opening gave; the others are counted until the end
-        playback = Playback()
+        playback = Playback(self.stats.warn)
         fixed = FixedMask(self.stats, self.config.hide_fixed and self.config.mask is None)
         frames = map(fixed.masked, sequence) if self.config.realtime else fixed.masked_ahead(sequence)
         try:
