@@ -13,7 +13,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from mvsgs_core.evaluation.frame_store import FrameStore
+from mvsgs_core.frame_store import FrameStore
 from mvsgs_core.held_out import HELD_OUT_EVERY, is_held_out
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mvsgs_core.evaluation.frame_store import FrameStore
+from mvsgs_core.frame_store import FrameStore
 from tests.support.full_disk import full_after
 
 RNG = np.random.default_rng(0)
