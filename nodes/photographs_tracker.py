@@ -32,8 +32,8 @@ class PhotographsTracker(TrackerNode):
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         self.core = PhotographTracker(self.config)
-        self._bent = False
-        self._lenses: dict[tuple[float, float, float, float, tuple[int, int]], Undistortion] = {}
+        self._bent = False  # a keyframe of the largest part
+        self._lenses: dict[tuple[float, ...], Undistortion] = {}  # by intrinsics, k1, k2, height and width
 
     def _add(self, frame: Frame) -> Update:
         guessed, place = frame.intrinsics_guessed, self._places.get(frame.index)
@@ -43,11 +43,11 @@ class PhotographsTracker(TrackerNode):
 
     @property
     def _focal_factor(self) -> float:
-        return self.core.focal_factor
+        return self.core.lens[0]
 
     @property
     def _distortion(self) -> np.ndarray | None:
-        return np.array(self.core.distortion) if self._bent else None
+        return np.array(self.core.lens[1:]) if self._bent else None
 
     def _keyframe(self, index: int) -> Keyframe:
         frame = self._frames[index]
@@ -71,17 +71,17 @@ class PhotographsTracker(TrackerNode):
         )
 
     def _undistortion(self, frame: Frame) -> Undistortion:
-        """Of the lens that was estimated, for images such as this; none where nobody would see it."""
-        k1, k2 = self.core.distortion
-        fx, fy, cx, cy = (float(v) for v in frame.intrinsics * [self._focal_factor, self._focal_factor, 1.0, 1.0])
+        """Of the lens that was estimated in its part, for images such as this; none where nobody would see it."""
+        factor, k1, k2 = self.core.keyframe_lens(frame.index)
+        fx, fy, cx, cy = (float(v) for v in frame.intrinsics * [factor, factor, 1.0, 1.0])
         size = (frame.image.shape[0], frame.image.shape[1])
-        key = (fx, fy, cx, cy, size)
+        key = (fx, fy, cx, cy, k1, k2, *size)
         if key not in self._lenses:
             r2 = (max(cx, size[1] - cx) / fx) ** 2 + (max(cy, size[0] - cy) / fy) ** 2
             bent = abs(r2 * (k1 + r2 * k2)) * r2**0.5 * fx
-            self._lenses[key] = Undistortion(Lens(key[:4], size, (k1, k2, 0.0, 0.0) if bent > VISIBLE else ()))
+            self._lenses[key] = Undistortion(Lens((fx, fy, cx, cy), size, (k1, k2, 0.0, 0.0) if bent > VISIBLE else ()))
             if bent > VISIBLE:
-                self._bent = True
+                self._bent |= (factor, k1, k2) == self.core.lens
                 self.stats.warn(
                     f"the photographs are distorted, by up to {bent:.0f} pixels, which is taken out: "
                     f"dataset.intrinsics=[{fx:.2f},{fy:.2f},{cx:.2f},{cy:.2f}] "

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -151,6 +153,57 @@ def test_photographs_of_nothing_say_so() -> None:
     assert set(trajectory.state.tolist()) == {TrackingState.LOST}
     assert np.isnan(trajectory.world_from_cam).all()
     assert "no photograph has a pose, of 3" in node.stats.values["nothing"]
+
+
+@pytest.mark.slow
+def test_three_photographs_are_enough_and_none_of_them_is_held_out() -> None:
+    _, sent, _ = run(fountain()[:3])
+    trajectory = sent[-1]
+    assert isinstance(trajectory, Trajectory)
+    assert trajectory.keyframe.all()
+    assert np.isfinite(trajectory.world_from_cam).all()
+
+
+def test_fewer_than_three_photographs_say_so() -> None:
+    node, _, _ = run(fountain()[:2])
+    assert "no photograph has a pose, of 2: 3 or more of one scene are needed" in node.stats.values["nothing"]
+
+
+def zoomed(item: Item, crop: float) -> Item:
+    """As taken with 1 / crop times the focal length."""
+    height, width = item.image.shape[:2]
+    rows, columns = round(0.5 * (1.0 - crop) * height), round(0.5 * (1.0 - crop) * width)
+    inner = item.image[rows : height - rows, columns : width - columns]
+    return replace(item, image=cv2.resize(inner, (width, height), interpolation=cv2.INTER_LANCZOS4))
+
+
+@pytest.mark.slow
+def test_each_part_has_its_own_lens() -> None:
+    """Of two cameras: the keyframes of each are as its own lens sees; the trajectory has the larger part's."""
+    other = open_dataset("images", path=shared("data/strecha/Herz-Jesus-P8"), size=240_000, stop=5)
+    node, sent, frames = run([*fountain()[:6], *(zoomed(item, 0.72) for item in other)])
+    *keyframes, trajectory = sent
+    assert isinstance(trajectory, Trajectory)
+    assert "the photographs fall into 2 parts that share too little" in node.stats.warnings
+    focal: dict[int, list[float]] = {0: [], 1: []}
+    for m in keyframes:
+        assert isinstance(m, Keyframe)
+        focal[m.segment].append(m.intrinsics[0] / frames[m.index].intrinsics[0])
+    factors = [float(np.median(focal[part])) for part in (0, 1)]
+    assert abs(factors[trajectory.segment[1]] - 1.0) < 0.05
+    assert abs(factors[trajectory.segment[-1]] * 0.72 - 1.0) < 0.05
+    assert abs(trajectory.focal_factor / factors[0] - 1.0) < 0.05
+    assert any("by the photographs, the focal length is" in w for w in node.stats.warnings) == (
+        trajectory.segment[-1] == 0
+    )
+
+
+@pytest.mark.slow
+def test_a_focal_length_that_the_photographs_contradict_is_told_of() -> None:
+    told = "by the photographs, the focal length is"
+    assert not any(told in w for w in solved()[0].stats.warnings)
+    node, _, _ = run(fountain(), factor=0.6)
+    assert any(told in w for w in node.stats.warnings)
 
 
 def test_numbers_of_which_nothing_can_come_are_refused() -> None:

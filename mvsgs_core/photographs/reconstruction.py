@@ -21,7 +21,7 @@ from mvsgs_core.photographs.two_views import TwoViews, relative_poses
 
 MIN_ANGLE = np.radians(1.5)  # between the rays of a point
 FIRST_ANGLE = np.radians(5.0)  # of the first two views, median
-FIRST_PAIRS, FIRST_TRIES = 12, 3  # pairs that are looked at, and that may begin a map
+FIRST_PAIRS, FIRST_TRIES = 12, 3  # pairs that are looked at, at least, and that may begin a map
 PLANE = 0.8  # of the matches: where one homography explains so many, they may lie on a plane
 MIN_PHOTOGRAPHS = 3  # of a model
 AGAIN = 1.2  # times as many points of the map must a photograph see to be tried again
@@ -119,14 +119,17 @@ class Reconstruction:
     ) -> list[tuple[tuple[int, int], list[np.ndarray]]]:
         """Pairs with their relative poses (4, 4): those first with most points at angles wide enough.
 
-        Looked at are those with most matches that no homography explains.
+        Looked at are those with most matches that no homography explains, until some may begin a map: copies of one
+        photograph match best of all, and tell nothing.
         """
         rated = sorted(
             ((len(v.matches) * (1.05 - v.by_homography), pair) for pair, v in pairs.items() if left[list(pair)].all()),
             reverse=True,
         )
         found: list[tuple[float, tuple[int, int], list[np.ndarray]]] = []
-        for _, (i, j) in rated[:FIRST_PAIRS]:
+        for looked_at, (_, (i, j)) in enumerate(rated):
+            if looked_at >= FIRST_PAIRS and len(found) >= FIRST_TRIES:
+                break
             matches = pairs[i, j].matches
             here = self.lens.unproject(np.full(len(matches), i), points[i][matches[:, 0]])
             there = self.lens.unproject(np.full(len(matches), j), points[j][matches[:, 1]])

@@ -3,6 +3,7 @@
 A step is wide where the points of a picture are not found again in the next as those of a video's frames are, or where
 these two pictures alone say how far the points are: then each shows what none between two others has to, and matches
 that ask for no small step find more. Measured on the video tracker's own image, with the flow that it follows.
+Steps in which nothing moves are of a camera that stands, or of several exposures of one photograph: they tell nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.matching.flow import refined_inverse_search
 
-PAIRS = 12  # of successive pictures that are looked at, at most
+PAIRS = 12  # of successive pictures that are looked at, at most, where something moves
+MORE = 24  # pairs that are looked at beside them, at most, where nothing moves in some
+STILL, FULL = 0.5, 0.9  # pixels of the tracking image, median, and fraction of points found, where nothing moves
 PIXELS = 1.0  # of the tracking image: matches within it of one homography lie on a plane, or the camera only turned
 WIDE = 1 / 3  # of the steps: where more are wide, who follows the points from picture to picture loses the camera
 MOST = 500  # pictures: of more, whatever their steps, nobody wants to wait for the last one without having said so
@@ -33,6 +36,11 @@ class Step:
 
     found: float  # of the textured points, fraction that the flow found again
     angle: float  # radians between the rays of a match, median; 0 where the matches tell no pose
+    flow: float  # pixels of the tracking image that points moved by, median; 0 where none was found again
+
+    @property
+    def still(self) -> bool:
+        return self.found > FULL and self.flow < STILL
 
     @property
     def lost(self) -> bool:
@@ -50,32 +58,53 @@ class Steps:
     steps: list[Step]
 
     @property
+    def moving(self) -> list[Step]:
+        return [step for step in self.steps if not step.still]
+
+    @property
     def wide(self) -> bool:
         """False where none tells anything, too."""
-        return sum(step.wide for step in self.steps) > WIDE * len(self.steps)
+        moving = self.moving
+        # few that move say little: a camera may have stood, and then have moved fast
+        told = len(moving) if len(moving) == len(self.steps) else PAIRS
+        return bool(sum(step.wide for step in moving) > WIDE * told)
 
     def __str__(self) -> str:
-        angles = [np.degrees(step.angle) for step in self.steps if not step.lost]
+        moving = self.moving
+        angles = [np.degrees(step.angle) for step in moving if not step.lost]
         between = f", {np.median(angles):.1f} degrees between the rays of a point" if angles else ""
-        found = 100.0 * np.median([step.found for step in self.steps])
-        wide = sum(step.wide for step in self.steps)
-        return f"{wide} of {len(self.steps)} steps between pictures are wide ({found:.0f} % of points found{between})"
+        found = 100.0 * np.median([step.found for step in moving])
+        wide, still = sum(step.wide for step in moving), len(self.steps) - len(moving)
+        others = f"; in {still} others nothing moves" if still else ""
+        return (
+            f"{wide} of {len(moving)} steps between pictures are wide ({found:.0f} % of points found{between}{others})"
+        )
 
 
 def chosen_pairs(count: int) -> list[int]:
-    """First pictures of the pairs that are looked at, of a sequence of `count`."""
+    """First pictures of the pairs that may be looked at, of a sequence of `count`: PAIRS, in order, then the others."""
     if count < 2:
         return []
-    return sorted({int(n) for n in np.linspace(0, count - 2, min(PAIRS, count - 1))})
+    spread = sorted({int(n) for n in np.linspace(0, count - 2, min(PAIRS, count - 1))})
+    # as by chance, and never in step with photographs of which each was taken several times
+    others = dict.fromkeys((np.arange(1, 10 * MORE) * 0.6180339887 % 1.0 * (count - 1)).astype(int).tolist())
+    return spread + [n for n in others if n not in spread][:MORE]
 
 
 def measure_steps(pairs: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Steps:
     """pairs: two RGB images (H, W, 3) uint8 of one size, and intrinsics (4,) of them, as guessed if they are not known.
 
-    Pictures in which there is nothing to follow tell nothing and are left out.
+    Pictures in which there is nothing to follow tell nothing and are left out. Ends when PAIRS move.
     """
-    found = (measure_step(*pair) for pair in pairs)
-    return Steps([step for step in found if step is not None])
+    steps, moving = [], 0
+    for pair in pairs:
+        step = measure_step(*pair)
+        if step is not None:
+            steps.append(step)
+            moving += not step.still
+        if moving == PAIRS:
+            break
+    return Steps(steps)
 
 
 def measure_step(first: np.ndarray, second: np.ndarray, intrinsics: np.ndarray) -> Step | None:
@@ -90,7 +119,8 @@ def measure_step(first: np.ndarray, second: np.ndarray, intrinsics: np.ndarray) 
     good = matches.alive & textured
     scaled = scale_intrinsics(intrinsics, (first.shape[0], first.shape[1]), size)
     angle = _angle(points[good], matches.target[good], scaled)
-    return Step(float(good.sum() / textured.sum()), angle)
+    moved = np.linalg.norm(matches.target[good] - points[good], axis=1)
+    return Step(float(good.sum() / textured.sum()), angle, float(np.median(moved)) if len(moved) else 0.0)
 
 
 def _angle(here: np.ndarray, there: np.ndarray, intrinsics: np.ndarray) -> float:

@@ -1,6 +1,7 @@
 """Photographs as a tracker: nothing is known before the last one; then all leave as keyframes, as the map saw them.
 
-Held-out photographs (held_out.py) get poses from the finished map and add nothing to it.
+Held-out photographs (held_out.py) get poses from the finished map and add nothing to it, where enough others are left
+to make it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photographs.config import PhotographsConfig
 from mvsgs_core.photographs.light import Light, Look
 from mvsgs_core.photographs.ordering import chain, covisibility
-from mvsgs_core.photographs.reconstruction import Model
+from mvsgs_core.photographs.reconstruction import MIN_PHOTOGRAPHS, Model
 from mvsgs_core.photographs.structure import Photographs
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.image import CELL, tracking_size
@@ -25,6 +26,7 @@ from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
+FAR_OFF = 1.25  # or its inverse: the focal length that was found, over one that was said to be known
 RELATIVE_SIGMA = 0.1  # error of an inverse depth, for one pixel of matching, at which its confidence is a half
 
 
@@ -52,6 +54,8 @@ class PhotographTracker:
         self.light = Light(self.stats)
         self._frames: list[tuple[int, float]] = []  # index and timestamp
         self._sizes: list[tuple[int, int]] = []
+        self._guessed = False  # the focal length of a photograph was
+        self._held_out = np.zeros(0, bool)  # (P,) once solved
         self._models: list[Model] = []
         self._units: list[float] = []  # of each model
         self._keyframes: dict[int, tuple[int, int]] = {}  # index -> model, photograph
@@ -68,6 +72,7 @@ class PhotographTracker:
         self.light.looks.append(Look.of(image, intrinsics, exposure, self.config.area, mask))
         self._frames.append((index, timestamp))
         self._sizes.append((image.shape[0], image.shape[1]))
+        self._guessed |= guessed
         self.pending.add(index)
         return Update(TrackingState.NOT_INITIALIZED)
 
@@ -75,7 +80,7 @@ class PhotographTracker:
         """All keyframes, one at a time, neighbors after each other; the parts of the map one after another."""
         self._solve()
         for number, model in enumerate(self._models):
-            members = [n for n in np.flatnonzero(model.registered).tolist() if not self._is_held_out(n)]
+            members = np.flatnonzero(model.registered & ~self._held_out).tolist()
             order = chain(covisibility(model.photograph, model.point, len(self._frames)), members)
             self._units.append(self._unit(model, order))
             for n in order:
@@ -87,13 +92,17 @@ class PhotographTracker:
         self.pending.clear()
 
     @property
-    def focal_factor(self) -> float:
-        return self._models[0].lens.factor if self._models else 1.0
+    def lens(self) -> tuple[float, float, float]:
+        """Factor on the focal lengths, and k1, k2 of the photographs as they came: of the largest part of the map."""
+        return self._lens_of(0) if self._models else (1.0, 0.0, 0.0)
 
-    @property
-    def distortion(self) -> tuple[float, float]:
-        """k1, k2 of the photographs as they came."""
-        return (self._models[0].lens.k1, self._models[0].lens.k2) if self._models else (0.0, 0.0)
+    def keyframe_lens(self, index: int) -> tuple[float, float, float]:
+        """As `lens`, of the part that a keyframe is in."""
+        return self._lens_of(self._keyframes[index][0])
+
+    def _lens_of(self, part: int) -> tuple[float, float, float]:
+        lens = self._models[part].lens
+        return lens.factor, lens.k1, lens.k2
 
     def keyframe(self, index: int, intrinsics: np.ndarray, size: tuple[int, int]) -> PhotographKeyframe:
         """A keyframe as a pinhole camera with `intrinsics` (4,) and images of `size` (height, width) would see it."""
@@ -131,8 +140,10 @@ class PhotographTracker:
 
     def _solve(self) -> None:
         count = len(self._frames)
-        held_out = np.array([self._is_held_out(n) for n in range(count)], bool)
-        mapped = ~held_out if count - held_out.sum() >= 2 else np.ones(count, bool)
+        self._held_out = np.array([is_held_out(index) for index, _ in self._frames], bool)
+        if count - self._held_out.sum() < MIN_PHOTOGRAPHS:  # they would make no map
+            self._held_out[:] = False
+        mapped = ~self._held_out
         self._models = self.photographs.solve(mapped)
         posed = np.zeros(count, bool)
         for model in self._models:
@@ -144,20 +155,30 @@ class PhotographTracker:
             self.stats.warn(f"photographs without a pose, too little of them matches the others: {missing} of {count}")
         if len(self._models) > 1:
             self.stats.warn(f"the photographs fall into {len(self._models)} parts that share too little")
-        if not self._models:
+        if count < MIN_PHOTOGRAPHS:
+            self.nothing = f"no photograph has a pose, of {count}: {MIN_PHOTOGRAPHS} or more of one scene are needed"
+        elif not self._models:
             pairs = self.photographs.stats.counts.get("pairs of photographs that agree with one geometry", 0)
             self.nothing = (
-                f"no photograph has a pose, of {count}: {pairs:.0f} pairs of them agree with one geometry, and none "
-                "has enough parallax to begin with. Take them from different places, each overlapping others by half"
+                f"no photograph has a pose, of {count}: {pairs:.0f} pairs of them agree with one geometry, and of none "
+                f"a map of {MIN_PHOTOGRAPHS} photographs grows. Take them from different places, each overlapping "
+                "others by half"
             )
         else:
+            self._warn_of_focal()
             self.phase = Phase.TRACKING
             residuals = np.concatenate([model.residual for model in self._models])
             self.stats.values["reprojection error, median"] = f"{np.median(residuals):.2f} pixels"
         self.stats.count(HELD_OUT, 0)
 
-    def _is_held_out(self, n: int) -> bool:
-        return is_held_out(self._frames[n][0])
+    def _warn_of_focal(self) -> None:
+        factor = self._models[0].lens.factor
+        if not self._guessed and not 1.0 / FAR_OFF < factor < FAR_OFF:
+            self.stats.warn(
+                f"by the photographs, the focal length is {factor:.2f} times the one that EXIF or dataset.intrinsics "
+                "says; if that is wrong, and the map bent by it, begin with a better one: "
+                "dataset.intrinsics=[fx,fy,cx,cy]"
+            )
 
     def _unit(self, model: Model, order: list[int]) -> float:
         """The median depth of the first keyframe, as everywhere in the tracker."""

@@ -47,6 +47,20 @@ def test_a_plane_is_no_obstacle() -> None:
     assert position_error(model.cam_from_world, of.cam_from_world) < 0.01
 
 
+@pytest.mark.parametrize("times", [3, 4])
+def test_copies_of_photographs_are_no_obstacle(times: int) -> None:
+    """They match each other better than any two photographs match, and no map begins with two of them."""
+    once = ring(5, flat=True)
+    once.pixels[np.random.default_rng(1).random(once.pixels.shape[:2]) < 0.3] = np.nan  # no feature is there
+    pixels = np.repeat(once.pixels, times, axis=0)
+    pixels += np.random.default_rng(0).normal(0.0, 0.05, pixels.shape)  # as edited and compressed again
+    lens = replace(once.lens, intrinsics=np.repeat(once.lens.intrinsics, times, axis=0))
+    of = Ring(np.repeat(once.cam_from_world, times, axis=0), once.world, pixels, lens)
+    (model,) = models_of(of, of.pairs(), free=False)
+    assert model.registered.all()
+    assert position_error(model.cam_from_world, of.cam_from_world) < 0.01
+
+
 def test_a_lens_that_is_known_stays() -> None:
     of = ring(5)
     (model,) = models_of(of, of.pairs(), free=False)

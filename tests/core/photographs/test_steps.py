@@ -6,7 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mvsgs_core.photographs.steps import PAIRS, Step, Steps, chosen_pairs, measure_steps
+from mvsgs_core.datasets import open_dataset
+from mvsgs_core.datasets.sequence import ImageSequence
+from mvsgs_core.photographs.steps import ENOUGH, MORE, PAIRS, Step, Steps, chosen_pairs, measure_steps
+from tests.support.shared_data import shared
 
 INTRINSICS = np.array([300.0, 300.0, 159.5, 119.5])
 
@@ -42,7 +45,7 @@ def test_pictures_of_nothing_tell_nothing() -> None:
 
 
 def test_one_step_that_is_lost_makes_a_video_no_photographs() -> None:
-    small, lost = Step(0.95, np.radians(0.5)), Step(0.0, 0.0)
+    small, lost = Step(0.95, np.radians(0.5), 3.0), Step(0.0, 0.0, 0.0)
     assert not Steps([small] * 9 + [lost]).wide
     assert Steps([small] * 5 + [lost] * 4).wide
     assert "1 of 10 steps between pictures are wide (95 % of points found, 0.5 degrees" in str(
@@ -50,9 +53,47 @@ def test_one_step_that_is_lost_makes_a_video_no_photographs() -> None:
     )
 
 
-@pytest.mark.parametrize(("count", "pairs"), [(0, 0), (1, 0), (2, 1), (9, 8), (1000, PAIRS)])
+@pytest.mark.parametrize(("count", "pairs"), [(0, 0), (1, 0), (2, 1), (9, 8), (1000, PAIRS + MORE)])
 def test_pairs_are_spread_over_all(count: int, pairs: int) -> None:
     found = chosen_pairs(count)
     assert len(found) == pairs
     assert all(0 <= n < count - 1 for n in found)
-    assert not found or (found[0] == 0 and found[-1] == count - 2)
+    assert len(set(found)) == pairs
+    spread = found[:PAIRS]
+    assert spread == sorted(spread)
+    assert not found or (spread[0] == 0 and spread[-1] == count - 2)
+
+
+def steps_of(pictures: list[np.ndarray]) -> Steps:
+    return measure_steps((pictures[n], pictures[n + 1], INTRINSICS) for n in chosen_pairs(len(pictures)))
+
+
+@pytest.mark.parametrize("times", [2, 3, 5])
+def test_photographs_that_were_taken_several_times_are_photographs(times: int) -> None:
+    """As with a bracket of exposures: the camera stands in most steps, and each of the others is wide."""
+    scenes = [texture(n) for n in range(12)]
+    found = steps_of([cv2.convertScaleAbs(scene, alpha=0.6 + 0.2 * n) for scene in scenes for n in range(times)])
+    assert found.wide
+    assert all(step.lost for step in found.moving)
+    assert f"; in {len(found.steps) - len(found.moving)} others nothing moves" in str(found)
+
+
+def test_a_video_of_a_camera_that_stands_is_a_video() -> None:
+    scene = texture(0)
+    assert not steps_of([scene] * 40).wide
+    assert not steps_of([scene] * 30 + [turned(scene, 1.0 * n) for n in range(10)]).wide
+    assert not steps_of([scene] * 10 + [texture(n) for n in range(1, 5)]).wide  # it ends with something else
+
+
+@pytest.mark.parametrize("still", [30, 120, 270])
+def test_a_real_video_with_a_still_start_is_a_video(still: int) -> None:
+    sequence = open_dataset("tum", path=shared("data/tum_fr1_xyz"))
+    assert isinstance(sequence, ImageSequence)
+    for start in (0, 80, 120):  # fast hands: three of the last eleven steps are wide
+        records = sequence.records[start : start + 30]
+        slower = open_dataset("tum", path=shared("data/tum_fr1_xyz"))
+        assert isinstance(slower, ImageSequence)
+        slower.records = records[:1] * still + records
+        steps = measure_steps(slower.successive(chosen_pairs(len(slower)), ENOUGH))
+        assert steps.moving
+        assert not steps.wide
