@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench import pieces
-from bench.runs import QUICK, Matrix, Run, figure, folder
-from bench.table import Row, main
+from bench.runs import QUICK, Matrix, Run, choices, figure, folder, said
+from bench.table import Row, failed, main, names, numbers
 from mvsgs_core.evaluation.metrics import at
 
 SCENES = ("room", "tum_fr1_xyz", "redkitchen", "room_exposure")
@@ -102,8 +102,8 @@ def rows_of(runs: list[Run], scenes: Sequence[str], variants: Sequence[str]) -> 
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    scenes, variants = options.scenes.split(","), [v for v in options.variants.split(",") if v != "full"]
-    seeds, overrides = [int(s) for s in options.seeds.split(",")], list(options.overrides)
+    variants, seeds, overrides = [v for v in options.variants if v != "full"], options.seeds, list(options.overrides)
+    scenes, skipped = pieces.with_data(options.scenes)
     if options.quick:
         scenes, variants, seeds = scenes[:1], variants[:1], seeds[:1]
         overrides += QUICK
@@ -114,16 +114,15 @@ def measure(options: argparse.Namespace) -> list[Row]:
         for scene in scenes
     }
     runs = made.runs(matrices)
-    failed = [
-        Row(f"{r.scene}/{r.variant}/seed {r.seed}", "failed", "", "finished", False) for r in runs if not r.report
-    ]
-    return rows_of(runs, scenes, variants) + failed + made.rows()
+    broken = [failed(f"{r.scene}/{r.variant}/seed {r.seed}", said(r)) for r in runs if r.report is None]
+    return rows_of(runs, scenes, variants) + broken + skipped + made.rows()
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", default=",".join(SCENES), help="comma separated")
-    parser.add_argument("--variants", default=",".join((*TABLE_III, *SKIPS, *OTHERS)), help="comma separated")
-    parser.add_argument("--seeds", default="0,1,2", help="comma separated")
+    parser.add_argument("--scenes", type=names(choices("scene")), default=SCENES, help="comma separated")
+    every = [*TABLE_III, *SKIPS, *OTHERS]
+    parser.add_argument("--variants", type=names(choices("variant")), default=every, help="comma separated")
+    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="comma separated")
     pieces.arguments(parser, "dataset.stop=100", jobs=True)
 
 

@@ -26,8 +26,21 @@ import numpy as np
 
 from bench import pieces
 from bench.finished import FinishedRun, frames_of
-from bench.runs import FEWER, QUICK, ROOT, Matrix, Run, fewer_iterations, figure, folder, folder_name, python, said
-from bench.table import Row, main
+from bench.runs import (
+    FEWER,
+    QUICK,
+    ROOT,
+    Matrix,
+    Run,
+    choices,
+    fewer_iterations,
+    figure,
+    folder,
+    folder_name,
+    python,
+    said,
+)
+from bench.table import Row, checked, failed, main, names, numbers
 
 Report = dict[str, Any]
 _SMALL_VIDEO = ("dataset.size=[180,240]", "dataset.stop=100")
@@ -115,12 +128,21 @@ FIGURES = (
 def check(checkout: Path) -> None:
     """Raises ValueError where a checkout would not run its own code."""
     code = "import sys; sys.path.insert(0, sys.argv[1]); import mvsgs_core; print(mvsgs_core.__file__)"
+    if not checkout.is_dir():
+        raise ValueError(f"{checkout} is no folder")
     command = [python(checkout), "-c", code, str(checkout)]
     done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
     found = done.stdout.strip()
     if done.returncode or not Path(found).is_relative_to(checkout):
         what = found or (done.stderr.strip().splitlines() or ["nothing"])[-1]
         raise ValueError(f"{checkout} would run {what}: it needs a .venv of its own; `make setup` there")
+
+
+def checkout_at(text: str) -> Path:
+    """Raises ValueError as `check`."""
+    found = Path(text).resolve()
+    check(found)
+    return found
 
 
 def completed(run: Run) -> Run:
@@ -258,21 +280,20 @@ def at_equal_time(scene: str, before: Sequence[Run], candidates: Mapping[str, Se
     ]
 
 
-def sides(other: Path, fewer: str | None) -> dict[str, tuple[Path, tuple[str, ...]]]:
+def sides(other: Path, fewer: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[Path, tuple[str, ...]]]:
     """Checkout and overrides of each kind of run."""
-    here = {name: (ROOT, settings) for name, settings in fewer_iterations(fewer).items()}
+    here = {name: (ROOT, settings) for name, settings in fewer.items()}
     return {"before": (other, ()), "after": (ROOT, ()), **here}
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    other = options.other.resolve()
-    scenes, seeds = options.scenes.split(","), [int(s) for s in options.seeds.split(",")]
+    other, seeds = options.other, options.seeds
+    scenes, skipped = pieces.with_data(options.scenes)
     overrides = ["recorder=track", "mapper.threads=1", *options.overrides]
     if options.quick:
-        scenes, seeds = ["room"], seeds[:1]
+        scenes, skipped, seeds = ["room"], [], seeds[:1]
         overrides += QUICK
-    for checkout in dict.fromkeys((other, ROOT)):
-        check(checkout)
+    check(ROOT)
     output = folder(options, "before")
     made = {checkout: pieces.Pieces.of(options, output) for checkout in (other, ROOT)}
     runs: dict[str, dict[str, list[Run]]] = {scene: {} for scene in scenes}
@@ -299,12 +320,12 @@ def measure(options: argparse.Namespace) -> list[Row]:
             rows += at_equal_time(scene, by_side["before"], candidates)
             rows += at_equal_quality(scene, by_side["before"], candidates)
         rows += [
-            Row(f"{scene}, {side}, seed {run.seed}", said(run), "", "a report", False)
+            failed(f"{scene}, {side}, seed {run.seed}", said(run))
             for side, group in by_side.items()
             for run in group
             if run.report is None
         ]
-    return rows + [row for kept in made.values() for row in kept.rows()]
+    return rows + skipped + [row for kept in made.values() for row in kept.rows()]
 
 
 def place(scene: str, seed: int, side: str) -> str:
@@ -313,10 +334,11 @@ def place(scene: str, seed: int, side: str) -> str:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--other", type=Path, default=ROOT, help="checkout to compare with, such as a git worktree")
-    parser.add_argument("--scenes", default=",".join(SCENES), help="comma separated")
-    parser.add_argument("--seeds", default="0,1,2", help="comma separated")
-    parser.add_argument("--fewer", help=FEWER)
+    told = "checkout to compare with, such as a git worktree; default: this one"
+    parser.add_argument("--other", type=checked(checkout_at), default=str(ROOT), help=told)
+    parser.add_argument("--scenes", type=names(choices("scene")), default=list(SCENES), help="comma separated")
+    parser.add_argument("--seeds", type=numbers, default=[0, 1, 2], help="comma separated")
+    parser.add_argument("--fewer", type=checked(fewer_iterations), default={}, help=FEWER)
     pieces.arguments(parser, "dataset.stop=60")
 
 

@@ -10,11 +10,12 @@ light. `--resume` takes what an earlier, interrupted call has finished from the 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from bench.pieces import Kept
 from bench.runs import folder, folder_name
 from bench.table import Row, all_of, at_least, at_most, main
 from bench.tracking.cases import CASES, Case
@@ -205,9 +207,7 @@ QUICKLY = ("mapper.iterations=8",)
 
 
 def recorded(items: Sequence[Item], file: Path) -> Path:
-    """A stream of them for whole runs, where it is not there yet."""
-    if file.exists():
-        return file
+    """A stream of them for whole runs."""
     aside = file.with_suffix(".part")
     aside.unlink(missing_ok=True)
     recorder = Recorder(Recorder.Config(path=str(aside), foxglove=False))
@@ -218,28 +218,29 @@ def recorded(items: Sequence[Item], file: Path) -> Path:
     return aside.rename(file)
 
 
-def held_out(words: Sequence[str], output: Path, first: int, resume: bool) -> dict[int, float]:
-    """PSNR of a run's held-out frames, by their index from that frame on; of a run that is there with resume."""
-    file = output / "report.json"
-    if not (resume and file.exists() and json.loads(file.read_text()).get("finished", True)):
+def held_out(words: Sequence[str], items: Sequence[Item], output: Path, first: int, kept: Kept) -> dict[int, float]:
+    """PSNR of a run's held-out frames, by their index from that frame on; of a run that is kept, where it is one of the
+    same images."""
+    file, given = output / "report.json", [*EACH, *words]
+    asked = {"overrides": given, "images": identity(items)}
+    if not kept.has(file, asked):
         shutil.rmtree(output, ignore_errors=True)
-        run_inline(compose([*EACH, *words, f"output={output}"]))
+        stream = recorded(items, output.with_suffix(".mcap"))
+        run_inline(compose([*given, f"dataset.path={stream}", f"output={output}"]))
+        if not json.loads(file.read_text()).get("finished", True):
+            raise RuntimeError(f"the run in {output} ended early: see its report.json")
+        kept.keep(file, asked)
     report: dict[str, Any] = json.loads(file.read_text())
     frames = report["rendering"]["frames"]
     return {frame["index"] - first: frame["psnr"] for frame in frames if frame["held_out"] and frame["index"] >= first}
 
 
-def rows_of_map(name: str, way: Return, first: Path, place: Path, options: argparse.Namespace) -> list[Row]:
+def rows_of_map(name: str, way: Return, first: Path, place: Path, options: argparse.Namespace, kept: Kept) -> list[Row]:
     """first: of the run over the first half, which ways back share; place: of the others."""
     words = QUICKLY if options.quick else ()
-
-    def of(items: Sequence[Item], output: Path, start: int, *more: str) -> dict[int, float]:
-        stream = recorded(items, output.with_suffix(".mcap"))
-        return held_out([*words, f"dataset.path={stream}", *more], output, start, options.resume)
-
-    of(way.first, first, 0, "keep_map=true")
-    extended = of(way.second, place / "second", 0, f"map={first}")
-    one = of(way.both, place / "both", len(way.first))
+    held_out([*words, "keep_map=true"], way.first, first, 0, kept)
+    extended = held_out([*words, f"map={first}"], way.second, place / "second", 0, kept)
+    one = held_out(words, way.both, place / "both", len(way.first), kept)
     same = sorted(extended.keys() & one.keys())
     gain = float(np.mean([extended[k] - one[k] for k in same]))
     mean = float(np.mean(list(extended.values())))
@@ -251,13 +252,12 @@ def rows_of_map(name: str, way: Return, first: Path, place: Path, options: argpa
     ]
 
 
-def kept(file: Path, resume: bool, made: Callable[[], list[Row]]) -> list[Row]:
-    """Rows that an earlier call left in a file, or that are measured now and left there."""
-    if resume and file.exists():
-        return [Row(**row) for row in json.loads(file.read_text())]
-    rows = made()
-    file.write_text(json.dumps([asdict(row) for row in rows]))
-    return rows
+def identity(items: Sequence[Item]) -> str:
+    """Of the same images, taken at the same times."""
+    digest = hashlib.sha256()
+    for item in items:
+        digest.update(np.float64(item.timestamp).tobytes() + item.intrinsics.tobytes() + item.image.tobytes())
+    return digest.hexdigest()
 
 
 def mapped(options: argparse.Namespace) -> dict[str, Scene]:
@@ -272,20 +272,24 @@ def mapped(options: argparse.Namespace) -> dict[str, Scene]:
 def parts(options: argparse.Namespace, place: Path) -> Iterator[list[Row]]:
     known: dict[str, KnownMap] = {}
     plain: dict[str, Return] = {}
+    kept, seen = Kept(options.resume), dict[str, str]()
     for scene, given in scenes(options).items():
         ways, file = given.returns(scene), place / f"{folder_name(scene)}.npz"
-        if not (options.resume and file.exists()):
+        seen[scene] = identity(ways[scene].both)
+        if not kept.has(file, seen[scene]):
             tracked(ways[scene].first)[0].keep_map(file)
+            kept.keep(file, seen[scene])
         for name, way in ways.items():
             measured = partial(rows_of_tracking, name, way, file)
-            yield kept(place / f"{folder_name(name)}.json", options.resume, measured)
+            yield kept.rows(place / f"{folder_name(name)}.json", identity(way.both), measured)
         known[scene], plain[scene] = load(file), ways[scene]
-    yield kept(place / "strangers.json", options.resume, partial(rows_of_strangers, known, plain))
+    yield kept.rows(place / "strangers.json", seen, partial(rows_of_strangers, known, plain))
     for scene, given in mapped(options).items():
         for name, way in given.returns(scene, [120, 160] if options.quick else SMALL).items():
             runs = place / folder_name(name)
             runs.mkdir(exist_ok=True)
-            yield rows_of_map(name, way, place / f"{folder_name(scene)}-first", runs, options)
+            yield rows_of_map(name, way, place / f"{folder_name(scene)}-first", runs, options, kept)
+    yield kept.origin()
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
@@ -296,7 +300,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
 def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--part", choices=("all", "tracker"), default="all", help="tracker: no whole runs")
     parser.add_argument("--maps", help="scenes of which there are whole runs, separated by semicolons; default: all")
-    parser.add_argument("--resume", action="store_true", help="what is in the folder already is not measured again")
+    parser.add_argument("--resume", action="store_true", help="what the same command left there is not measured again")
     parser.add_argument("--output", type=Path, help="folder of the runs; default: runs/bench/known_map")
 
 

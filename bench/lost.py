@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from bench.known_map import errors, tracked
-from bench.table import Row, all_of, at_least, at_most, main
+from bench.table import Row, all_of, at_least, at_most, main, names
 from bench.tracking.cases import CASES, Case
 from launch.compose import compose
 from launch.inline import run_inline
@@ -286,12 +286,13 @@ def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
     if options.quick:
         return [row for name, case in QUICK.items() for row in rows_of(name, case, QUICK_AWAY)]
-    wanted = SCENES if options.scenes is None else {name: SCENES[name] for name in options.scenes.split(";")}
+    wanted = SCENES if options.scenes is None else {name: SCENES[name] for name in options.scenes}
     return [row for name, case in wanted.items() if case.there for row in rows_of(name, case, AWAY)]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", help=f"separated by semicolons, of {'; '.join(SCENES)}; default: all that are here")
+    told = f"separated by semicolons, of {'; '.join(SCENES)}; default: all that are here"
+    parser.add_argument("--scenes", type=names(SCENES, ";"), help=told)
 
 
 if __name__ == "__main__":

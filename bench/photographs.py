@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,9 @@ from bench import pieces
 from bench.baselines import colmap_poses, offline
 from bench.baselines.colmap_poses import Model
 from bench.baselines.offline import Trained
-from bench.baselines.ours import Ours, run_ours
-from bench.runs import QUICK, figure, folder
-from bench.table import Row, at_least, main
+from bench.baselines.ours import Ours, run_ours, why_not
+from bench.runs import QUICK, choices, figure, folder
+from bench.table import Row, at_least, failed, main, names
 from bench.wide import in_pieces
 
 SCENES = ("fountain", "kitti_piece", "drone_tractor_orbit", "south_building")
@@ -34,12 +35,12 @@ WAYS = {"exposure": ("none", "trained"), "rates": tuple(offline.RATES)}  # of wh
 
 
 def colmap(ours: Ours, place: Path, resume: bool) -> tuple[Model | None, str]:
-    """COLMAP's model of all photographs, at the size of our run."""
-    if resume and (place / "model.npz").exists():
-        return colmap_poses.load(place), ""
+    """COLMAP's model of all photographs, at the size of our run; with resume one of the same images is taken again."""
+    if not resume:
+        colmap_poses.forget(place)
     frames = {index: frame.image for index, frame in ours.frames.items()}
     intrinsics = next(iter(ours.frames.values())).intrinsics
-    return colmap_poses.reconstruct(frames, intrinsics, place, 1, photographs=True)
+    return colmap_poses.reconstruct_once(frames, intrinsics, place, 1, photographs=True)
 
 
 def with_focal(ours: Ours, focal: float) -> Ours:
@@ -84,13 +85,16 @@ def protocol(scene: str, ours: Ours) -> Row:
     return Row(f"{scene}: protocol", f"{len(ours.frames)} at {width}x{height}, {len(ours.held_out)} held out, {made}")
 
 
+def overrides_of(options: argparse.Namespace) -> list[str]:
+    return [*GIVEN, *options.overrides, *(QUICK if options.quick else ())]
+
+
 def compare(scene: str, options: argparse.Namespace, output: Path) -> list[Row]:
     place = output / scene
-    overrides = [*GIVEN, *options.overrides, *(QUICK if options.quick else ())]
     made = pieces.Pieces(place, options.resume)
-    ours, _ = run_ours(scene, overrides, {}, place / "ours", made)
+    ours, _ = run_ours(scene, overrides_of(options), {}, place / "ours", made)
     if ours is None:
-        return [Row(f"{scene}: ours", f"failed: see {place / 'ours' / 'full' / 'runs.log'}", "", "a report", False)]
+        return [failed(f"{scene}: ours", why_not(scene, place / "ours"))]
     rows = [protocol(scene, ours)]
     model, why = colmap(ours, place / "colmap", options.resume)
     if model is None:
@@ -107,13 +111,15 @@ def compare(scene: str, options: argparse.Namespace, output: Path) -> list[Row]:
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    scenes = options.scenes.split(",") if options.scenes else list(SCENES[:1] if options.quick else SCENES)
-    output = folder(options, "photographs")
-    return in_pieces(scenes, output, options.resume, options.minutes, lambda scene: compare(scene, options, output))
+    scenes, skipped = pieces.with_data(options.scenes or (SCENES[:1] if options.quick else SCENES))
+    output, asked = folder(options, "photographs"), {"overrides": overrides_of(options), "quick": options.quick}
+    measured = partial(compare, options=options, output=output)
+    return in_pieces(scenes, output, options.resume, options.minutes, measured, asked) + skipped
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", help=f"comma separated; default: {','.join(SCENES)}; --quick: {SCENES[0]}")
+    told = f"comma separated; default: {','.join(SCENES)}; --quick: {SCENES[0]}"
+    parser.add_argument("--scenes", type=names(choices("scene")), help=told)
     parser.add_argument("overrides", nargs="*", help="of our runs: dataset.size=60000")
     parser.add_argument("--output", type=Path, help="folder of what was measured; default: in runs")
     parser.add_argument("--resume", action="store_true", help="keep what an earlier call measured")

@@ -1,7 +1,8 @@
 """Runs in pieces: a long benchmark can be stopped, goes on where it was, and runs made at several times stand together.
 
-Each piece is a Matrix in a folder of its own. One that ended keeps piece.json: what was asked for, and the commit. With
---resume the same command finds it and runs only what is missing; without, everything is measured anew.
+Each piece is a Matrix in a folder of its own, or a file of what was measured. One that ended keeps what was asked for
+and the commit: piece.json of a folder, FILE.asked of a file. With --resume the same command finds it and runs only what
+is missing, failed or was asked for otherwise; without, everything is measured anew.
 """
 
 from __future__ import annotations
@@ -9,13 +10,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.runs import ROOT, Matrix, Run, commit
-from bench.table import Row
+from bench.runs import ROOT, Matrix, Run, commit, missing_data
+from bench.table import Row, is_failure
+from mvsgs_core.atomic_file import replace_text
 
 
 @dataclass
@@ -47,9 +49,10 @@ class Pieces:
             place = self.output / name
             if done is None:
                 (place / "piece.json").unlink(missing_ok=True)
-                (run or Matrix.run)(matrix, place)
                 done = {**asked(matrix), "commit": commit(matrix.checkout)}
-                (place / "piece.json").write_text(json.dumps(done, indent=1))
+                (run or Matrix.run)(matrix, place)
+                if all(made.report is not None for made in matrix.collect(place)):
+                    (place / "piece.json").write_text(json.dumps(done, indent=1))
             found += matrix.collect(place)
             if done["commit"] not in self.commits:
                 self.commits.append(done["commit"])
@@ -81,6 +84,60 @@ class Pieces:
             return None
         done: dict[str, Any] = json.loads(file.read_text())
         return done if {key: done.get(key) for key in asked(matrix)} == asked(matrix) else None
+
+
+@dataclass
+class Kept:
+    """Files of what was measured, each with what was asked for beside it."""
+
+    resume: bool
+    commits: list[str] = field(default_factory=list)  # that made them, each once
+    _commit: str = field(default_factory=commit)  # of this call
+
+    def has(self, file: Path, asked: Any) -> bool:
+        """Whether an earlier call left the file, and asked for the same: for what JSON can say."""
+        beside = _asked_file(file)
+        done = json.loads(beside.read_text()) if self.resume and file.exists() and beside.exists() else None
+        if done is None or done["asked"] != json.loads(json.dumps(asked)):
+            beside.unlink(missing_ok=True)  # the file is about to be another
+            return False
+        self._made_by(done["commit"])
+        return True
+
+    def keep(self, file: Path, asked: Any) -> None:
+        """The file is made: a later call may take it."""
+        replace_text(_asked_file(file), json.dumps({"asked": asked, "commit": self._commit}, indent=1))
+        self._made_by(self._commit)
+
+    def rows(self, file: Path, asked: Any, measured: Callable[[], list[Row]]) -> list[Row]:
+        """Rows that an earlier call left in the file, or that are measured now and, if nothing failed, left there."""
+        if self.has(file, asked):
+            return [Row(**row) for row in json.loads(file.read_text())]
+        rows = measured()
+        if not any(map(is_failure, rows)):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            replace_text(file, json.dumps([asdict(row) for row in rows], indent=1))
+            self.keep(file, asked)
+        return rows
+
+    def origin(self) -> list[Row]:
+        """What must be said of what was read: nothing where all is of one commit."""
+        return [Row("results of the commits", ", ".join(self.commits))] if len(self.commits) > 1 else []
+
+    def _made_by(self, name: str) -> None:
+        if name not in self.commits:
+            self.commits.append(name)
+
+
+def _asked_file(file: Path) -> Path:
+    return file.with_name(f"{file.name}.asked")
+
+
+def with_data(scenes: Sequence[str]) -> tuple[list[str], list[Row]]:
+    """The scenes whose data are on this machine, and a row for each that is left out."""
+    missing = {scene: path for scene in scenes if (path := missing_data(scene)) is not None}
+    rows = [Row(f"{scene}: skipped", f"{path} is missing") for scene, path in missing.items()]
+    return [scene for scene in scenes if scene not in missing], rows
 
 
 def arguments(parser: argparse.ArgumentParser, example: str, jobs: bool = False) -> None:

@@ -63,7 +63,7 @@ def fewer_iterations(text: str | None) -> dict[str, tuple[str, ...]]:
     for part in text.split(",") if text else ():
         each, colon, last = part.partition(":")
         if not each.isdecimal() or (colon and not last.isdecimal()):
-            raise ValueError(f"--fewer {part!r} must be iterations a keyframe and at the end, such as 10:100")
+            raise ValueError(f"{part!r} must be iterations a keyframe and at the end, such as 10:100")
         name = f"{each} a keyframe, {last} at the end" if colon else f"{each} a keyframe"
         end = (f"mapper.refinement={last}",) if colon else ()
         found[name] = (f"mapper.iterations={each}", *end)
@@ -207,15 +207,15 @@ def choices(kind: str) -> list[str]:
     return sorted(file.stem for file in (CONF / kind).glob("*.yaml"))
 
 
+def missing_data(scene: str) -> Path | None:
+    """Where a scene's data should be on this machine; None where they are there, or need none."""
+    path = OmegaConf.load(CONF / "scene" / f"{scene}.yaml").dataset.get("path")
+    return None if path is None or (ROOT / path).exists() else ROOT / path
+
+
 def available_scenes() -> list[str]:
     """The scenes whose data are on this machine."""
-    found = []
-    for name in choices("scene"):
-        config = OmegaConf.load(CONF / "scene" / f"{name}.yaml")
-        path = config.dataset.get("path")
-        if path is None or (ROOT / path).exists():
-            found.append(name)
-    return found
+    return [name for name in choices("scene") if missing_data(name) is None]
 
 
 def folder(options: argparse.Namespace, name: str) -> Path:
@@ -251,7 +251,10 @@ def said(run: Run) -> str:
         lines = log.read_text().splitlines() if log.exists() else []
         pairs = itertools.pairwise(lines)
         own = [line for line, after in pairs if " failed: " in line and f"{run.folder}/logs" in after]
-        refused = [line for line in lines if line.startswith("error: ")]  # before a run starts: no folder is named
+        begins = [k for k, line in enumerate(lines) if line.startswith(f"job {run.folder.name}:")]
+        after = lines[begins[0] :] if begins else lines
+        # before a run starts no folder is named; the cause comes first, then what follows from it
+        refused = [line for line in after if line.startswith("error: ")][:1]
         return (own or refused or ["no report"])[-1]
     warned = [f"{node}: {text}" for node, texts in run.report.get("warnings", {}).items() for text in texts]
     return "; ".join(warned) or "nothing"

@@ -12,7 +12,7 @@ import numpy as np
 
 from bench import pieces, plots
 from bench.runs import QUICK, Matrix, Run, available_scenes, choices, figure, folder, said
-from bench.table import Row, main
+from bench.table import Row, failed, main, names, numbers
 from mvsgs_core.evaluation import metrics, svg
 
 COLUMNS = {  # path in the report
@@ -75,9 +75,7 @@ def rows(runs: list[Run]) -> list[Row]:
                 spread = (max(values) - min(values)) / 2 if len(values) > 1 else None
                 found.append(Row(f"{scene}/{variant}: {column}", float(np.mean(values)), unit, spread=spread))
         found += [
-            Row(f"{scene}/{variant}/seed {run.seed}: finished", said(run), "", "a report", False)
-            for run in group
-            if run.report is None
+            failed(f"{scene}/{variant}/seed {run.seed}: finished", said(run)) for run in group if run.report is None
         ]
     for scene in dict.fromkeys(run.scene for run in runs if run.scene in PAPER):
         published = zip(("all PSNR", "SSIM", "LPIPS"), PAPER[scene])
@@ -86,10 +84,12 @@ def rows(runs: list[Run]) -> list[Row]:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    known = ", ".join(choices("scene"))
-    parser.add_argument("--scenes", help=f"comma separated; default: those whose data are here; known: {known}")
-    parser.add_argument("--variants", default="full", help=f"comma separated: {', '.join(choices('variant'))}")
-    parser.add_argument("--seeds", default="0", help="comma separated")
+    known, variants = choices("scene"), choices("variant")
+    told = f"comma separated; default: those whose data are here; known: {', '.join(known)}"
+    parser.add_argument("--scenes", type=names(known), help=told)
+    told = f"comma separated: {', '.join(variants)}"
+    parser.add_argument("--variants", type=names(variants), default=["full"], help=told)
+    parser.add_argument("--seeds", type=numbers, default=[0], help="comma separated")
     pieces.arguments(parser, "mapper.iterations=30", jobs=True)
 
 
@@ -97,13 +97,13 @@ def measure(options: argparse.Namespace) -> list[Row]:
     overrides = list(options.overrides)
     if options.quick:
         overrides += QUICK
-    scenes = options.scenes.split(",") if options.scenes else ["room"] if options.quick else available_scenes()
+    scenes, skipped = pieces.with_data(options.scenes or (["room"] if options.quick else available_scenes()))
     parts = {scene: [scene] for scene in scenes} if options.jobs == 1 else {"runs": scenes}  # those at once are one
-    variants, seeds = options.variants.split(","), [int(s) for s in options.seeds.split(",")]
     made = pieces.Pieces.of(options, folder(options, "scenes"))
-    runs = made.runs({name: Matrix(some, variants, seeds, overrides, options.jobs) for name, some in parts.items()})
+    given = options.variants, options.seeds, overrides, options.jobs
+    runs = made.runs({name: Matrix(some, *given) for name, some in parts.items() if some})
     plots.write(made.output / "time_against_error.svg", time_against_error(runs))
-    return rows(runs) + made.rows()
+    return rows(runs) + skipped + made.rows()
 
 
 if __name__ == "__main__":

@@ -1,16 +1,28 @@
-"""What every benchmark shares: rows, a table on the screen, `--json FILE`, `--quick`."""
+"""What every benchmark shares: rows, a table on the screen, `--json FILE`, `--quick`, names on its command line.
+
+FILE gets the rows, and FILE.origin beside it commit, machine and date of the measurement, which `bench.record` keeps.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
-from collections.abc import Callable, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from rich.console import Console
 from rich.table import Table
+
+from bench.runs import commit, machine
+
+T = TypeVar("T")
+REPORT = "a report"  # goal of a run: without one there is nothing to measure
 
 
 @dataclass(frozen=True)
@@ -38,20 +50,66 @@ def all_of(name: str, met: int, runs: int) -> Row:
     return Row(name, f"{met} of {runs}", "", f"{runs} of {runs}", met == runs)
 
 
+def failed(name: str, why: str) -> Row:
+    """A run that left no report; the benchmark ends with exit code 1."""
+    return Row(name, why, "", REPORT, False)
+
+
+def is_failure(row: Row) -> bool:
+    return row.goal == REPORT and row.met is False
+
+
 def timed(
     name: str, values: Sequence[float], unit: str, maximum: float | None = None, minimum: float | None = None
 ) -> Row:
     """The median of repeated measurements with their spread. A goal is met where all of them meet it.
 
     values: one a round; what is compared runs in turns within each round, so that whatever else the machine does meets
-    both. Of the goals `maximum` and `minimum` at most one is given.
+    both. Of the goals `maximum` and `minimum` at most one is given. NaN among them: the figure is NaN, and no goal met.
     """
-    value, spread = statistics.median(values), (max(values) - min(values)) / 2
+    known = not any(map(math.isnan, values))  # neither orders nor limits hold for NaN
+    value = statistics.median(values) if known else math.nan
+    spread = (max(values) - min(values)) / 2 if known else math.nan
     if maximum is not None:
-        return Row(name, value, unit, f"<= {maximum:g}, all of {len(values)}", max(values) <= maximum, spread)
+        met = known and max(values) <= maximum
+        return Row(name, value, unit, f"<= {maximum:g}, all of {len(values)}", met, spread)
     if minimum is not None:
-        return Row(name, value, unit, f">= {minimum:g}, all of {len(values)}", min(values) >= minimum, spread)
+        met = known and min(values) >= minimum
+        return Row(name, value, unit, f">= {minimum:g}, all of {len(values)}", met, spread)
     return Row(name, value, unit, spread=spread)
+
+
+def checked(convert: Callable[[str], T]) -> Callable[[str], T]:
+    """A type of an argument: the ValueErrors of `convert` are said with the usage."""
+
+    def converted(text: str) -> T:
+        try:
+            return convert(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return converted
+
+
+def names(known: Iterable[str], separator: str = ",") -> Callable[[str], list[str]]:
+    """A type of an argument: one of the known names or several."""
+    there = list(known)
+
+    def listed(text: str) -> list[str]:
+        found = text.split(separator)
+        if unknown := [name for name in found if name not in there]:
+            raise ValueError(f"no {', '.join(map(repr, unknown))}; there are: {f'{separator} '.join(there)}")
+        return found
+
+    return checked(listed)
+
+
+@checked
+def numbers(text: str) -> list[int]:
+    """A type of an argument: 0,1,2."""
+    if not all(part.isdecimal() for part in text.split(",")):
+        raise ValueError(f"{text!r} must be numbers such as 0,1,2")
+    return [int(part) for part in text.split(",")]
 
 
 def show(rows: list[Row], title: str) -> None:
@@ -70,14 +128,37 @@ def main(
     title: str,
     arguments: Callable[[argparse.ArgumentParser], None] | None = None,
 ) -> None:
-    """Command line of a benchmark: measures, prints the table, writes the JSON rows."""
+    """Command line of a benchmark: measures, prints the table, writes the rows. Exits with 1 where a run failed."""
     parser = argparse.ArgumentParser(description=title)
     parser.add_argument("--quick", action="store_true", help="a smaller run that ends within a minute")
     parser.add_argument("--json", type=Path, help="write the rows as JSON")
     if arguments:
         arguments(parser)
     options = parser.parse_args()
+    made = {"commit": commit(), "machine": machine(), "date": time.strftime("%Y-%m-%d")}  # of what runs from here on
+    if options.json:
+        try:
+            _try_to_write(options.json)
+        except OSError as error:
+            parser.error(f"--json {options.json}: {error.strerror}")
     rows = measure(options)
     show(rows, title)
     if options.json:
         options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+        origin_of(options.json).write_text(json.dumps(made, indent=1))
+    if any(map(is_failure, rows)):
+        sys.exit(1)
+
+
+def origin_of(file: Path) -> Path:
+    """Where commit, machine and date of a file of rows are."""
+    return file.with_name(f"{file.name}.origin")
+
+
+def _try_to_write(file: Path) -> None:
+    """Raises OSError where nothing can be written there: a measurement takes hours and would be lost at its end."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    new = not file.exists()
+    file.open("a").close()
+    if new:
+        file.unlink()

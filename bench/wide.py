@@ -6,30 +6,30 @@ pairs. Position error: root mean square of the distance to COLMAP's positions af
 photographs that both have, in percent of the path from photograph to photograph in the order of their names.
 
 What was measured of a scene is kept in runs/bench/wide: with --resume the same command measures only the scenes that
-are missing there, and --minutes ends it early, so that all can be measured at several times. Ours and COLMAP's are
-always of the same time.
+are missing there or were measured otherwise, and --minutes ends it early, so that all can be measured at several times.
+Ours and COLMAP's are always of the same time.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from bench.baselines.colmap_poses import Model as ColmapModel
 from bench.baselines.colmap_poses import reconstruct
-from bench.runs import DATA, commit, folder
-from bench.table import Row, at_most, main
+from bench.pieces import Kept
+from bench.runs import DATA, folder
+from bench.table import Row, at_most, main, names
 from mvsgs_core import geometry
-from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.photographs.reconstruction import Model
 from mvsgs_core.photographs.structure import Photographs
@@ -169,43 +169,40 @@ def apart(name: str, theirs: ColmapModel, again: ColmapModel) -> list[Row]:
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    scenes = options.scenes.split(",") if options.scenes else list(QUICK if options.quick else NAMES)
-    unknown = set(scenes) - set(NAMES)
-    if unknown:
-        raise SystemExit(f"--scenes {','.join(sorted(unknown))}: there are {','.join(NAMES)}")
+    scenes = options.scenes or list(QUICK if options.quick else NAMES)
+    missing = {name: DATA / NAMES[name][0] for name in scenes if not (DATA / NAMES[name][0]).exists()}
+    skipped = [Row(f"{name}: skipped", f"{path} is missing") for name, path in missing.items()]
+    scenes = [name for name in scenes if name not in missing]
     measured = partial(scene, both_orders=options.colmap_in_both_orders)
-    return in_pieces(scenes, folder(options, "wide"), options.resume, options.minutes, measured)
+    asked = {"colmap_in_both_orders": options.colmap_in_both_orders}
+    return in_pieces(scenes, folder(options, "wide"), options.resume, options.minutes, measured, asked) + skipped
 
 
 def in_pieces(
-    scenes: Sequence[str], output: Path, resume: bool, minutes: float | None, measured: Callable[[str], list[Row]]
-) -> list[Row]:
+    scenes: Sequence[str], output: Path, resume: bool, minutes: float | None, measured: Callable[[str], list[Row]],
+    asked: Any,
+) -> list[Row]:  # fmt: skip
     """The rows of all scenes, of which those of another time are read where `resume`; each is kept as it ends.
 
-    minutes: no scene is begun after; None: all are.
+    minutes: no scene is begun after; None: all are. asked: what else the rows of a scene depend on.
     """
-    start, rows, commits, missing = time.monotonic(), [], set(), []
+    start, rows, kept, missing = time.monotonic(), [], Kept(resume), []
     for name in scenes:
         file = output / f"{name}.json"
-        if not (resume and file.exists()):
-            if minutes is not None and time.monotonic() - start > 60.0 * minutes:
-                missing.append(name)
-                continue
-            found = {"commit": commit(), "rows": [asdict(row) for row in measured(name)]}
-            output.mkdir(parents=True, exist_ok=True)
-            replace_text(file, json.dumps(found, indent=1))
-        kept = json.loads(file.read_text())
-        commits.add(kept["commit"])
-        rows += [Row(**row) for row in kept["rows"]]
-    if len(commits) > 1:
-        rows.append(Row("scenes of the commits", ", ".join(sorted(commits))))
+        late = minutes is not None and time.monotonic() - start > 60.0 * minutes
+        if late and not kept.has(file, asked):
+            missing.append(name)
+        else:
+            rows += kept.rows(file, asked, partial(measured, name))
+    rows += kept.origin()
     if missing:
         rows.append(Row("not measured yet (--resume goes on with them)", ", ".join(missing)))
     return rows
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", help="those to measure, by commas; all, or the two smallest with --quick")
+    told = "those to measure, by commas; default: all, or the two smallest with --quick"
+    parser.add_argument("--scenes", type=names(NAMES), help=told)
     parser.add_argument("--output", type=Path, help="folder of what was measured; default: in runs")
     parser.add_argument("--resume", action="store_true", help="keep the scenes that an earlier call measured")
     parser.add_argument("--minutes", type=float, help="begin no scene after; --resume goes on")

@@ -17,17 +17,18 @@ from pathlib import Path
 
 from bench import pieces
 from bench.baselines import offline, opensplat
-from bench.baselines.colmap_poses import Model
+from bench.baselines.colmap_poses import Model, forget
 from bench.baselines.offline import GAIN, Trained, converged
-from bench.baselines.ours import Ours, ate_percent, cheapest, run_ours
+from bench.baselines.ours import Ours, ate_percent, cheapest, run_ours, why_not
 from bench.finished import read_frames
-from bench.runs import FEWER, QUICK, Run, fewer_iterations, figure, folder
-from bench.table import Row, at_least, at_most, main
+from bench.runs import FEWER, QUICK, Run, choices, fewer_iterations, figure, folder
+from bench.table import Row, at_least, at_most, checked, failed, main, names
 from bench.tracking.baselines import Baseline, solve
 from mvsgs_core.datasets import Item
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.machine import available_cores
 
+SCENES = ["redkitchen", "tum_fr1_xyz"]
 QUICK_SCENE = "room"  # scene of a quick run: in 30 frames of the real ones COLMAP puts no two images together
 EVENLY = 100  # frames that COLMAP gets, about, besides our keyframes and every 5th
 AHEAD = 0.5  # dB that ours is to be better than the best of theirs, at equal processor time
@@ -40,7 +41,7 @@ def solve_poses(ours: Ours, place: Path, threads: int, resume: bool) -> tuple[Ba
     stride = max(1, round(len(ours.frames) / EVENLY))
     known = {*ours.keyframes, *(i for i in ours.frames if is_held_out(i) or i % stride == 0)}
     if not resume:
-        (place / "images.sha256").unlink(missing_ok=True)  # what `solve` would know an earlier model by
+        forget(place)
     place.mkdir(parents=True, exist_ok=True)
     whole = read_frames({**ours.settings, "size": None})
     items = [Item(i, whole[i].timestamp, whole[i].image, whole[i].intrinsics) for i in sorted(known)]
@@ -100,15 +101,13 @@ def longer_rows(scene: str, model: Model, trained: list[Trained]) -> list[Row]:
 
 def verdict(scene: str, ours: Ours, fewer: dict[str, Run], model: Model, equal: Trained) -> list[Row]:
     """Ours against the best of theirs at equal processor time, and the time to their quality."""
-    whole = equal.seconds + model.processor_seconds
+    whole, known = equal.seconds + model.processor_seconds, set(model.index.tolist())
     rows = [
         Row(f"{scene}: COLMAP + splatting, its best way", equal.way),
-        at_least(
-            f"{scene}: ours minus theirs, equal time", ours.psnr(set(model.index.tolist())) - equal.psnr, "dB", AHEAD
-        ),
+        at_least(f"{scene}: ours minus theirs, equal time", ours.psnr(known) - equal.psnr, "dB", AHEAD),
     ]
     name = f"{scene}: time from frames to their PSNR, ours over theirs"
-    found = cheapest(ours, fewer, equal.psnr)
+    found = cheapest(ours, fewer, equal.psnr, known)
     if found is None:
         return [*rows, Row(name, "none of ours is as good", "", f"<= {SHARE:g}", False)]
     return [*rows, at_most(name, found[1] / whole, f"(by {found[0]})", SHARE)]
@@ -127,12 +126,11 @@ def protocol(scene: str, ours: Ours, baseline: Baseline, frames: list[int]) -> R
 
 def compare(scene: str, options: argparse.Namespace, overrides: list[str], made: pieces.Pieces) -> list[Row]:
     place = made.output / scene
-    ours, fewer = run_ours(scene, overrides, fewer_iterations(options.fewer), place / "ours", made)
+    ours, fewer = run_ours(scene, overrides, options.fewer, place / "ours", made)
     if ours is None:
         if any(name.startswith(f"{scene}/") for name in made.missing):
             return []
-        log = place / "ours" / "full" / "runs.log"
-        return [Row(f"{scene}: ours", f"failed: see {log}", "", "a report", False)]
+        return [failed(f"{scene}: ours", why_not(scene, place / "ours"))]
     resume = options.resume or options.collect
     baseline, frames = solve_poses(ours, place / "colmap", options.threads or available_cores(), resume)
     rows = [protocol(scene, ours, baseline, frames)]
@@ -173,21 +171,22 @@ def opensplat_rows(scene: str, binary: Path | None, ours: Ours, model: Model, pl
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    scenes = options.scenes.split(",")
+    scenes, skipped = pieces.with_data(options.scenes)
     overrides = list(options.overrides)
     if options.quick:
-        scenes, options.longest = [QUICK_SCENE], 1.0
+        scenes, skipped, options.longest = [QUICK_SCENE], [], 1.0
         overrides += QUICK
     made = pieces.Pieces.of(options, folder(options, "baselines"))
     rows = [row for scene in scenes for row in compare(scene, options, overrides, made)]
-    return rows + made.rows()
+    return rows + skipped + made.rows()
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", default="redkitchen,tum_fr1_xyz", help=f"comma separated; --quick: {QUICK_SCENE}")
+    told = f"comma separated; default: {','.join(SCENES)}; --quick: {QUICK_SCENE}"
+    parser.add_argument("--scenes", type=names(choices("scene")), default=SCENES, help=told)
     parser.add_argument("--longest", type=float, default=8.0, help="times our mapper's time, for the offline one")
     parser.add_argument("--threads", type=int, help="of COLMAP; default: all cores")
-    parser.add_argument("--fewer", help=FEWER)
+    parser.add_argument("--fewer", type=checked(fewer_iterations), default={}, help=FEWER)
     parser.add_argument("--opensplat", type=Path, help="binary of OpenSplat, to be run too")
     pieces.arguments(parser, "dataset.stop=100")
 

@@ -12,10 +12,11 @@ from omegaconf import OmegaConf
 
 from bench import pieces
 from bench.finished import read_frames
-from bench.runs import Matrix, Run, figure, folder_name
+from bench.runs import Matrix, Run, folder_name, said
 from msgs import GroundTruth
 from mvsgs_core.evaluation import trajectory_metrics
 from mvsgs_core.held_out import is_held_out
+from mvsgs_core.mapping.config import MapperConfig
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Ours:
     track: dict[str, list[Any]]
     frames: dict[int, GroundTruth]
     settings: dict[str, Any] = field(default_factory=dict)  # of the reader
+    iterations: str = ""  # of the mapper, as `fewer_iterations` calls them
 
     @property
     def keyframes(self) -> list[int]:
@@ -73,8 +75,13 @@ class Ours:
 
     def psnr(self, frames: set[int]) -> float:
         """Mean over those of `frames` that are held out."""
-        scores = self.report["rendering"]["frames"]
-        return float(np.mean([s["psnr"] for s in scores if s["held_out"] and s["index"] in frames]))
+        return held_out_psnr(self.report, frames)
+
+
+def held_out_psnr(report: dict[str, Any], frames: set[int]) -> float:
+    """Mean over those of `frames` that are held out in a run."""
+    scores = report["rendering"]["frames"]
+    return float(np.mean([s["psnr"] for s in scores if s["held_out"] and s["index"] in frames]))
 
 
 def processor_seconds(report: dict[str, Any]) -> float:
@@ -92,8 +99,8 @@ def run_ours(
     for name, settings in {"full": (), **fewer}.items():
         folder = output / folder_name(name)
         matrix = Matrix([scene], overrides=[*given, *overrides, *settings])
-        made.runs({str(folder.relative_to(made.output)): matrix})
-        runs[name] = matrix.collect(folder)[0]
+        found = made.runs({str(folder.relative_to(made.output)): matrix})  # nothing where it is missing
+        runs[name] = found[0] if found else Run(scene, "full", 0, folder / "0", None)
     full = runs.pop("full")
     if full.report is None or not (full.folder / "track.json").exists():
         return None, runs
@@ -101,19 +108,27 @@ def run_ours(
     assert isinstance(config, dict)
     track = json.loads((full.folder / "track.json").read_text())
     reader = dict(config["dataset"])
-    return Ours(full.report, track, read_frames(reader), reader), runs
+    return Ours(full.report, track, read_frames(reader), reader, iterations_of(config["mapper"])), runs
 
 
-def cheapest(ours: Ours, fewer: dict[str, Run], psnr: float) -> tuple[str, float] | None:
-    """Of our runs that reach a held-out PSNR the one of the fewest processor seconds, and these; None: none does."""
-    reports = {
-        "30 a keyframe, 300 at the end": ours.report,
-        **{n: run.report for n, run in fewer.items() if run.report},
-    }
+def iterations_of(mapper: dict[str, Any]) -> str:
+    """What the mapper's parameters say of its iterations, as `fewer_iterations` calls them."""
+    given = {name: mapper[name] for name in ("iterations", "refinement", "realtime")}
+    each = f"{MapperConfig(**given).budget} a keyframe"
+    return each if given["refinement"] is None else f"{each}, {given['refinement']} at the end"
+
+
+def why_not(scene: str, output: Path) -> str:
+    """What `run_ours` said of a run of which there is none, and where more of it is."""
+    return f"{said(Run(scene, 'full', 0, output / 'full' / '0', None))} (see {output / 'full' / 'runs.log'})"
+
+
+def cheapest(ours: Ours, fewer: dict[str, Run], psnr: float, frames: set[int]) -> tuple[str, float] | None:
+    """Of our runs that reach a PSNR, over those of `frames` that are held out, the one of the fewest processor seconds,
+    and these; None: none does."""
+    reports = {ours.iterations: ours.report, **{n: run.report for n, run in fewer.items() if run.report}}
     found = {
-        name: processor_seconds(report)
-        for name, report in reports.items()
-        if (figure(report, "rendering.held_out.psnr") or 0.0) >= psnr
+        name: processor_seconds(report) for name, report in reports.items() if held_out_psnr(report, frames) >= psnr
     }
     name = min(found, key=lambda n: found[n], default=None)
     return None if name is None else (name, found[name])

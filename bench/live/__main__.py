@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from bench.live.recordings import SCENES, available, recording
+from bench.pieces import Kept
 from bench.runs import ROOT, environment, figure, folder, folder_name
-from bench.table import Row, at_least, at_most, main
+from bench.table import Row, at_least, at_most, failed, main, names
 from mvsgs_core.mvs.cascade import Cascade
 
 ALL = tuple(range(len(Cascade.efforts)))
@@ -87,23 +88,29 @@ def below(live: Result, unhurried: Result, refined: bool) -> float:
     return float(np.mean([there[i] - here[i] for i in common])) if common else float("inf")
 
 
-def run(scene: str, way: Way, place: Path, options: argparse.Namespace) -> Result:
-    """Maps a scene; a report that is there already is taken with --resume."""
+def run(scene: str, way: Way, place: Path, options: argparse.Namespace, kept: Kept) -> Result:
+    """Maps a scene, or takes a report of the same that is kept."""
     output = place / scene / folder_name(way.name)
     file = output / "report.json"
-    if not (options.resume and file.exists()):
-        shutil.rmtree(output, ignore_errors=True)
-        output.mkdir(parents=True)
-        path = recording(scene, place, options.stop)
-        cores = ",".join(map(str, sorted(os.sched_getaffinity(0))[: way.cores]))
-        command = [
-            "taskset", "-c", cores, sys.executable, str(ROOT / "launch" / "run_all.py"), *ALWAYS,
-            f"dataset.path={path}", f"output={output}", *way.overrides, *options.overrides,
-        ]  # fmt: skip
-        with (output.parent / f"{output.name}.log").open("w") as log:
-            subprocess.run(command, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT, check=False)
+    given = [*ALWAYS, *way.overrides, *options.overrides]
+    asked = {"overrides": given, "cores": way.cores, "stop": options.stop}
+    if kept.has(file, asked):
+        return Result(json.loads(file.read_text()))
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir(parents=True)
+    path = recording(scene, place, options.stop)
+    cores = ",".join(map(str, sorted(os.sched_getaffinity(0))[: way.cores]))
+    command = [
+        "taskset", "-c", cores, sys.executable, str(ROOT / "launch" / "run_all.py"), f"dataset.path={path}",
+        f"output={output}", *given,
+    ]  # fmt: skip
+    with (output.parent / f"{output.name}.log").open("w") as log:
+        subprocess.run(command, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT, check=False)
     report = json.loads(file.read_text()) if file.exists() else None
-    return Result(report if report is not None and report.get("finished", True) else None)
+    if report is None or not report.get("finished", True):
+        return Result(None)
+    kept.keep(file, asked)
+    return Result(report)
 
 
 def rows_of_pace(name: str, live: Result) -> list[Row]:
@@ -150,20 +157,27 @@ def rows_of_loss(
     return [*rows, Row(f"{name}: last keyframe to the map before its refinement, s", handed_out)]
 
 
-def measure_scene(scene: str, place: Path, options: argparse.Namespace) -> list[Row]:
-    unhurried = run(scene, UNHURRIED, place, options)
-    governed = run(scene, GOVERNED, place, options)
-    rows = [*rows_of_pace(f"{scene}: {GOVERNED.name}", governed)]
+def measure_scene(scene: str, place: Path, options: argparse.Namespace, kept: Kept) -> list[Row]:
+    rows: list[Row] = []
+
+    def run_way(way: Way) -> Result:
+        found = run(scene, way, place, options, kept)
+        if found.report is None:
+            rows.append(failed(f"{scene}: {way.name}", f"see {place / scene / folder_name(way.name)}.log"))
+        return found
+
+    unhurried, governed = run_way(UNHURRIED), run_way(GOVERNED)
+    rows += rows_of_pace(f"{scene}: {GOVERNED.name}", governed)
     rows += rows_of_loss(f"{scene}: {GOVERNED.name}", governed, unhurried, 2.0, 0.5)
     if options.quick:
         return rows
     for way in (ONE_CORE, *SLOWED):
-        found = run(scene, way, place, options)
+        found = run_way(way)
         rows += rows_of_pace(f"{scene}: {way.name}", found)[:4]
         rows += rows_of_loss(f"{scene}: {way.name}", found, unhurried, below(governed, unhurried, False) + 2.0)
     best = float("inf")
     for way in (*FIXED, *WITHOUT):
-        found = run(scene, way, place, options)
+        found = run_way(way)
         rows += rows_of_pace(f"{scene}: {way.name}", found)[3:6]
         rows += rows_of_loss(f"{scene}: {way.name}", found, unhurried)
         in_time = found.latency("mapper", TO_MAP, "p99") <= 3.0
@@ -176,21 +190,23 @@ def measure_scene(scene: str, place: Path, options: argparse.Namespace) -> list[
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", help=f"comma separated, of {', '.join(SCENES)}; default: those whose data are here")
+    told = f"comma separated, of {', '.join(SCENES)}; default: those whose data are here"
+    parser.add_argument("--scenes", type=names(SCENES), help=told)
     parser.add_argument("--stop", type=int, help="frames of each; default: all")
-    parser.add_argument("--resume", action="store_true", help="runs whose reports are there are not run again")
+    parser.add_argument("--resume", action="store_true", help="what the same command left is not run again")
     parser.add_argument("--output", type=Path, help="folder of the runs; default: runs/bench/live")
     parser.add_argument("overrides", nargs="*", help="for all runs, such as mapper.refinement=300")
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    scenes: Sequence[str] = options.scenes.split(",") if options.scenes else available()
-    if unknown := sorted(set(scenes) - SCENES.keys()):
-        raise SystemExit(f"no scene {', '.join(unknown)}; there are: {', '.join(SCENES)}")
+    there = available()
+    scenes: Sequence[str] = options.scenes or there
     if options.quick and not options.scenes:
         scenes, options.stop = ["room"], options.stop or 90
-    place = folder(options, "live")
-    return [row for scene in scenes for row in measure_scene(scene, place, options)]
+    place, kept = folder(options, "live"), Kept(options.resume)
+    rows = [row for scene in scenes if scene in there for row in measure_scene(scene, place, options, kept)]
+    rows += [Row(f"{scene}: skipped", f"{SCENES[scene]['path']} is missing") for scene in scenes if scene not in there]
+    return rows + kept.origin()
 
 
 if __name__ == "__main__":

@@ -131,9 +131,9 @@ def difficulties(options: argparse.Namespace, overrides: list[str], easy: Outcom
 
 
 def real(options: argparse.Namespace) -> list[Row]:
-    matrix = Matrix(REAL, overrides=SMALL[4:], jobs=options.jobs)
-    rows = []
-    for run in _go(matrix, options, "real"):
+    scenes, rows = pieces.with_data(REAL)
+    matrix = Matrix(scenes, overrides=SMALL[4:], jobs=options.jobs)
+    for run in _go(matrix, options, "real") if scenes else []:
         known_poses = figure(run.report, "trajectory.path_length") is not None
         rows += rows_of(run.scene, Outcome.of(run), None, known_poses=known_poses)
     return rows

@@ -194,7 +194,8 @@ def parts(options: argparse.Namespace) -> list[Row]:
 def arguments(parser: argparse.ArgumentParser) -> Any:
     flag = argparse.BooleanOptionalAction
     parser.add_argument("--runs", type=int, default=3, help="of every sequence")
-    parser.add_argument("--only", nargs="*", help="names of sequences, memory")
+    known = [*CASES, "memory"]
+    parser.add_argument("--only", nargs="*", choices=known, metavar="NAME", help="sequences, or memory; default: all")
     parser.add_argument("--colmap", action=flag, default=True, help="pycolmap on the same frames (one core, minutes)")
     parser.add_argument("--curve", action=flag, default=True, help="run time against error over the main settings")
     parser.add_argument("--frames", type=int, default=2000, help="of the run whose memory is measured, more than 500")

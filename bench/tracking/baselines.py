@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from bench.baselines.colmap_poses import Model, load, reconstruct
+from bench.baselines.colmap_poses import Model, reconstruct_once
 from bench.table import Row, at_most
 from bench.tracking.cases import CASES
 from mvsgs_core import geometry
@@ -36,17 +35,7 @@ def solve(items: Sequence[Item], folder: Path, threads: int) -> Baseline:
     small = fit_size(*size, AREA) if size[0] * size[1] > AREA else size
     frames = {i.index: resize_image(i.image, small) for i in items}
     intrinsics = scale_intrinsics(items[0].intrinsics, size, small)
-    digest = hashlib.sha256(intrinsics.tobytes())
-    for index, image in frames.items():
-        digest.update(index.to_bytes(8, "little") + image.tobytes())
-    key = folder / "images.sha256"
-    if key.exists() and key.read_text() == digest.hexdigest():
-        return Baseline(load(folder), "", small)
-    key.unlink(missing_ok=True)
-    model, why = reconstruct(frames, intrinsics, folder, threads)
-    if model is not None:
-        key.write_text(digest.hexdigest())
-    return Baseline(model, why, small)
+    return Baseline(*reconstruct_once(frames, intrinsics, folder, threads), small)
 
 
 def solve_case(name: str, folder: Path) -> Baseline:

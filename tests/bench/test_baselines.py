@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import stat
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +14,15 @@ import numpy as np
 import pytest
 import torch
 
-from bench import figures
+from bench import figures, photographs
 from bench.baselines import __main__ as baselines
-from bench.baselines import offline, opensplat
+from bench.baselines import colmap_poses, offline, opensplat
 from bench.baselines.colmap_poses import Model
 from bench.baselines.offline import Trained, Way
-from bench.baselines.ours import Ours, ate_percent, cheapest
+from bench.baselines.ours import Ours, ate_percent, cheapest, iterations_of, run_ours
 from bench.baselines.sparse_splats import Posed, SparseConfig, SparseMap
-from bench.runs import Run
+from bench.pieces import Pieces
+from bench.runs import Run, fewer_iterations
 from bench.table import Row
 from msgs import GroundTruth
 from mvsgs_core.datasets import open_dataset
@@ -51,7 +54,7 @@ def six_frames(track: dict[str, Any] | None = None, **figures: Any) -> Ours:
         gray = np.full((12, 16, 3), 40 * i, np.uint8)
         frames[i] = GroundTruth(i, 0.1 * i, gray, np.array([9.0, 9, 5, 3]), pose, None)
     path = {"index": [0, 3, 5], "keyframe": [True, True, False], "world_from_cam": [None] * 3, **(track or {})}
-    return Ours(report(**figures), path, frames)
+    return Ours(report(**figures), path, frames, iterations="15 a keyframe")
 
 
 def by_name(rows: list[Row]) -> dict[str, Row]:
@@ -68,6 +71,39 @@ def test_ours_has_its_frames_its_times_and_its_exposures() -> None:
     assert known is not None
     assert known.keys() == {0, 5}
     assert known[5][1, 1] == 2.0
+
+
+def test_a_run_of_ours_is_called_by_its_own_iterations() -> None:
+    plain = {"iterations": None, "refinement": None, "realtime": False}
+    assert iterations_of(plain) == f"{MapperConfig().budget} a keyframe"
+    assert iterations_of({**plain, "iterations": 7, "refinement": 50}) == "7 a keyframe, 50 at the end"
+    assert list(fewer_iterations("7:50,5")) == ["7 a keyframe, 50 at the end", "5 a keyframe"]  # as the others
+
+
+def test_a_run_that_is_missing_is_not_taken_from_an_earlier_call(tmp_path: Path) -> None:
+    left = tmp_path / "ours" / "5_a_keyframe" / "0"
+    left.mkdir(parents=True)
+    (left / "report.json").write_text(json.dumps(report()))
+    fewer = {"5 a keyframe": ("mapper.iterations=5",)}
+    ours, others = run_ours("room", [], fewer, tmp_path / "ours", Pieces(tmp_path, collect=True))
+    assert ours is None
+    assert others["5 a keyframe"].report is None
+
+
+def test_colmap_s_model_of_other_images_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def reconstruct(frames: dict[int, np.ndarray], *args: Any) -> tuple[Model, str]:
+        made.append(frames[0].size)
+        return NO_MODEL, ""
+
+    monkeypatch.setattr(colmap_poses, "reconstruct", reconstruct)
+    monkeypatch.setattr(colmap_poses, "load", lambda folder: NO_MODEL)
+    for size, resume in ((4, True), (4, True), (6, True), (6, False)):
+        small = six_frames()
+        frames = {0: replace(small.frames[0], image=np.zeros((2, size, 3), np.uint8))}
+        assert photographs.colmap(replace(small, frames=frames), tmp_path, resume) == (NO_MODEL, "")
+    assert made == [24, 36, 36]
 
 
 def test_the_error_of_other_poses_is_taken_over_common_frames_after_alignment() -> None:
@@ -125,7 +161,10 @@ def test_ours_is_to_be_better_at_equal_time_and_as_good_in_a_tenth_of_theirs() -
     assert (ahead.value, ahead.met) == (pytest.approx(0.6), True)
     share = rows["room: time from frames to their PSNR, ours over theirs"]
     assert (share.value, share.met) == (pytest.approx(2.0 / 34.0), True)
-    assert cheapest(six_frames(), fewer, 24.8) == ("30 a keyframe, 300 at the end", 4.0)
+    assert cheapest(six_frames(), fewer, 24.8, {5}) == ("15 a keyframe", 4.0)
+    apart = report(30.0, 0.5)  # better only where COLMAP has no pose
+    apart["rendering"]["frames"] = [{"index": i, "psnr": p, "held_out": True} for i, p in ((5, 20.0), (10, 50.0))]
+    assert cheapest(six_frames(), {"5": Run("room", "full", 0, Path("x"), apart)}, 24.8, {5}) == ("15 a keyframe", 4.0)
     worse = by_name(baselines.verdict("room", six_frames(psnr=24.0), {}, model, equal))
     assert [row.met for row in worse.values()] == [None, False, False]
 

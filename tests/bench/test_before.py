@@ -114,12 +114,10 @@ def test_the_best_map_in_the_time_of_before_tells_what_is_gained_in_it() -> None
 
 
 def test_sides_are_checkouts_with_their_iterations() -> None:
-    found = before.sides(Path("other"), "10:100")
+    found = before.sides(Path("other"), runs.fewer_iterations("10:100"))
     assert found["before"] == (Path("other"), ())
     assert found["after"] == (ROOT, ())
     assert found["10 a keyframe, 100 at the end"] == (ROOT, ("mapper.iterations=10", "mapper.refinement=100"))
-    with pytest.raises(ValueError, match="such as 10:100"):
-        before.sides(ROOT, "ten")
 
 
 def test_how_long_the_end_is_may_be_left_to_the_mapper() -> None:
@@ -128,7 +126,7 @@ def test_how_long_the_end_is_may_be_left_to_the_mapper() -> None:
         "22 a keyframe": ("mapper.iterations=22",),
     }
     for wrong in ("5:", "some", ":50"):
-        with pytest.raises(ValueError, match="iterations a keyframe"):
+        with pytest.raises(ValueError, match=r"iterations a keyframe.*such as 10:100"):
             runs.fewer_iterations(wrong)
 
 
@@ -157,6 +155,8 @@ def test_a_checkout_that_would_run_other_code_is_refused(tmp_path: Path) -> None
     before.check(ROOT)
     with pytest.raises(ValueError, match=r"would run .*: it needs a .venv of its own"):
         before.check(tmp_path)
+    with pytest.raises(ValueError, match="nowhere is no folder"):
+        before.checkout_at(str(tmp_path / "nowhere"))
 
 
 def test_both_run_in_turns_with_the_settings_of_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
+import json
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from bench.live.__main__ import FIXED, SLOW, WITHOUT, Result, below, efforts, rows_of_pace
+from bench.live.__main__ import FIXED, ONE_CORE, SLOW, WITHOUT, Result, below, efforts, rows_of_pace, run
 from bench.live.recordings import SCENES, recording
 from bench.live.slow import SlowFusion, SlowMapper, SlowStereo, slowed
+from bench.pieces import Kept
 from launch.compose import compose
 from msgs import Frame
 from nodes.player import Player
@@ -31,6 +34,32 @@ def test_maps_are_compared_on_the_held_out_frames_that_both_know() -> None:
 def test_a_run_that_failed_meets_no_goal() -> None:
     rows = rows_of_pace("x", Result(None))
     assert [row.met for row in rows if row.goal] == [False] * 4
+
+
+def test_only_a_finished_run_of_the_same_settings_is_taken_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[list[str]] = []
+    finished = iter((False, True, True, True))
+
+    def start(command: list[str], **_: Any) -> None:
+        ran.append(command)
+        output = next(Path(word.removeprefix("output=")) for word in command if word.startswith("output="))
+        (output / "report.json").write_text(json.dumps({"finished": next(finished), "run": len(ran)}))
+
+    kept = Kept(True)
+    monkeypatch.setattr("bench.live.__main__.recording", lambda *_: tmp_path / "room.mcap")
+    monkeypatch.setattr("bench.live.__main__.subprocess.run", start)
+
+    def reports(stop: int, *overrides: str) -> Any:
+        options = argparse.Namespace(stop=stop, overrides=list(overrides))
+        return run("room", ONE_CORE, tmp_path, options, kept).report
+
+    assert reports(90) is None  # it ended early
+    assert reports(90)["run"] == reports(90)["run"] == 2
+    assert reports(60)["run"] == 3
+    assert reports(60, "mapper.refinement=300")["run"] == 4
+    assert len(ran) == 4
 
 
 def test_goals_are_those_of_pose_and_map() -> None:

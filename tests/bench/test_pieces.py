@@ -11,8 +11,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from bench import ablation
-from bench.pieces import Pieces
+from bench.pieces import Kept, Pieces, with_data
 from bench.runs import CONF, Matrix, Run
+from bench.table import Row
 from nodes.mapper import Mapper
 from nodes.mvs import Mvs
 from nodes.parameters import parameters
@@ -59,6 +60,46 @@ def test_a_piece_of_other_settings_or_one_that_was_cut_short_is_not_taken_for_do
     (tmp_path / "room" / "piece.json").unlink()
     assert Pieces(tmp_path, resume=True).runs(matrices("room"))
     assert ran == ["room", "room", "room"]
+
+
+def test_a_piece_with_a_run_that_failed_is_run_again(tmp_path: Path, ran: list[str]) -> None:
+    Pieces(tmp_path).runs(matrices("room"))
+    file = tmp_path / "room" / "1" / "report.json"
+
+    def fails(matrix: Matrix, output: Path) -> None:
+        file.unlink()
+
+    failed = Pieces(tmp_path).runs(matrices("room"), fails)
+    assert [run.report is None for run in failed] == [False, True]
+    assert not (tmp_path / "room" / "piece.json").exists()
+    assert all(run.report for run in Pieces(tmp_path, resume=True).runs(matrices("room")))
+    assert ran == ["room", "room"]
+
+
+def test_a_file_of_other_settings_is_not_taken(tmp_path: Path) -> None:
+    file = tmp_path / "report.json"
+    asked = {"overrides": ("mapper.iterations=3",), "cores": 2}
+    file.touch()
+    assert not Kept(True).has(file, asked)  # nobody knows what it is of
+    first = Kept(False)
+    first.keep(file, asked)
+    assert Kept(True).has(file, asked)
+    assert not Kept(False).has(file, asked)  # a new measurement is one
+    assert not Kept(True).has(file, asked)  # from then on the file is what that call made
+    first.keep(file, asked)
+    assert not Kept(True).has(file, {**asked, "cores": 1})
+    first.keep(file, asked)
+    other = Kept(True, _commit="abc1234")
+    assert other.has(file, asked)
+    other.keep(tmp_path / "other.json", asked)
+    assert [str(row.value) for row in other.origin()] == [f"{first.commits[0]}, abc1234"]
+
+
+def test_scenes_whose_data_are_missing_are_left_out_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MVSGS_SHARED", "/nowhere")
+    scenes, rows = with_data(["room", "redkitchen"])
+    assert scenes == ["room"]
+    assert rows == [Row("redkitchen: skipped", "/nowhere/data/seven_scenes_redkitchen is missing")]
 
 
 def test_what_did_not_run_and_other_commits_are_said(tmp_path: Path, ran: list[str]) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.baselines import colmap_poses
 from bench.baselines.colmap_poses import Model, load
 from bench.tracking import baselines, curves, memory
 from bench.tracking.baselines import Baseline
@@ -85,13 +86,15 @@ def test_colmap_is_a_mark_only_where_it_registers_most_frames(registered: int, g
 def test_colmaps_model_is_kept_for_the_same_images_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
-    def fake(frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: Path, threads: int) -> tuple[Model, str]:
+    def fake(
+        frames: dict[int, np.ndarray], intrinsics: np.ndarray, folder: Path, threads: int, photographs: bool
+    ) -> tuple[Model, str]:
         calls.append(len(frames))
         np.savez(folder / "model.npz", index=np.arange(2), world_from_cam=np.zeros((2, 4, 4)), points=0, colors=0)
         (folder / "seconds.json").write_text('{"wall": {"matching": 1.0}, "processor": 2.0}')
         return load(folder), ""
 
-    monkeypatch.setattr(baselines, "reconstruct", fake)
+    monkeypatch.setattr(colmap_poses, "reconstruct", fake)
     items, _ = moving(5)
     for used in (items, items, items[:4]):
         baseline = baselines.solve(used, tmp_path, 1)

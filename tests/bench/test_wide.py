@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.baselines.colmap_poses import Model
-from bench.table import Row
+from bench.table import Row, failed
 from bench.wide import apart, in_pieces
 
 
@@ -20,14 +20,27 @@ def test_what_was_measured_is_kept_and_what_is_missing_named(tmp_path: Path) -> 
         asked.append(name)
         return [Row(f"{name}: parts", len(asked))]
 
-    late = in_pieces(["a", "b"], tmp_path, resume=True, minutes=-1.0, measured=measured)
-    assert [row.value for row in late] == ["a, b"]
-    assert in_pieces(["a"], tmp_path, resume=True, minutes=None, measured=measured) == [Row("a: parts", 1)]
-    both = in_pieces(["a", "b"], tmp_path, resume=True, minutes=None, measured=measured)
-    assert both == [Row("a: parts", 1), Row("b: parts", 2)]
-    anew = in_pieces(["a"], tmp_path, resume=False, minutes=None, measured=measured)
-    assert anew == [Row("a: parts", 3)]
-    assert asked == ["a", "b", "a"]
+    def made(names: list[str], resume: bool = True, minutes: float | None = None, size: int = 1) -> list[Row]:
+        return in_pieces(names, tmp_path, resume, minutes, measured, {"size": size})
+
+    assert [row.value for row in made(["a", "b"], minutes=-1.0)] == ["a, b"]
+    assert made(["a"]) == [Row("a: parts", 1)]
+    assert made(["a", "b"]) == [Row("a: parts", 1), Row("b: parts", 2)]
+    assert made(["a", "b"], minutes=-1.0) == [Row("a: parts", 1), Row("b: parts", 2)]
+    assert made(["a"], resume=False) == [Row("a: parts", 3)]
+    assert made(["a"], size=2) == [Row("a: parts", 4)]  # what was measured otherwise is no result of this call
+    assert made(["a"], size=2) == [Row("a: parts", 4)]
+    assert asked == ["a", "b", "a", "a"]
+
+
+def test_what_failed_is_measured_again(tmp_path: Path) -> None:
+    outcomes = [[failed("a: ours", "no memory")], [Row("a: parts", 1)]]
+
+    def made() -> list[Row]:
+        return in_pieces(["a"], tmp_path, True, None, lambda name: outcomes.pop(0), None)
+
+    assert made() == [failed("a: ours", "no memory")]
+    assert made() == made() == [Row("a: parts", 1)]
 
 
 def test_results_of_two_orders_are_compared_photograph_by_photograph() -> None:
