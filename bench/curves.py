@@ -1,9 +1,11 @@
 """Run time against error of whole runs, over the main settings one at a time: where the defaults stand.
 
 Each curve changes one setting and leaves the others at their defaults; the plot of a scene shows them all with the
-Pareto front (nothing else is both faster and better) and the default. The default runs several times: half the range is
-the noise, and what beats it by more than that is named. Times are wall times from the first frame to the refined map,
-so they mean something on an idle machine only. Runs are kept by scene and curve: --resume runs only what is missing.
+Pareto front (nothing else is both faster and better) and the default. The default runs several times, first, last and
+between the curves, so that a machine that gets slower or faster meets both: with the seeds of the points, then with
+those one higher, and so on. Half the range is the noise, and what beats it by more than that is named. Times are wall
+times from the first frame to the refined map, so they mean something on an idle machine only. Runs are kept by scene
+and curve: --resume runs only what is missing.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench import pieces, plots
-from bench.runs import QUICK, Matrix, Run, Setting, figure, folder, stage_seconds
-from bench.table import Row, main
+from bench.runs import QUICK, Matrix, Run, Setting, choices, figure, folder, said, stage_seconds
+from bench.table import Row, failed, main, names, numbers
 from mvsgs_core.evaluation.metrics import at
 
 # The cascade of the core with one stage more: scale, step, hypotheses, radius, p1, p2
@@ -30,7 +32,7 @@ CURVES: dict[str, dict[str, str]] = {  # parameter: label of each point and its 
     "mvs.stages": {"3 stages": f"[{_COARSEST},{_MIDDLE},{_FINE}]"},
     "depth_fusion.confidence": {"0.6": "0.6", "0.9": "0.9"},
     "depth_fusion.min_views": {"3": "3"},
-    "mapper.iterations": {"15": "15", "60": "60", "120": "120"},
+    "mapper.iterations": {"15": "15", "60": "60", "120": "120"},  # 15: the default once more
     "mapper.max_pixels": {"9k": "9600", "19k": "19200"},
     "mapper.density_control.max_splats": {"10k": "10000", "20k": "20000"},
 }
@@ -71,6 +73,24 @@ def settings(curves: dict[str, dict[str, str]]) -> dict[str, list[Setting]]:
     return found
 
 
+def matrices_of(
+    scene: str, curves: dict[str, dict[str, str]], seeds: list[int], repeats: int, overrides: list[str]
+) -> dict[str, Matrix]:
+    """What is run of a scene, by the name of its piece and in this order: runs of the default stand first, last and at
+    equal steps between the curves."""
+    made = settings(curves)
+    default = made.pop("default")
+    turns = [round(k * len(made) / max(1, repeats - 1)) for k in range(repeats)]  # how many curves go before each
+    found: dict[str, Matrix] = {}
+    for done, (curve, points) in enumerate([*made.items(), ("", [])]):
+        for k in (k for k, turn in enumerate(turns) if turn == done):
+            shifted = [seed + k for seed in seeds]
+            found[f"{scene}/default/{k}"] = Matrix([scene], seeds=shifted, overrides=overrides, settings=default)
+        if points:
+            found[f"{scene}/{curve}"] = Matrix([scene], seeds=seeds, overrides=overrides, settings=points)
+    return found
+
+
 def points_of(runs: list[Run], curves: dict[str, dict[str, str]]) -> tuple[Point | None, list[Point]]:
     """The default, None where it did not run, and the others that did; runs of several seeds are averaged."""
     by_setting: dict[str, list[Run]] = {}
@@ -94,7 +114,7 @@ def rows_of(scene: str, default: Point, others: list[Point]) -> list[Row]:
     for k, point in enumerate(everything):
         name = f"{scene}: {point.curve}" + ("" if point is default else f" {point.label}")
         if point.run.report is None:
-            rows.append(Row(name, "failed", "", "finished", False))
+            rows.append(failed(name, said(point.run)))
             continue
         rows.append(Row(f"{name}: wall time", point.seconds, "s"))
         rows.append(Row(f"{name}: held-out PSNR", point.psnr, "dB"))
@@ -120,24 +140,17 @@ def _mean(runs: list[Run], path: str) -> tuple[float, float]:
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    scenes, overrides = options.scenes.split(","), list(options.overrides)
-    curves = {name: CURVES[name] for name in (options.curves.split(",") if options.curves else CURVES)}
-    repeats = options.repeats
+    overrides, repeats = list(options.overrides), options.repeats
+    scenes, rows = pieces.with_data(options.scenes)
+    curves = {name: CURVES[name] for name in options.curves}
     if options.quick:
         scenes, curves, repeats = scenes[:1], {"mapper.iterations": {"5": "5"}}, 1
         overrides += QUICK
-    seeds = [int(s) for s in options.seeds.split(",")]
     made = pieces.Pieces.of(options, folder(options, "curves"))
-    matrices = {
-        f"{scene}/{curve}": Matrix(
-            [scene], seeds=range(max(repeats, len(seeds))) if curve == "default" else seeds, overrides=overrides,
-            settings=points,
-        )
-        for scene in scenes
-        for curve, points in settings(curves).items()
-    }  # fmt: skip
+    matrices: dict[str, Matrix] = {}
+    for scene in scenes:
+        matrices |= matrices_of(scene, curves, options.seeds, repeats, overrides)
     runs = made.runs(matrices)
-    rows = []
     for scene in scenes:
         default, others = points_of([run for run in runs if run.scene == scene], curves)
         if default is None:
@@ -151,10 +164,13 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--scenes", default="room,redkitchen", help="comma separated")
-    parser.add_argument("--curves", help=f"comma separated; default all: {', '.join(CURVES)}")
-    parser.add_argument("--seeds", default="0", help="comma separated; figures are means over them")
-    parser.add_argument("--repeats", type=int, default=3, help="runs of the default, seeds 0, 1, ...: the noise")
+    known = choices("scene")
+    parser.add_argument("--scenes", type=names(known), default=["room", "redkitchen"], help="comma separated")
+    told = f"comma separated; default all: {', '.join(CURVES)}"
+    parser.add_argument("--curves", type=names(CURVES), default=list(CURVES), help=told)
+    parser.add_argument("--seeds", type=numbers, default=[0], help="comma separated; figures are means over them")
+    told = "runs of the default between the curves, each with seeds one higher: the noise"
+    parser.add_argument("--repeats", type=int, default=3, help=told)
     pieces.arguments(parser, "dataset.stop=60")
 
 

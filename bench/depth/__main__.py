@@ -161,10 +161,11 @@ def baselines_section(options: argparse.Namespace) -> list[Row]:
 def variants_section(options: argparse.Namespace, title: str, variants: Mapping[str, Variant]) -> list[Row]:
     if options.quick:
         variants = dict(list(variants.items())[:1])
-    room = measured("room", SMALL, QUICK if options.quick else None, False)
-    rows = variant_rows(title, *room, variants, align=False)
+    default = CascadeConfig(area=SMALL), FusionConfig()
+    room = load_scene("room", SMALL, QUICK if options.quick else None)
+    rows = variant_rows(title, room, default, variants, align=False)
     if not options.quick and available(("redkitchen",)):
-        rows += variant_rows(title, *measured("redkitchen", SMALL, None, True), variants, align=True)
+        rows += variant_rows(title, load_tracked("redkitchen", SMALL), default, variants, align=True)
     return rows
 
 

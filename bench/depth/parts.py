@@ -14,6 +14,7 @@ from mvsgs_core.fusion.fusion import FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
 
 Variant = tuple[CascadeConfig, FusionConfig]
+Figures = dict[str, tuple[float, str]]  # value and unit
 _COUNTED = ("outside the range", "outside the cells")
 
 
@@ -57,20 +58,31 @@ def skip_variants(area: int) -> dict[str, Variant]:
     }
 
 
-def variant_rows(title: str, scene: Scene, default: Run, variants: Mapping[str, Variant], align: bool) -> list[Row]:
-    """Each variant's figures, and its changes against the default."""
-    base = _figures(scene, default, align)
-    rows = [Row(f"{title}, {scene.name}: default: {name}", value, unit) for name, (value, unit) in base.items()]
-    for variant, (cascade, fusion) in variants.items():
-        found = _figures(scene, run(scene.views, cascade, fusion), align)
-        rows += [
-            Row(f"{title}, {scene.name}: {variant}: {name}, change", f"{found[name][0] - value:+.3g}", unit)
-            for name, (value, unit) in base.items()
-        ]
+def variant_rows(title: str, scene: Scene, default: Variant, variants: Mapping[str, Variant], align: bool) -> list[Row]:
+    """Each variant's figures, and its changes against the default; "~": not larger than the default's own spread.
+
+    The default runs first, last and in the midst of the variants: what the machine does meanwhile is in its spread.
+    """
+    turns, found = (0, len(variants) // 2, len(variants)), dict[str, Figures]()
+    again: list[Figures] = []
+    for done, (variant, (cascade, fusion)) in enumerate([*variants.items(), ("", default)]):
+        again += [_figures(scene, run(scene.views, *default), align) for turn in turns if turn == done]
+        if variant:
+            found[variant] = _figures(scene, run(scene.views, cascade, fusion), align)
+    rows, base = [], dict[str, tuple[float, float]]()
+    for name, (_, unit) in again[0].items():
+        values = [figures[name][0] for figures in again]
+        base[name] = float(np.median(values)), float(np.ptp(values) / 2)
+        rows.append(Row(f"{title}, {scene.name}: default: {name}", base[name][0], unit, spread=base[name][1] or None))
+    for variant, figures in found.items():
+        for name, (value, unit) in figures.items():
+            change = value - base[name][0]
+            text = ("~ " if abs(change) <= base[name][1] and base[name][1] else "") + f"{change:+.3g}"
+            rows.append(Row(f"{title}, {scene.name}: {variant}: {name}, change", text, unit))
     return rows
 
 
-def _figures(scene: Scene, found: Run, align: bool) -> dict[str, tuple[float, str]]:
+def _figures(scene: Scene, found: Run, align: bool) -> Figures:
     raw = score([d.result.depth for d in found.stereo], scene, align)
     kept = score([f.depth for f in found.fused], scene, align)
     totals = [sum(d.result.counts.get(what, 0.0) for d in found.stereo) for what in _COUNTED]

@@ -148,6 +148,11 @@ def test_what_a_run_said(tmp_path: Path) -> None:
     log += "job 1\nmapper failed: MemoryError\nlog: {0}/1/logs/mapper.log\n"
     (tmp_path / "runs.log").write_text(log.format(tmp_path))
     assert said(Run("room", "full", 0, tmp_path / "0", None)) == "tracker failed: ValueError: no image"
+    log = "job 0: scene=room\nerror: dataset: no such file\nerror: job 0 ended with code 2\n"
+    log += "job 1: scene=fox\nerror: mapper: no such choice\nerror: job 1 ended with code 2\n"
+    (tmp_path / "runs.log").write_text(log)
+    for number, cause in (("0", "error: dataset: no such file"), ("1", "error: mapper: no such choice")):
+        assert said(Run("room", "full", 0, tmp_path / number, None)) == cause  # not what follows from it
 
 
 def test_scene_rows_are_means_with_spreads_the_papers_and_failures() -> None:
@@ -233,6 +238,16 @@ def test_what_beats_the_default_by_more_than_the_noise_is_named() -> None:
     assert once is not None
     assert curves.rows_of("room", once, points)[-1].value == "unknown"
     assert curves.points_of(runs[2:], chosen)[0] is None
+
+
+def test_the_default_runs_in_turns_with_the_curves_with_their_seeds() -> None:
+    chosen = {name: {"1": "1"} for name in ("a", "b", "c", "d")}
+    found = curves.matrices_of("room", chosen, [5], 3, ["dataset.stop=60"])
+    names = [name.removeprefix("room/") for name in found]
+    assert names == ["default/0", "a", "b", "default/1", "c", "d", "default/2"]
+    assert [list(found[f"room/{name}"].seeds) for name in names] == [[5], [5], [5], [6], [5], [5], [7]]
+    assert next(iter(curves.matrices_of("room", chosen, [0], 1, []))) == "room/default/0"
+    assert all(matrix.overrides == ["dataset.stop=60"] for matrix in found.values())
 
 
 def test_stress_passes_what_holds_or_says_that_it_does_not() -> None:

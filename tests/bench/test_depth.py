@@ -9,7 +9,7 @@ from bench.depth.__main__ import SECTIONS, SMALL
 from bench.depth.calibration import fit, reliability
 from bench.depth.curves import Point, settings
 from bench.depth.data import Scene, coarse_grid, without_ragged_edges
-from bench.depth.parts import part_variants, skip_variants
+from bench.depth.parts import part_variants, skip_variants, variant_rows
 from bench.depth.run import Run, scaled_to, score, surest
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig
 from mvsgs_core.mvs.cascade import CascadeConfig
@@ -118,3 +118,28 @@ def test_a_fit_finds_the_weights_counts_scenes_alike_and_keeps_what_is_given() -
     given = fit([scene], {2: 0.25})
     assert given[2] == 0.25
     assert given[1] > 1.0
+
+
+def test_the_default_runs_in_turns_with_its_variants(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that gets faster from run to run shows no gain of what runs later."""
+    seconds = iter((10.0, 9.0, 8.0, 7.0, 3.0, 6.0))
+    ran: list[CascadeConfig] = []
+
+    def run(views: object, cascade: CascadeConfig, fusion: FusionConfig) -> Run:
+        ran.append(cascade)
+        return Run([], [], 0.0, 0.0, next(seconds))
+
+    def figures(scene: Scene, found: Run, align: bool) -> dict[str, tuple[float, str]]:
+        return {"processor time": (1000 * found.processor_seconds, "ms")}
+
+    monkeypatch.setattr("bench.depth.parts.run", run)
+    monkeypatch.setattr("bench.depth.parts._figures", figures)
+    default, other = CascadeConfig(area=1), CascadeConfig(area=2)
+    made = variant_rows("parts", scene(np.ones((2, 2), np.float32)), (default, FusionConfig()), {
+        name: (other, FusionConfig()) for name in ("a", "b", "c")
+    }, align=False)  # fmt: skip
+    assert [config.area for config in ran] == [1, 2, 1, 2, 2, 1]
+    rows = {row.name.removeprefix("parts, made up: "): row for row in made if "time" in row.name}
+    assert (rows["default: processor time"].value, rows["default: processor time"].spread) == (8000.0, 2000.0)
+    changes = [rows[f"{name}: processor time, change"].value for name in "abc"]
+    assert changes == ["~ +1e+03", "~ -1e+03", "-5e+03"]

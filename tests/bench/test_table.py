@@ -1,0 +1,84 @@
+"""The command line that every benchmark has: what it refuses, what it leaves, how it ends."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from bench import curves
+from bench.table import Row, checked, failed, main, names, numbers, origin_of, timed
+
+
+def ended(monkeypatch: pytest.MonkeyPatch, rows: list[Row], *words: str) -> int:
+    """The exit code of a benchmark that measures these rows."""
+    monkeypatch.setattr("sys.argv", ["bench", *words])
+    try:
+        main(lambda options: rows, "Something")
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def test_rows_go_into_a_folder_that_is_made_and_say_where_they_are_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bench.table.commit", lambda: "abc1234")
+    file = tmp_path / "new" / "rows.json"
+    assert ended(monkeypatch, [Row("a", 1.0)], "--json", str(file)) == 0
+    assert json.loads(file.read_text()) == [
+        {"name": "a", "value": 1.0, "unit": "", "goal": "", "met": None, "spread": None}
+    ]
+    made = json.loads(origin_of(file).read_text())
+    assert made["commit"] == "abc1234"
+    assert made.keys() == {"commit", "machine", "date"}
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_anything_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    measured: list[str] = []
+    monkeypatch.setattr("sys.argv", ["bench", "--json", str(tmp_path / "file" / "rows.json")])
+    with pytest.raises(SystemExit):
+        main(lambda options: measured.append("once") or [], "Something")  # type: ignore[func-returns-value]
+    assert measured == []
+    assert "rows.json: " in capsys.readouterr().err
+
+
+def test_a_run_that_failed_ends_with_one_and_a_goal_that_is_missed_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ended(monkeypatch, [failed("room", "mapper failed: no memory"), Row("a", 1.0)]) == 1
+    assert ended(monkeypatch, [Row("a", 1.0, "", "<= 0.5", False)]) == 0
+
+
+def test_unknown_names_are_refused_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    parser = argparse.ArgumentParser()
+    curves.arguments(parser)
+    parser.add_argument("--maps", type=names(["room", "room, loop"], ";"))
+    parser.add_argument("--even", type=checked(lambda text: int(text) // 2))
+    assert parser.parse_args(["--maps", "room, loop;room"]).maps == ["room, loop", "room"]
+    assert parser.parse_args(["--seeds", "5,0"]).seeds == [5, 0]
+    for words, told in (
+        (["--curves", "mapper.iteration"], "no 'mapper.iteration'; there are: tracker.area, "),
+        (["--scenes", "rom"], "no 'rom'; there are: aerial, "),
+        (["--seeds", "1,x"], "'1,x' must be numbers such as 0,1,2"),
+        (["--maps", "hall"], "no 'hall'; there are: room; room, loop"),
+        (["--even", "x"], "invalid literal"),
+    ):
+        with pytest.raises(SystemExit):
+            parser.parse_args(words)
+        assert told in capsys.readouterr().err
+    assert numbers("3") == [3]
+
+
+def test_no_number_meets_no_goal() -> None:
+    """Whatever place it has among the others: comparisons with NaN are false."""
+    for values in ([math.nan, 1.0, 1.2], [1.0, math.nan, 1.2], [1.0, 1.2, math.nan]):
+        for goal in ({"maximum": 2.0}, {"minimum": 0.5}):
+            row = timed("a", values, "s", **goal)
+            assert row.met is False
+            assert isinstance(row.value, float)
+            assert math.isnan(row.value)
