@@ -3,7 +3,8 @@
     python -m bench.compare runs/bench-quick/*.json
 
 Figures are matched by benchmark (the file's name) and row. Each kind of figure has a noise, below which a change says
-nothing, and a bound, beyond which it is a regression and the exit code is 1. Times, rates and memory are compared with
+nothing, and a bound, beyond which it is a regression and the exit code is 1; so is a goal that is no longer met by more
+than the noise, and a number that is none any more. Times, rates and memory are compared with
 wide tolerances, and only warn where the machine is another than the recorded one; ratios and errors hold anywhere.
 """
 
@@ -103,15 +104,21 @@ class Change:
 def change(row: dict[str, Any], before: dict[str, Any], same_machine: bool) -> Change | None:
     """None where the figure says nothing, or nothing new."""
     name, now, then = row["name"], row["value"], before["value"]
-    if row["met"] is False and before["met"] is True and isinstance(now, str):
-        return Change(name, str(then), now, True, True, "goal no longer met")
-    numbers = [v for v in (now, then) if isinstance(v, int | float) and not isinstance(v, bool)]
-    rule = tolerance(row)
-    if rule is None or len(numbers) < 2:
+    new, old, rule = _number(now), _number(then), tolerance(row)
+    missed = row["met"] is False and before["met"] is True
+    if old is not None and new is None:
+        return Change(name, _text(then, row), str(now), True, True, "no figure any more")
+    if missed and (new is None or rule is None):
+        return Change(name, str(then), str(now), True, True, "goal no longer met")
+    if new is None or old is None:
         return None
-    new, old = (float(v) for v in numbers)
-    if not math.isfinite(new):
-        return None if not math.isfinite(old) else Change(name, _text(then, row), str(now), True, True, "not finite")
+    if not math.isfinite(new) or not math.isfinite(old):
+        if math.isfinite(new) == math.isfinite(old):
+            return None
+        worse = not math.isfinite(new)
+        return Change(name, _text(then, row), _text(now, row), worse, worse, "not finite" if worse else "finite again")
+    if rule is None:
+        return None
     spread = float(before.get("spread") or 0.0)
     if rule.absolute:
         worse_by = (old - new) if rule.higher_is_better else (new - old)
@@ -127,7 +134,8 @@ def change(row: dict[str, Any], before: dict[str, Any], same_machine: bool) -> C
         amount = f"{new / old:.2f} times" if old else ""
     if abs(worse_by) <= noise:
         return None
-    regression = worse_by > bound and (same_machine or not rule.machine_bound)
+    regression = worse_by > (noise if missed else bound) and (same_machine or not rule.machine_bound)
+    amount += ", goal no longer met" if missed else ""
     return Change(name, _text(then, row), _text(now, row), worse_by > 0, regression, amount)
 
 
@@ -144,6 +152,10 @@ def compare(name: str, rows: list[dict[str, Any]], recorded: Record) -> list[Cha
         if key not in now
     ]
     return changes
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def _text(value: Any, row: dict[str, Any]) -> str:

@@ -5,6 +5,7 @@ The first of them stand in README.md, too.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,7 @@ Rows = Callable[[str], list[dict[str, Any]]]  # those recorded of a benchmark, b
 
 @dataclass(frozen=True)
 class Figure:
-    """Two rows of one record, side by side."""
+    """Two rows of one record, side by side. {ours} and {theirs}: the images of both, from the record's protocol."""
 
     what: str
     benchmark: str
@@ -28,9 +29,16 @@ class Figure:
     theirs: str  # name of its row
     first: bool = False  # among those that a newcomer sees
 
+    @property
+    def rows(self) -> list[str]:
+        """Names of the rows that it is made of; what both had stands in the last, where `what` or `baseline` say it."""
+        protocol = f"{self.ours.partition(':')[0]}: protocol"
+        return [self.ours, self.theirs, *([protocol] if "{" in self.what + self.baseline else [])]
 
-_REDKITCHEN, _FR1 = "RedKitchen, 100 frames at 240x180", "freiburg1_xyz, 100 frames at 240x180"
-_COLMAP, _OFFLINE = "COLMAP, same frames", "COLMAP + offline splatting, equal optimization time"
+
+_REDKITCHEN, _FR1 = "RedKitchen, {ours}", "freiburg1_xyz, {ours}"
+_COLMAP, _OFFLINE = "COLMAP, same frames at {theirs}", "COLMAP at {theirs} + offline splatting, equal optimization time"
+_PROTOCOL = re.compile(r"(\d+ frames at \d+x\d+), .*COLMAP got \d+ of the frames at (\d+x\d+)")
 FIGURES = (
     Figure(f"Position error, {_REDKITCHEN}, of the path", "baselines",
            "redkitchen: poses, ours: ATE, frames that COLMAP has", _COLMAP,
@@ -38,7 +46,7 @@ FIGURES = (
     Figure(f"Position error, {_FR1}, of the path", "baselines",
            "tum_fr1_xyz: poses, ours: ATE, frames that COLMAP has", _COLMAP,
            "tum_fr1_xyz: poses, COLMAP: ATE, frames that COLMAP has"),
-    Figure(f"Time to poses, {_REDKITCHEN}", "baselines",
+    Figure(f"Processor time to poses, {_REDKITCHEN}", "baselines",
            "redkitchen: poses, ours: seconds", _COLMAP, "redkitchen: poses, COLMAP: seconds"),
     Figure("Depth of the room, true poses: kept pixels within 2 %, at 0.88 of completeness", "depth",
            "room, 320x240: inliers", "plane sweep of OpenCV's parts",
@@ -46,7 +54,7 @@ FIGURES = (
     Figure("Depth of RedKitchen, tracked poses: kept pixels within 5 %, at 0.71 of completeness", "depth",
            "redkitchen, tracked, 320x240: inliers", "plane sweep of OpenCV's parts",
            "redkitchen, tracked: plane sweep inliers, as complete as filtered"),
-    Figure(f"Time from frames to map, {_REDKITCHEN}", "baselines",
+    Figure(f"Processor time from frames to map, {_REDKITCHEN}", "baselines",
            "redkitchen: map, ours: seconds, frames to map", _OFFLINE,
            "redkitchen: map, COLMAP + splatting, equal time: seconds, frames to map", first=True),
     Figure(f"Held-out PSNR, {_REDKITCHEN}", "baselines",
@@ -63,17 +71,31 @@ FIGURES = (
 )  # fmt: skip
 
 
+def lacking(benchmark: str, rows: list[dict[str, Any]]) -> list[str]:
+    """Names of the rows of a benchmark that the figures need and that are not among these."""
+    needed = [name for figure in FIGURES if figure.benchmark == benchmark for name in figure.rows]
+    return sorted(set(needed) - {row["name"] for row in rows})
+
+
 def markdown(rows: Rows, first: bool = False) -> str:
     """A table of all, or of the first ones.
 
-    Raises FileNotFoundError where a benchmark is not recorded, KeyError where its record lacks a row.
+    Raises FileNotFoundError where a benchmark is not recorded, KeyError where its record lacks a row, and ValueError
+    where it does not say what images both had.
     """
     lines = []
     for figure in (figure for figure in FIGURES if figure.first or not first):
         found = {row["name"]: row for row in rows(figure.benchmark)}
-        ours, theirs = (pivot.value(found[name], found[name]["unit"]) for name in (figure.ours, figure.theirs))
+        row, other, *protocol = (found[name] for name in figure.rows)
+        ours, theirs = (pivot.value(one, one["unit"]) for one in (row, other))
+        what, baseline = figure.what, figure.baseline
+        if protocol:
+            images = _PROTOCOL.match(protocol[0]["value"])
+            if images is None:
+                raise ValueError(f"{protocol[0]['name']}: {protocol[0]['value']!r} does not say what images both had")
+            what, baseline = (text.format(ours=images[1], theirs=images[2]) for text in (what, baseline))
         page = f"[`python -m bench.{figure.benchmark}`](docs/benchmarks/{figure.benchmark}.md)"
-        lines.append([figure.what, f"**{ours}**", theirs, figure.baseline, page])
+        lines.append([what, f"**{ours}**", theirs, baseline, page])
     return pivot.table(["", "ours", "baseline", "which is", "printed by"], lines, numbers=2)
 
 

@@ -4,9 +4,11 @@
     python -m bench.record                    only writes the documents anew from what is recorded
 
 Several files of the same rows are repeated runs: a figure becomes their mean, with half their range as its spread. The
-record, bench/recorded/NAME.json, has a row a line, and keeps command, commit, machine and date. `--from`: the folder of
-the run, of which plots, *.svg, go to docs/benchmarks/. In docs/benchmarks/NAME.md what is between `<!-- bench:NAME -->`
-and `<!-- /bench:NAME -->` is replaced by tables and plots; the words around it are written by hand.
+record, bench/recorded/NAME.json, has a row a line, and keeps the command, and commit, machine and date of the
+measurement, from FILE.json.origin. `--from`: the folder of the run, of which plots, *.svg, go to docs/benchmarks/. Rows
+of which a document could not be made are refused, and nothing is changed. In docs/benchmarks/NAME.md what is between
+`<!-- bench:NAME -->` and `<!-- /bench:NAME -->` is replaced by tables and plots; the words around it are written by
+hand.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from typing import Any
 
 from bench import figures, pivot, plots
 from bench.runs import ROOT, commit, machine
+from bench.table import origin_of
 
 RECORDED = ROOT / "bench" / "recorded"
 PAGES = ROOT / "docs" / "benchmarks"
@@ -103,20 +106,26 @@ def merge(runs: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
     return merged
 
 
-def render(text: str, folder: Path = RECORDED) -> str:
-    """A document with what is recorded in its blocks; a block of what is not says so."""
+def render(text: str, folder: Path = RECORDED, new: Record | None = None) -> str:
+    """A document with what is recorded in its blocks; a block of what is not says so. new: stands for the one of its
+    name."""
 
     def block(match: re.Match[str]) -> str:
         name = match[2]
         if name in ("figures", "first"):
-            body = figures.markdown(lambda of: Record.load(of, folder).rows, first=name == "first")
-        elif (folder / f"{name}.json").exists():
-            body = Record.load(name, folder).markdown()
+            body = figures.markdown(lambda of: loaded(of, folder, new).rows, first=name == "first")
+        elif (new is not None and new.name == name) or (folder / f"{name}.json").exists():
+            body = loaded(name, folder, new).markdown()
         else:
             body = "*Not recorded yet.*"
         return f"{match[1]}\n{body}\n\n{match[3]}"
 
     return _BLOCK.sub(block, text)
+
+
+def loaded(name: str, folder: Path = RECORDED, new: Record | None = None) -> Record:
+    """`new` where it is of that name, or what is recorded. Raises FileNotFoundError as `Record.load`."""
+    return new if new is not None and new.name == name else Record.load(name, folder)
 
 
 def documents() -> list[Path]:
@@ -134,22 +143,55 @@ def read_rows(files: Iterable[Path]) -> list[list[dict[str, Any]]]:
     return runs
 
 
+def origin(files: Iterable[Path]) -> tuple[dict[str, str], list[Path]]:
+    """Commit, machine and date of what is in the files, all that there are of each, and the files that do not say it:
+    for these it is now and here."""
+    found: list[dict[str, str]] = []
+    silent = []
+    for file in files:
+        beside = origin_of(file)
+        if beside.exists():
+            found.append(json.loads(beside.read_text()))
+        else:
+            silent.append(file)
+            found.append({"commit": commit(), "machine": machine(), "date": time.strftime("%Y-%m-%d")})
+    return {key: ", ".join(dict.fromkeys(one[key] for one in found)) for key in found[0]}, silent
+
+
+def merged(name: str, files: list[Path], command: str, made_in: Path | None = None, note: str = "") -> Record:
+    """The runs in `files` as one record, which is not saved. Raises ValueError for rows of which the figures could not
+    be made."""
+    rows = merge(read_rows(files))
+    if missing := figures.lacking(name, rows):
+        raise ValueError(f"{name}: its record stays as it is, since these rows lack {'; '.join(missing)}")
+    made, silent = origin(files)
+    if silent:
+        of_recording = f"commit, machine and date are those of recording {', '.join(file.name for file in silent)}"
+        note = f"{note}; {of_recording}" if note else of_recording
+    copied = [f"{name}_{plot.name}" for plot in _plots(made_in)]
+    return Record(name, command, **made, runs=len(files), note=note, rows=rows, plots=copied)
+
+
 def record(
     name: str, files: list[Path], command: str, made_in: Path | None = None, note: str = "", folder: Path = RECORDED,
     pages: Path = PAGES,
 ) -> Record:  # fmt: skip
-    """Merges the runs in `files`, copies *.svg from `made_in` to `pages`, saves and returns the record."""
-    copied = []
-    for plot in sorted(made_in.glob("*.svg")) if made_in else []:
-        copied.append(f"{name}_{plot.name}")
-        pages.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(plot, pages / copied[-1])
-    rows = merge(read_rows(files))
-    entry = Record(
-        name, command, commit(), machine(), time.strftime("%Y-%m-%d"), len(files), note, rows, copied
-    )  # fmt: skip
-    entry.save(folder)
+    """Merges the runs in `files`, saves and returns the record. Raises ValueError as `merged`."""
+    entry = merged(name, files, command, made_in, note)
+    keep(entry, made_in, folder, pages)
     return entry
+
+
+def keep(entry: Record, made_in: Path | None, folder: Path = RECORDED, pages: Path = PAGES) -> None:
+    """Saves a record, and copies its plots from `made_in` to `pages`."""
+    for plot, copy in zip(_plots(made_in), entry.plots):
+        pages.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(plot, pages / copy)
+    entry.save(folder)
+
+
+def _plots(made_in: Path | None) -> list[Path]:
+    return sorted(made_in.glob("*.svg")) if made_in else []
 
 
 def run(arguments: list[str]) -> int:
@@ -160,18 +202,31 @@ def run(arguments: list[str]) -> int:
     parser.add_argument("--note", default="", help="what the reader must know besides: other work on the machine")
     parser.add_argument("--from", type=Path, dest="made_in", help="folder of the run, for *.svg")
     options = parser.parse_args(arguments)
+    entry = None
     if options.name:
         if not options.files:
             parser.error(f"{options.name}: which files?")
         stem, quick = options.name.rpartition("/")[2], options.name.startswith("quick/")
-        if not any(read_rows(options.files)):
-            print(f"{options.name} measured nothing here: its record stays as it is")
-            return 0
-        command = options.command or f"python -m bench.{stem}" + (" --quick" if quick else "")
-        record(options.name, options.files, command.strip(), options.made_in, options.note)
-    for document in documents():
-        document.write_text(render(document.read_text()))
-    for name, svg in figures.plots_of(lambda of: Record.load(of).rows).items():
+        try:
+            if all(": skipped" in row["name"] for rows in read_rows(options.files) for row in rows):
+                print(f"{options.name} measured nothing here: its record stays as it is")
+                return 0
+            command = options.command or f"python -m bench.{stem}" + (" --quick" if quick else "")
+            entry = merged(options.name, options.files, command.strip(), options.made_in, options.note)
+        except (OSError, ValueError) as error:
+            print(error)
+            return 1
+    try:  # before anything is saved
+        texts = {document: render(document.read_text(), new=entry) for document in documents()}
+        drawn = figures.plots_of(lambda of: loaded(of, new=entry).rows)
+    except (KeyError, ValueError) as error:
+        print(f"no record and no document is changed: the figures cannot be made without {error}")
+        return 1
+    if entry is not None:
+        keep(entry, options.made_in)
+    for document, text in texts.items():
+        document.write_text(text)
+    for name, svg in drawn.items():
         plots.write(PAGES / f"{name}.svg", svg)
     return 0
 

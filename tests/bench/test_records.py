@@ -11,7 +11,17 @@ import pytest
 
 from bench import compare, curves, figures, pivot, record
 from bench.runs import choices
-from bench.table import Row, timed
+from bench.table import Row, origin_of, timed
+
+
+@pytest.fixture(autouse=True)
+def _from_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of rows without an origin of their own, which tests write, are of one commit."""
+    monkeypatch.setattr(record, "commit", lambda: "abc1234")
+
+
+def measured_at(file: Path, commit: str, date: str = "2026-01-02") -> None:
+    origin_of(file).write_text(json.dumps({"commit": commit, "machine": "a machine", "date": date}))
 
 
 def row(name: str, value: Any, unit: str = "", goal: str = "", met: bool | None = None) -> dict[str, Any]:
@@ -50,6 +60,7 @@ def test_records_are_rendered_between_their_markers_only(tmp_path: Path) -> None
     for k, value in enumerate((1.0, 2.0)):
         files.append(tmp_path / f"{k}.json")
         files[-1].write_text(json.dumps([row("latency | 99 %", value, "ms", "<= 3", True)]))
+        measured_at(files[-1], "abc1234")
     made = record.record("quick/transport", files, "python -m bench.transport", folder=tmp_path)
     assert record.Record.load("quick/transport", tmp_path) == made
     block = "<!-- bench:{0} -->\n{1}<!-- /bench:{0} -->\n"
@@ -108,12 +119,47 @@ def test_what_has_no_room_in_a_cell_is_told_below() -> None:
 
 def test_a_record_has_a_row_a_line_and_comes_back_as_it_was(tmp_path: Path) -> None:
     (tmp_path / "rows.json").write_text(json.dumps([row("a", 1.0), row("b", "word", "x", "<= 2", True)]))
+    measured_at(tmp_path / "rows.json", "abc1234")
     made = record.record("curves", [tmp_path / "rows.json"], "c", note="on a Sunday", folder=tmp_path)
     lines = (tmp_path / "curves.json").read_text().splitlines()
     assert '{"name": "a", "value": 1.0},' in lines
     assert '{"name": "b", "value": "word", "unit": "x", "goal": "<= 2", "met": true}' in lines
     assert record.Record.load("curves", tmp_path) == made
     assert "Made so: on a Sunday." in made.markdown()
+
+
+def test_a_record_says_where_and_when_it_was_measured_not_recorded(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("one.json", "two.json", "old.json")]
+    for file in files:
+        file.write_text(json.dumps([row("a", 1.0)]))
+    measured_at(files[0], "1111111")
+    measured_at(files[1], "2222222", "2026-01-03")
+    made = record.record("curves", files[:2], "c", folder=tmp_path)
+    assert (made.commit, made.machine, made.date) == ("1111111, 2222222", "a machine", "2026-01-02, 2026-01-03")
+    assert made.note == ""
+    silent = record.record("curves", files, "c", note="on a Sunday", folder=tmp_path)
+    assert silent.commit == "1111111, 2222222, abc1234"
+    assert silent.note == "on a Sunday; commit, machine and date are those of recording old.json"
+
+
+def test_rows_that_the_documents_cannot_be_made_of_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A record is replaced as a whole: what a run without its data leaves would wipe it."""
+    saved: list[str] = []
+    monkeypatch.setattr(record, "keep", lambda entry, *args: saved.append(entry.name))
+    file = tmp_path / "rows.json"
+    file.write_text(json.dumps([row("redkitchen: ours", "failed", "", "a report", False)]))
+    assert record.run(["baselines", str(file)]) == 1
+    assert "these rows lack redkitchen: map, COLMAP + splatting" in capsys.readouterr().out
+    file.write_text(json.dumps([row("redkitchen: skipped", "no data")]))
+    assert record.run(["baselines", str(file)]) == 0
+    assert "measured nothing" in capsys.readouterr().out
+    unplotted = "redkitchen: map, COLMAP + splatting, 2 times as long: seconds, frames to map"
+    file.write_text(json.dumps([r for r in record.Record.load("baselines").rows if r["name"] != unplotted]))
+    assert record.run(["baselines", str(file)]) == 1
+    assert "'seconds, frames to map'" in capsys.readouterr().out
+    assert saved == []
 
 
 def test_plots_of_a_run_go_beside_the_page(tmp_path: Path) -> None:
@@ -129,8 +175,18 @@ def test_plots_of_a_run_go_beside_the_page(tmp_path: Path) -> None:
 def test_the_figures_name_rows_that_are_recorded_and_benchmarks_that_print_them() -> None:
     text = figures.markdown(lambda name: record.Record.load(name).rows)
     assert len(text.splitlines()) == 2 + len(figures.FIGURES) == 12
+    of_colmap = [line for line in text.splitlines() if "COLMAP" in line]
+    protocol = {r["name"]: r["value"] for r in record.Record.load("baselines").rows}["redkitchen: protocol"]
+    assert "at 240x180" in protocol
+    assert "COLMAP got 100 of the frames at 512x384" in protocol
+    assert all("100 frames at 240x180" in line and " at 512x384" in line for line in of_colmap)
+    assert sum(line.startswith("| Processor time ") for line in of_colmap) == 2
     with pytest.raises(KeyError, match="ATE"):
         figures.markdown(lambda name: [row("other", 1.0)])
+    for name in {figure.benchmark for figure in figures.FIGURES}:
+        assert figures.lacking(name, record.Record.load(name).rows) == []
+        assert figures.lacking(name, [])
+    assert figures.lacking("curves", []) == []
     drawn = figures.plots_of(lambda name: record.Record.load(name).rows)
     assert drawn["poses"].count("<rect") >= 10
     assert drawn["maps"].count("<circle") >= 6
@@ -152,7 +208,18 @@ def test_the_figures_name_rows_that_are_recorded_and_benchmarks_that_print_them(
         (row("depth inliers", 0.9), row("depth inliers", 0.7), "regression"),
         (row("ratio", 1.0, "x", "<= 2", True), row("ratio", 1.3, "x", "<= 2", True), None),
         (row("ratio", 1.0, "x", "<= 2", True), row("ratio", 3.0, "x", "<= 2", False), "regression"),
-        (row("speedup", 5.0, "x", ">= 4", True), row("speedup", 3.0, "x", ">= 4", False), "worse"),
+        (row("speedup", 5.0, "x", ">= 4", True), row("speedup", 3.0, "x", ">= 4", False), "regression"),
+        (row("speedup", 4.1, "x", ">= 4", True), row("speedup", 3.9, "x", ">= 4", False), None),  # noise
+        (row("speedup", 5.0, "x"), row("speedup", 3.0, "x"), None),  # without a goal
+        (row("psnr", 25.0, "dB"), row("psnr", None, "dB"), "regression"),
+        (row("psnr", 25.0, "dB"), row("psnr", "failed", "dB"), "regression"),
+        (row("splats", 1000), row("splats", None), "regression"),
+        (row("psnr", None, "dB"), row("psnr", None, "dB"), None),
+        (row("none is sent", True, "", "True", True), row("none is sent", False, "", "True", False), "regression"),
+        (row("keyframes", 12, "", "12", True), row("keyframes", 11, "", "12", False), "regression"),
+        (row("latency", float("inf"), "ms"), row("latency", 10.0, "ms"), "better"),
+        (row("latency", float("inf"), "ms"), row("latency", float("inf"), "ms"), None),
+        (row("latency", 10.0, "ms"), row("latency", float("inf"), "ms"), "regression"),
         (
             row("its outliers over ours", 3.0, "", ">= 2"),
             row("its outliers over ours", 9.0, "", ">= 2"),
