@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
@@ -14,13 +15,14 @@ from mvsgs_core.stream_times import LATEST, StreamTimes
 FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye and a telescope nothing can be tracked
 MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
 CLOCKS_END = 2.0**31  # seconds: what ROS 2 can say
+BEHIND = 2.0  # s of delay that a user should know of
 
 
 class StreamFrames:
     """The frames of one sender, whom warnings name as `sender`.
 
     In the counts: `unusable` ones in all, and of these those that were `doubled`, late (`out_of_order`) or of an
-    `other_size`.
+    `other_size`. In the values: `delay`, seconds that the newest took longer to come than the promptest, by its stamp.
     stamped: the sender says when it took them; one that only hands pictures on may give the same one again.
     """
 
@@ -33,6 +35,7 @@ class StreamFrames:
         self._times = StreamTimes()
         self._newest: Frame | None = None  # as it came
         self._restarted = False
+        self._promptest = math.inf  # s from a frame's time to its coming, by two clocks
 
     def restarted(self) -> None:
         """The sender's program started again: its clock may be another."""
@@ -70,7 +73,19 @@ class StreamFrames:
             self._stats.warn(
                 f"{self._sender}'s timestamps stood still, went back or leapt: there the time here was taken"
             )
+        if self._stamped:
+            self._note_delay(time.monotonic() - shown)
         return shown
+
+    def _note_delay(self, lag: float) -> None:
+        self._promptest = min(self._promptest, lag)
+        delay = lag - self._promptest
+        self._stats.values["delay"] = round(delay, 2)
+        if delay > BEHIND:
+            self._stats.warn(
+                f"frames of {self._sender} come more than {BEHIND:g} s later than they should by their timestamps: the "
+                "link, or the program that sends them, is slower than the stream"
+            )
 
     def _doubled(self, frame: Frame) -> bool:
         last = self._newest

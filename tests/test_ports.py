@@ -16,7 +16,7 @@ from launch import ports
 from launch.ports import free_ports
 from msgs import Frame
 from nodes.runtime.transport import Publisher, ReliableReader, create_keys
-from nodes.runtime.transport.live import LivePublisher
+from nodes.runtime.transport.live import LivePublisher, LiveReader
 from tests.support.patience import until
 from tests.support.ports import free_port, tcp_address
 from tests.support.shared_data import ROOT
@@ -80,7 +80,7 @@ def test_who_closes_has_freed_the_address(kind: type[Publisher]) -> None:
     try:
         for _ in range(60):
             publisher = kind(f"tcp://127.0.0.1:{port}")
-            reader = ReliableReader(f"tcp://127.0.0.1:{port}", Frame)
+            reader = (LiveReader if kind is LivePublisher else ReliableReader)(f"tcp://127.0.0.1:{port}", Frame)
             until(lambda: publisher.ready(1))  # noqa: B023
             publisher.close(farewell=False)
             socket.create_server(("127.0.0.1", port)).close()

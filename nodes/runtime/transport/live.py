@@ -14,7 +14,7 @@ from typing import Any
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from msgs.codec import CodecError, decode
+from msgs.codec import NEWEST, CodecError, decode
 from nodes.runtime.addresses import TransportError
 from nodes.runtime.transport.publisher import Publisher
 from nodes.runtime.transport.readers import REFUSED, NewestReader
@@ -23,6 +23,7 @@ from nodes.runtime.transport.sockets import open_monitor, readable
 RETRY = 0.3  # s without ZeroMQ's own attempt after which a lost connection is made anew
 FASTEST = 1000  # frames a second: a larger jump of the sequence numbers is no loss, but a sender that counts anew
 BURST = 100  # frames that may come at once
+KERNEL_BYTES = 2**18  # that a publisher's kernel holds: enough for 25 MB/s where an answer takes 10 ms
 TURNED_AWAY = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
 
 
@@ -92,11 +93,18 @@ class LiveReader(NewestReader):
 
 
 class LivePublisher(Publisher):
-    """A topic that programs elsewhere read; `refused` says how many of them were turned away."""
+    """A topic that programs elsewhere read; `refused` says how many of them were turned away.
+
+    No reader holds it back, so that only readers of the newest are served. Over a link that is slower than the stream
+    new messages are dropped while old ones wait: as few wait as can.
+    """
+
+    served = (NEWEST,)
+    kernel_bytes = KERNEL_BYTES
 
     def __init__(self, address: str, **options: Any) -> None:
         self._count: threading.Thread | None = None
-        super().__init__(address, **options)
+        super().__init__(address, buffer=1, **options)
         self.refused = 0  # attempts of readers without the right keys; one tries again several times a second
         monitor = open_monitor(self.socket, TURNED_AWAY | zmq.EVENT_MONITOR_STOPPED)
         self._count = threading.Thread(target=self._count_refused, args=(monitor,), name="refused", daemon=True)

@@ -43,6 +43,9 @@ class Publisher:
     only one that stays away for longer is an error. Meanwhile `buffer` messages are kept for it, then `send` waits.
     """
 
+    served: tuple[bytes, ...] = (RELIABLE, NEWEST)  # deliveries: a reader of another gets nothing
+    kernel_bytes: int | None = None  # that the kernel holds on their way to one reader; None: as it sees fit
+
     def __init__(
         self,
         address: str,
@@ -78,6 +81,8 @@ class Publisher:
             guard.enter(keys)
         self.socket = open_socket(zmq.XPUB, address, keys, MAX_SUBSCRIPTION_BYTES)
         self.socket.sndhwm = max(1, buffer)
+        if self.kernel_bytes is not None:
+            self.socket.sndbuf = self.kernel_bytes
         self.socket.sndtimeo = HELD_BACK_MS
         self.socket.setsockopt(zmq.XPUB_NODROP, 1)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
@@ -146,7 +151,7 @@ class Publisher:
                 self.observers.pop(name, None)
         elif what == GOODBYE:
             self._goodbyes += arrived
-        elif what[:1] in (RELIABLE, NEWEST) and not (arrived and doubted):  # else it is no reader of ours, or whose?
+        elif what[:1] in self.served and not (arrived and doubted):  # else it is no reader of ours, or whose?
             repeated = len(what) > 1 + NAME_BYTES and any(
                 count > 0 and other[: 1 + NAME_BYTES] == what[: 1 + NAME_BYTES]
                 for other, count in self._arrived.items()

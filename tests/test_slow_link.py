@@ -1,0 +1,75 @@
+"""A robot whose reader, or the link to it, is slower than its frames: the newest come, and nobody holds it back."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import zmq
+
+from msgs import Frame
+from msgs.codec import NEWEST, RELIABLE, decode
+from mvsgs_core.stats import Stats
+from nodes import stream_frames
+from nodes.runtime.transport import LivePublisher
+from nodes.stream_frames import StreamFrames
+from tests.support.patience import until
+from tests.support.ports import tcp_address
+
+COUNT = 40  # frames of nearly a megabyte
+
+
+def frame(number: int) -> Frame:
+    return Frame(number, number / 30, np.zeros((480, 640, 3), np.uint8), np.array([500.0, 500.0, 320.0, 240.0]))
+
+
+def subscribed(address: str, delivery: bytes) -> zmq.Socket[bytes]:
+    """A reader that takes nothing by itself."""
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+    socket.linger, socket.rcvhwm, socket.rcvbuf = 0, 1, 2**16
+    socket.connect(address)
+    socket.subscribe(delivery)
+    return socket
+
+
+def test_few_old_frames_wait_for_a_reader_that_is_behind() -> None:
+    publisher = LivePublisher(tcp_address())
+    with subscribed(publisher.topic, NEWEST) as reader:
+        until(lambda: publisher.ready(1))
+        for number in range(COUNT):
+            publisher.send(frame(number))
+            time.sleep(0.005)
+        waiting = []
+        while reader.poll(1000):
+            message = decode(reader.recv(), expect=(Frame,)).message
+            assert isinstance(message, Frame)
+            waiting.append(message.index)
+    publisher.close()
+    assert 1 <= len(waiting) <= 6, waiting  # two at either end, and what is on its way
+
+
+def test_a_reader_of_every_frame_is_not_served() -> None:
+    publisher = LivePublisher(tcp_address())
+    with subscribed(publisher.topic, RELIABLE), subscribed(publisher.topic, NEWEST) as newest:
+        until(lambda: publisher.ready(1))
+        time.sleep(0.3)  # the other one is there, too
+        assert not publisher.ready(2)
+        publisher.send(frame(0))
+        assert newest.poll(5000)
+    publisher.close()
+
+
+def test_the_delay_of_a_stream_is_told_and_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    stats, now = Stats(), [50.0]
+    monkeypatch.setattr(stream_frames.time, "monotonic", lambda: now[0])
+    stream = StreamFrames(stats, "the robot")
+    for number, late in enumerate((0.1, 0.0, 0.5)):
+        now[0] = 50.0 + number / 30 + late
+        assert stream.accept(frame(number)) is not None
+    assert stats.values["delay"] == 0.5
+    assert not stats.warnings
+    now[0] = 50.0 + 3 / 30 + 2.5
+    assert stream.accept(frame(3)) is not None
+    assert stats.values["delay"] == 2.5
+    assert "slower than the stream" in stats.warnings[0]
