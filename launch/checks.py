@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any
 
 import msgs
 from launch.graph import Graph, Slot
+from launch.output import RESULTS, is_of_a_run, others_files
 from launch.refusal import GraphError
 from launch.run_directory import base_directory
+from launch.settings_file import FILES
 from launch.specs import check_addresses
 from nodes.parameters import did_you_mean
 
@@ -28,6 +31,7 @@ def check(graph: Graph) -> None:
     if not graph.settings.inline:
         check_addresses(graph)
         base_directory(graph)
+    _check_output(graph)
 
 
 def _check_placement(slot: Slot) -> None:
@@ -49,6 +53,28 @@ def _check_placement(slot: Slot) -> None:
             f"{slot.name}.cpu={cores}: must be cores that this program may use, which are {_ranges(there)}; "
             "null: all of them"
         )
+
+
+def _check_output(graph: Graph) -> None:
+    """What is not of a run stays as it is, and what is read stays where it is."""
+    output = Path(graph.settings.output)
+    for name in graph.sources:
+        for key in FILES:
+            value = graph.slots[name].config.get(key)
+            if isinstance(value, str) and value and _in_results(Path(value).resolve(), output.resolve()):
+                raise GraphError(f"output={output}: has {name}.{key}={value} in it; give another output=DIR")
+    if others := others_files(output):
+        raise GraphError(
+            f"output={output}: has {', '.join(others)}, which no run has left there and this one would replace; give "
+            "another output=DIR"
+        )
+
+
+def _in_results(read: Path, output: Path) -> bool:
+    """Whether what is read lies where results do. A run that is gone on with reads its own output's checkpoint."""
+    if read == output:
+        return not is_of_a_run(output)
+    return any(read.is_relative_to(output / name) for name in RESULTS)
 
 
 def _ranges(numbers: set[int]) -> str:

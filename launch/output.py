@@ -13,22 +13,25 @@ import shlex
 import shutil
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from launch.outcome import Outcome
 from launch.refusal import GraphError
-from launch.settings_file import write_settings
+from launch.settings_file import HEADER, write_settings
 from mvsgs_core.atomic_file import replace_text
-from mvsgs_core.kept_map import FOLDER
-from mvsgs_core.mapping.checkpoints.files import checkpoint_info
+from mvsgs_core.kept_map import FOLDER, TRACKER
+from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info
 from mvsgs_core.passwords import without_passwords
 
-LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
-MAP = ("map.ply", "trajectory.txt", "localization.csv", FOLDER)  # what is worth keeping of an earlier run
-BESIDE = (  # and what belongs to it
-    "report.html", REPORT, "comparison.png", "cameras.json", "transforms.json", "keyframes", "config.yaml",
+LOCK, PREVIOUS, REPORT, CONFIG = ".lock", "previous", "report.json", "config.yaml"
+FOUND = ("map.ply", "localization.csv")  # either, or a checkpoint, is worth keeping of an earlier run
+IMAGES = "keyframes"
+RESULTS = (  # all that a run leaves, but for the two files that say that it is one's
+    *FOUND, FOLDER, "trajectory.txt", "report.html", "comparison.png", "cameras.json", "transforms.json", IMAGES,
     "georeference.json",
 )  # fmt: skip
 RUN_ALL = Path(__file__).resolve().parent / "run_all.py"
@@ -54,7 +57,7 @@ class Output:
             raise GraphError(f"output={path}: {error.strerror}") from error
 
     def begin(self, config: Mapping[str, Any], command: str, *, resumed: bool) -> None:
-        """Moves an earlier run's results aside (a resumed one's stay), and writes this run's configuration, under the
+        """Moves what an earlier run found aside (a resumed one's stays), and writes this run's configuration, under the
         command that composed it.
 
         Raises GraphError where that cannot be written.
@@ -63,7 +66,7 @@ class Output:
             if not resumed:
                 self._move_previous()
             self.write_report({"finished": False, "reason": "still running, or killed with its launcher"})
-            write_settings(self.path / "config.yaml", config, command)
+            write_settings(self.path / CONFIG, config, command)
         except OSError as error:
             raise GraphError(f"output={self.path}: {error.strerror or error}") from error
 
@@ -121,15 +124,70 @@ class Output:
         os.close(self._lock)
 
     def _move_previous(self) -> None:
-        if not any((self.path / name).exists() for name in MAP):
-            (self.path / "report.html").unlink(missing_ok=True)  # of a run without a map: it would pass for this one's
+        """What an earlier run found goes to a folder of its own, so that no run takes another's place; what it left
+        without having found anything goes, as it would pass for this run's."""
+        if not is_of_a_run(self.path):
             return
-        previous = self.path / PREVIOUS
-        shutil.rmtree(previous, ignore_errors=True)
-        previous.mkdir()
-        for name in (*MAP, *BESIDE):
+        if not _worth_keeping(self.path):
+            _remove_results(self.path)
+            return
+        aside = next(folder for folder in _numbered(self.path / PREVIOUS) if not folder.exists())
+        aside.mkdir()
+        for name in (REPORT, CONFIG):  # copies: at any time both folders say whose they are
+            with suppress(FileNotFoundError):
+                shutil.copy2(self.path / name, aside / name)
+        for name in RESULTS:
             if (self.path / name).exists():
-                (self.path / name).rename(previous / name)
+                (self.path / name).rename(aside / name)
+
+
+def others_files(output: Path) -> list[str]:
+    """What lies there under the name of a run's results, and no run has left: it is not ours to replace."""
+    if is_of_a_run(output):
+        return []
+    return [name for name in (*RESULTS, REPORT, CONFIG) if (output / name).exists()]
+
+
+def is_of_a_run(output: Path) -> bool:
+    """Whether a run has written there: its report or its settings say so."""
+    if "finished" in read_report(output):
+        return True
+    try:
+        with (output / CONFIG).open("rb") as file:
+            return file.read(len(HEADER)) == HEADER.encode()
+    except OSError:
+        return False
+
+
+def _worth_keeping(output: Path) -> bool:
+    if any((output / name).exists() for name in FOUND):
+        return True
+    try:
+        checkpoint_info(output)
+    except ValueError:
+        return False
+    return True
+
+
+def _remove_results(output: Path) -> None:
+    """Files and folders of our names; of folders only what has our names in them."""
+    for name in RESULTS:
+        if (output / name).is_file():
+            (output / name).unlink()
+    checkpoint = output / FOLDER
+    for file in (*checkpoint.glob("state-*.npz"), checkpoint / TRACKER, *(output / IMAGES).glob("*.png")):
+        file.unlink(missing_ok=True)
+    shutil.rmtree(checkpoint / KEYFRAMES, ignore_errors=True)
+    for folder in (checkpoint, output / IMAGES):
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _numbered(folder: Path) -> Iterator[Path]:
+    """previous, previous-2, previous-3 and so on."""
+    yield folder
+    for number in count(2):
+        yield folder.with_name(f"{folder.name}-{number}")
 
 
 def read_report(output: Path) -> dict[str, Any]:

@@ -101,6 +101,34 @@ def test_it_is_said_in_one_line(words: list[str], answer: str, tmp_path: Path, s
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.parametrize("output", ["photos", "./photos/../photos", "walk/../photos"])
+def test_the_folder_that_is_read_is_no_output(output: str, tmp_path: Path, said: Callable[..., str]) -> None:
+    fill(tmp_path)
+    before = sorted((tmp_path / "photos").rglob("*"))
+    assert "in it; give another output=DIR" in said("photos", f"output={output}")
+    assert sorted((tmp_path / "photos").rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "config.yaml", "cameras.json", "trajectory.txt", "checkpoint"])
+def test_files_that_no_run_has_left_are_not_replaced(name: str, tmp_path: Path, said: Callable[..., str]) -> None:
+    fill(tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / name).write_text("a user's")
+    assert f"has {name}, which no run has left there" in said("photos", "output=mine")
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == [name]
+    assert (tmp_path / "mine" / name).read_text() == "a user's"
+
+
+def test_a_run_does_not_move_what_it_reads(tmp_path: Path, said: Callable[..., str]) -> None:
+    fill(tmp_path)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "report.json").write_text('{"finished": true}')
+    (tmp_path / "photos").rename(out / "keyframes")
+    assert "in it; give another output=DIR" in said("out/keyframes", "output=out")
+    assert (out / "keyframes").is_dir()
+
+
 @pytest.mark.parametrize("words", [["host=0.0.0.0"], ["keys=nowhere"], ["port=0"]])
 def test_what_is_refused_leaves_the_results_that_are_there(
     words: list[str], tmp_path: Path, said: Callable[..., str]

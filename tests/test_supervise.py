@@ -181,15 +181,17 @@ def test_one_run_at_a_time_writes_to_a_directory(launch: type[Launch]) -> None:
 def test_an_earlier_runs_results_are_moved_aside_whole(launch: type[Launch], tmp_path: Path) -> None:
     out = tmp_path / "out"
     (out / "checkpoint").mkdir(parents=True)
-    for name in ("map.ply", "trajectory.txt", "report.html", "config.yaml", "checkpoint/state"):
-        (out / name).write_text(f"of the first: {name}")
+    names = ("map.ply", "trajectory.txt", "report.html", "config.yaml", "checkpoint/state")
+    for name in names:
+        (out / name).write_text(f"# mvsgs of the first: {name}")
     for count in (3, 4):  # the second of these has no map to move: the first one's stays
         assert launch(f"source.count={count}").finish()[0] == 0
         assert not (out / "map.ply").exists()
         assert not (out / "report.html").exists()
         assert not (out / "checkpoint").exists()
-        for name in ("map.ply", "trajectory.txt", "report.html", "config.yaml", "checkpoint/state"):
-            assert (out / "previous" / name).read_text() == f"of the first: {name}"
+        assert not (out / "previous-2").exists()
+        for name in names:
+            assert (out / "previous" / name).read_text() == f"# mvsgs of the first: {name}"
         assert f"count: {count}" in (out / "config.yaml").read_text()
 
 
