@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+_STILL = 1e-9  # of a position's magnitude: two that are nearer are the same
+
 
 def inverse(pose: np.ndarray) -> np.ndarray:
     """Inverse of rigid transforms (..., 4, 4)."""
@@ -138,18 +140,25 @@ def interpolate(pose_a: np.ndarray, pose_b: np.ndarray, t: float) -> np.ndarray:
     return pose_a @ se3_exp(t * se3_log(inverse(pose_a) @ pose_b))
 
 
+def moves(positions: np.ndarray) -> bool:
+    """Whether positions (N, 3) differ by more than rounding: where they do not, they have no direction nor length."""
+    magnitude = float(np.abs(positions).max(initial=0.0))
+    return len(positions) > 0 and bool(np.ptp(positions, axis=0).max() > _STILL * (magnitude + 1.0))
+
+
 def umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> tuple[float, np.ndarray, np.ndarray]:
     """Least-squares similarity: target = s R source + t (Umeyama 1991, eq. 40-42).
 
-    source, target: (N, 3). Returns (s, R (3, 3), t (3,)). Raises ValueError with fewer than 3 points or without extent.
+    source, target: (N, 3). Returns (s, R (3, 3), t (3,)). Raises ValueError with fewer than 3 points, and where either
+    side has no extent.
     """
     if len(source) < 3:
         raise ValueError(f"an alignment needs at least 3 positions, got {len(source)}")
+    if not (moves(source) and moves(target)):
+        raise ValueError("all positions coincide: no alignment")
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     ds, dt = source - mean_s, target - mean_t
     variance = float(np.mean(np.sum(ds * ds, axis=1)))
-    if variance <= 0 or not np.isfinite(variance):
-        raise ValueError("all positions coincide: no alignment")
     u, d, vt = np.linalg.svd(dt.T @ ds / len(source))
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0])
     rotation = u @ np.diag(s) @ vt

@@ -138,6 +138,21 @@ def test_without_truth_the_figures_are_null(tmp_path: Path) -> None:
     assert report["rendering"]["keyframes"]["psnr"] is not None
 
 
+@pytest.mark.parametrize("place", [0.0, 0.1])
+def test_true_poses_that_stand_still_align_nothing(tmp_path: Path, place: float) -> None:
+    """At .1, which no binary number is, their mean is off by rounding, which is no motion."""
+    node, image, depth = wall_evaluator(tmp_path), np.zeros((H, W, 3), np.uint8), np.full((H, W), 4.0, np.float32)
+    still = np.eye(4)
+    still[:3, 3] = place
+    for k in range(N):
+        list(node.on_ground_truth(GroundTruth(k, k / 30, image, INTRINSICS, still, depth)))
+    report = feed(node)
+    assert report["trajectory"]["ate_rmse"] is None
+    assert any("no trajectory error: the true poses do not move" in note for note in report["notes"])
+    assert report["depth"]["scale_ratio"] is None
+    assert report["depth"]["abs_rel"] == pytest.approx(0, abs=1e-6)
+
+
 def test_a_run_that_never_made_a_map_still_reports(tmp_path: Path) -> None:
     node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off", input="camera rtsp://me:secret@host/2"))
     (tmp_path / "config.yaml").write_text("# mvsgs camera\npath: rtsp://me:secret@host/2\n")
@@ -238,7 +253,7 @@ def test_what_other_nodes_say_is_shown_whatever_its_form(evaluator: Evaluator) -
 
 
 def test_the_report_is_json_where_a_figure_is_not_finite(evaluator: Evaluator) -> None:
-    """A render equal to its photograph has a PSNR without bound."""
+    """Of what another node counted."""
     feed(evaluator, upstream={"tracker": {"counts": {"frames": float("nan"), "keyframes": 4}}})
     assert evaluator.folder is not None
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from msgs import GroundTruth, Trajectory
+from msgs import FusedKeyframe, GroundTruth, Trajectory
 from mvsgs_core import geometry
+from mvsgs_core.datasets.lens import Lens, Undistortion
 from mvsgs_core.evaluation.scoring import render_frame
 from mvsgs_core.photometry import vignetting_factor
 from nodes.evaluator import Evaluator
@@ -161,3 +162,49 @@ def test_where_tracking_was_lost_all_figures_are_of_the_part_that_the_map_shows(
     path = node.evaluation.aligned_path()
     assert path is not None
     assert path.index.tolist() == list(range(6, N))
+
+
+@pytest.mark.parametrize("bent", [False, True], ids=["as it came", "once straightened"])
+def test_a_frame_whose_mask_leaves_nothing_is_not_scored(tmp_path: Path, bent: bool) -> None:
+    """Frame 4, and keyframe 3, whose own image would stand in for it. bent: their masks leave a corner, which is
+    outside of the image without the distortion."""
+    node = Evaluator(Evaluator.Config(output=str(tmp_path), lpips="off"))
+    node.evaluation.given = {"lpips": lambda a, b: 0.5}
+    image, whole, nothing = np.zeros((H, W, 3), np.uint8), np.ones((H, W), bool), np.zeros((H, W), bool)
+    nothing[0, 0] = bent
+    lens = Undistortion(Lens((30.0, 30.0, 15.5, 11.5), (H, W), (-0.4, 0.1, 0.0, 0.0)))
+    assert not lens.mask(nothing).any()
+    for k in range(N):
+        mask = nothing if k in (3, 4) else whole
+        list(node.on_ground_truth(GroundTruth(k, k / 30, image, INTRINSICS, None, None, mask=mask)))
+    depth = np.zeros((H // 2, W // 2), np.float32)
+    own = FusedKeyframe(3, 0.1, image, INTRINSICS, np.eye(4), 1.0, depth, depth, np.zeros((*depth.shape, 3), "f4"), 0)
+    list(node.on_fused_keyframe(replace(own, mask=nothing)))
+    poses, index, none = poses_along(), np.arange(N), np.zeros(N, np.int32)
+    track = Trajectory(index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none)
+    list(node.on_trajectory(replace(track, distortion=np.array([-0.4, 0.1])) if bent else track))
+    list(node.on_splat_map(splat_map_of(True)))
+    list(node.on_end())
+    assert [frame["index"] for frame in node.report["rendering"]["frames"]] == [0, 1, 2, *range(5, N)]
+    assert node.report["rendering"]["all"]["psnr"] is not None
+
+
+def test_true_depth_is_compared_without_the_distortion_that_was_found(evaluator: Evaluator) -> None:
+    """A keyframe's depth is that of its image, which has none."""
+    lens = Undistortion(Lens((30.0, 30.0, 15.5, 11.5), (H, W), (-0.4, 0.1, 0.0, 0.0)))
+    v, u = np.mgrid[:H, :W]
+    truth, image = (2.0 + 0.1 * u + 0.05 * v).astype(np.float32), np.zeros((H, W, 3), np.uint8)
+    list(evaluator.on_ground_truth(GroundTruth(3, 0.1, image, INTRINSICS, None, truth)))
+    straight = lens.depth(truth)
+    assert np.abs(straight / truth - 1.0).max() > 0.05
+    poses, index, none = poses_along(), np.arange(N), np.zeros(N, np.int32)
+    normals = np.zeros((H, W, 3), np.float32)
+    view = FusedKeyframe(3, 0.1, image, INTRINSICS, poses[3], 1.0, straight, np.ones_like(straight), normals, 0)
+    list(evaluator.on_fused_keyframe(view))
+    track = Trajectory(index, index / 30, poses, index % 3 == 0, none.astype(np.uint8), none)
+    list(evaluator.on_trajectory(replace(track, distortion=np.array([-0.4, 0.1]))))
+    list(evaluator.on_splat_map(splat_map_of(True)))
+    list(evaluator.on_end())
+    depth = evaluator.report["depth"]
+    assert depth["abs_rel"] == pytest.approx(0.0, abs=1e-6)
+    assert depth["completeness"] == 1.0

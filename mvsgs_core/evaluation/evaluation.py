@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.evaluation import metrics, scoring, trajectory_metrics
 from mvsgs_core.evaluation.depth_metrics import NO_DEPTH, depth_ratios, score_depth
 from mvsgs_core.evaluation.exposure import FrameExposures, frame_exposures, summary
@@ -77,7 +78,8 @@ class Evaluation:
         mask: np.ndarray | None = None,
     ) -> None:  # fmt: skip
         """A keyframe as it is mapped, with its filtered depth, computed at the map's scale `scale`."""
-        self._frames.add_keyframe(index, image, intrinsics, depth, scale, mask)
+        if mask is None or mask.any():
+            self._frames.add_keyframe(index, image, intrinsics, depth, scale, mask)
 
     def add_map(self, finished: Snapshot, refined: bool) -> None:
         self.maps[refined] = finished
@@ -194,6 +196,20 @@ class Evaluation:
 
         return Photograph(lambda: lens.image(given()), lens.intrinsics, True, straightened)
 
+    def _true_depth(self, index: int) -> np.ndarray | None:
+        """(H, W) float32, 0 unknown, at the pixels of the keyframe: without the distortion that the tracker found."""
+        known = self._frames.true_depth(index)
+        if known is None:
+            return None
+        depth, intrinsics = known
+        if self.trajectory is None or self.trajectory.distortion is None:
+            return depth
+        assert self.size is not None
+        size = depth.shape[0], depth.shape[1]
+        lens = undistortion(self.trajectory, scale_intrinsics(intrinsics, self.size, size), size)
+        assert lens is not None
+        return lens.depth(depth)
+
     def filtered_depths(self) -> list[int]:
         """Keyframes whose filtered depth is there."""
         return [index for index, _ in self._frames.filtered_depths()]
@@ -210,6 +226,7 @@ class Evaluation:
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
         chosen = scoring.choose(self.scored_frames(refined), self.max_frames)
+        chosen = [frame for frame in chosen if frame.shows]
         scores = self._scores(finished, chosen)
         if refined and self.fitted:
             started = time.perf_counter()
@@ -291,7 +308,7 @@ class Evaluation:
             for index, scale in self._frames.filtered_depths():
                 if known_frames is not None and index not in known_frames:  # of a map before, which has another scale
                     continue
-                truth, depth = self._frames.true_depth(index), self._frames.filtered_depth(index)
+                truth, depth = self._true_depth(index), self._frames.filtered_depth(index)
                 if truth is not None and depth is not None:
                     yield depth * (now.get(index, scale) / scale), truth
 
@@ -304,7 +321,7 @@ class Evaluation:
             return {**metrics.of_all(metrics.DEPTH, NO_DEPTH), "scale_ratio": None, "count": 0}
         scale = float(np.median(known))
         total = sum((score_depth(depth, truth, scale) for depth, truth in maps()), NO_DEPTH)
-        ratio = scale / alignment.scale if alignment else None
+        ratio = scale / alignment.scale if alignment and alignment.scale > 0.0 else None
         return {**metrics.of_all(metrics.DEPTH, total), "scale_ratio": ratio, "count": count}
 
     def close(self) -> None:

@@ -106,11 +106,14 @@ class Frames:
     def _photograph(self, index: int, intrinsics: np.ndarray, *, as_mapped: bool) -> Photograph:
         return Photograph(partial(self._read, index), intrinsics, as_mapped, partial(self._mask, index))
 
-    def true_depth(self, index: int) -> np.ndarray | None:
-        """(H, W) float32, 0 unknown; None where it is not known."""
+    def true_depth(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """(H, W) float32, 0 unknown, as the frame came, and its intrinsics (4,); None where it is not known."""
+        streamed = self._streamed[is_held_out(index)]
         if index in self._ending:
-            return self._ending[index].depth
-        return self._streamed[is_held_out(index)].get(index, "depth")
+            depth, intrinsics = self._ending[index].depth, self._ending[index].intrinsics
+        elif (depth := streamed.get(index, "depth")) is not None:
+            intrinsics = streamed.notes[index]
+        return None if depth is None else (depth, intrinsics)
 
     def filtered_depths(self) -> Iterator[tuple[int, float]]:
         """Index and scale of the keyframes whose depth is there."""

@@ -62,9 +62,16 @@ class Figure:
         return found
 
 
+BEST_PSNR = 100.0  # dB: of a render that equals its photograph it has no bound, and no mean either
+
+
+def _psnr(*pair: Any) -> float:
+    return min(image_metrics.psnr(*pair), BEST_PSNR)
+
+
 # The first of them ranks the frames: what is called the worst frame is the worst by it.
 IMAGE = (
-    Metric("psnr", "PSNR", "dB", 2, "higher", of=image_metrics.psnr),
+    Metric("psnr", "PSNR", "dB", 2, "higher", of=_psnr),
     Metric("ssim", "SSIM", "", 3, "higher", of=image_metrics.ssim),
     Metric("lpips", "LPIPS", "", 3, "lower"),  # its network is loaded where its weights are found
 )

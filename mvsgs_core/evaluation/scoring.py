@@ -39,6 +39,12 @@ class ScoredFrame:
     mask: Callable[[], np.ndarray | None] = lambda: None  # (H, W) bool, the pixels that count, read when needed
     reads_columns: bool = False  # while it was read, not rows, see `rasterize`
 
+    @property
+    def shows(self) -> bool:
+        """Whether its mask leaves a pixel that counts."""
+        mask = self.mask()
+        return mask is None or bool(mask.any())
+
 
 @dataclass(frozen=True)
 class Score:

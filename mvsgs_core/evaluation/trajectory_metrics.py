@@ -32,6 +32,9 @@ def align(estimate: np.ndarray, truth: np.ndarray) -> Alignment:
 
     Raises ValueError where no alignment exists: fewer than 3 poses, or positions that coincide.
     """
+    for poses, which in ((truth, "true"), (estimate, "estimated")):
+        if len(poses) >= 3 and not geometry.moves(poses[:, :3, 3]):
+            raise ValueError(f"the {which} poses do not move: their positions coincide")
     # the truth's own origin may be far away: solved around its mean inside umeyama, in float64
     return Alignment(*geometry.umeyama(estimate[:, :3, 3], truth[:, :3, 3]))
 

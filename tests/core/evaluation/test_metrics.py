@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,14 @@ from tests.support.small_maps import empty_map
 def frame(index: int, gray: int) -> ScoredFrame:
     lens = np.array([30.0, 30.0, 15.5, 11.5])
     return ScoredFrame(index, False, np.eye(4), lens, lambda: np.full((24, 32, 3), gray, np.uint8), 0.01)
+
+
+def test_a_render_that_equals_its_photograph_leaves_the_means_finite() -> None:
+    scores = [score_frame(empty_map(), "gaussian", frame(index, gray)) for index, gray in ((0, 0), (5, 51))]
+    found = summarize(scores)
+    assert scores[0].figures["psnr"] == metrics.BEST_PSNR == 100.0
+    assert found["held_out"]["psnr"] == pytest.approx((100.0 + 13.98) / 2, abs=0.01)
+    assert summarize([scores[0], replace(scores[0], index=1, keyframe=True)])["generalization_gap"] == 0.0
 
 
 def test_a_new_entry_is_scored_ranked_and_shown(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,9 +75,13 @@ def test_no_alignment_is_an_error() -> None:
     estimate, truth = _trajectories()
     with pytest.raises(ValueError, match="at least 3"):
         trajectory_metrics.align(estimate[:2], truth[:2])
-    estimate[:, :3, 3] = 1.0
-    with pytest.raises(ValueError, match="coincide"):
-        trajectory_metrics.align(estimate, truth)
+    for place in (1.0, 0.1, 1e6 + 0.1):
+        still = estimate.copy()
+        still[:, :3, 3] = place
+        with pytest.raises(ValueError, match="the estimated poses do not move: their positions coincide"):
+            trajectory_metrics.align(still, truth)
+        with pytest.raises(ValueError, match="the true poses do not move"):
+            trajectory_metrics.align(estimate, still)
 
 
 def test_tum_files_round_trip_and_evo_reads_them(tmp_path: Path) -> None:
