@@ -78,7 +78,7 @@ class Trajectory:
         """The part that a map shows, moved to where that has its keyframes (K,), by index: world_from_cam (K, 4, 4).
 
         The frames between two of them move as they do, on the screw from one motion to the other, linear in time;
-        those before the first and after the last move as that one.
+        those before the first and after the last move as that one. Time is as `along` has it.
         """
         order = np.argsort(keyframes)
         shown = self.main(keyframes)
@@ -93,8 +93,8 @@ class Trajectory:
         poses[:, :3, 3] -= origin
         target = known.copy()
         target[:, :3, 3] -= origin
-        moves, times, now = target @ geometry.inverse(poses[anchors]), self.timestamp[anchors], self.timestamp[main]
-        place = np.interp(now, times, np.arange(len(anchors)))
+        moves, times = target @ geometry.inverse(poses[anchors]), along(self.timestamp)
+        place = np.interp(times[main], times[anchors], np.arange(len(anchors)))
         before = np.floor(place).astype(int)
         after = np.minimum(before + 1, len(anchors) - 1)
         change = geometry.se3_log(geometry.inverse(moves[before]) @ moves[after])
@@ -104,21 +104,27 @@ class Trajectory:
         return replace(self, world_from_cam=poses)
 
 
+def along(timestamps: np.ndarray) -> np.ndarray:
+    """(N,) ascending, what lies between frames: their times (N,), or where these stand still or go back, as of a clock
+    that was set, their numbers."""
+    return timestamps if (np.diff(timestamps) > 0.0).all() else np.arange(len(timestamps), dtype=np.float64)
+
+
 def velocities(timestamps: np.ndarray, world_from_cam: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Camera velocities (N, 6) by the `known` (N,) neighbors in time of each frame; 0 where there is none.
 
     A twist (translation, rotation) a second in the camera's own axes, in the unit of the poses. timestamps: (N,)
-    seconds, ascending. world_from_cam: (N, 4, 4).
+    seconds; of frames whose times stand still or go back it is 0. world_from_cam: (N, 4, 4).
     """
     result = np.zeros((len(timestamps), 6))
     order = np.flatnonzero(known)
     for k, n in enumerate(order):
         around = [m for m in order[max(k - 1, 0) : k + 2] if abs(timestamps[m] - timestamps[n]) < LONGEST_GAP]
         seconds = timestamps[around[-1]] - timestamps[around[0]]
-        if seconds > 0.0:
+        if seconds > 0.0 and (np.diff(timestamps[around]) > 0.0).all():
             moved = geometry.inverse(world_from_cam[around[0]]) @ world_from_cam[around[-1]]
             result[n] = geometry.se3_log(moved) / seconds
     return result
 
 
-__all__ = ["LONGEST_GAP", "TrackingState", "Trajectory", "velocities"]
+__all__ = ["LONGEST_GAP", "TrackingState", "Trajectory", "along", "velocities"]

@@ -1,7 +1,8 @@
 """Exposure and white balance of every frame: the tracker's, in the gauge of the map.
 
 Nothing is fitted to a frame that is scored: the tracker's exposure comes from the frame's matches to keyframes. What a
-map has for its keyframes beside the tracker's, the gauge and what was trained, is interpolated in time.
+map has for its keyframes beside the tracker's, the gauge and what was trained, is interpolated in time, as
+`trajectory.along` has it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mvsgs_core.photometry import IDENTITY, compose, inverse
+from mvsgs_core.trajectory import along
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class FrameExposures:
 def frame_exposures(
     timestamps: np.ndarray, measured: np.ndarray | None, rows: np.ndarray, affines: np.ndarray
 ) -> FrameExposures | None:
-    """Of frames at `timestamps` (N,) ascending; None where the map was made without any.
+    """Of frames at `timestamps` (N,); None where the map was made without any.
 
     measured: (N, 3, 4) the tracker's, NaN where not known (then interpolated in time from those that are); None: it
     has none. rows: (K,) the keyframes among the frames, ascending; affines: (K, 3, 4) the map's of those. Before the
@@ -34,13 +36,14 @@ def frame_exposures(
     known = np.zeros(len(timestamps), bool) if measured is None else np.isfinite(measured).all(axis=(1, 2))
     if np.array_equal(affines, np.broadcast_to(IDENTITY, affines.shape)) and (len(rows) or not known.any()):
         return None
+    times = along(timestamps)
     tracked = np.tile(IDENTITY.astype(np.float64), (len(timestamps), 1, 1))
     if measured is not None and known.any():
-        tracked = _interpolated(timestamps, timestamps[known], measured[known])
+        tracked = _interpolated(times, times[known], measured[known])
     if not len(rows):
         return FrameExposures(tracked.astype(np.float32))
     remainders = compose(inverse(tracked[rows]), affines)
-    found = compose(tracked, _interpolated(timestamps, timestamps[rows], remainders))
+    found = compose(tracked, _interpolated(times, times[rows], remainders))
     return FrameExposures(found.astype(np.float32))
 
 
@@ -65,9 +68,9 @@ def summary(
     }
 
 
-def _interpolated(timestamps: np.ndarray, known: np.ndarray, affines: np.ndarray) -> np.ndarray:
-    """(N, 3, 4) float64 at `timestamps` (N,), linear between the affines (M, 3, 4) of `known` (M,), ascending."""
-    found = np.empty((len(timestamps), 3, 4))
+def _interpolated(times: np.ndarray, known: np.ndarray, affines: np.ndarray) -> np.ndarray:
+    """(N, 3, 4) float64 at `times` (N,), linear between the affines (M, 3, 4) of `known` (M,), ascending."""
+    found = np.empty((len(times), 3, 4))
     for row, column in np.ndindex(3, 4):
-        found[:, row, column] = np.interp(timestamps, known, affines[:, row, column])
+        found[:, row, column] = np.interp(times, known, affines[:, row, column])
     return found

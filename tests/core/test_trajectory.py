@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.trajectory import Trajectory
@@ -52,6 +53,19 @@ def test_between_two_keyframes_the_motion_is_between_theirs() -> None:
     for frame, share in ((0, 0.0), (3, 0.0), (4, 1 / 3), (5, 2 / 3), (6, 1.0), (7, 0.75), (9, 0.25), (12, 0.0)):
         expected = moved(before.world_from_cam[frame], geometry.se3_exp(share * twist))
         np.testing.assert_allclose(after.world_from_cam[frame], expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("back", [0.2, 100.0])
+def test_where_times_go_back_the_motion_is_between_theirs_by_frames(back: float) -> None:
+    """As of a clock that was set, or of two recordings: times then say nothing of which frames are beside another."""
+    before, twist = tracked(), np.array([0.02, 0.01, -0.02, 0.003, 0.004, -0.002])
+    target = before.world_from_cam[KEYFRAMES].copy()
+    target[1] = moved(target[1], geometry.se3_exp(twist))
+    expected = before.following(KEYFRAMES, target)
+    timestamp = before.timestamp - np.where(before.index >= 5, back, 0.0)
+    for times in (timestamp, np.zeros(N)):
+        after = replace(before, timestamp=times).following(KEYFRAMES, target)
+        np.testing.assert_allclose(after.world_from_cam, expected.world_from_cam, atol=1e-8)
 
 
 def test_frames_without_a_pose_and_other_parts_of_the_map_stay() -> None:

@@ -27,6 +27,15 @@ def test_velocity_is_zero_where_no_neighbor_in_time_is_known() -> None:
     assert not found[[1, 3, 4]].any()
 
 
+def test_velocity_is_zero_where_times_go_back() -> None:
+    """Of the poses before and after, whose times are .02 s apart, it would be ten times too large."""
+    times = np.array([0.0, 0.1, 0.02, 0.12])
+    poses = np.array([geometry.se3_exp(VELOCITY * t) for t in (0.0, 0.1, 0.2, 0.3)])
+    found = velocities(times, poses, np.ones(4, dtype=bool))
+    np.testing.assert_allclose(found[[0, 3]], [VELOCITY, VELOCITY], atol=1e-9)
+    assert not found[[1, 2]].any()
+
+
 def test_frames_of_two_segments_say_nothing_of_each_others_velocity() -> None:
     times = np.arange(6) / 10.0
     poses = np.array([geometry.se3_exp(VELOCITY * t) for t in times])

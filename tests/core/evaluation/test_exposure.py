@@ -50,6 +50,19 @@ def test_of_a_frame_that_the_tracker_does_not_know_its_neighbors_tell() -> None:
     np.testing.assert_allclose(gains(found.affines)[:, 0], [1.0, 1.0, 1.5, 2.0, 2.0], atol=1e-6)
 
 
+def test_where_times_go_back_frames_lie_between_by_their_numbers() -> None:
+    measured = tracked(1.0, 1.0, 1.5, 2.0, 2.0)
+    measured[2] = np.nan
+    rows = np.array([1, 3])
+    trained = measured[rows].astype(np.float64)
+    trained[1, :, :3] *= 1.2
+    expected = frame_exposures(TIMES, measured, rows, trained)
+    found = frame_exposures(np.array([10.0, 11.0, 0.0, 1.0, 2.0]), measured, rows, trained)
+    assert expected is not None
+    assert found is not None
+    np.testing.assert_array_equal(found.affines, expected.affines)
+
+
 def test_without_a_tracker_that_knows_the_maps_are_interpolated_and_identities_are_none() -> None:
     rows, plain = np.array([0, 4]), np.stack([IDENTITY, IDENTITY])
     bright = tracked(1.0, 3.0)
