@@ -27,7 +27,8 @@ FEWEST = 4  # positions that agree: three always do
 SAMPLES = 500  # of three positions each
 JUDGES = 1000  # positions, evenly of all, by which they are rated
 BEST = 10  # samples that are refined
-GATE = 3.0  # times the median residual: farther off is an outlier (4.6 standard deviations in three dimensions)
+GATE = 3.0  # times the usual residual: farther off is an outlier (4.6 standard deviations in three dimensions)
+FEW = 4.0  # positions beside three, of which the best of many fits flatters: they double the gate, more hardly widen it
 MAX_ANGLE = 10.0  # degrees, one standard deviation, about any axis
 MOST_ALIKE = 0.98  # successive errors: of more nothing is told
 MAX_SCALE = 0.2  # one standard deviation of the unit
@@ -70,18 +71,21 @@ class Georeference:
 def georeference(world_from_cam: np.ndarray, places: np.ndarray, camera_up: bool = False) -> Georeference:
     """Of poses (N, 4, 4), in the order of the stream, and their places (N, 3), in degrees and metres, all known.
 
-    The similarity whose median residual is least (least median of squares, Rousseeuw 1984) over samples of three,
-    then least squares over the positions within three times it (Umeyama 1991). camera_up: where the cameras stand on
-    a line, the rotation about it, which no position tells, is the one that has them upright.
+    The similarity whose usual residual is least (least quantile of squares, Rousseeuw and Leroy 1987) over samples of
+    three, then least squares over the positions within three times it, of few positions more (Umeyama 1991): of four
+    and five places a false one is hardly told, it shows in the deviations. camera_up: where the cameras stand on a
+    line, the rotation about it, which no position tells, is the one that has them upright.
     Raises NoReferenceError where it is not determined, and says how sure it would be.
     """
     positions = world_from_cam[:, :3, 3]
     if len(positions) < FEWEST:
         raise NoReferenceError(f"{len(positions)} camera positions have a GPS place, {FEWEST} are needed")
-    if not np.ptp(positions, axis=0).any():
+    if not geometry.moves(positions):
         raise NoReferenceError("all camera positions coincide")
     origin = geodesy.middle(places)
     target = geodesy.east_north_up(places, origin)
+    if not geometry.moves(target):
+        raise NoReferenceError(f"all {len(target)} GPS places are the same: the receiver gave none anew")
     scale, rotation, translation, kept = _robust(positions, target)
     if kept.sum() < max(FEWEST, len(kept) / 2):
         raise NoReferenceError(f"of {len(kept)} GPS places {int(kept.sum())} agree with the camera positions")
@@ -142,11 +146,13 @@ def _robust(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, 
         samples = np.array(list(itertools.combinations(range(count), 3)))
     else:
         samples = np.random.default_rng(0).integers(count, size=(SAMPLES, 3))
-    samples = samples[np.ptp(source[samples], axis=1).any(axis=1)]
+    samples = samples[(np.ptp(source[samples], axis=1) > 0.0).any(axis=1)]
+    samples = samples[(np.ptp(target[samples], axis=1) > 0.0).any(axis=1)]
     found = _similarities(source[samples], target[samples])
     some = np.arange(0, count, -(-count // JUDGES))
     off = np.einsum("sij,nj->sni", found[:, :3, :3], source[some]) + found[:, None, :3, 3] - target[some]
-    first = np.argsort(np.median(np.linalg.norm(off, axis=2), axis=1), kind="stable")[:BEST]
+    first = np.argsort(_usual(np.linalg.norm(off, axis=2)), kind="stable")[:BEST]
+    gate = GATE * (1.0 + (FEW / (count - 3)) ** 2)
     smallest = 1e-6 * float(np.ptp(target, axis=0).max())  # below it is rounding
     best = None
     for matrix in found[first]:
@@ -155,19 +161,26 @@ def _robust(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, 
         kept = np.zeros(count, bool)
         for _ in range(20):
             off = _off(source, target, solved)
-            now = off <= max(GATE * float(np.median(off)), smallest)
+            now = off <= max(gate * float(_usual(off)), smallest)
             if (now == kept).all():
                 break
             kept = now
-            if not np.ptp(source[kept], axis=0).any():
+            if not (geometry.moves(source[kept]) and geometry.moves(target[kept])):
                 break
             solved = geometry.umeyama(source[kept], target[kept])
-        median = float(np.median(_off(source, target, solved)))
+        median = float(_usual(_off(source, target, solved)))
         if best is None or median < best[0]:
             best = median, solved, kept
     if best is None:
-        raise NoReferenceError("all camera positions coincide")
+        raise NoReferenceError("no three camera positions differ whose GPS places do")
     return (*best[1], best[2])
+
+
+def _usual(off: np.ndarray) -> np.ndarray:
+    """Of residuals (..., N), N >= 4, the median where they are many: of few it is those of the three that were fitted,
+    so that it is the second after it."""
+    rank = off.shape[-1] // 2 + 1
+    return np.asarray(np.partition(off, rank, axis=-1)[..., rank])
 
 
 def _similarities(source: np.ndarray, target: np.ndarray) -> np.ndarray:

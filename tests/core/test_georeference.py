@@ -81,6 +81,21 @@ def test_deviations_are_what_noise_makes(drift: float) -> None:
     assert 0.7 < np.sqrt(np.linalg.eigvalsh(np.cov(np.array(angles).T))[-1]) / angle < 1.4
 
 
+@pytest.mark.parametrize(("count", "false"), [(4, 0), (5, 0), (6, 0), (7, 0), (10, 0), (6, 1), (7, 1), (10, 1)])
+def test_few_places_are_as_sure_as_is_said(count: int, false: int) -> None:
+    """Of 60 draws of path and noise; of more than five places a false one is left out."""
+    off, outliers = [], []
+    for seed in range(60):
+        poses, places, _ = flight(count, (120.0, 100.0, 30.0), noise=1.0, seed=seed)
+        places[:false, :2] += 0.001
+        found = georeference(poses, places)
+        off.append((found.scale / SCALE - 1.0) / found.scale_deviation)
+        outliers.append(found.outliers)
+    assert np.mean(np.array(outliers) == false) > 0.95
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.6
+    assert np.mean(np.abs(off) < 2.0) > 0.8
+
+
 def test_paths_that_do_not_tell() -> None:
     poses, places, _ = flight(30, (4.0, 3.0, 1.0), noise=5.0)
     with pytest.raises(NoReferenceError, match=r"the path, .* m, is too short for GPS that is off by"):
@@ -89,6 +104,12 @@ def test_paths_that_do_not_tell() -> None:
         georeference(poses[:3], places[:3])
     with pytest.raises(NoReferenceError, match="all camera positions coincide"):
         georeference(np.tile(poses[:1], (9, 1, 1)), places[:9])
+    with pytest.raises(NoReferenceError, match="all 30 GPS places are the same"):
+        georeference(poses, np.tile(places[:1], (30, 1)))
+    frozen = flight(30, (200.0, 150.0, 30.0), noise=1.0)[1]
+    frozen[:20] = frozen[0]
+    with pytest.raises(NoReferenceError):
+        georeference(poses, frozen)
 
 
 def test_on_a_line_the_roll_is_the_cameras_only_if_said() -> None:
