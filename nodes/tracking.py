@@ -209,11 +209,11 @@ class TrackerNode(Node, ABC):
         raise TypeError(f"{type(self).__name__} sends keyframes alone")
 
     def _send(self, update: Update) -> Iterator[Keyframe | Poses | TrackedFrame]:
-        for index in update.keyframes:
-            yield self._keyframe(index)
-        if update.correction is not None:
+        if update.correction is not None:  # first: stereo looks at the new keyframes and at those around them at once
             self._revision += 1
             yield Poses(self._revision, **vars(update.correction))
+        for index in update.keyframes:
+            yield self._keyframe(index)
         yield from self._frames_between(update.between)
         needed = self.core.pending | (set() if self._later is None else self._later.frames)
         for index in self._frames.keys() - needed:

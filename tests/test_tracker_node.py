@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,11 +25,16 @@ from msgs import (
 )
 from mvsgs_core import geometry
 from mvsgs_core.held_out import is_held_out
+from mvsgs_core.stats import Stats
+from mvsgs_core.tracking.phase import Phase
+from mvsgs_core.tracking.publish import Correction, Update
 from nodes import Node, handlers, outputs
 from nodes.localizer import Localizer
 from nodes.photographs_tracker import PhotographsTracker
 from nodes.posed_tracker import PosedTracker
 from nodes.tracker import Tracker
+from nodes.tracking import TrackerNode
+from tests.support import keyframe_messages
 from tests.support.sequences import synthetic
 
 
@@ -84,8 +90,25 @@ def test_a_request_that_cannot_be_met_changes_nothing_and_says_what_to_do(tmp_pa
     assert not Path(empty).exists()
 
 
+def test_what_an_update_corrects_is_known_before_its_keyframes() -> None:
+    """Stereo looks at a new keyframe and at those around it as soon as it comes: all must stand in one map."""
+
+    class Sending(TrackerNode):
+        core = SimpleNamespace(stats=Stats(), pending=set(), phase=Phase.TRACKING, nothing="")  # type: ignore[assignment]
+
+        def _add(self, frame: Frame) -> Update:
+            correction = Correction(np.array([frame.index - 1]), np.eye(4)[None], np.ones(1))
+            return Update(TrackingState.TRACKED, (frame.index,), correction)
+
+        def _keyframe(self, index: int) -> Keyframe:
+            return keyframe_messages.keyframe(index)
+
+    sent = list(Sending().on_frame(Frame(3, 0.3, np.zeros((2, 2, 3), np.uint8), np.ones(4))))
+    assert [type(message) for message in sent[:2]] == [Poses, Keyframe]
+
+
 @pytest.mark.slow
-def test_tracker_sends_keyframes_then_poses_then_the_trajectory() -> None:
+def test_tracker_sends_keyframes_and_poses_then_the_trajectory() -> None:
     frames, _ = messages()
     node = Tracker()
     sent = [m for frame in frames for m in node.on_frame(frame)] + list(node.on_end())
