@@ -85,11 +85,11 @@ class LoopCloser:
         scale: unit of keyframe `index` over that of the keyframe found.
         """
         old, new = self.graph.keyframes[found.index], self.graph.keyframes[index]
-        joined = new.segment if old.segment != new.segment else None
-        moved = joined is not None or not self._disagreement(found, index, scale) < self.config.max_disagreement
-        if joined is not None:
-            self._join(found, index, scale)
-        elif moved:
+        if old.segment != new.segment:
+            joined, moved = self._join(found, index, scale), True
+        else:
+            joined, moved = None, not self._disagreement(found, index, scale) < self.config.max_disagreement
+        if joined is None and moved:
             failure = self._spread_correction(found, index, scale)
             if failure:
                 return Closure(found.index, index, False, failure=failure)
@@ -134,15 +134,22 @@ class LoopCloser:
         self._apply(order, solution.similarities)
         return ""
 
-    def _join(self, found: PlaceMatch, index: int, scale: float) -> None:
-        """Brings the segment of `index` into the frame and unit of the keyframe found."""
-        target = self.graph.keyframes[found.index].segment
-        wanted = self._measured(found, index, scale) @ self.graph.keyframes[found.index].cam_from_world
-        other_from_target = self.graph.world_from_cam(index) @ wanted
-        members = self.local_map.members(self.graph.keyframes[index].segment)
+    def _join(self, found: PlaceMatch, index: int, scale: float) -> int:
+        """Brings the newer of the two segments into the frame and unit of the older one; returns which is no more.
+
+        Keyframes of a map that is gone on with have negative indices: it stays where it is.
+        """
+        old, new = self.graph.keyframes[found.index].segment, self.graph.keyframes[index].segment
+        measured = self._measured(found, index, scale) @ self.graph.keyframes[found.index].cam_from_world
+        other_from_target = self.graph.world_from_cam(index) @ measured
+        target, joined = old, new
+        if self.local_map.members(new)[0] < self.local_map.members(old)[0]:
+            target, joined, other_from_target = new, old, np.linalg.inv(other_from_target)
+        members = self.local_map.members(joined)
         self._apply(members, self.graph.keyframes.poses(members) @ other_from_target)
         for k in members:
             self.graph.keyframes[k].segment = target
+        return joined
 
     def _apply(self, indices: list[int], similarities: np.ndarray) -> None:
         """Makes similarities (K, 4, 4) poses: the keyframes' units become the world's.

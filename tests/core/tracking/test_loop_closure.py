@@ -193,8 +193,9 @@ def test_a_loop_that_cannot_be_closed_changes_nothing_and_says_why(
         np.testing.assert_array_equal(a, b)
 
 
-def test_two_segments_become_one_map_with_one_unit() -> None:
-    """The second half of the ring lies anywhere, in a unit of its own."""
+@pytest.mark.parametrize(("source", "to"), [(1, COUNT - 2), (COUNT - 2, 1)])
+def test_two_segments_become_one_map_with_the_frame_and_unit_of_the_older(source: int, to: int) -> None:
+    """The second half of the ring lies anywhere, in a unit of its own; either half may be found from the other."""
     true, graph = ring(), ring()
     half, unit = COUNT // 2, 3.7
     away = geometry.se3_exp(np.array([5.0, -2.0, 1.0, 0.3, -1.0, 0.5]))
@@ -211,7 +212,7 @@ def test_two_segments_become_one_map_with_one_unit() -> None:
                 segment=1,
             )
         )
-    closure = closer(graph).close(*between(true, graph, 1, COUNT - 2))
+    closure = closer(graph).close(*between(true, graph, source, to))
     assert closure.joined == 1
     assert closure.moved
     assert {k.segment for k in graph.keyframes.values()} == {0}
