@@ -44,11 +44,18 @@ class LocalizationFile:
                     self._file.write(f"{HEADER}\n")
             self._file.write(f"{frame.index},{frame.timestamp:.6f},{shown},{found.confidence:.3f},{found.segment}\n")
         except OSError as error:
-            self._stats.warn(f"{self._path} cannot be written: {error.strerror or error}")
+            self._warn(error)
 
     def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
+        """What a full disk did not take is tried once more, and given up."""
+        try:
+            if self._file is not None:
+                self._file.close()
+        except OSError as error:
+            self._warn(error)
+
+    def _warn(self, error: OSError) -> None:
+        self._stats.warn(f"{self._path} cannot be written: {error.strerror or error}")
 
 
 __all__ = ["FILE", "HEADER", "LocalizationFile"]

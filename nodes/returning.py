@@ -102,8 +102,12 @@ class Returning:
         self._changed, self._due = False, now + (now - began) / SHARE
 
     def _write(self, line: str) -> None:
-        with self._log.open("a") as log:
-            log.write(f"\n{line};")  # begins a line: one that was cut off stays by itself
+        """A disk that is full costs the return, not the run."""
+        try:
+            with self._log.open("a") as log:
+                log.write(f"\n{line};")  # begins a line: one that was cut off stays by itself
+        except OSError as error:
+            self._stats.warn(f"if this tracker is killed it cannot go on: {error}")
 
 
 __all__ = ["Returning"]

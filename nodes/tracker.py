@@ -112,9 +112,9 @@ class Tracker(TrackerNode):
 
     def on_end(self) -> Iterator[Keyframe | Poses | TrackedFrame | Trajectory]:
         yield from super().on_end()
-        self._localized.close()
         if self.config.keep_map and not self.only_localizes and self.config.output is not None:
             self._keep_map(self.config.output)
+        self._localized.close()
 
     def _keep_map(self, output: str) -> None:
         """A disk that is full costs the map of tomorrow, not today's."""
