@@ -31,6 +31,7 @@ def go_on(session: Session, known: KnownMap) -> None:
         graph.readout_time, graph.reads_columns = known.readout_time, known.reads_columns
     session.calibration.settled = True
     session.calibration.guessed = False
+    session.calibration.of_map = True
     for keyframe in known.keyframes:
         graph.add(keyframe)
     graph.edges |= known.edges

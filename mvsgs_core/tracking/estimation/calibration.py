@@ -45,6 +45,7 @@ class Calibration:
             self.stats.values["reads_columns"] = self.reads_columns
         self.given = self.graph.intrinsics  # (4,) that came with the frames, at the tracker's size
         self.settled = not self.guessed
+        self.of_map = False  # the focal length: of a map that is gone on with
         self.rolled = False  # a readout time that is not 0 was used before the one now, also by a map gone on with
 
     @property
@@ -149,11 +150,25 @@ class Calibration:
             return
         self._say_checked(factor, sigma)
         self.stats.values["focal_doubt"] = f"the keyframes want {factor:.4f} times as much"
+        used = self.focal_factor * self.pixels
+        what, whose, advice = (
+            (
+                "the map's focal length",
+                "of the map",
+                "Are the frames of the map's camera, zoomed as it was? A map of their own begins without map=DIR",
+            )
+            if self.of_map
+            else (
+                "the given calibration",
+                "that were given",
+                "Is it of this camera at this size, and does the lens bend (dataset.distortion)? Or run again with "
+                "dataset.intrinsics=[fx,fy,cx,cy] as they want it",
+            )
+        )
         self.stats.warn(
-            "the given calibration and the images contradict each other: the keyframes want a focal length of "
-            f"{self._told(factor * self.pixels)}, {factor:.3f} times the {self.pixels:.0f} px that were given, give or "
-            f"take {100 * sigma:.1f} %; poses and map may be bent. Is it of this camera at this size, and does the "
-            "lens bend (dataset.distortion)? Or run again with dataset.intrinsics=[fx,fy,cx,cy] as they want it"
+            f"{what} and the images contradict each other: the keyframes want a focal length of "
+            f"{self._told(factor * used)}, {factor:.3f} times the {used:.0f} px {whose}, give or "
+            f"take {100 * sigma:.1f} %; poses and map may be bent. {advice}"
         )
 
     def _say_zoomed(self, zoom: Zoom) -> None:

@@ -16,6 +16,32 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 
 
 @pytest.mark.parametrize(
+    ("of_map", "said"),
+    [
+        (False, ("the given calibration", "390 px in images of 640x480, 1.300 times the 300 px that were given")),
+        (True, ("the map's focal length", "325 px in images of 640x480, 1.300 times the 250 px of the map", "map=DIR")),
+    ],
+)
+def test_a_contradiction_is_told_of_the_focal_length_that_was_used(
+    of_map: bool, said: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That of a map holds for frames that came with another one."""
+    monkeypatch.setattr(calibration, "find_zoom", lambda *_: None)
+    monkeypatch.setattr(calibration, "focal_of_all", lambda *_: 1.3)
+    monkeypatch.setattr(calibration, "observability", lambda *_: np.inf)
+    monkeypatch.setattr(calibration, "uncertainty", lambda *_: 0.01)
+    stats, graph = Stats(), KeyframeGraph(np.array([150.0, 150.0, 160.0, 120.0]))
+    checked = Calibration(graph, FocalConfig(), stats, 300.0, (480, 640), False, 0.0, False, 1)
+    if of_map:
+        checked.of_map, graph.intrinsics = True, np.array([125.0, 125.0, 160.0, 120.0])
+    checked.check(list(range(20)))
+    (warning,) = stats.warnings
+    for text in said:
+        assert text in warning
+    assert stats.values["focal_checked_px"] == pytest.approx(325.0 if of_map else 390.0)
+
+
+@pytest.mark.parametrize(
     ("keyframes", "asked", "who"),
     [(200, 200, "all keyframes together"), (3600, MANY, f"the first {MANY} keyframes")],
 )

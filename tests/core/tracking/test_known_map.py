@@ -147,6 +147,7 @@ def test_a_guessed_focal_length_is_the_maps(file: Path) -> None:
     tracker = returning(load(file), items[:3])
     assert tracker.phase is Phase.TRACKING
     assert tracker.focal_factor == pytest.approx(1.0 / 1.2, rel=1e-3)
+    assert tracker.session.calibration.of_map
 
 
 def test_another_camera_is_refused(file: Path) -> None:
