@@ -18,6 +18,11 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
 
     step = "fusion"
 
+    @classmethod
+    def check(cls, config: Any) -> None:
+        if config.min_views < 1:
+            raise ValueError(f"min_views={config.min_views}: views that must agree, the reference counted: 1 or more")
+
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)
         self._depths: dict[int, Depth] = {}  # not sent yet

@@ -36,7 +36,7 @@ class FusionConfig:
     relative: float = 0.02  # relative depth difference that still agrees; refined, the support's width if that is more
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
     pixels: float = 1.0  # round trip: distance to where it started
-    min_views: int = 2  # views that must agree, the reference counted
+    min_views: int = 2  # views that must agree, the reference counted; 1: its own depth will do
     confidence: float = 0.755  # of a kept pixel at least: lower keeps more, with more outliers
     device: str = "auto"  # auto (CUDA if there is one), cpu (C++), torch (PyTorch on the CPU), cuda
     threads: int | None = None  # of the C++ kernels; null: all
@@ -184,7 +184,7 @@ def fuse(
         if len(neighbors) < needed:
             needed = len(neighbors)
             problem = "too few neighbors for the consistency check" if needed else "no neighbor to check depth with"
-        agreed = consistent >= max(needed, 1)
+        agreed = consistent >= (max(needed, 1) if config.min_views > 1 else 0)
         counts["rejected: consistency"] = float((keep & ~agreed).sum())
         keep = keep & agreed
     keep = keep & sure
