@@ -158,8 +158,10 @@ def _settings(config: Mapping[str, Any]) -> tuple[Settings, dict[str, Mapping[st
     if not 0.0 < supervise.silent < supervise.dead:
         raise GraphError(f"supervise.silent={supervise.silent:g}: must be above 0 and below dead={supervise.dead:g}")
     if settings.map is not None:
-        settings = replace(settings, map=str(Path(settings.map).expanduser().absolute()))
-        if settings.map == settings.output:
+        read = Path(settings.map).expanduser().absolute()
+        settings = replace(settings, map=str(read))
+        written = None if settings.output is None else Path(settings.output).resolve()
+        if read.resolve() == written:  # by a link, too: the map would be moved aside
             raise GraphError(f"map={settings.map} is the output too: a new map is written, give another output=DIR")
     if settings.keep_map is None:
         settings = replace(settings, keep_map=settings.map is not None)

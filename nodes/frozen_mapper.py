@@ -79,6 +79,8 @@ class FrozenMapper(Node):
         elif request.asked == Asked.LOAD_MAP and not problem:
             try:
                 self.atlas = begin_on(Path(request.folder), self.config, Stats())
+                self._found.clear()  # parts and poses of the map before
+                self._frames.clear()
                 said = f"the camera is looked for in {request.folder}"
             except ValueError as error:
                 problem = f"the camera is looked for in {request.folder}, whose splats cannot be taken up: {error}"

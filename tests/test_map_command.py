@@ -11,11 +11,11 @@ import pytest
 from launch.compose import compose
 from launch.inline import run_inline
 from launch.refusal import GraphError
-from msgs import CameraPose, Frame, SplatMap
+from msgs import Asked, CameraPose, Frame, Reply, Request, SplatMap
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.kept_map import STREAM, tracker_file
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
-from mvsgs_core.maps.info import main
+from mvsgs_core.maps.info import days_of, main
 from nodes import Node
 from nodes.frozen_mapper import FrozenMapper
 from nodes.localization_file import HEADER
@@ -43,6 +43,24 @@ def test_both_halves_of_a_map_are_told(tmp_path: Path) -> None:
 def test_a_map_is_not_overwritten_by_its_own_run(tmp_path: Path) -> None:
     with pytest.raises(GraphError, match="another output"):
         compose([f"map={tmp_path}", f"output={tmp_path}"])
+    (tmp_path / "out").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "out")
+    for read, written in (("link", "out"), ("out", "link"), ("out", "out/../out")):
+        with pytest.raises(GraphError, match="another output"):
+            compose([f"map={tmp_path / read}", f"output={tmp_path / written}"])
+
+
+@pytest.mark.parametrize(
+    ("stamps", "days"),
+    [
+        ((0.0, 3.5, 90_000.0), ""),  # of a file's beginning
+        ((1_700_000_000.0, 1_700_000_009.0), "2023-11-14"),
+        ((3.5, 1_700_000_000.0, 1_700_100_000.0), "2023-11-14 to 2023-11-16"),
+        ((1.7e12, 1.7e18), ""),  # milliseconds, nanoseconds
+    ],
+)
+def test_days_are_named_where_timestamps_are_a_clocks(stamps: tuple[float, ...], days: str) -> None:
+    assert days_of(stamps) == days
 
 
 @pytest.mark.parametrize("word", ["map=there", "keep_map=true"])
@@ -129,13 +147,31 @@ def test_a_frozen_map_must_be_named(node: type[Node]) -> None:
         node.check(node.Config())
 
 
-def test_the_frozen_map_is_shown_with_the_camera_in_it(tmp_path: Path) -> None:
-    writer = CheckpointWriter(tmp_path, PLAIN)
+def frozen(folder: Path) -> FrozenMapper:
+    """With a map of two parts."""
+    writer = CheckpointWriter(folder, PLAIN)
     writer.submit(begun(PLAIN).frozen(), sync=False)
     assert writer.wait(LONG)
-    tracker_file(tmp_path).touch()
-    given = view(3)
-    node = FrozenMapper(FrozenMapper.Config(map=str(tmp_path), threads=1, device="cpu"))
+    tracker_file(folder).touch()
+    return FrozenMapper(FrozenMapper.Config(map=str(folder), threads=1, device="cpu"))
+
+
+def test_what_was_found_in_one_map_says_nothing_of_the_next(tmp_path: Path) -> None:
+    node, given = frozen(tmp_path), view(3)
+    list(node.on_frame(Frame(0, 0.0, np.asarray(given.image), given.intrinsics)))
+    for index in range(3):
+        list(node.on_camera_pose(CameraPose(index, 0.1 * index, given.world_from_cam, 0, None, 0.9)))
+    (refused,) = node.on_request(Request(1, Asked.LOAD_MAP, folder=str(tmp_path / "none")))
+    assert isinstance(refused, Reply)
+    assert not refused.success
+    assert node._mapper is node.atlas.parts[0], "the map is still that one"
+    list(node.on_request(Request(2, Asked.LOAD_MAP, folder=str(tmp_path))))
+    assert not list(node.on_camera_pose(CameraPose(0, 0.5, given.world_from_cam, 1, None, 0.9))), "an older frame"
+    assert node._mapper is node.atlas.parts[1]
+
+
+def test_the_frozen_map_is_shown_with_the_camera_in_it(tmp_path: Path) -> None:
+    node, given = frozen(tmp_path), view(3)
     splats = len(node.atlas.parts[0].state)
     list(node.on_frame(Frame(7, 0.7, np.asarray(given.image), given.intrinsics)))
     (shown,) = node.on_camera_pose(CameraPose(7, 0.7, given.world_from_cam, 0, None, 0.9))

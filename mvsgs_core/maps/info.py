@@ -15,6 +15,8 @@ from mvsgs_core.kept_map import FOLDER, TRACKER, check_kept_map, tracker_file
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.tracking import known_map
 
+CLOCK = (1e9, 2.0**31)  # s that are a clock's, 2001 to 2038: others count from a file's beginning or in another unit
+
 
 def main(words: Sequence[str] | None = None, prog: str | None = None) -> int:
     """Prints it; the exit code, 2 where there is no map."""
@@ -44,14 +46,19 @@ def info(output: Path) -> list[str]:
         f"light       {_light(known)}",
         f"extent      {_lengths(np.ptp(positions, axis=0))} between keyframes, {depth:.3g} to what they see (median)",
     ]
-    streams = sorted({int(keyframe.image.timestamp // 86400) for keyframe in known.keyframes})
-    if streams[-1] > 0:  # timestamps of a clock, not of a file's beginning
-        days = [time.strftime("%Y-%m-%d", time.gmtime(86400 * day)) for day in (streams[0], streams[-1])]
-        lines.append(f"taken       {' to '.join(dict.fromkeys(days))}")
+    if days := days_of([keyframe.image.timestamp for keyframe in known.keyframes]):
+        lines.append(f"taken       {days}")
     if len(known.segments) > 1:
         lines.append(f"parts       {len(known.segments)}, which share no frame of reference")
     size = sum(file.stat().st_size for file in (output / FOLDER).rglob("*") if file.is_file())
     return [*lines, f"size        {1e-6 * size:.1f} MB in {output / FOLDER}"]
+
+
+def days_of(timestamps: Sequence[float]) -> str:
+    """The first and the last day of those that are of a clock; empty where none is."""
+    known = [stamp for stamp in timestamps if CLOCK[0] <= stamp < CLOCK[1]]
+    ends = (min(known), max(known)) if known else ()
+    return " to ".join(dict.fromkeys(time.strftime("%Y-%m-%d", time.gmtime(stamp)) for stamp in ends))
 
 
 def _light(known: known_map.KnownMap) -> str:
@@ -65,7 +72,7 @@ def _lengths(extent: np.ndarray) -> str:
     return " x ".join(f"{length:.3g}" for length in extent)
 
 
-__all__ = ["info", "main"]
+__all__ = ["days_of", "info", "main"]
 
 if __name__ == "__main__":
     sys.exit(main())
