@@ -21,6 +21,7 @@ class LearnedFusion(FusionNode):
 
     @classmethod
     def check(cls, config: Config) -> None:
+        super().check(config)
         if config.weights != RANDOM:
             weights.find("vfuse", config.weights)
 

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from mvsgs_core.fusion.backend import NativeFusionBackend
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig, fuse
+from nodes import Node
+from nodes.depth_fusion import DepthFusion
+from nodes.learned_fusion import LearnedFusion
 from tests.support.depth_views import view
 from tests.support.plane_scene import look, true_depth
 
@@ -13,7 +19,7 @@ SIZE = (160, 224)  # where parallax is enough for a depth to be sure
 CONFIG = FusionConfig(device="cpu", threads=1)
 
 
-def fused(patch: slice | None = None, grown: slice | None = None) -> FusedDepth:
+def fused(patch: slice | None = None, grown: slice | None = None, config: FusionConfig = CONFIG) -> FusedDepth:
     """A wall seen four times. patch: rows and columns that the reference alone sees elsewhere; grown: columns that all
     see before the wall."""
     views = [view(k, 0.3 * x, size=SIZE) for k, x in enumerate((0, 1, -1, 1.5))]
@@ -23,7 +29,7 @@ def fused(patch: slice | None = None, grown: slice | None = None) -> FusedDepth:
         for one in views:
             one.depth[:, grown] *= 0.8
             one.confidence[:, grown] = 0.5
-    return fuse(views[0], views[1:], CONFIG, NativeFusionBackend(1))
+    return fuse(views[0], views[1:], config, NativeFusionBackend(1))
 
 
 def test_kept_is_what_is_sure_and_agreed_on_and_each_rejection_is_counted() -> None:
@@ -32,6 +38,23 @@ def test_kept_is_what_is_sure_and_agreed_on_and_each_rejection_is_counted() -> N
     np.testing.assert_array_equal(found.depth > 0, sure & (found.consistent >= 1))
     assert found.counts["kept"] == (found.depth > 0).sum() > 0.5 * found.depth.size
     assert found.counts["rejected: confidence"] == ((found.unfiltered > 0) & ~sure).sum() > 0
+
+
+def test_one_view_that_must_agree_is_the_reference_itself() -> None:
+    alone = replace(CONFIG, min_views=1, confidence=0.0, refine=False)
+    found = fused(slice(60, 70), config=alone)
+    assert (found.consistent[60:70, 60:70] == 0).any()
+    np.testing.assert_array_equal(found.depth, found.unfiltered)
+    unseen = fuse(found.view, [], alone, NativeFusionBackend(1))
+    np.testing.assert_array_equal(unseen.depth, found.view.depth)
+    assert not unseen.problem
+    assert not fuse(found.view, [], CONFIG, NativeFusionBackend(1)).depth.any()
+
+
+@pytest.mark.parametrize("node", [DepthFusion, LearnedFusion])
+def test_no_view_that_must_agree_is_refused(node: type[Node]) -> None:
+    with pytest.raises(ValueError, match="min_views=0: views that must agree"):
+        node.check(node.Config(min_views=0))
 
 
 def test_no_small_patch_that_one_view_alone_sees_gets_through() -> None:
