@@ -11,6 +11,7 @@ import numpy as np
 import viser
 
 from mvsgs_core.geometry import quaternion_from_rotation
+from nodes.page_guard import guarded
 
 _PATH_COLOR = (230, 90, 40)
 _PLAIN_COLOR, _MARKED_COLOR = (90, 110, 140), (230, 90, 40)
@@ -35,13 +36,14 @@ def check_address(host: str, port: int, dashes: str = "") -> None:
 
 class MapPage:
     """The page. Lengths in it are divided by the `unit` that `begin` finds, so that any map fits the browser's near and
-    far planes; what it is given is in the map's own unit, relative to one origin.
+    far planes; what it is given is in the map's own unit, relative to one origin. No other page can read it.
     """
 
     def __init__(self, host: str, port: int) -> None:
         """Listens at `port`, or at the next free one if it is taken. Raises ValueError, see `check_address`."""
         check_address(host, port)
-        self.server = viser.ViserServer(host=host, port=port, label="MVS-GS", verbose=False)
+        with guarded(host):
+            self.server = viser.ViserServer(host=host, port=port, label="MVS-GS", verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         self.unit: float | None = None  # map units in one unit of the page
         self.splats: viser.GaussianSplatHandle | None = None

@@ -90,14 +90,14 @@ def check_address(address: str, *, bind: bool = False, keys: Keys | None = None)
     host, _, port = rest.rpartition(":")
     if kind != "tcp" or not host or not (port.isdigit() and int(port) < 65536):
         raise TransportError(f"{address} is no address; use ipc:///path or tcp://host:port")
-    if bind and keys is None and not _is_loopback(host):
+    if bind and keys is None and not is_loopback(host):
         raise TransportError(
             f"{address} can be reached from other machines and would accept anybody: give CURVE keys, "
             "or bind to 127.0.0.1 or an ipc:// path"
         )
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

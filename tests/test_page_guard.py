@@ -1,0 +1,66 @@
+"""A page on this machine that another page, open in the same browser, asks for what it shows."""
+
+from __future__ import annotations
+
+import http.client
+from collections.abc import Iterator
+
+import pytest
+import viser
+import websockets.asyncio.server as websocket_server
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
+
+from nodes.map_page import MapPage
+from nodes.page_guard import guarded, refusal
+from tests.support.ports import free_port
+from tests.support.viewer_page import page
+
+SERVE = websocket_server.serve
+
+
+@pytest.fixture(scope="module")
+def opened() -> Iterator[MapPage]:
+    map_page = MapPage("127.0.0.1", free_port())
+    yield map_page
+    map_page.server.stop()
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:1", "null"])
+def test_another_page_gets_nothing(opened: MapPage, origin: str) -> None:
+    address, protocol = opened.url.replace("http", "ws"), Subprotocol(f"viser-v{viser.__version__}")
+    with pytest.raises(InvalidStatus, match="403"), connect(address, origin=Origin(origin), subprotocols=[protocol]):
+        pass
+    with connect(address, origin=Origin(opened.url), subprotocols=[protocol], max_size=None) as itself:
+        assert itself.recv(timeout=10)
+    assert "ReplayDone" in page(opened.url)  # a program that is no browser
+
+
+def test_a_name_that_leads_here_gets_nothing(opened: MapPage) -> None:
+    port = opened.server.get_port()
+    for name, status in (("evil.example", 403), ("", 403), ("[", 403), ("localhost", 200), ("127.0.0.1", 200)):
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection.request("GET", "/", headers={"Host": f"{name}:{port}"})
+        answer = connection.getresponse()
+        assert answer.status == status, name
+        if status == 403:
+            assert b"open it at http://127.0.0.1" in answer.read()
+        connection.close()
+
+
+def test_who_opens_it_to_the_network_may_be_asked_by_any_name_but_by_no_other_page() -> None:
+    for name in ("robot.local:8080", "192.168.1.5:8080", "[fe80::1]:8080"):
+        assert refusal(Headers(Host=name), "0.0.0.0") is None
+        assert refusal(Headers(Host=name, Origin=f"http://{name}"), "0.0.0.0") is None
+        assert refusal(Headers(Host=name, Origin="https://evil.example"), "0.0.0.0") is not None
+    tunnel = Headers(Host="localhost:9000", Origin="http://localhost:9000")
+    for host in ("127.0.0.1", "::1", "localhost"):
+        assert refusal(tunnel, host) is None
+
+
+def test_a_server_that_is_made_otherwise_is_not_taken_for_guarded() -> None:
+    with pytest.raises(RuntimeError, match="cannot be guarded"), guarded("127.0.0.1"):
+        pass
+    assert websocket_server.serve is SERVE
