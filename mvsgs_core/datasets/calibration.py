@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mvsgs_core.bad_file import BadFileError
-from mvsgs_core.datasets.exif import read_exif_lens
+from mvsgs_core.datasets.exif import exif_contradiction, read_exif_lens
 from mvsgs_core.datasets.files import UnreadableImageError, opened_image, upright_size
 from mvsgs_core.datasets.lens import Lens, guess_lens
 
@@ -63,7 +63,7 @@ def lens_for_images(
     lens = read_exif_lens(images[0]) if intrinsics == "auto" else None
     if lens is None or lens.size != size:
         return lens_from_option(intrinsics, distortion, size)
-    return with_distortion(lens, distortion), [exif_notice(lens, distortion)]
+    return with_distortion(lens, distortion), exif_notices(images[0], lens, distortion)
 
 
 def with_distortion(lens: Lens, distortion: Sequence[float | str]) -> Lens:
@@ -72,12 +72,14 @@ def with_distortion(lens: Lens, distortion: Sequence[float | str]) -> Lens:
     return replace(lens, distortion=coefficients, fisheye=fisheye) if len(distortion) else lens
 
 
-def exif_notice(lens: Lens, distortion: Sequence[float | str]) -> str:
-    """What to say of a lens whose focal length is EXIF's."""
-    return (
+def exif_notices(path: Path, lens: Lens, distortion: Sequence[float | str]) -> list[str]:
+    """What to say of a lens whose focal length is of the EXIF header of the image `path`."""
+    contradiction = exif_contradiction(path)
+    return [
         f"intrinsics are from EXIF: focal length {lens.intrinsics[0]:.0f} pixels for {lens.size[1]}x{lens.size[0]}, "
-        f"good to a few percent, distortion {'as given' if len(distortion) else 'unknown'}"
-    )
+        f"good to a few percent, distortion {'as given' if len(distortion) else 'unknown'}",
+        *([contradiction] if contradiction else []),
+    ]
 
 
 def image_size(images: Iterable[Path]) -> tuple[int, int]:

@@ -1,8 +1,9 @@
-"""What the EXIF header of a photograph tells: intrinsics, good to a few percent, its exposure, and GPS."""
+"""What the EXIF header of a photograph tells: intrinsics, good to a few percent, exposure, time, and GPS."""
 
 from __future__ import annotations
 
 import math
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -17,35 +18,93 @@ _EXPOSURE_TIME, _F_NUMBER, _SENSITIVITY = 0x829A, 0x829D, 0x8827  # seconds, -, 
 _PLANE_X_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210  # sensor pixels per unit
 _PIXEL_WIDTH, _PIXEL_HEIGHT = 0xA002, 0xA003  # of the picture as taken
 _UNIT_MILLIMETERS = {2: 25.4, 3: 10.0, 4: 1.0}
+_TAKEN, _TAKEN_FRACTION, _TAKEN_OFFSET = 0x9003, 0x9291, 0x9011  # DateTimeOriginal, of the camera's own clock
 _GPS_IFD = 0x8825
 _LATITUDE, _LONGITUDE, _ALTITUDE = (1, 2), (3, 4), (5, 6)  # tags of reference and value
 _BELOW = (1, 3)  # references of altitudes below the sea, below the ellipsoid (EXIF 3.0)
+_APART = 1.15  # or its inverse, of two focal lengths: rounding and another shape of sensor make less
+_NARROW = math.radians(10.0)  # across the longer side: as a 200 mm lens has
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)  # CIPA DCG-001: "35 mm equivalent" compares diagonals
 
 
-def read_exif_lens(path: Path) -> Lens | None:
+def read_exif_lens(path: Path, *, turn_upright: bool = True) -> Lens | None:
     """Focal length from the header, principal point in the middle, no distortion; None where the header lacks it.
 
     A header that cannot be read, or tells of a focal length that no camera has, is one that lacks it.
     Prefers focal length times the resolution of the sensor, which is exact for a picture that was scaled but not
-    cropped, over the 35 mm equivalent, which is rounded to whole millimeters.
+    cropped, over the 35 mm equivalent, which is rounded to whole millimeters; where both contradict each other, the
+    resolution is of another size of the picture. Alone, it must be of no narrower view than nearly all lenses have.
+    turn_upright: the lens is of the image as the header says it should be shown.
     """
     try:
         with opened_image(path, path.name) as image:
             header = image.getexif().get_ifd(_EXIF_IFD)
-            height, width = upright_size(image)
+            height, width = upright_size(image) if turn_upright else (image.height, image.width)
     except UnreadableImageError:
         return None  # reading the sequence reports it
-    focal = _from_sensor(header, max(height, width))
+    by_sensor, by_35mm = _focal_lengths(header, (height, width))
+    if by_sensor is not None and by_35mm is None and 2.0 * math.atan(0.5 * max(height, width) / by_sensor) < _NARROW:
+        return None
+    focal = by_35mm if by_sensor is None or _apart(by_sensor, by_35mm) else by_sensor
     if focal is None:
-        focal_35mm = _positive(header.get(_FOCAL_LENGTH_35MM))
-        if focal_35mm is None:
-            return None
-        focal = focal_35mm * math.hypot(width, height) / _DIAGONAL_35MM
+        return None
     try:
         return Lens((focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), (height, width))
     except ValueError:  # a focal length that no camera has
         return None
+
+
+def exif_contradiction(path: Path) -> str:
+    """What to say of a header that names two focal lengths; empty where it does not."""
+    try:
+        with opened_image(path, path.name) as image:
+            header = image.getexif().get_ifd(_EXIF_IFD)
+            by_sensor, by_35mm = _focal_lengths(header, (image.height, image.width))
+    except UnreadableImageError:
+        return ""
+    if by_sensor is None or not _apart(by_sensor, by_35mm):
+        return ""
+    return (
+        f"EXIF of {path.name} contradicts itself: by the sensor's resolution the focal length is {by_sensor:.0f} "
+        f"pixels, as of a picture that was scaled; that of the 35 mm equivalent is taken, {by_35mm:.0f}"
+    )
+
+
+def _focal_lengths(header: dict[int, object], size: tuple[int, int]) -> tuple[float | None, float | None]:
+    """Pixels of an image (height, width): by the resolution of the sensor, and by the 35 mm equivalent."""
+    equivalent = _positive(header.get(_FOCAL_LENGTH_35MM))
+    by_35mm = None if equivalent is None else equivalent * math.hypot(*size) / _DIAGONAL_35MM
+    return _from_sensor(header, max(size)), by_35mm
+
+
+def _apart(by_sensor: float, by_35mm: float | None) -> bool:
+    return by_35mm is not None and not 1.0 / _APART < by_sensor / by_35mm < _APART
+
+
+def read_exif_time(path: Path) -> datetime | None:
+    """When a photograph was taken, by the camera's clock: with its zone where the header names one.
+
+    None where the header lacks it, or cannot be read.
+    """
+    try:
+        with opened_image(path, path.name) as image:
+            header = image.getexif().get_ifd(_EXIF_IFD)
+    except UnreadableImageError:
+        return None
+    text, fraction, offset = (_text(header.get(tag)) for tag in (_TAKEN, _TAKEN_FRACTION, _TAKEN_OFFSET))
+    day, _, time = text.partition(" ")
+    seconds = f".{fraction[:6]}" if fraction.isdecimal() else ""
+    for zone in (offset, ""):  # some cameras write blanks there
+        try:
+            return datetime.fromisoformat(f"{day.replace(':', '-')}T{time}{seconds}{zone}")
+        except ValueError:
+            continue
+    return None
+
+
+def _text(value: object) -> str:
+    text = value.decode("ascii", "replace") if isinstance(value, bytes) else value
+    return text.replace("\0", " ").strip() if isinstance(text, str) else ""
 
 
 def read_exif_exposure(path: Path) -> float:

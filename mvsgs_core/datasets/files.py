@@ -114,8 +114,12 @@ def read_image(
 def upright_size(image: Image.Image) -> tuple[int, int]:
     """(height, width) of an opened image as EXIF says it should be shown, without decoding it."""
     width, height = image.size
-    turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)  # a quarter turn
-    return (width, height) if turned else (height, width)
+    return (width, height) if is_turned(image) else (height, width)
+
+
+def is_turned(image: Image.Image) -> bool:
+    """Whether EXIF says that an opened image should be shown with a quarter turn, without decoding it."""
+    return image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
 
 
 def read_depth(path: Path, per_unit: float, invalid: tuple[int, ...] = (0,)) -> np.ndarray:
@@ -177,9 +181,14 @@ def natural_order(name: str) -> list[tuple[int, int | str]]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Image files directly in `folder`, in natural order, without the masks beside them."""
-    found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
-    return sorted((p for p in found if not is_mask_beside(p)), key=lambda p: natural_order(p.name))
+    """Image files directly in `folder`, in natural order, without masks and depth maps beside them."""
+    return sorted((p for p in folder.iterdir() if is_image(p)), key=lambda p: natural_order(p.name))
+
+
+def is_image(path: Path) -> bool:
+    """Whether that is a picture of its own: no hidden file, as macOS puts beside, and no mask or depth of another."""
+    named = path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    return named and not _is_mask_beside(path) and not _is_depth_beside(path)
 
 
 def numbered_images(folder: Path) -> list[Path]:
@@ -187,7 +196,13 @@ def numbered_images(folder: Path) -> list[Path]:
     return [p for p in images_in(folder) if p.stem.isascii() and p.stem.isdecimal()] if folder.is_dir() else []
 
 
-def is_mask_beside(path: Path) -> bool:
+def _is_mask_beside(path: Path) -> bool:
     """Whether that is the mask of an image in the same folder: NAME.jpg.png of NAME.jpg."""
     image = path.with_suffix("")
     return path.suffix.lower() == ".png" and image.suffix.lower() in IMAGE_SUFFIXES and image.exists()
+
+
+def _is_depth_beside(path: Path) -> bool:
+    """Whether that is depth or normals of an image in the same folder: r_0_depth_0001.png of r_0.png, as of NeRF."""
+    found = re.fullmatch(r"(.+)_(depth|normal)(_\d+)?", path.stem)
+    return found is not None and path.with_name(found[1] + path.suffix).exists()

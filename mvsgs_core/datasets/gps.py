@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -42,7 +43,7 @@ _SRT_ALTITUDE = tuple(  # above the sea, then above the place of the start
 class GpsTrack:
     """The places of a file: by frame name, else in the order of time."""
 
-    by_name: dict[str, np.ndarray]  # lower case, without folders
+    named: list[tuple[str, np.ndarray]]  # names as the file gives them, with folders, in lower case
     seconds: np.ndarray  # (N,) of `places`, ascending
     places: np.ndarray  # (N, 3)
     warnings: list[str] = field(default_factory=list)
@@ -52,8 +53,37 @@ class GpsTrack:
         """Whether its times are since 1970, and not since the stream's beginning."""
         return len(self.seconds) > 0 and float(self.seconds[0]) > CLOCK
 
-    def places_of(self, start: float | None) -> Callable[[float, str], np.ndarray | None]:
-        """Place of a frame from its timestamp and name, asked once in the order of the stream.
+    def places_by_name(self, frames: Sequence[Path]) -> tuple[dict[Path, np.ndarray], list[Path]]:
+        """Places of the frames that are named, and frames that have none because their names are of several.
+
+        A frame is found under its name with or without its suffix, where there are several by the longest end of both
+        paths. A name is of the frames of one folder: of several that it would suit, those that it suits best have it.
+        """
+        names: dict[str, list[int]] = defaultdict(list)
+        for n, (name, _) in enumerate(self.named):
+            names[name.rpartition("/")[2]].append(n)
+        suits: dict[int, list[tuple[int, Path]]] = defaultdict(list)  # by name: how well, and which frame
+        unsure: list[Path] = []
+        for frame in frames:
+            found = names.get(frame.name.lower()) or names.get(frame.stem.lower(), [])
+            folders = frame.parent.as_posix().lower()
+            fit = [_common_end(self.named[n][0].rpartition("/")[0], folders) for n in found]
+            best = [n for n, length in zip(found, fit) if length == max(fit)]
+            if len({tuple(self.named[n][1]) for n in best}) == 1:
+                suits[best[0]].append((max(fit), frame))
+            elif best:
+                unsure.append(frame)
+        places = {}
+        for n, candidates in suits.items():
+            best_frames = [frame for fit, frame in candidates if fit == max(candidates)[0]]
+            if len({frame.parent for frame in best_frames}) == 1:
+                places.update(dict.fromkeys(best_frames, self.named[n][1]))
+            else:
+                unsure += best_frames
+        return places, unsure
+
+    def places_of(self, start: float | None) -> Callable[[float], np.ndarray | None]:
+        """Place of a frame from its timestamp, asked once in the order of the stream.
 
         start: when timestamp 0 was, seconds since 1970; None: not known.
         """
@@ -64,11 +94,8 @@ class GpsTrack:
         fix = np.cumsum(changed)
         last = -1
 
-        def place(timestamp: float, name: str) -> np.ndarray | None:
+        def place(timestamp: float) -> np.ndarray | None:
             nonlocal last
-            named = self.by_name.get(name.lower(), self.by_name.get(Path(name).stem.lower()))
-            if named is not None or not len(self.seconds):
-                return named
             now = timestamp + shift
             after = int(np.searchsorted(self.seconds, now))
             before = int(np.searchsorted(self.seconds, now, side="right")) - 1
@@ -83,6 +110,16 @@ class GpsTrack:
         return place
 
 
+def _common_end(one: str, other: str) -> int:
+    """How many folders two paths end with alike."""
+    length = 0
+    for a, b in zip(reversed(one.split("/")), reversed(other.split("/"))):
+        if a != b or not a:
+            break
+        length += 1
+    return length
+
+
 def read_gps(path: Path) -> GpsTrack:
     """The places in a .csv, .tsv or .txt with a header, a .gpx, or a .srt. Raises BadFileError and OSError."""
     parse = _PARSERS.get(path.suffix.lower())
@@ -94,24 +131,24 @@ def read_gps(path: Path) -> GpsTrack:
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"it has more than {MAX_BYTES >> 20} MB")
         text = path.read_text(encoding="utf-8-sig", errors="replace")
-        names: dict[str, np.ndarray] = {}
+        named: list[tuple[str, np.ndarray]] = []
         timed: list[tuple[float, np.ndarray]] = []
         without = 0
         for key, place in parse(text):
             if place is None:
                 without += 1
             elif isinstance(key, str):
-                names[key] = place
+                named.append((key, place))
             else:
                 timed.append((key, place))
-        if not names and not timed:
+        if not named and not timed:
             raise ValueError(f"it has no place, of {without} entries: latitude, longitude and altitude are needed")
         timed.sort(key=lambda entry: entry[0])
         seconds = np.array([entry[0] for entry in timed])
         if len(seconds) and not (seconds[-1] < CLOCK or CLOCK < seconds[0] < seconds[-1] + 1 < 1e11):
             raise ValueError("its times are neither seconds of the stream nor since 1970, nor of ISO 8601")
         warnings = [f"entries of {path.name} without a place that can be used: {without}"] if without else []
-        return GpsTrack(names, seconds, np.array([entry[1] for entry in timed]).reshape(-1, 3), warnings)
+        return GpsTrack(named, seconds, np.array([entry[1] for entry in timed]).reshape(-1, 3), warnings)
 
 
 def clock_time(text: str) -> float:
@@ -142,7 +179,7 @@ def _csv(text: str) -> Iterator[_Entry]:
         try:
             values = [row[column].strip() for column in at]
             place = np.array([float(value) for value in values]) if all(values) else None
-            by = Path(row[key].strip().replace("\\", "/")).name.lower() if named >= 0 else _seconds(row[key])
+            by = row[key].strip().replace("\\", "/").lower() if named >= 0 else _seconds(row[key])
         except (ValueError, IndexError) as error:
             raise ValueError(f"line {number}, {','.join(row)[:120]!r}: {error}") from None
         yield by, _checked(place, f"line {number}")
@@ -169,7 +206,7 @@ def _gpx(text: str) -> Iterator[_Entry]:
             raise ValueError(f"point {number} has neither time nor name")
         ele = inner.get("ele")
         place = np.array([float(point.get("lat", "")), float(point.get("lon", "")), float(ele)]) if ele else None
-        yield clock_time(by) if "time" in inner else by.lower(), _checked(place, f"point {number}")
+        yield clock_time(by) if "time" in inner else by.replace("\\", "/").lower(), _checked(place, f"point {number}")
 
 
 def _srt(text: str) -> Iterator[_Entry]:

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import dataset
-from mvsgs_core.datasets.calibration import exif_notice, image_size, lens_from_option, with_distortion
+from mvsgs_core.datasets.calibration import exif_notices, image_size, lens_from_option, with_distortion
 from mvsgs_core.datasets.colmap import find_colmap, read_colmap
-from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens, read_exif_place
+from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens, read_exif_place, read_exif_time
 from mvsgs_core.datasets.files import (
     IMAGE_SUFFIXES,
     Layout,
     UnreadableImageError,
     images_in,
-    is_mask_beside,
+    is_image,
+    is_turned,
     natural_order,
     opened_image,
-    upright_size,
 )
 from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
@@ -42,6 +45,8 @@ LAYOUT = Layout(
     "your own camera; frames of a video: ffmpeg -i video.mp4 -qscale:v 2 images/%05d.jpg (or dataset=video directly)",
 )
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
+_LOOKED_AT = 1000  # images of which the header is read for their sizes, at most
+_MANY = 3  # times as many as beside such a subfolder: those are a preview, a plan, a logo
 
 
 @dataset
@@ -73,34 +78,84 @@ class Images(ImageSequence):
         if self.intrinsics is not None and self.model is not None:
             raise ValueError("give intrinsics or model, not both: a model has its own intrinsics")
         folder = LAYOUT.folder(self.path)
-        images = _find_images(folder)
-        model = None if self.intrinsics is not None else _find_model(folder, images, self.model)
+        images = _find_images(folder, self.warnings)
+        sizes = _Sizes.of(images)
+        model = None if self.intrinsics is not None else _find_model(folder, images, self.model, sizes.taken)
         masks = masks_of(images, folder) if self.mask is None else [None] * len(images)
+        self._find_times(images)
         if model is not None:
             records = _from_model(model, folder, images, self.rate, self.warnings)
             known = dict(zip(images, masks))
             records = [replace(record, mask=record.mask or known[record.image]) for record in records]
-            return Found(records, turn_upright=False)
-        _check_shapes(images)
-        lenses = self._lenses(images)
+            return Found(records, turn_upright=False, size=_Sizes.of([record.image for record in records]).taken)
+        sizes.check()
+        if sizes.unturned:
+            self.warnings.append(
+                f"EXIF turns some of the images by a quarter and others not, such as {sizes.usual.name}: all are read "
+                "as the camera took them, without a turn, so that intrinsics and masks are of one shape"
+            )
+        lenses = self._lenses(images, sizes)
         found = enumerate(zip(images, lenses, masks))
-        return Found([Record(i / self.rate, image, lens, mask=mask) for i, (image, lens, mask) in found])
+        records = [Record(i / self.rate, image, lens, mask=mask) for i, (image, lens, mask) in found]
+        return Found(records, turn_upright=not sizes.unturned, size=sizes.shown)
 
-    def _lenses(self, images: list[Path]) -> list[Lens]:
+    def _lenses(self, images: list[Path], sizes: _Sizes) -> list[Lens]:
         if self.intrinsics is not None:
-            return [self._given_lens(images, self.intrinsics)] * len(images)
-        found = [read_exif_lens(image) for image in images]
-        known = [lens for lens in found if lens is not None]
+            return [self._given_lens([sizes.usual, *images], self.intrinsics)] * len(images)
+        found = [read_exif_lens(image, turn_upright=not sizes.unturned) for image in images]
+        known = [(image, lens) for image, lens in zip(images, found) if lens is not None]
         if not known:
-            lens, warnings = lens_from_option("auto", self.distortion, image_size(images))
+            lens, warnings = lens_from_option("auto", self.distortion, sizes.shown)
             where = f"{images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal lengths"
             self.warnings += [f"no calibration for {where} were found", *warnings]
             return [lens] * len(images)
-        self.warnings.append(exif_notice(known[0], self.distortion))
+        image, first = known[0]
+        self.warnings += exif_notices(image, first, self.distortion)
         if len(known) < len(images):
             without = len(images) - len(known)
             self.warnings.append(f"images without an EXIF focal length, which take the first one's: {without}")
-        return [with_distortion(lens if lens is not None else known[0], self.distortion) for lens in found]
+        return [with_distortion(lens if lens is not None else first, self.distortion) for lens in found]
+
+    def _find_times(self, images: list[Path]) -> None:
+        """When photographs were taken, for places of a clock's times; frames of a video have their rate instead.
+
+        Raises ValueError where it is not known in what time zone, or whether they are frames of a video.
+        """
+        self._taken: dict[Path, float] | None = None  # seconds since the first one
+        self._first_taken: datetime | None = None
+        if self._gps is None or not self._gps.on_a_clock:
+            return
+        times = {image: taken for image in images if (taken := read_exif_time(image)) is not None}
+        if not times and self.gps_start is None:
+            raise ValueError(
+                f"{self.gps} has times of a clock, and EXIF says of no image when it was taken: for photographs give a "
+                ".csv with their names and places; for frames of a video set dataset.gps_start=2026-01-31T12:00:00Z, "
+                "the time of the first, and dataset.options.rate"
+            )
+        if self.gps_start is None:
+            image, local = next(iter(times.items()))
+            times = {image: taken for image, taken in times.items() if taken.tzinfo is not None}
+            if not times:
+                raise ValueError(
+                    f"{self.gps} has times of a clock, and EXIF does not say in what zone the camera's was: set "
+                    f"dataset.gps_start={local.isoformat()}+02:00, the time of {image.name}, with the zone of that, or "
+                    "another time where the camera's clock was wrong"
+                )
+        else:
+            times = {image: taken.replace(tzinfo=None) for image, taken in times.items()}
+        if times:
+            self._first_taken = next(iter(times.values()))
+            self._taken = {image: (taken - self._first_taken).total_seconds() for image, taken in times.items()}
+
+    def _seconds(self, record: Record) -> float | None:
+        if self._taken is None:
+            return record.timestamp
+        if record.image not in self._taken:
+            self._notices.tally("photographs whose EXIF does not say when they were taken", record.image.name)
+        return self._taken.get(record.image)
+
+    def _began(self) -> str | None:
+        return None if self._first_taken is None else self._first_taken.isoformat()
 
     def _exposure(self, record: Record) -> float:
         return read_exif_exposure(record.image)
@@ -120,46 +175,91 @@ def _places(folder: Path) -> list[Path]:
     return [*special, folder, *(folder / name for name in _SUBFOLDERS)]
 
 
-def _find_images(folder: Path) -> list[Path]:
-    for candidate in _places(folder):
-        images = images_in(candidate) if candidate.is_dir() else []
-        if images:
-            return images
-    below = [p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(p, folder)]
-    if not below:
-        raise LAYOUT.missing(f"{folder} has no image")
-    return sorted(below, key=lambda p: natural_order(p.relative_to(folder).as_posix()))
+def _find_images(folder: Path, notes: list[str]) -> list[Path]:
+    """The images in the folder, in one of its subfolders, or anywhere below; what is left out is told in `notes`."""
+    found = {place: images for place in _places(folder) if place.is_dir() and (images := images_in(place))}
+    place = next(iter(found), folder)
+    inner = next((inner for inner in found if inner.parent == folder and inner.name in _SUBFOLDERS), place)
+    if place == folder and len(found.get(inner, ())) >= _MANY * len(found.get(folder, ())):
+        place = inner
+    below = [p for p in place.rglob("*") if is_image(p) and not _is_aside(p, place)]
+    below.sort(key=lambda p: natural_order(p.relative_to(place).as_posix()))
+    if place not in found:
+        if not below:
+            raise LAYOUT.missing(f"{folder} has no image")
+        return below
+    left = [p for p in below if p.parent != place]
+    if place.parent == folder and place.name in _SUBFOLDERS:
+        left += found.get(folder, [])
+    if left:
+        names = f"{len(left)} (first: {left[0].relative_to(folder).as_posix()})"
+        notes.append(f"the images are those directly in {place}; others in {folder} that are not read: {names}")
+    return found[place]
 
 
-def _is_mask(path: Path, folder: Path) -> bool:
-    return is_mask_beside(path) or any(part.lower() in FOLDERS for part in path.relative_to(folder).parts[:-1])
+def _is_aside(path: Path, folder: Path) -> bool:
+    """Whether it is in a folder of masks, or a hidden one."""
+    return any(part.lower() in FOLDERS or part.startswith(".") for part in path.relative_to(folder).parts[:-1])
 
 
-def _check_shapes(images: list[Path]) -> None:
-    """Raises ValueError where most images would be left out, as they have another shape than the first. Looks at a
-    hundred of them at most; those that cannot be read are no matter of shape."""
-    shapes: dict[Path, tuple[int, int]] = {}
-    for path in images[:: -(-len(images) // 100)]:
-        with suppress(UnreadableImageError), opened_image(path, path.name) as opened:
-            shapes[path] = upright_size(opened)
-    if not shapes:
-        return
-    first, shape = next(iter(shapes.items()))
-    others = [path for path, other in shapes.items() if not same_shape(other, shape)]
-    if 2 * len(others) > len(shapes):
-        height, width = shapes[others[0]]
-        raise ValueError(
-            f"{len(others)} of {len(shapes)} images have another shape than the first, {first.name} of "
-            f"{shape[1]}x{shape[0]}: {others[0].name} is {width}x{height}; one camera's images of one shape make "
-            "a map: put the others into a folder of their own, or turn them"
-        )
+@dataclass(frozen=True)
+class _Sizes:
+    """What sizes (height, width) the images have, of many some; those that cannot be read are no matter."""
+
+    taken: tuple[int, int]  # the most frequent one on disk
+    shown: tuple[int, int]  # and as images are read, of those in the first image's shape
+    usual: Path  # an image of that size, not turned where others are
+    unturned: bool  # the images have one shape as the camera took them, of which EXIF turns some by a quarter
+    upright: dict[Path, tuple[int, int]]
+
+    @classmethod
+    def of(cls, images: list[Path]) -> _Sizes:
+        """Raises BadFileError where none can be read."""
+        taken, upright = {}, {}
+        for path in images[:: -(-len(images) // _LOOKED_AT)]:
+            with suppress(UnreadableImageError), opened_image(path, path.name) as opened:
+                taken[path] = opened.height, opened.width
+                upright[path] = taken[path][::-1] if is_turned(opened) else taken[path]
+        if not taken:
+            size = image_size(images)
+            return cls(size, size, images[0], False, {})
+        unturned = not _of_one_shape(upright) and _of_one_shape(taken)
+        shown = taken if unturned else upright
+        first = next(iter(shown.values()))
+        size = _most_frequent([size for size in shown.values() if same_shape(size, first)])
+        usual = next(path for path, own in upright.items() if own == size)
+        return cls(_most_frequent(taken.values()), size, usual, unturned, upright)
+
+    def check(self) -> None:
+        """Raises ValueError where most images would be left out, as they have another shape than the first."""
+        if self.unturned or not self.upright:
+            return
+        first, shape = next(iter(self.upright.items()))
+        others = [path for path, other in self.upright.items() if not same_shape(other, shape)]
+        if 2 * len(others) > len(self.upright):
+            height, width = self.upright[others[0]]
+            raise ValueError(
+                f"{len(others)} of {len(self.upright)} images have another shape than the first, {first.name} of "
+                f"{shape[1]}x{shape[0]}: {others[0].name} is {width}x{height}; one camera's images of one shape make "
+                "a map: put the others into a folder of their own, or turn them"
+            )
 
 
-def _find_model(folder: Path, images: list[Path], given: str | Path | None) -> Model | None:
+def _most_frequent(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    return Counter(sizes).most_common(1)[0][0]
+
+
+def _of_one_shape(sizes: dict[Path, tuple[int, int]]) -> bool:
+    first = next(iter(sizes.values()))
+    return all(same_shape(size, first) for size in sizes.values())
+
+
+def _find_model(folder: Path, images: list[Path], given: str | Path | None, size: tuple[int, int]) -> Model | None:
+    """size: (height, width) of the images on disk, for a model that does not say it."""
     place = folder if given is None else Path(given).expanduser()
     if given is not None and not place.exists():
         raise FileNotFoundError(f"model {place} is missing: a folder with cameras and images of COLMAP, or {NAMES[0]}")
-    if given is None and (scannetpp := read_scannetpp(images[0].parent, image_size(images))) is not None:
+    if given is None and (scannetpp := read_scannetpp(images[0].parent, size)) is not None:
         return scannetpp
     for base in dict.fromkeys((place, images[0].parent, images[0].parent.parent) if given is None else (place,)):
         transforms = base if base.is_file() else find_transforms(base, place.name)
@@ -167,7 +267,7 @@ def _find_model(folder: Path, images: list[Path], given: str | Path | None) -> M
         if colmap is not None:
             return read_colmap(colmap)
         if transforms is not None:
-            return read_transforms(transforms, image_size(images))
+            return read_transforms(transforms, size)
         strecha = find_strecha(base)
         if strecha is not None:
             return read_strecha(strecha)

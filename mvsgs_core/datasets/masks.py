@@ -1,6 +1,7 @@
 """Masks: which pixels of an image count. 0 is to be ignored and all else counts, as for COLMAP and nerfstudio.
 
-People, cars, the robot's own body, a watermark, a fisheye's rim. A mask belongs to one image, or to all of a camera.
+People, cars, the robot's own body, a watermark, a fisheye's rim. A mask belongs to one image, or to all of a camera; an
+image that was cut out has its own, where it is transparent.
 """
 
 from __future__ import annotations
@@ -17,15 +18,30 @@ from mvsgs_core.datasets.framing import Framing, same_shape
 from mvsgs_core.datasets.lens import Lens
 
 FOLDERS = ("masks", "mask")
+_NO_ALPHA = (".jpg", ".jpeg", ".bmp", ".ppm")
 _LOSSY = (".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")  # whose black is nearly black
 
 
-def read_mask(path: Path) -> np.ndarray:
-    """(H, W) bool, True where a pixel counts. Raises UnreadableImageError."""
+def read_mask(path: Path, *, turn_upright: bool = True) -> np.ndarray:
+    """(H, W) bool, True where a pixel counts. turn_upright: as its image is read. Raises UnreadableImageError."""
     with opened_image(path, path.name) as opened:
-        image = ImageOps.exif_transpose(opened)
+        image = ImageOps.exif_transpose(opened) if turn_upright else opened
         values = np.asarray(image if image.mode in ("1", "L") or image.mode.startswith("I") else image.convert("L"))
     return np.asarray(values >= 128 if path.suffix.lower() in _LOSSY else values > 0)
+
+
+def read_alpha(path: Path, *, turn_upright: bool = True) -> np.ndarray | None:
+    """(H, W) bool of an image that was cut out: False where it is transparent; None where it has no transparency.
+
+    Raises UnreadableImageError.
+    """
+    if path.suffix.lower() in _NO_ALPHA:
+        return None
+    with opened_image(path, path.name) as opened:
+        if not opened.has_transparency_data:
+            return None
+        image = ImageOps.exif_transpose(opened) if turn_upright else opened
+        return np.asarray(image.convert("RGBA").getchannel("A")) > 0
 
 
 def masks_of(images: Sequence[Path], folder: Path, given: Path | None = None) -> list[Path | None]:
@@ -112,4 +128,4 @@ class CameraMask:
         return self._framed[key]
 
 
-__all__ = ["FOLDERS", "CameraMask", "masks_of", "read_mask"]
+__all__ = ["FOLDERS", "CameraMask", "masks_of", "read_alpha", "read_mask"]

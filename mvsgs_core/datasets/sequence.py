@@ -17,7 +17,7 @@ from mvsgs_core.datasets.files import UnreadableImageError, read_depth, read_ima
 from mvsgs_core.datasets.framing import Framing, same_shape
 from mvsgs_core.datasets.gps import CLOCK, clock_time, read_gps
 from mvsgs_core.datasets.lens import Lens
-from mvsgs_core.datasets.masks import CameraMask, masks_of, read_mask
+from mvsgs_core.datasets.masks import CameraMask, masks_of, read_alpha, read_mask
 from mvsgs_core.datasets.options import FileOptions
 
 
@@ -78,12 +78,10 @@ class FileReader(FileOptions):
         self.warnings: list[str] = Notices()
         self._notices: Notices = self.warnings  # the same list, with its counting
         self.warnings += [] if self._gps is None else self._gps.warnings
-        self._places: Callable[[float, str], np.ndarray | None] | None = None
+        self._places: Callable[[float], np.ndarray | None] | None = None
         self._placed = 0  # frames with a place of the file
 
-    def _place(
-        self, timestamp: float, name: str = "", began: Callable[[], str | None] | None = None
-    ) -> np.ndarray | None:
+    def _place(self, timestamp: float, began: Callable[[], str | None] | None = None) -> np.ndarray | None:
         """The place (3,) of the next frame, in the order of the stream; None where dataset.gps has none for it.
 
         began: asked when timestamp 0 was, as the file says, ISO 8601. Raises ValueError where a clock's times meet a
@@ -93,7 +91,7 @@ class FileReader(FileOptions):
             return None
         if self._places is None:
             self._places = self._gps.places_of(self._start_of_clock(timestamp, began))
-        place = self._places(timestamp, name)
+        place = self._places(timestamp)
         self._placed += place is not None
         return place
 
@@ -111,9 +109,9 @@ class FileReader(FileOptions):
             )
         if self.gps_start is None:
             self.warnings.append(
-                f"the video is taken to have begun at {said}, as it says; dataset.gps_start changes it"
+                f"the first frame is taken to be of {said}, as the file says; dataset.gps_start changes it"
             )
-        with reading("dataset.gps_start" if self.gps_start else "the video", "has no time of ISO 8601"):
+        with reading("dataset.gps_start" if self.gps_start else "the first frame", "has no time of ISO 8601"):
             return clock_time(said)
 
     def _end_places(self) -> None:
@@ -144,6 +142,7 @@ class Found:
     records: Sequence[Record]
     depth_format: DepthFormat | None = None  # None: there are no depth maps
     turn_upright: bool = True  # whether the calibration is for the image as EXIF says it should be shown
+    size: tuple[int, int] | None = None  # (height, width) on disk that all are scaled to; None: that of the first
 
 
 @dataclass(kw_only=True, eq=False)
@@ -162,8 +161,10 @@ class ImageSequence(FileReader, ABC):
             count = len(found.records)
             raise ValueError(f"no frame left: the sequence has {count}, wanted from {self.start} to {self.stop}")
         self._check_distortion(self.lens)
-        self._depth_format, self._turn_upright = found.depth_format, found.turn_upright
+        self._depth_format, self._turn_upright, self._size = found.depth_format, found.turn_upright, found.size
         self._find_masks()
+        self._named: dict[Path, np.ndarray] = {}
+        self._find_named_places()
         self._opening_warnings = len(self.warnings)
 
     @property
@@ -222,37 +223,37 @@ class ImageSequence(FileReader, ABC):
     def __iter__(self) -> Iterator[Item]:
         self._notices.truncate(self._opening_warnings)
         index = 0
-        first: tuple[int, int] | None = None  # size on disk of the first image
+        usual = self._size  # on disk
         for record in self.records:
             try:
                 image = read_image(record.image, turn_upright=self._turn_upright)
             except UnreadableImageError as error:
                 self._notices.tally("images left out because they could not be read", str(error))
                 continue
-            item = self._item(index, record, image, first)
+            item = self._item(index, record, image, usual)
             if item is not None:
-                first = first or (image.shape[0], image.shape[1])
+                usual = usual or (image.shape[0], image.shape[1])
                 index += 1
                 yield item
         self._end_places()
         if index == 0:
             raise BadFileError("no image could be read: " + "; ".join(self._notices))
 
-    def _item(self, index: int, record: Record, image: np.ndarray, first: tuple[int, int] | None) -> Item | None:
+    def _item(self, index: int, record: Record, image: np.ndarray, usual: tuple[int, int] | None) -> Item | None:
         native = image.shape[0], image.shape[1]
         if not same_shape(native, record.lens.size):
             what = "images left out because their calibration is for another aspect ratio"
             self._notices.tally(what, f"{record.image.name}, {_text(native)} for {_text(record.lens.size)}")
             return None
-        if first is not None and native != first:
-            example = f"{record.image.name}, {_text(native)} after {_text(first)}"
-            if not same_shape(native, first):
-                self._notices.tally("images left out because they have another aspect ratio than the first", example)
+        if usual is not None and native != usual:
+            example = f"{record.image.name}, {_text(native)} for {_text(usual)}"
+            if not same_shape(native, usual):
+                self._notices.tally("images left out because they have another aspect ratio than the others", example)
                 return None
-            self._notices.tally("images scaled to the size of the first", example)
-        if first is None:
-            self.warnings += self._framing.notice(native)
-        size = self._framing.size_of(first or native)
+            self._notices.tally("images scaled to the size of the others", example)
+        if index == 0:
+            self.warnings += self._framing.notice(usual or native)
+        size = self._framing.size_of(usual or native)
         lens = record.lens.at(native)
         try:
             framed, intrinsics = self._framing.image(image, lens, size)
@@ -269,28 +270,59 @@ class ImageSequence(FileReader, ABC):
         if depth is not None:
             depth = self._framing.depth(depth, lens, size)
         pose, exposure = record.world_from_cam, self._exposure(record)
-        place = self._place(record.timestamp, record.image.name) if self._gps is not None else self._own_place(record)
+        place = self._own_place(record) if self._gps is None else self._given_place(record)
         return Item(index, record.timestamp, framed, intrinsics, pose, depth, lens.guessed, exposure, place, mask)
 
     def _own_place(self, record: Record) -> np.ndarray | None:
         """As in `Item`: of most sets nothing is known of it."""
         return None
 
+    def _find_named_places(self) -> None:
+        """Of the images that dataset.gps names."""
+        if self._gps is None:
+            return
+        self._named, unsure = self._gps.places_by_name([record.image for record in self.records])
+        if unsure:
+            self.warnings.append(
+                f"images without a place, as several have the name in {self.gps}, which should have their folders too: "
+                f"{len(unsure)} (first: {unsure[0].name})"
+            )
+
+    def _given_place(self, record: Record) -> np.ndarray | None:
+        """By dataset.gps: of the image's name, else of its time."""
+        named, seconds = self._named.get(record.image), self._seconds(record)
+        if named is None:
+            return None if seconds is None else self._place(seconds, self._began)
+        self._placed += 1
+        return named
+
+    def _seconds(self, record: Record) -> float | None:
+        """When an image was taken, as `_began` counts; None where that is not known."""
+        return record.timestamp
+
+    def _began(self) -> str | None:
+        """When the second 0 was, ISO 8601; None where that is not known."""
+        return None
+
     def _mask(self, record: Record, lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
         """(h, w) bool at `size`, None where every pixel counts. Raises ValueError for a mask that cannot be used."""
         if self._camera_mask is not None:
             return self._camera_mask.framed(self._framing, lens, size)
-        if not self._masked:
+        if record.mask is None:
+            source, mask = record.image, read_alpha(record.image, turn_upright=self._turn_upright)
+        else:
+            source, mask = record.mask, None
+            if record.mask.is_file():
+                mask = read_mask(record.mask, turn_upright=self._turn_upright)
+        if mask is None:
+            if self._masked:
+                self._notices.tally("images without a mask, of which every pixel counts", record.image.name)
             return None
-        if record.mask is None or not record.mask.is_file():
-            self._notices.tally("images without a mask, of which every pixel counts", record.image.name)
-            return None
-        mask = read_mask(record.mask)
         if not same_shape((mask.shape[0], mask.shape[1]), lens.size):
-            raise ValueError(f"{record.mask.name} is {_text(mask.shape)} for an image of {_text(lens.size)}")
+            raise ValueError(f"{source.name} is {_text(mask.shape)} for an image of {_text(lens.size)}")
         mask = self._framing.mask(mask, lens, size)
         if not mask.any():
-            raise ValueError(f"{record.mask.name} leaves no pixel of its image: black is ignored")
+            raise ValueError(f"{source.name} leaves no pixel of its image: what is black or transparent is ignored")
         return None if mask.all() else mask
 
     def _exposure(self, record: Record) -> float:

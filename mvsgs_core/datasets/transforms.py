@@ -30,8 +30,8 @@ def find_transforms(folder: Path, part: str = "") -> Path | None:
 def read_transforms(path: Path, image_size: tuple[int, int], masks: Path | None = None) -> Model:
     """The model of a transforms.json, with the images that it keeps for tests.
 
-    image_size (height, width) where the file does not say it; masks: folder that names of masks start at, where it is
-    not the file's; one that is not there has none.
+    image_size (height, width) on disk, not turned by EXIF, where the file does not say it; masks: folder that names of
+    masks start at, where it is not the file's; one that is not there has none.
     Raises BadFileError for a malformed file, a camera or pose in it that cannot be, or a camera model that has no
     counterpart.
     """
@@ -67,5 +67,7 @@ def _lens(c: Mapping[str, Any], image_size: tuple[int, int]) -> Lens:
     if camera not in _FISHEYES + _PINHOLES:
         raise ValueError(f"camera_model {camera} is not supported: undistort the images, and write PINHOLE")
     fisheye = camera in _FISHEYES or bool(c.get("is_fisheye", False))
+    if not fisheye and float(c.get("k4", 0.0)) != 0.0:  # of r^8, which OpenCV's pinhole has no place for
+        raise ValueError(f"k4={c['k4']} of a camera that is no fisheye is not supported: undistort the images")
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     return Lens((fx, fy, cx, cy), (height, width), tuple(float(c.get(name, 0.0)) for name in names), fisheye)

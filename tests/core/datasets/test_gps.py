@@ -84,6 +84,27 @@ def test_a_file_names_frames(tmp_path: Path) -> None:
     np.testing.assert_allclose(third, [47.5, 8.5, 400.0])
 
 
+def test_equal_names_in_several_folders_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    for camera in ("100MEDIA", "101MEDIA"):
+        photographs(tmp_path / camera, 2)
+    table = tmp_path / "gps.csv"
+    lines = [f"D:\\flight\\{camera}\\IMG_{n}.JPG,{40 + k},8,{n}\n" for k, camera in enumerate(("100MEDIA", "101media"))
+             for n in range(2)]  # fmt: skip
+    table.write_text("SourceFile,lat,lon,alt\n" + "".join(lines))
+    found = np.array(places(tmp_path, gps=table))
+    np.testing.assert_allclose(found[:, [0, 2]], [[40, 0], [40, 1], [41, 0], [41, 1]])
+    table.write_text("SourceFile,lat,lon,alt\nIMG_0.jpg,40,8,1\n100MEDIA/IMG_1.jpg,41,8,2\n")
+    sequence = open_dataset("images", path=tmp_path, gps=table)
+    found = [item.place for item in sequence]
+    assert [place is not None for place in found] == [False, True, False, False], "IMG_0 may be either"
+    told = (
+        f"images without a place, as several have the name in {table}, which should have their folders too: 2 (first:"
+    )
+    assert any(w.startswith(told) for w in sequence.warnings)
+    table.write_text("SourceFile,lat,lon,alt\nIMG_0.jpg,40,8,1\nIMG_0.jpg,41,8,2\n")
+    assert places(tmp_path / "100MEDIA", gps=table) == [None, None], "it has two places"
+
+
 def test_times_are_interpolated_once_a_fix_and_not_over_gaps(tmp_path: Path) -> None:
     write_photos(tmp_path / "photos", 9)
     (tmp_path / "dji.SRT").write_text(DJI)

@@ -194,7 +194,7 @@ def test_focal_length_from_exif(tmp_path: Path) -> None:
     assert not next(iter(auto)).intrinsics_guessed
     assert "intrinsics are from EXIF" in auto.warnings[0]
     # 4.5 mm in front of 160 pixels a millimeter, on a picture that was 640 wide and is 64 now
-    sensor = {equivalent: 99, focal: 4.5, resolution: 1600.0, unit: 3, width: 640, height: 480}
+    sensor = {equivalent: 42, focal: 4.5, resolution: 1600.0, unit: 3, width: 640, height: 480}
     save_photo(tmp_path / "a.jpg", sensor)
     write_image(tmp_path / "b.jpg", 5)
     sequence = open_dataset("images", path=tmp_path)
@@ -280,7 +280,7 @@ def test_mixed_sizes(tmp_path: Path, size: tuple[int, int] | None) -> None:
     assert {item.image.shape[:2] for item in items} == {size or (48, 64)}
     for item in items:
         np.testing.assert_allclose(item.intrinsics, items[0].intrinsics)
-    assert "images scaled to the size of the first: 1 (first: b.png, 128x96 after 64x48)" in sequence.warnings
+    assert "images scaled to the size of the others: 1 (first: b.png, 128x96 for 64x48)" in sequence.warnings
     assert (
         "images left out because their calibration is for another aspect ratio: 2 (first: c.png, 48x64 for 64x48)"
         in sequence.warnings
@@ -293,7 +293,7 @@ def test_mixed_sizes_with_a_calibration_each(tmp_path: Path) -> None:
     sequence = open_dataset("images", path=tmp_path)
     assert len(list(sequence)) == 1
     left_out = (
-        "images left out because they have another aspect ratio than the first: 1 (first: b.jpg, 48x64 after 64x48)"
+        "images left out because they have another aspect ratio than the others: 1 (first: b.jpg, 48x64 for 64x48)"
     )
     assert left_out in sequence.warnings
 

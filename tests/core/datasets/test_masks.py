@@ -136,6 +136,30 @@ def test_images_whose_masks_cannot_be_used_are_left_out_and_counted(tmp_path: Pa
     )
 
 
+def test_what_is_transparent_is_ignored_where_there_is_no_mask(tmp_path: Path) -> None:
+    """As of objects that were cut out, and of NeRF's own sets."""
+    for i, alpha in enumerate((LEFT, LEFT | True, 0 * LEFT)):
+        cut = np.full((HEIGHT, WIDTH, 4), 20 + i, np.uint8)
+        cut[..., 3] = 255 * alpha
+        Image.fromarray(cut).save(tmp_path / f"photo{i}.png")
+    found, warnings = items_of(tmp_path)
+    assert [item.image[0, 0, 0] for item in found] == [20, 21]
+    np.testing.assert_array_equal(found[0].mask, LEFT)
+    assert found[1].mask is None
+    assert any(
+        line.startswith("images left out because of their masks: 1 (first: photo2.png leaves no") for line in warnings
+    )
+    write_mask(tmp_path / "masks/photo0.png", ~LEFT)
+    found, _ = items_of(tmp_path)
+    np.testing.assert_array_equal(found[0].mask, ~LEFT)
+    palette = Image.new("P", (WIDTH, HEIGHT))
+    palette.putpalette([9, 9, 9, 7, 7, 7])
+    palette.paste(1, (WIDTH // 2, 0, WIDTH, HEIGHT))
+    (tmp_path / "palette/images").mkdir(parents=True)
+    palette.save(tmp_path / "palette/images/0.png", transparency=0)
+    np.testing.assert_array_equal(items_of(tmp_path / "palette")[0][0].mask, LEFT)
+
+
 def test_a_lossy_mask_is_black_where_it_is_nearly(tmp_path: Path) -> None:
     path = tmp_path / "mask.jpg"
     Image.fromarray(np.where(LEFT, 250, 6).astype(np.uint8)).save(path)
