@@ -122,10 +122,11 @@ class Densifier:
 
     def _append(self, points: Points, view: TrainingView) -> int:
         """Makes splats of camera-frame points, as many as the map has room for; returns their number."""
-        room = self._max_splats - len(self.state)
+        room = max(0, self._max_splats - len(self.state))  # a map that is gone on with may have more
         if len(points) > room:
-            self.log.refuse("splats", len(points) - room, f"the map is full: {len(self.state)} splats (max_splats)")
-            points = points.first(max(0, room))
+            text = f"the map is full: max_splats={self._max_splats}; what is new is not mapped"
+            self.log.refuse("splats", len(points) - room, text)
+            points = points.first(room)
         bases = self.state.splats.sh.shape[1]
         new = splats_from_points(points, view.local_from_cam, bases, self._kernel, self.config)
         self.state.append(new, torch.full((len(points),), view.index, dtype=torch.int64))

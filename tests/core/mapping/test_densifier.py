@@ -1,4 +1,4 @@
-"""What a keyframe's noise does to the number of its splats."""
+"""What a keyframe's noise does to the number of its splats, and a map that is full."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from mvsgs_core.mapping import densifier
 from mvsgs_core.mapping.densifier import noise_variance
+from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
 from tests.support.small_maps import CONFIG
@@ -36,6 +38,14 @@ def test_a_noisy_keyframe_gets_fewer_splats_than_one_whose_noise_is_not_known(mo
     with_noise = second(8.0)
     monkeypatch.setattr(densifier, "noise_variance", lambda squared: 0.0)
     assert 0 < with_noise < 0.95 * second(8.0)
+
+
+def test_a_full_map_says_so_in_one_sentence() -> None:
+    mapper = OnlineMapper(replace(CONFIG, density_control=DensityControlConfig(max_splats=50)))
+    for index in range(3):
+        mapper.add_keyframe(rgbd_keyframe(index, pose_on_arc(index / 2)))
+        mapper.state.keep(torch.arange(len(mapper.state)) > index)  # as density control does
+    assert mapper.log.warnings == ["the map is full: max_splats=50; what is new is not mapped"]
 
 
 def _noisy(index: int, t: float, sigma: float) -> RGBDKeyframe:
