@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import bisect
 import math
-import statistics
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from mvsgs_core.mapping.background import Background
 from mvsgs_core.mapping.between import BetweenView
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.owed import Owed
-from mvsgs_core.mapping.resting_images import on_disk, room_of
+from mvsgs_core.mapping.resting_images import rest, room_of
+from mvsgs_core.mapping.thinning import closest
 from mvsgs_core.stats import Stats
 
 
@@ -27,13 +29,15 @@ class KeyframeStore:
         """window: newest keyframes, whose images are never let go. in_memory: images that do not wait on disk; None:
         all."""
         self._max_images, self._window, self._log = max_images, window, log
-        self._in_memory = max_images if in_memory is None else max(in_memory, window)
+        self._in_memory = max_images if in_memory is None else awake(in_memory, window)
         self.views = list(views)
         self.with_image = [view for view in self.views if view.has_image]
         self.between = list(between)
         self._by_index = {view.index: view for view in self.views}
         self.owed = Owed()
         self.owed.count(self.with_image)
+        self.background = Background(self.views)
+        self._depths: list[float] | None = None  # of all keyframes, ascending; None: to be sorted
 
     def __len__(self) -> int:
         return len(self.views)
@@ -45,8 +49,17 @@ class KeyframeStore:
     @property
     def median_depth(self) -> float:
         """Of the scene, in the mapper's unit: what lengths are related to."""
-        known = [view.median_depth for view in self.views if view.median_depth > 0]
-        return statistics.median(known) if known else 1.0  # NumPy's takes ten times as long for so few
+        if self._depths is None:
+            self._depths = sorted(view.median_depth for view in self.views if view.median_depth > 0)
+        known, half = self._depths, len(self._depths) // 2
+        if not known:
+            return 1.0
+        return known[half] if len(known) % 2 else (known[half - 1] + known[half]) / 2
+
+    def corrected(self) -> None:
+        """Keyframes have other poses and scales: counts anew what is owed to them, and the depths."""
+        self.owed.count(self.with_image)
+        self._depths = None
 
     @property
     def image_bytes(self) -> int:
@@ -67,6 +80,9 @@ class KeyframeStore:
         self.views.append(view)
         self.with_image.append(view)
         self._by_index[view.index] = view
+        if self._depths is not None and view.median_depth > 0:
+            bisect.insort(self._depths, view.median_depth)
+        self.background.take([view])
         return self._bound_images() or bool(self.between)
 
     def add_between(self, view: BetweenView) -> None:
@@ -88,7 +104,8 @@ class KeyframeStore:
         self.between = sorted(self.between + other.between, key=index)
         self._by_index |= other._by_index
         self._bound_images()
-        self.owed.count(self.with_image)
+        self.background = Background(self.views)
+        self.corrected()
 
     def place_anew(self, local: Callable[[np.ndarray], np.ndarray], unit: float = 1.0) -> None:
         """The frame of reference has another unit: `local` takes poses (4, 4) of the world to it. unit: its length in
@@ -100,30 +117,27 @@ class KeyframeStore:
     def _bound_images(self) -> bool:
         """Lets go the images of the frames, then of the keyframes, whose neighbors in time are closest. Keyframes'
         splats stay, and move with their poses."""
-        changed = False
-        while self.between and len(self.with_image) + len(self.between) > self._max_images:
-            between = [view.index for view in self.between]
-            order = [between[0] - 1, *between, between[-1] + 1]
-            k = min(range(len(between)), key=lambda k: order[k + 2] - order[k])
-            del self.between[k]
-            changed = True
-            self._log.skip("frames between keyframes beyond max_keyframes")
-        while len(self.with_image) > self._max_images:
-            last = len(self.with_image) - max(1, self._window)
-            if last < 2:
-                break
-            order = [view.index for view in self.with_image]
-            k = min(range(1, last), key=lambda k: order[k + 1] - order[k - 1])
-            self.with_image.pop(k).drop_image()
-            changed = True
+        keyframes, between = self.with_image, self.between
+        gone = min(len(between), max(0, len(keyframes) + len(between) - self._max_images))
+        if gone:
+            out = set(closest([view.index for view in between], range(len(between)), gone))
+            self.between = [view for k, view in enumerate(between) if k not in out]
+            self._log.skip("frames between keyframes beyond max_keyframes", gone)
+        may = range(1, max(1, len(keyframes) - max(1, self._window)))
+        thinned = min(len(may), max(0, len(keyframes) - self._max_images))
+        if thinned:
+            out = set(closest([view.index for view in keyframes], may, thinned))
+            for k in out:
+                keyframes[k].drop_image()
+            self.with_image = [view for k, view in enumerate(keyframes) if k not in out]
             self._log.refuse(
                 "images",
-                1,
+                thinned,
                 f"more than {self._max_images} keyframes (max_keyframes): images of "
                 "older ones are thinned out and no longer trained on",
             )
         self._rest(self._in_memory)
-        return changed
+        return gone + thinned > 0
 
     def rest(self) -> None:
         """All images but those of the newest keyframes go to disk: the stream goes on in another map."""
@@ -138,12 +152,13 @@ class KeyframeStore:
             if len(waking) - place <= in_memory and held <= room:
                 return
             held -= _bytes(view)
-            try:
-                valid = None if view.valid is None else on_disk(view.valid)
-                view.image, view.valid, view.image_on_disk = on_disk(view.image), valid, True
-            except OSError as error:
-                self._log.warn(f"images stay in memory beyond mapper.images_in_memory: {error}")
+            if not rest(view, self._log):
                 return
+
+
+def awake(in_memory: int, window: int) -> int:
+    """How many images do not wait on disk: what `images_in_memory` says, and the newest keyframes' in any case."""
+    return max(in_memory, window)
 
 
 def _bytes(view: TrainingView) -> int:

@@ -11,7 +11,6 @@ import torch
 
 from mvsgs_core.devices import resolve_device
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.mapping.background import background_of
 from mvsgs_core.mapping.between import BetweenView, FrameBetween, between_view
 from mvsgs_core.mapping.coarse import LATER, CoarseKeyframes
 from mvsgs_core.mapping.config import MapperConfig
@@ -61,9 +60,8 @@ class OnlineMapper:
         )
         self.schedule = Schedule(config.window, config.seed)
         self.trainer = Trainer(config, self.state, self.log, self.photometry)
-        self.trainer.background = background_of(self.views)
+        self.trainer.background = self.keyframes.background.color
         self.coarse = CoarseKeyframes(self.log)
-        self._late = 0  # of these, how many got their splats after the stream
         trainer, keyframes = self.trainer, self.keyframes
 
         def render(view: TrainingView, size: tuple[int, int] | None = None) -> Render:
@@ -130,7 +128,7 @@ class OnlineMapper:
             return 0
         if self.keyframes.add(view):
             self.schedule.reset()
-        self.trainer.background = background_of(self.views)
+        self.trainer.background = self.keyframes.background.color
         with self.log.time("insertion"):
             later = halvings >= NONE_NOW and len(self.state) > 0
             inserted = 0 if later else self.densifier.add(checked, view.smaller(min(halvings, NONE_NOW - 1)), depth)
@@ -202,12 +200,12 @@ class OnlineMapper:
             return False
         found = self.coarse.next() if splats else None
         if found is not None:
-            self._late += limit is not None
+            schedule.late += limit is not None
             self._complete(*found)
             self.log.count(LATER)
             return True
         if limit is not None:
-            schedule.spared = min(schedule.spared, limit + self._late * (self.config.refinement_of(0) // LATE))
+            schedule.spared = min(schedule.spared, limit + schedule.late * (self.config.refinement_of(0) // LATE))
         if not schedule.spared:
             return False
         schedule.spared -= 1
@@ -278,7 +276,7 @@ class OnlineMapper:
         for between in self.keyframes.between:
             if between.keyframe in moved:
                 between.begin_anew()
-        self.keyframes.owed.count(self.keyframes.with_image)
+        self.keyframes.corrected()
         with self.log.time("correction"):
             count = move_with_anchors(self.state, moved)
         self.log.count("corrected_keyframes", len(moved))
@@ -314,7 +312,8 @@ class OnlineMapper:
             if not same:
                 changes[view.index] = view.expose(now)
         if changes:
-            self.trainer.background = background_of(self.views)
+            self.keyframes.background.take([view for view in self.views if view.index in changes])
+            self.trainer.background = self.keyframes.background.color
         with self.log.time("correction"):
             count = recolor_with_anchors(self.state, changes)
         self.log.count("corrected_exposures", len(changes))
@@ -337,10 +336,12 @@ class OnlineMapper:
             self.state.take_over(other.state)
         other.keyframes.place_anew(self.frame.local)
         self.keyframes.take_over(other.keyframes, change.scale)
-        self.trainer.background = background_of(self.views)
+        self.trainer.background = self.keyframes.background.color
+        self.trainer.bound(self.keyframes.with_image, self.median_depth)
         self.schedule.reset()
         self.schedule.add_budget(other.schedule.drop())
         self.schedule.spared += other.schedule.spared
+        self.schedule.late += other.schedule.late
         self.coarse.take_over(other.coarse)
         self.trainer.iterations += other.trainer.iterations
 

@@ -44,11 +44,27 @@ def prune(
     known = torch.isin(state.anchors, torch.tensor([view.index for view in given], device=state.device))
     cost = torch.where(known, cost, math.inf)
     order = torch.argsort(cost, stable=True)
-    removed = order[torch.cumsum(cost[order], 0) <= fraction * error]
-    keep = torch.ones_like(known)
-    keep[removed] = False
+    return _remove(state, order[torch.cumsum(cost[order], 0) <= fraction * error])
+
+
+def bound(
+    state: MapState, views: list[TrainingView], render: Callable[[Splats, TrainingView], Render], count: int,
+    generator: torch.Generator,
+) -> int:  # fmt: skip
+    """Removes all but `count` splats, those first that would add least to the squared error of the views' images, those
+    last that none of them says anything of; returns their number. render: as in `prune`."""
+    beyond = len(state) - count
+    if beyond <= 0:
+        return 0
+    cost, _ = removal_cost(state, views, render, generator)
+    return _remove(state, torch.argsort(cost, stable=True)[:beyond])
+
+
+def _remove(state: MapState, splats: Tensor) -> int:
+    keep = torch.ones(len(state), dtype=torch.bool, device=state.device)
+    keep[splats] = False
     state.keep(keep)
-    return len(removed)
+    return len(splats)
 
 
 def removal_cost(

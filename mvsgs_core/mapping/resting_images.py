@@ -1,30 +1,84 @@
-"""Images and masks that wait on disk until they are trained on again: each in a file of its own, mapped into memory.
+"""Images and masks that wait on disk until they are trained on again: in files of many, mapped into memory.
 
 The system holds in memory what there is room for of them, and gives it back where others need it. A file has no name
-and goes with its image, however the process ends.
+and goes with the last of its images, however the process ends.
 """
 
 from __future__ import annotations
 
 import math
+import mmap
+import os
 import tempfile
+import weakref
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from mvsgs_core.mapping.keyframes import TrainingView
+from mvsgs_core.stats import Stats
+
+SLOTS = 1024  # images of a file: Linux maps 65,530 pieces into a process, and lets it open 1,024 files
+
+
+class _File:
+    """Images of about the same size, each in a slot, which another one gets when nothing refers to it any more."""
+
+    def __init__(self, size: int) -> None:
+        """size: bytes of a slot, whole pages. Raises OSError."""
+        self.size = size
+        self.free = list(range(SLOTS))[::-1]
+        self._file = tempfile.TemporaryFile(prefix="mvsgs-images-", buffering=0)  # noqa: SIM115 - as long as its images
+        weakref.finalize(self, self._file.close)
+        self._file.truncate(SLOTS * size)  # takes no room yet
+        self._mapped = mmap.mmap(self._file.fileno(), SLOTS * size)
+
+    def put(self, plain: np.ndarray) -> Tensor:
+        """Raises OSError where the disk takes no more: written through the mapping, that would end the process."""
+        slot, rest = self.free.pop(), memoryview(plain.tobytes())
+        offset = slot * self.size
+        try:
+            while rest:
+                rest = rest[os.pwrite(self._file.fileno(), rest, offset + plain.nbytes - len(rest)) :]
+        except OSError:
+            self.free.append(slot)
+            raise
+        # who shares the memory of `array`, be it a tensor or an array of one, holds `array`, and that the file
+        array = np.frombuffer(self._mapped, plain.dtype, plain.size, offset).reshape(plain.shape)
+        weakref.finalize(array, self._give_back, slot).atexit = False
+        return torch.from_numpy(array)
+
+    def _give_back(self, slot: int) -> None:
+        self.free.append(slot)
+
+
+_files: weakref.WeakSet[_File] = weakref.WeakSet()  # of this process; they live as long as an image in them does
 
 
 def on_disk(image: Tensor) -> Tensor:
     """The same image (H, W, 3) uint8 or mask (H, W) bool, on the CPU, in a file of the system's temporary folder
     (TMPDIR).
 
-    Raises OSError where the disk takes no more.
+    Raises OSError where the disk takes no more, or the system maps no more files.
     """
-    plain = image.detach().cpu().contiguous()
-    with tempfile.NamedTemporaryFile(prefix="mvsgs-image-") as file:
-        file.write(plain.numpy().tobytes())
-        file.flush()
-        mapped = torch.from_file(file.name, shared=False, size=plain.numel(), dtype=plain.dtype)
-    return mapped.view(plain.shape)
+    plain = np.ascontiguousarray(image.detach().cpu().numpy())
+    size = -(-plain.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE
+    file = next((file for file in _files if file.size == size and file.free), None)
+    if file is None:
+        _files.add(file := _File(size))
+    return file.put(plain)
+
+
+def rest(view: TrainingView, log: Stats) -> bool:
+    """A keyframe's image goes to disk, with its mask; False where the disk is full: it stays, which is said."""
+    try:
+        valid = None if view.valid is None else on_disk(view.valid)
+        view.image, view.valid, view.image_on_disk = on_disk(view.image), valid, True
+    except OSError as error:
+        log.warn(f"images stay in memory beyond mapper.images_in_memory: {error}")
+        return False
+    return True
 
 
 def room_of(device: torch.device) -> float:
@@ -34,4 +88,4 @@ def room_of(device: torch.device) -> float:
     return float(torch.cuda.get_device_properties(device).total_memory) / 4
 
 
-__all__ = ["on_disk", "room_of"]
+__all__ = ["on_disk", "rest", "room_of"]

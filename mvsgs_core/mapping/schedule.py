@@ -20,6 +20,7 @@ class Schedule:
         self.pending = 0
         self.beside = 0
         self.spared = 0
+        self.late = 0  # keyframes that got their splats after the stream
         self._random = np.random.default_rng(seed)
         self._local: list[int] = []
         self._all: list[int] = []
@@ -80,7 +81,8 @@ class Schedule:
     def state(self) -> dict[str, Any]:
         """All that the next draws depend on, as JSON has it."""
         return {
-            "pending": self.pending, "beside": self.beside, "spared": self.spared, "turn": self._turn,
+            "pending": self.pending, "beside": self.beside, "spared": self.spared, "late": self.late,
+            "turn": self._turn,
             "local": list(self._local), "all": list(self._all), "random": self._random.bit_generator.state,
         }  # fmt: skip
 
@@ -92,6 +94,7 @@ class Schedule:
         self.pending, self.beside, self.spared, self._turn = (
             _at_least_zero(state.get(name)) for name in ("pending", "beside", "spared", "turn")
         )
+        self.late = _at_least_zero(state.get("late", 0))  # earlier versions wrote none
         self._local, self._all = _positions(state.get("local"), count), _positions(state.get("all"), trained)
         try:
             self._random.bit_generator.state = state["random"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,7 +25,7 @@ from mvsgs_core.mapping.losses import (
 )
 from mvsgs_core.mapping.map_state import MapState
 from mvsgs_core.mapping.partition import LEVELS
-from mvsgs_core.mapping.pruning import prune
+from mvsgs_core.mapping.pruning import bound, prune
 from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.interface import SplatStep
 from mvsgs_core.rasterizer.photograph_loss import Formation, photograph_loss
@@ -124,14 +126,30 @@ class Trainer:
         config = self.config.density_control
         if config.mode == "none":
             return
+        with self.log.time("density_control"):
+            generator = torch.Generator().manual_seed(self.config.seed)
+            render = self._judged(median_depth)
+            self.log.count("needless", prune(self.state, views, render, config.needless, generator))
+
+    def bound(self, views: list[TrainingView], median_depth: float) -> None:
+        """Of a map that has become larger than may be, the splats go that the images of these keyframes miss least."""
+        most = self.config.density_control.max_splats
+        if len(self.state) <= most:
+            return
+        with self.log.time("density_control"):
+            generator = torch.Generator().manual_seed(self.config.seed)
+            removed = bound(self.state, views, self._judged(median_depth), most, generator)
+        text = f"two maps that were joined had more than max_splats={most}: what their images miss least was taken out"
+        self.log.refuse("splats", removed, text)
+
+    def _judged(self, median_depth: float) -> Callable[[Splats, TrainingView], Render]:
+        """What `pruning` judges splats by."""
 
         def render(splats: Splats, view: TrainingView) -> Render:
             exposure = None if view.measured is None else view.exposure.detach()
             return self._rasterize(splats, view, view.intrinsics, view.size, median_depth, exposure, None, weights=True)
 
-        with self.log.time("density_control"):
-            generator = torch.Generator().manual_seed(self.config.seed)
-            self.log.count("needless", prune(self.state, views, render, config.needless, generator))
+        return render
 
     def _rasterize(
         self, splats: Splats, view: TrainingView, intrinsics: np.ndarray, size: tuple[int, int], median_depth: float,

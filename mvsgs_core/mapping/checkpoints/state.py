@@ -17,13 +17,16 @@ from mvsgs_core.mapping.checkpoints.waiting import INDEX as WAITING
 from mvsgs_core.mapping.checkpoints.waiting import waiting_arrays, waiting_of
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.exposure import ImageFormation
+from mvsgs_core.mapping.keyframe_store import awake
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.resting_images import rest
 from mvsgs_core.photometry import is_exposure, is_vignetting
 from mvsgs_core.stats import Stats
 
 Corrections = dict[int, tuple[np.ndarray, float]]
+V = TypeVar("V", bound=TrainingView)
 
 SPLATS: dict[str, tuple[type, tuple[int, ...]]] = {  # N splats: dtype and shape of a row, without harmonics
     "means": (np.float32, (3,)), "log_scales": (np.float32, (3,)), "quaternions": (np.float32, (4,)),
@@ -114,13 +117,28 @@ def unpack(
     meta: Any, arrays: Arrays, config: MapperConfig, log: Stats, corrections: Corrections, photometry: ImageFormation,
     image: Callable[[str, torch.device], tuple[torch.Tensor, torch.Tensor | None]],
 ) -> OnlineMapper:  # fmt: skip
-    """The mapper that was packed. image: a keyframe's by its name, as `read_image`. Raises ValueError for damage."""
+    """The mapper that was packed. image: a keyframe's by its name, as `read_image`. Raises ValueError for damage.
+
+    Images that do not stay in memory go to disk as they are read: a map may have more than there is room for.
+    """
     if not isinstance(meta, dict):
         raise ValueError("a mapper's part is no object")
     device = torch.device(resolve_device(config.device))
-    views = [_view(row, device, image, TrainingView) for row in keyframe_rows(arrays.of("views"), meta.get("images"))]
-    rows = keyframe_rows(arrays.of("between"), meta.get("between"), BETWEEN)
-    between = [_view(row, device, image, BetweenView) for row in rows]
+    rows = keyframe_rows(arrays.of("views"), meta.get("images"))
+    frames = keyframe_rows(arrays.of("between"), meta.get("between"), BETWEEN)
+    shown = sorted(row["index"] for row in (*rows, *frames) if row["file"])
+    left = meta.get("current") is False  # the stream has gone on in another map
+    count = awake(config.images_in_memory, config.window) if not left else config.window
+    resting = set(shown[: max(0, len(shown) - count)])
+
+    def taken(row: dict[str, Any], kind: type[V]) -> V:
+        rests = row["index"] in resting
+        view = _view(row, device, torch.device("cpu") if rests else device, image, kind)
+        if rests:
+            rest(view, log)
+        return view
+
+    views, between = [taken(row, TrainingView) for row in rows], [taken(row, BetweenView) for row in frames]
     if not {view.keyframe for view in between} <= {view.index for view in views} or not all(
         b.has_image for b in between
     ):
@@ -210,14 +228,13 @@ def keyframe_rows(
     ]
 
 
-V = TypeVar("V", bound=TrainingView)
-
-
 def _view(
-    row: dict[str, Any], device: torch.device,
+    row: dict[str, Any], device: torch.device, image_on: torch.device,
     image: Callable[[str, torch.device], tuple[torch.Tensor, torch.Tensor | None]], kind: type[V],
 ) -> V:  # fmt: skip
-    row["image"], row["valid"] = image(row.pop("file"), device)
+    """image_on: the device of its image, which the row, kept by whoever has it, must not hold."""
+    row = dict(row)
+    row["image"], row["valid"] = image(row.pop("file"), image_on)
     row["image_size"] = tuple(row["image_size"].tolist())
     row["exposure"] = torch.from_numpy(row["exposure"]).to(device)
     row["measured"] = None if np.isnan(row["measured"]).any() else row["measured"]

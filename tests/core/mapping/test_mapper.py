@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.mapping import keyframe_store, losses
+from mvsgs_core.mapping import keyframe_store, losses, resting_images
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig
@@ -248,7 +248,7 @@ def test_images_on_disk_give_the_same_map(monkeypatch: pytest.MonkeyPatch) -> No
     def full(image: torch.Tensor) -> torch.Tensor:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(keyframe_store, "on_disk", full)
+    monkeypatch.setattr(resting_images, "on_disk", full)
     stays = mapped(views, replace(config, images_in_memory=3))
     assert stays.keyframes.image_bytes == 10 * 48 * 64 * 3
     assert any("no space left" in text for text in stays.log.warnings)
