@@ -91,11 +91,11 @@ class Atlas:
         self.stream_ended = True
         self.take_between()
         self.largest.end()
-        parts, log = list(self.parts.values()), self.current.log
+        parts, log = [part for part in self.parts.values() if part.views], self.current.log
         log.values["segments_apart"] = max(0, len(parts) - 1)  # beside the map that is shown
+        self.current = self.largest
         if len(parts) < 2:
             return
-        self.current = self.largest
         total = sum(len(part.views) for part in parts)
         known = [part for part in parts if part.views and part.views[0].index < 0]
         lost = "tracking was lost"

@@ -10,6 +10,7 @@ import torch
 from mvsgs_core import geometry
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
+from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.mapping.mapper import OnlineMapper
@@ -19,6 +20,7 @@ from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from mvsgs_core.stats import Stats
 from tests.support.small_atlas import gain
+from tests.support.small_atlas import view as keyframe
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (24, 32)
@@ -149,3 +151,58 @@ def test_images_of_a_part_that_was_left_rest_on_disk() -> None:
         pass
     atlas.add(rgbd_keyframe(6, pose_on_arc(6 / 8), SIZE), segment=0)
     assert [view.image_on_disk for view in current.views] == [True, False, False]
+
+
+def test_a_join_keeps_to_max_splats_by_what_the_images_miss_least() -> None:
+    free = replace(CONFIG, iterations=0, window=8, max_keyframes=8)
+    most = 40
+    full = replace(free, density_control=DensityControlConfig(max_splats=most))
+    corrections: dict = {}
+
+    def part(config: MapperConfig, *indices: int) -> OnlineMapper:
+        mapper = OnlineMapper(config, corrections=corrections)
+        for index in indices:
+            mapper.add_keyframe(keyframe(index))
+        return mapper
+
+    def error(mapper: OnlineMapper) -> float:
+        return sum(float((mapper.render(known).color - known.target).square().sum()) for known in mapper.views)
+
+    one, other = part(full, 0, 2), part(full, 4, 6)
+    assert len(one.state) == len(other.state) == most
+    refused = one.log.counts["refused_splats"]
+    whole = part(free, 0, 2)
+    whole.state.become(one.state.tensors())
+    whole.join(part(full, 4, 6))
+    one.join(other)
+    assert (len(one.state), len(whole.state)) == (most, 2 * most)
+    assert one.log.counts["refused_splats"] == refused + most
+    assert any("joined" in text and f"max_splats={most}" in text for text in one.log.warnings)
+    first = one.state.tensors()
+    whole.state.keep(torch.arange(2 * most) < most)  # as any of them
+    assert error(one) < error(whole)
+    assert all(len(value) == most for value in first.values())
+
+    new = one.log.counts["refused_splats"]
+    one.state.take_over(part(full, 4, 6).state)  # as a map of a run that might have more
+    assert one.add_keyframe(keyframe(7)) == 0
+    assert 0 < one.log.counts["refused_splats"] - new <= SIZE[0] * SIZE[1], "no more than the keyframe's own"
+
+
+def test_what_late_splats_brought_is_joined_too() -> None:
+    one, other = OnlineMapper(CONFIG), mapped([1, 2], np.eye(4), 1.0, {})
+    one.schedule.late, other.schedule.late = 2, 3
+    one.join(other)
+    assert one.schedule.late == 5
+
+
+def test_a_part_without_a_keyframe_is_no_part_of_the_map() -> None:
+    atlas = Atlas(OnlineMapper(CONFIG))
+    for index in range(3):
+        atlas.add(keyframe(index), 0)
+    pose = np.full((4, 4), np.nan)
+    assert atlas.add(replace(keyframe(3), world_from_cam=pose), 1) is None
+    atlas.finish()
+    assert atlas.current.log.values["segments_apart"] == 0
+    assert not any("lost" in text for text in atlas.current.log.warnings)
+    assert [known.index for known in atlas.current.views] == [0, 1, 2], "that of the keyframes is gone on with"
