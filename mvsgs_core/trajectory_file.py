@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core import geometry
-from mvsgs_core.bad_file import reading
+from mvsgs_core.bad_file import BadFileError, reading
 
 LATEST = 1e12  # seconds, or units from the origin: more is damage
 
@@ -18,12 +18,13 @@ def write_trajectory(file: Path, timestamps: np.ndarray, world_from_cam: np.ndar
     with file.open("w") as out:
         out.write("# timestamp tx ty tz qx qy qz qw (camera to world)\n")
         for t, pose, (w, x, y, z) in zip(timestamps, world_from_cam, quaternions):
-            values = (*pose[:3, 3], x, y, z, w)
-            out.write(f"{t:.6f} " + " ".join(f"{v:.9g}" for v in values) + "\n")
+            position = " ".join(f"{v:.15g}" for v in pose[:3, 3])  # a micrometre at the size of UTM's coordinates, too
+            out.write(f"{t:.6f} {position} " + " ".join(f"{v:.9g}" for v in (x, y, z, w)) + "\n")
 
 
 def read_trajectory(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Timestamps (N,) and world_from_cam (N, 4, 4) float64, sorted by time. Raises BadFileError for a malformed line.
+    """Timestamps (N,) and world_from_cam (N, 4, 4) float64, sorted by time. Raises BadFileError for a malformed line,
+    and where times are in other units than seconds.
 
     Rows that are no pose are left out: motion capture writes zeros where it lost its markers.
     """
@@ -36,6 +37,11 @@ def read_trajectory(file: Path) -> tuple[np.ndarray, np.ndarray]:
             row = [float(v) for v in text]
             if len(row) != 8:
                 raise ValueError(f"{len(row)} numbers")
+        if LATEST <= abs(row[0]) < np.inf:
+            raise BadFileError(
+                f"{file} has a line {number} whose time, {text[0]}, is not in seconds: divide all times by 1e9 where they "
+                "are nanoseconds, by 1e6 or 1e3 where they are micro- or milliseconds"
+            )
         if np.all(np.abs(row) < LATEST) and np.linalg.norm(row[4:]) > 0.5:
             rows.append(row)
     data = np.array(rows, dtype=np.float64).reshape(-1, 8)

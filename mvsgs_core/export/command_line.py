@@ -115,16 +115,24 @@ def lens(options: argparse.Namespace) -> tuple[np.ndarray, tuple[int, int]]:
     return intrinsics, size
 
 
+def read_path(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) and poses (N, 4, 4) of a file as `read_trajectory` reads it. Raises ValueError where it has none."""
+    stamps, poses = read_trajectory(file)
+    if not len(poses):
+        raise ValueError(f"{file} has no poses: a line of it is `time tx ty tz qx qy qz qw`, as in a run's trajectory.txt")
+    return stamps, poses
+
+
 def cameras_of_map(options: argparse.Namespace) -> Cameras:
     """Every --every-th keyframe of the map, or pose of --trajectory, at --scale.
 
-    Raises ValueError where the map has no cameras.json and no trajectory was given.
+    Raises ValueError where the map has no cameras.json and no trajectory was given, and where that has no poses.
     """
     if options.every < 1:
         raise ValueError("--every must be at least 1")
     known = known_cameras(options)
     if options.trajectory is not None:
-        stamps, poses = read_trajectory(options.trajectory)
+        stamps, poses = read_path(options.trajectory)
         found = Cameras(
             keyframes=np.arange(len(stamps)), timestamps=stamps, world_from_cam=poses, intrinsics=np.zeros((0, 4)),
             sizes=np.zeros((0, 2)), exposures=np.tile(np.eye(3, 4), (len(stamps), 1, 1)),

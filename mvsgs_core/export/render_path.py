@@ -14,10 +14,9 @@ import numpy as np
 import torch
 
 from mvsgs_core import geometry
-from mvsgs_core.export.command_line import input_arguments, lens, read_map, run
+from mvsgs_core.export.command_line import input_arguments, lens, read_map, read_path, run
 from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.trajectory_file import read_trajectory
 from mvsgs_core.video_file import write_video
 
 
@@ -46,9 +45,7 @@ def render_path(options: argparse.Namespace) -> str:
     if not options.trajectory.is_file():
         raise FileNotFoundError(f"{options.trajectory} is missing: a path is poses, as in a run's trajectory.txt")
     final, left_out = read_map(options)
-    _, poses = read_trajectory(options.trajectory)
-    if not len(poses):
-        raise ValueError(f"{options.trajectory} has no poses")
+    _, poses = read_path(options.trajectory)
     path = resampled(poses, options.frames or len(poses))
     intrinsics, size = lens(options)
     count = write_video(options.out, frames_along(final, path, intrinsics, size), size, options.fps)

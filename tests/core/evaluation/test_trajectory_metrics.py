@@ -9,6 +9,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 
 from mvsgs_core import geometry, trajectory_file
+from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.evaluation import trajectory_metrics
 
 
@@ -96,3 +97,19 @@ def test_tum_files_round_trip_and_evo_reads_them(tmp_path: Path) -> None:
     (tmp_path / "bad.txt").write_text("1 2 3\n")
     with pytest.raises(ValueError, match=r"bad\.txt has a line 1 that is not `timestamp tx"):
         trajectory_file.read_trajectory(tmp_path / "bad.txt")
+
+
+def test_tum_files_keep_micrometres_far_from_the_origin(tmp_path: Path) -> None:
+    """As of a map in the coordinates of UTM."""
+    poses, _ = _trajectories()
+    poses[:, :3, 3] += [467123.0, 5412345.0, 312.0]
+    trajectory_file.write_trajectory(tmp_path / "t.txt", np.arange(len(poses)) / 30, poses)
+    _, read = trajectory_file.read_trajectory(tmp_path / "t.txt")
+    np.testing.assert_allclose(read[:, :3, 3], poses[:, :3, 3], rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("time", ["1403636579763555584", "1403636579763.5", "-1e15"])
+def test_times_that_are_no_seconds_are_refused(tmp_path: Path, time: str) -> None:
+    (tmp_path / "t.txt").write_text(f"0.5 1 0 0 0 0 0 1\n{time} 1 0 0 0 0 0 1\n")
+    with pytest.raises(BadFileError, match=rf"t\.txt has a line 2 whose time, {time}, is not in seconds: divide"):
+        trajectory_file.read_trajectory(tmp_path / "t.txt")

@@ -183,3 +183,19 @@ def test_a_trajectory_in_the_keyframes_place(tmp_path: Path) -> None:
     shots = read_colmap(out / "sparse" / "0").shots
     assert sorted(shots) == ["000000.png", "000002.png", "000004.png"]
     np.testing.assert_allclose(shots["000004.png"].world_from_cam, poses_around([1.0])[0], atol=1e-6)
+
+
+def test_a_trajectory_without_poses_is_no_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_cameras(tmp_path, [0.5])
+    write_ply(tmp_path / "map.ply", final_map())
+    path = tmp_path / "trajectory.txt"
+    words = [str(tmp_path / "map.ply"), str(tmp_path / "model"), "--trajectory", str(path)]
+    for content, said in (
+        ("1403636579763555584 1 0 0 0 0 0 1\n", "has a line 1 whose time, 1403636579763555584, is not in seconds"),
+        ("1.5 1 0 0 0 0 0 0\n", "trajectory.txt has no poses"),
+        ("", "trajectory.txt has no poses"),
+    ):
+        path.write_text(content)
+        assert export.main(words) == 1
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "model").exists()
