@@ -110,7 +110,7 @@ class Synthetic:
         if d.motion_blur > 0:
             # The exposure is centered on the frame's time, where pose and depth are exact.
             offsets = d.motion_blur * ((np.arange(SUB_FRAMES) + 0.5) / SUB_FRAMES - 0.5)
-            light = np.asarray(np.mean([self._light(n + o) for o in offsets], axis=0, dtype=np.float32))
+            light = np.asarray(np.mean([self._light(n, o) for o in offsets], axis=0, dtype=np.float32))
         elif not at_once:
             light = self._light(n)
         covered = d.covered > 0 and d.covered_start <= n < d.covered_start + d.covered
@@ -136,19 +136,20 @@ class Synthetic:
         view = self.stage.renderer.render(pose, intrinsics, size, gloss=d.gloss, threads=self.threads)
         return Sensor(Difficulties(), self.seed).image(view.color, 0), view.depth * np.float32(d.scale)
 
-    def _light(self, s: float) -> np.ndarray:
-        """(H, W, 3) float32 of an instant; of a rolling shutter, whose middle row or column is read at frame s."""
-        d = self.difficulties
+    def _light(self, n: int, offset: float = 0.0) -> np.ndarray:
+        """(H, W, 3) float32 of an instant of frame n, `offset` frames from its time; of a rolling shutter, whose middle
+        row or column is read then."""
+        d, s = self.difficulties, n + offset
         readout_time, axis = d.rolling_shutter or d.rolling_columns, 1 if d.rolling_columns else 0
         if readout_time == 0:
-            return self._view(self.path.pose(s), self.intrinsics, self.size, s, depth=False).color
+            return self._view(self.path.pose(s, n), self.intrinsics, self.size, s, depth=False).color
         strips, lines = [], self.size[axis]
         for first in range(0, lines, STRIP):
             count = min(STRIP, lines - first)
             at = s + readout_time * ((first + (count - 1) / 2) / lines - 0.5)
             lens, size = self.intrinsics.copy(), (self.size[0], count) if axis else (count, self.size[1])
             lens[3 - axis] -= first
-            strips.append(self._view(self.path.pose(at), lens, size, at, depth=False).color)
+            strips.append(self._view(self.path.pose(at, n), lens, size, at, depth=False).color)
         return np.concatenate(strips, axis)
 
     def _view(

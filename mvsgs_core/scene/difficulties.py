@@ -64,10 +64,13 @@ class DifficultPath:
         self.path = path
         self.difficulties = difficulties
 
-    def pose(self, s: float) -> np.ndarray:
+    def pose(self, s: float, frame: int | None = None) -> np.ndarray:
+        """(4, 4) world from camera at time s, in frames. frame: whose exposure or readout this instant is of, which
+        lies on one side of a jump as a whole; None: of the one at s."""
         d = self.difficulties
+        of, _ = _without(s if frame is None else frame, d.rest_start, d.rest)
         s, _ = _without(s, d.rest_start, d.rest)
-        if d.jump and s >= d.jump_start:
+        if d.jump and of >= d.jump_start:
             s += d.jump
         s, turning = _without(s, d.pure_rotation_start, d.pure_rotation)
         pose = self.path.pose(s)
