@@ -26,6 +26,7 @@ from nodes.stream_presence import Presence, pauses
 
 ANSWER = 5.0  # s for a network camera to answer, before it is tried again
 POLL = 0.5  # s at most between two looks at whether the stream goes on
+MANY = 2**40  # frames: no file has as many; OpenCV counts them so, or below zero, where a stream has no end
 
 
 class CameraError(OSError):
@@ -198,6 +199,12 @@ def _open(config: Camera.Config) -> cv2.VideoCapture:
     if not capture.isOpened():
         capture.release()
         raise CameraError(f"{_called(config)} cannot be opened: {hint}")
+    if number is None and config.path.lower().startswith("http") and 0 < capture.get(cv2.CAP_PROP_FRAME_COUNT) < MANY:
+        capture.release()
+        raise CameraError(
+            f"{_called(config)} is a video file, which ends, and no camera: download it and give the file, as in "
+            "`mvsgs walk.mp4`"
+        )
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # drivers that queue pictures would deliver old ones
     if config.resolution is not None:
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.resolution[0])

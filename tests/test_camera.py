@@ -354,3 +354,24 @@ def test_a_network_camera_that_falls_silent() -> None:
     assert values == sorted(values)
     assert told(camera, "gave no usable picture for 1.5 s: the stream ends here")
     assert told(camera, "was lost (")
+
+
+def test_the_address_of_a_video_file_is_refused_as_it_would_begin_anew_for_ever(tmp_path: Path) -> None:
+    file = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 20.0, (64, 48))
+    for number in range(20):
+        writer.write(np.full((48, 64, 3), 10 * number, dtype=np.uint8))
+    writer.release()
+
+    class Folder(http.server.SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Length", str(file.stat().st_size))
+            self.end_headers()
+            self.wfile.write(file.read_bytes())
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with serving(Folder) as address, pytest.raises(CameraError, match="is a video file, which ends, .* download it"):
+        list(Camera(Camera.Config(path=address, timeout=3.0, stop=5)).run())
