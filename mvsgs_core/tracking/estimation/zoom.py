@@ -7,6 +7,7 @@ how sure they are of it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -21,6 +22,9 @@ STEPS = 30  # of their bundle adjustment: they may begin far from what they want
 LEAST = 0.06  # by how much two parts differ, as a logarithm, ...
 CLEAR = 3.0  # ... and by how many standard deviations, with
 ALIKE = 0.015  # the deviation of one part that matches of a still lens have beyond what they say (measured)
+# By how many where one part alone differs from the others. It may be wrong by itself: six keyframes of a camera that
+# moves straight ahead were by 3.2, and those of a video whose wrong timestamps hide how long its shutter rolls.
+ALONE = 3.5
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,9 @@ class Zoom:
         """Standard deviation of the factor's logarithm."""
         return float(np.hypot(_sigma(self.before), _sigma(self.after)))
 
+    def clear(self, deviations: float) -> bool:
+        return abs(float(np.log(self.factor))) > max(LEAST, deviations * self.sigma)
+
 
 def find_zoom(graph: KeyframeGraph, members: list[int], probe: float, threads: int) -> Zoom | None:
     """The zoom that parts of these keyframes, in their order, say there was; None where none is clear. The graph stays
@@ -69,8 +76,14 @@ def find_zoom(graph: KeyframeGraph, members: list[int], probe: float, threads: i
         rise = observability(graph, part, probe, threads, factor)
         parts.append(Part((part[0], part[-1]), factor, curvature_sigma(graph, part, rise, probe)))
     zooms = [Zoom(a, b) for a, b in combinations(parts, 2)]
-    clear = [zoom for zoom in zooms if abs(np.log(zoom.factor)) > max(LEAST, CLEAR * zoom.sigma)]
-    return min(clear, key=lambda zoom: zoom.sigma, default=None)
+    return surest([zoom for zoom in zooms if zoom.clear(CLEAR)])
+
+
+def surest(zooms: Sequence[Zoom]) -> Zoom | None:
+    """Of those that are clear by `CLEAR`; by `ALONE` where one part is in all of them."""
+    if zooms and set.intersection(*({zoom.before, zoom.after} for zoom in zooms)):
+        zooms = [zoom for zoom in zooms if zoom.clear(ALONE)]
+    return min(zooms, key=lambda zoom: zoom.sigma, default=None)
 
 
 def _sigma(part: Part) -> float:

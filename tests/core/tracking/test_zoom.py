@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mvsgs_core.datasets import Item
-from mvsgs_core.tracking.estimation.zoom import PART, find_zoom
+from mvsgs_core.datasets import Item, open_dataset
+from mvsgs_core.datasets.lens import guess_lens
+from mvsgs_core.tracking.estimation.zoom import ALONE, CLEAR, PART, Part, Zoom, find_zoom, surest
 from mvsgs_core.tracking.tracker import Tracker
 from tests.support.sequences import synthetic, tracked_room
+from tests.support.shared_data import shared
 
 pytestmark = pytest.mark.slow
 
@@ -59,3 +61,29 @@ def test_a_camera_that_does_not_zoom_is_not_said_to() -> None:
     assert find_zoom(graph, members[: 2 * PART - 1], PROBE, 1) is None, "too few to tell"
     assert find_zoom(graph, [-1 - n for n in range(2 * PART)], PROBE, 1) is None, "of a map that it goes on with"
     assert all(np.array_equal(graph.keyframes[index].cam_from_world, pose) for index, pose in before.items())
+
+
+@pytest.mark.parametrize("guessed", [True, False])
+def test_a_camera_that_moves_straight_ahead_at_first_is_not_said_to_zoom(guessed: bool) -> None:
+    """Its first keyframes want 1.2 times the focal length of the others: by 3 deviations, and there are no more."""
+    tracker = Tracker()
+    for item in open_dataset("tum", path=shared("data/tum_fr1_xyz"), stride=2, stop=48):
+        guess = np.array(guess_lens(item.image.shape[:2]).intrinsics)
+        tracker.add(item.index, item.timestamp, item.image, guess if guessed else item.intrinsics, guessed)
+    list(tracker.finish())
+    assert "zoom" not in tracker.stats.values
+    assert not any("zoomed" in warning for warning in tracker.stats.warnings)
+
+
+def test_one_part_that_differs_from_all_others_must_do_so_more_clearly() -> None:
+    first, second, third, fourth = (
+        Part((n, n + 9), factor, 0.01) for n, factor in zip((0, 10, 20, 30), (1, 1, 1, 1.08))
+    )
+    sigma = Zoom(first, fourth).sigma
+    assert CLEAR < np.log(1.08) / sigma < ALONE
+    alone = [Zoom(part, fourth) for part in (first, second, third)]
+    assert surest(alone) is None
+    assert surest([*alone, Zoom(first, Part((40, 49), 1.08, 0.01))]) is not None, "another part says the same"
+    sure = Zoom(second, Part((30, 39), 1.2, 0.01))
+    assert surest([alone[1], sure]) == sure
+    assert surest([]) is None
