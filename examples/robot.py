@@ -33,7 +33,7 @@ try:
     from mvsgs_core.datasets.ros import camera_info_topic
     from nodes.camera import Camera
     from nodes.ros2 import forms
-    from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, check_installed
+    from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, DdsError, check_installed
     from nodes.ros2.messages import CameraInfo, Image
     from nodes.runtime.addresses import TransportError, load_keys
     from nodes.runtime.transport import LivePublisher
@@ -143,7 +143,7 @@ def main() -> None:
             if arguments.ros2 is None
             else Ros2Camera(arguments.ros2, arguments.interface)
         )
-    except (TransportError, ValueError, OSError) as error:
+    except (TransportError, DdsError, ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # `kill` and systemd end it as Ctrl-C does
     sent = 0
@@ -160,7 +160,7 @@ def main() -> None:
             sent += 1
     except KeyboardInterrupt:
         pass
-    except (ValueError, OSError) as error:
+    except (DdsError, ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     finally:
         publisher.close()  # tells the readers that this is the end

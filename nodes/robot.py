@@ -16,7 +16,7 @@ from mvsgs_core.datasets.framing import Framing, target_size
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource, camera_mask
-from nodes.runtime.addresses import TransportError, check_address, load_keys
+from nodes.runtime.addresses import TransportError, check_address, load_keys, unknown_host
 from nodes.runtime.transport import LiveReader
 from nodes.stream_frames import StreamFrames
 from nodes.stream_presence import Presence
@@ -58,6 +58,8 @@ class Robot(LiveSource):
     def _open(self) -> None:
         """Raises TransportError for an address that is none and for refused keys."""
         keys = None if self.config.keys is None else load_keys(Path(self.config.keys))
+        if (host := unknown_host(self.config.path)) is not None:
+            self.stats.warn(f"nobody here knows a host {host}: is its name right, and is it in the network?")
         self._reader = LiveReader(self.config.path, Frame, topic=f"robot at {self.config.path}", keys=keys)
 
     def _close(self) -> None:

@@ -361,7 +361,8 @@ def test_nothing_binds_beyond_loopback_without_keys(address: str, tmp_path: Path
     with pytest.raises(TransportError, match="give CURVE keys"):
         Publisher(address)
     check_address(address, bind=True, keys=create_keys(tmp_path))
-    check_address(address)
+    if "*" not in address:
+        check_address(address)
 
 
 @pytest.mark.parametrize("address", ["", "tcp://", "tcp://localhost", "tcp://localhost:99999", "inproc://a", "ipc://"])

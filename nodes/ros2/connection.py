@@ -15,6 +15,10 @@ _NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _INTERFACE = re.compile(r"[A-Za-z0-9_.:@-]{1,64}")
 
 
+class DdsError(RuntimeError):
+    """DDS cannot do it; the message says what to change."""
+
+
 @dataclass(kw_only=True)
 class Connection:
     """Where other programs of ROS 2 are found. Nothing beyond this machine sends or gets anything unless it is named.

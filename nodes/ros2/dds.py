@@ -31,7 +31,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from nodes.ros2.cdr import CdrError, Nested, NestedSequence, Number, Numbers, Text, decode, encode, kinds
-from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, Quality
+from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, DdsError, Quality
 from nodes.ros2.messages import Message
 from nodes.ros2.services import ServiceMessage, ServiceType
 
@@ -44,10 +44,6 @@ _IDL = {
     "?": bool, "u1": types.uint8, "i4": types.int32, "u4": types.uint32, "f8": types.float64,
     "i8": types.int64, "u8": types.uint64,
 }  # fmt: skip
-
-
-class DdsError(RuntimeError):
-    """DDS cannot do it; the message says what to change."""
 
 
 class Overrun(NamedTuple):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import re
 import shlex
+import socket
 import stat
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +14,7 @@ from typing import NamedTuple
 IPC_PATH_BYTES = 107  # the kernel's limit of a socket's path
 KEY_FILE = "graph.key"
 MAX_KEY_BYTES = 1000
+_HOST = re.compile(r"[^\s/]+")
 
 
 class TransportError(RuntimeError):
@@ -88,13 +91,31 @@ def check_address(address: str, *, bind: bool = False, keys: Keys | None = None)
             raise TransportError(f"the socket path {rest} is longer than {IPC_PATH_BYTES} bytes: use a shorter folder")
         return
     host, _, port = rest.rpartition(":")
-    if kind != "tcp" or not host or not (port.isdigit() and int(port) < 65536):
+    if kind != "tcp" or not _HOST.fullmatch(host) or not (port.isdigit() and int(port) < 65536):
         raise TransportError(f"{address} is no address; use ipc:///path or tcp://host:port")
+    if not bind and (host == "*" or int(port) == 0):
+        raise TransportError(
+            f"{address} is where a program can listen, but nothing is reached there: give the name or number of its "
+            "host (127.0.0.1: this one) and its port"
+        )
     if bind and keys is None and not is_loopback(host):
         raise TransportError(
             f"{address} can be reached from other machines and would accept anybody: give CURVE keys, "
             "or bind to 127.0.0.1 or an ipc:// path"
         )
+
+
+def unknown_host(address: str) -> str | None:
+    """The host of an address that `check_address` accepts, where nobody knows it by that name; else None."""
+    kind, _, rest = address.partition("://")
+    host = rest.rpartition(":")[0].rpartition(";")[2].strip("[]")  # before a ";" is the own end of the connection
+    if kind != "tcp":
+        return None
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError):
+        return host
+    return None
 
 
 def is_loopback(host: str) -> bool:

@@ -71,7 +71,11 @@ class _Reader:
         self._socket.rcvhwm = self._buffer
         self._socket.reconnect_ivl, self._socket.reconnect_ivl_max = 50, self.longest_pause
         self.monitor = open_monitor(self._socket, self.monitored)
-        self._socket.connect(address)
+        try:
+            self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self._close_socket()
+            raise TransportError(f"{self.topic}: cannot connect to {address}: {error}") from error
         # Where strangers can knock, one's message can hide who said this: it is then said again, under the same name.
         self._said = [token.encode() + self.delivery + (os.urandom(NAME_BYTES) if token else b"")]
         self._opened = time.monotonic()
