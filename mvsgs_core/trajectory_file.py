@@ -39,7 +39,7 @@ def read_trajectory(file: Path) -> tuple[np.ndarray, np.ndarray]:
                 raise ValueError(f"{len(row)} numbers")
         if LATEST <= abs(row[0]) < np.inf:
             raise BadFileError(
-                f"{file} has a line {number} whose time, {text[0]}, is not in seconds: divide all times by 1e9 where they "
+                f"{file} has a line {number} whose time, {text[0]}, is not in seconds: divide times by 1e9 where they "
                 "are nanoseconds, by 1e6 or 1e3 where they are micro- or milliseconds"
             )
         if np.all(np.abs(row) < LATEST) and np.linalg.norm(row[4:]) > 0.5:

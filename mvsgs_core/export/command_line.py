@@ -119,7 +119,7 @@ def read_path(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (N,) and poses (N, 4, 4) of a file as `read_trajectory` reads it. Raises ValueError where it has none."""
     stamps, poses = read_trajectory(file)
     if not len(poses):
-        raise ValueError(f"{file} has no poses: a line of it is `time tx ty tz qx qy qz qw`, as in a run's trajectory.txt")
+        raise ValueError(f"{file} has no poses: a line is `time tx ty tz qx qy qz qw`, as in a run's trajectory.txt")
     return stamps, poses
 
 
