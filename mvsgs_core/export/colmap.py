@@ -19,6 +19,12 @@ from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 
 BEHIND = 0.03  # of the rendered depth: a point farther behind the surface is hidden by it
+HEADS = {  # the first lines of our files, which COLMAP's own begin otherwise
+    "cameras.txt": "# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+    "images.txt": "# Image list: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; "
+    "then POINTS2D[] (X, Y, POINT3D_ID)",
+    "points3D.txt": "# 3D point list: POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] (IMAGE_ID, POINT2D_IDX)",
+}
 
 
 @dataclass(frozen=True)
@@ -43,26 +49,28 @@ def write_colmap(
     only has their names, which are the same. Those of a stream before, whose images another run has, are left out then.
     observations: each point's track names the images in which it is seen, at the pixels it projects to: they are of
     this map, not measured. Hidden is what lies `BEHIND` the rendered depth. Splats of less than `min_opacity` make no
-    point. COLMAP's pixel (0, 0) is the corner of the first pixel, ours its center. Raises ValueError where an image of
-    this stream is missing, or one is of another size than its camera.
+    point. COLMAP's pixel (0, 0) is the corner of the first pixel, ours its center. An earlier export there is replaced.
+    Raises ValueError where an image of this stream is missing, or one is of another size than its camera, and for a
+    folder with another program's model, or with images that would be replaced.
     """
     given = len(cameras)
+    ours = _is_ours(folder / "sparse" / "0")
     if images is not None:
         cameras = cameras.chosen((cameras.keyframes >= 0) | there(images, cameras.keyframes))
         if given and not len(cameras):
             raise ValueError(f"no keyframe's image is in {images}: run with mapper.save_images=true")
-        _copy(images, folder / "images", cameras)
+        _copy(images, folder / "images", cameras, replacing=ours)
     model = folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
     lenses, lens_of = np.unique(np.hstack([cameras.sizes, cameras.intrinsics]), axis=0, return_inverse=True)
-    text = ["# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    text = [HEADS["cameras.txt"]]
     for k, (height, width, fx, fy, cx, cy) in enumerate(lenses.tolist()):
         text.append(f"{k + 1} PINHOLE {width:.0f} {height:.0f} {fx!r} {fy!r} {cx + 0.5!r} {cy + 0.5!r}")
     _write(model / "cameras.txt", text)
     solid = torch.sigmoid(final.splats.opacity_logits).numpy() >= min_opacity
     means = final.splats.means.numpy()[solid].astype(np.float64)
     tracks = _Tracks(len(means))
-    text = ["# Image list: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D[] (X, Y, POINT3D_ID)"]
+    text = [HEADS["images.txt"]]
     for k in range(len(cameras)):
         cam_from_world = geometry.inverse(cameras.world_from_cam[k])
         numbers = [*geometry.quaternion_from_rotation(cam_from_world[:3, :3]), *cam_from_world[:3, 3]]
@@ -75,7 +83,7 @@ def write_colmap(
     _write(model / "images.txt", text)
     colors = np.clip((0.5 + C0 * final.splats.sh[:, 0].numpy()[solid]) * 255.0, 0, 255).round().astype(int)
     world = (means + final.origin).tolist()
-    text = ["# 3D point list: POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] (IMAGE_ID, POINT2D_IDX)"]
+    text = [HEADS["points3D.txt"]]
     for k, ((x, y, z), (r, g, b), track) in enumerate(zip(world, colors.tolist(), tracks, strict=True)):
         text.append(" ".join([f"{k + 1} {x!r} {y!r} {z!r} {r} {g} {b} 0", *track]))
     _write(model / "points3D.txt", text)
@@ -127,7 +135,25 @@ def _seen(final: Snapshot, means: np.ndarray, cameras: Cameras, k: int) -> tuple
     return ahead[shown], pixels[shown]
 
 
-def _copy(images: Path, target: Path, cameras: Cameras) -> None:
+def _is_ours(model: Path) -> bool:
+    """Whether an earlier export lies there; False: nothing does. Raises ValueError for another program's model, of
+    which readers take cameras.bin before a cameras.txt of ours."""
+    files = sorted(path for path in model.glob("*") if path.suffix in (".bin", ".txt"))
+    others = [path.name for path in files if _first_line(path) != HEADS.get(path.name)]
+    if others:
+        raise ValueError(
+            f"{model} has a model that is no export of a map ({', '.join(others)}): give another folder, or move it"
+        )
+    return bool(files)
+
+
+def _first_line(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.readline(200).decode(errors="replace").rstrip()
+
+
+def _copy(images: Path, target: Path, cameras: Cameras, *, replacing: bool) -> None:
+    """replacing: images that are there may be."""
     found = {}
     for index, (height, width) in zip(cameras.keyframes.tolist(), cameras.sizes.tolist()):
         found[index] = images / image_name(index)
@@ -140,6 +166,8 @@ def _copy(images: Path, target: Path, cameras: Cameras) -> None:
             raise ValueError(f"{found[index]} is no image that can be read: {error}") from None
         if size != (width, height):
             raise ValueError(f"{found[index]} has {size[0]}x{size[1]} pixels, its camera {width}x{height}")
+        if not replacing and (target / found[index].name).exists():
+            raise ValueError(f"{target} has another {found[index].name}: give another folder")
     target.mkdir(parents=True, exist_ok=True)
     for path in found.values():
         shutil.copyfile(path, target / path.name)

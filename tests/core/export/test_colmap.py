@@ -199,3 +199,37 @@ def test_a_trajectory_without_poses_is_no_model(tmp_path: Path, capsys: pytest.C
         assert export.main(words) == 1
         assert said in capsys.readouterr().err
     assert not (tmp_path / "model").exists()
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "cameras.txt", "rigs.bin"])
+def test_another_programs_model_is_not_written_into(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    save_cameras(tmp_path, TIMES)
+    write_ply(tmp_path / "map.ply", final_map())
+    model = tmp_path / "project" / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / name).write_bytes(b"# Camera list with one line of data per camera:\n\xff")
+    assert export.main([str(tmp_path / "map.ply"), str(tmp_path / "project")]) == 1
+    assert f"has a model that is no export of a map ({name}): give another folder" in capsys.readouterr().err
+    assert [path.name for path in model.iterdir()] == [name]
+    assert (model / name).read_bytes() == b"# Camera list with one line of data per camera:\n\xff"
+
+
+def test_an_earlier_export_is_replaced_with_its_images_and_no_other_images_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_cameras(tmp_path, TIMES)
+    for k in range(len(TIMES)):
+        write_image(tmp_path / "keyframes", 7 * k, np.zeros((*SIZE, 3), dtype=np.uint8))
+    out = exported(tmp_path, "--images")
+    before = (out / "sparse" / "0" / "images.txt").read_bytes()
+    assert exported(tmp_path, "--images", "--scale", "2") == out
+    assert (out / "sparse" / "0" / "images.txt").read_bytes() != before
+    photo = tmp_path / "project" / "images" / "000007.png"
+    photo.parent.mkdir(parents=True)
+    photo.write_bytes(b"a user's")
+    assert export.main([str(tmp_path / "map.ply"), str(tmp_path / "project"), "--images"]) == 1
+    assert "has another 000007.png: give another folder" in capsys.readouterr().err
+    assert photo.read_bytes() == b"a user's"
+    assert not (tmp_path / "project" / "sparse").exists()
