@@ -8,6 +8,7 @@ chunk that holds it.
 from __future__ import annotations
 
 import re
+import shlex
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -42,7 +43,7 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
     except ImportError as error:
         raise ImportError("bags are read by rosbags, which is optional: pip install rosbags") from error
     _bound_decompression()
-    with reading(path, "is no bag that can be read"):
+    with reading(path, f"is no bag that can be read (if it was cut off, {_repair(path)} mends it)"):
         _check_metadata(path / "metadata.yaml")
         _check_compressed_files(path)
         # ROS 2 bags before Iron hold no message definitions; image and camera_info have not changed since
@@ -84,6 +85,17 @@ def messages(bag: AnyReader, connections: Sequence[Connection], notices: Notices
                     notices.tally("messages left out because they are damaged", str(error))
                     continue
             yield connection, nanoseconds, data
+
+
+def _repair(path: Path) -> str:
+    """The command that makes a whole bag of one whose recorder was killed: the libraries read no other."""
+    kind, beside = path.suffix.lower(), shlex.quote(str(path.with_stem(f"{path.stem}_whole")))
+    commands = {
+        ".mcap": f"mcap recover {shlex.quote(str(path))} -o {beside}",
+        ".bag": f"rosbag reindex {shlex.quote(str(path))}",
+        ".db3": f'sqlite3 {shlex.quote(str(path))} ".recover" | sqlite3 {beside}',
+    }
+    return f"`{commands.get(kind, f'ros2 bag reindex {shlex.quote(str(path))}')}`"
 
 
 def _bound_decompression() -> None:

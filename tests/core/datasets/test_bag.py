@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -138,6 +139,30 @@ def test_a_camera_whose_clock_was_set_goes_on_by_the_bags_times(tmp_path: Path, 
         np.testing.assert_allclose([item.timestamp for item in items], [100 + i / 10 for i in numbers], atol=1e-6)
         assert any("time stamps stood still, went back or leapt" in warning for warning in sequence.warnings)
         assert any("those before: 4" in warning for warning in sequence.warnings)
+
+
+def test_a_bag_that_was_cut_off_says_what_mends_it(tmp_path: Path) -> None:
+    ros = Messages(2)
+    with Writer2(tmp_path / "walk", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/camera/image_raw", "sensor_msgs/msg/Image", typestore=ros.store)
+        for i in range(9):
+            message = ros.image(i, "rgb8", picture(i), 3 * WIDTH)
+            writer.write(connection, 10**9 * i, ros.store.serialize_cdr(message, message.__msgtype__))
+    (whole,) = (tmp_path / "walk").glob("*.mcap")
+    cut = tmp_path / "cut off.mcap"
+    cut.write_bytes(whole.read_bytes()[:-900])
+    command = f"mcap recover '{cut}' -o '{tmp_path}/cut off_whole.mcap'"
+    with pytest.raises(BadFileError, match=re.escape(command)):
+        open_dataset("bag", path=cut)
+    one = ros.write(tmp_path / "other", [("/camera/image_raw", 1.0, message)])
+    next(one.glob("*.db3")).write_bytes(b"SQLite format 3\0")
+    with pytest.raises(BadFileError, match="ros2 bag reindex"):
+        open_dataset("bag", path=one)
+    first = Messages(1)
+    old = first.write(tmp_path / "old.bag", [("/camera/image_raw", 1.0, first.image(0, "rgb8", picture(0), 3 * WIDTH))])
+    old.write_bytes(old.read_bytes()[:-900])
+    with pytest.raises(BadFileError, match="rosbag reindex"):
+        open_dataset("bag", path=old)
 
 
 def test_stamps_that_stand_still_are_replaced_and_a_late_image_is_left_out(tmp_path: Path, ros: Messages) -> None:
