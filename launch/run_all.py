@@ -44,6 +44,7 @@ try:
     from launch.resume import leave_out_refused, resumed_config
     from launch.sweep import check_jobs, check_launcher, check_single, swept
     from mvsgs_core.atomic_file import replace_text
+    from mvsgs_core.printable import not_utf8
 except ModuleNotFoundError as error:
     sys.exit(f"error: {error}: run `make setup` once, then .venv/bin/mvsgs, or .venv/bin/python launch/run_all.py")
 
@@ -55,6 +56,8 @@ SHOWN = (GRAPH, "--help", "-h")  # --cfg, --info and --hydra-help are Hydra's ow
 def main(arguments: Sequence[str]) -> int:
     """Runs the command line; returns the exit code, see launch/outcome.py."""
     try:
+        if problem := not_utf8([*arguments, os.getcwd()]):
+            raise GraphError(problem)
         if any(word.startswith(RESUME) for word in arguments):
             return run(resumed_job(arguments))
         shown = next((word for word in arguments if word in SHOWN), None)

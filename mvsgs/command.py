@@ -65,6 +65,11 @@ def main(words: Sequence[str] | None = None) -> int:
     if not command.module:
         return run_all([*command.words, *rest])
     _put_path_in_order()
+    from mvsgs_core.printable import not_utf8
+
+    if problem := not_utf8([*rest, str(Path.cwd())]):
+        print(f"error: {problem}", file=sys.stderr)
+        return REFUSED
     code: int = importlib.import_module(command.module).main(rest, prog=f"mvsgs {first}")
     return code
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 TEXT_LIMIT = 500  # characters
 
 
@@ -33,4 +35,15 @@ def printable(text: object, limit: int = TEXT_LIMIT) -> str:
     return shown[: max(0, limit - len(note))] + note[:limit]
 
 
-__all__ = ["TEXT_LIMIT", "printable"]
+def not_utf8(names: Iterable[str]) -> str | None:
+    """Of names of files, as the system gave them, what is wrong with the first that libraries in C cannot take: one
+    that is no UTF-8. None: nothing is."""
+    for name in names:
+        try:
+            name.encode("utf-8")
+        except UnicodeEncodeError:
+            return f"{printable(name)}: this name is no valid UTF-8; rename it, by hand or with convmv"
+    return None
+
+
+__all__ = ["TEXT_LIMIT", "not_utf8", "printable"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import subprocess
 import sys
 import tomllib
@@ -75,6 +76,24 @@ def test_what_is_wrong_is_said_in_one_line(words: list[str], said: str, tmp_path
     assert refused.stdout == ""
     assert said in refused.stderr
     assert refused.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("first", ["", "graph", "view", "export", "info", "render"])
+def test_a_name_that_is_no_utf_8_is_refused(first: str, tmp_path: Path) -> None:
+    name = os.fsdecode(b"walk\xe9.mp4")
+    (tmp_path / name).touch()
+    refused = mvsgs(tmp_path, *filter(None, [first]), name, "out")
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr == "error: walk\\udce9.mp4: this name is no valid UTF-8; rename it, by hand or with convmv\n"
+
+
+def test_so_is_a_folder_in_which_nothing_could_be_written(tmp_path: Path) -> None:
+    here = tmp_path / os.fsdecode(b"photos\xe9")
+    here.mkdir()
+    for words in (["walk.mp4"], ["info", "."]):
+        refused = mvsgs(here, *words)
+        assert refused.returncode == 2
+        assert "photos\\udce9: this name is no valid UTF-8" in refused.stderr
 
 
 def test_a_map_is_named_by_its_folder_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

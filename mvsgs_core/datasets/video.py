@@ -20,6 +20,7 @@ from mvsgs_core.datasets.files import Layout
 from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.sequence import FileReader
+from mvsgs_core.printable import not_utf8
 
 LAYOUT = Layout(
     "A video",
@@ -187,6 +188,8 @@ class Video(FileReader):
             )
 
     def _open(self) -> cv2.VideoCapture:
+        if problem := not_utf8([str(self._path)]):  # OpenCV crashes
+            raise BadFileError(problem)
         loud = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it in words
         try:
             with reading(self._path, "cannot be opened by OpenCV"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from fractions import Fraction
 from pathlib import Path
 
@@ -151,6 +152,13 @@ def test_a_video_without_its_index_says_what_to_do(tmp_path: Path) -> None:
     writer.release()
     truncate(path, 0.5)
     with pytest.raises(BadFileError, match=r"walk\.mp4.*cut off before its index was written"):
+        check("video", path=path, intrinsics="auto")
+
+
+def test_a_video_whose_name_is_no_utf_8_is_not_given_to_opencv(tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"walk\xe9.mp4")  # OpenCV ends the process
+    path.write_bytes(b"no video")
+    with pytest.raises(BadFileError, match=r"walk\\udce9\.mp4: this name is no valid UTF-8; rename it"):
         check("video", path=path, intrinsics="auto")
 
 
