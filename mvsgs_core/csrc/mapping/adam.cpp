@@ -8,17 +8,19 @@
 #include <stdexcept>
 #include <tuple>
 
+#include "in_place.hpp"
 #include "rasterizer/adam.hpp"
 
 namespace nb = nanobind;
-using Rows = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Gradient = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Rows = InPlace<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<const bool, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Counts = nb::ndarray<int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Counts = InPlace<int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 namespace {
 
 // value, gradient, first and second moment (N, width) of a parameter; rate, final_rate, low, high, lead and tail of Group
-using Parameter = std::tuple<Rows, Rows, Rows, Rows, float, float, float, float, int, float>;
+using Parameter = std::tuple<Rows, Gradient, Rows, Rows, float, float, float, float, int, float>;
 
 int64_t step_all(const std::vector<Parameter>& parameters, Flags visible, Counts steps, float beta1, float beta2,
              float epsilon, int decay_steps, int threads) {
@@ -28,9 +30,11 @@ int64_t step_all(const std::vector<Parameter>& parameters, Flags visible, Counts
     std::vector<adam::Group> groups;
     for (const auto& [value, gradient, first, second, rate, final_rate, low, high, lead, tail] : parameters) {
         const auto width = value.shape(1);
-        for (const Rows* rows : {&value, &gradient, &first, &second})
-            if (static_cast<int64_t>(rows->shape(0)) != n || rows->shape(1) != width)
-                throw std::invalid_argument("adam: the arrays of a group differ in shape");
+        const auto differs = [&](const auto& rows) {
+            return static_cast<int64_t>(rows.shape(0)) != n || rows.shape(1) != width;
+        };
+        if (differs(value) || differs(gradient) || differs(first) || differs(second))
+            throw std::invalid_argument("adam: the arrays of a group differ in shape");
         if (width > adam::kMaxWidth) throw std::invalid_argument("adam: more than 48 values a splat");
         groups.push_back({value.data(), gradient.data(), first.data(), second.data(), static_cast<int>(width), rate,
                           final_rate, low, high, lead, tail, {}});

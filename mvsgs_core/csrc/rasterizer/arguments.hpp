@@ -1,4 +1,4 @@
-// What Python hands over, as the kernels take it. Arrays come in as they lie in memory; nothing is copied.
+// What Python hands over, as the kernels take it. What is written into is never a copy.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -8,6 +8,7 @@
 #include <nanobind/stl/tuple.h>
 #include <omp.h>
 
+#include "in_place.hpp"
 #include "rasterizer/frame.hpp"
 
 namespace splats {
@@ -17,7 +18,9 @@ namespace nb = nanobind;
 template <class T, class... Shape>
 using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu, Shape...>;
 using In = Array<const float>;
-using Out = Array<float>;
+template <class T>
+using Written = InPlace<T, nb::c_contig, nb::device::cpu>;
+using Out = Written<float>;
 
 // The fields of splats.py's Splats, in their order.
 using SplatArrays = std::array<In, 6>;

@@ -5,6 +5,7 @@
 
 #include <cstring>
 
+#include "caught.hpp"
 #include "rasterizer/shading.hpp"
 #include "rasterizer/tile_walk.hpp"
 
@@ -185,8 +186,11 @@ void bin(Frame& frame, const Parameters& parameters, float* radii, int threads) 
     frame.depth_keys.resize(count);
     if (frame.chunk_pairs.size() < chunks) frame.chunk_pairs.resize(chunks);
     int64_t refused = 0;
+    Caught caught;  // pairs take what memory the view asks for
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) reduction(+ : refused)
-    for (size_t chunk = 0; chunk < chunks; ++chunk) fill_chunk(frame, parameters, chunk, radii, refused);
+    for (size_t chunk = 0; chunk < chunks; ++chunk)
+        caught([&] { fill_chunk(frame, parameters, chunk, radii, refused); });
+    caught.rethrow();
     frame.refused = refused;
     join_chunks(frame, count, chunks, threads);
     const size_t seen = gather_seen(frame, count);

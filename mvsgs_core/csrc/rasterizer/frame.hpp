@@ -56,8 +56,9 @@ class Buffer {
     T* resize(size_t count) {
         if (count > capacity_) {
             release();
-            capacity_ = count + count / 4 + 64;
-            data_ = static_cast<T*>(take_memory(capacity_ * sizeof(T)));
+            const size_t capacity = count + count / 4 + 64;
+            data_ = static_cast<T*>(take_memory(capacity * sizeof(T)));
+            capacity_ = capacity;  // only now: the memory may not be there
         }
         return data_;
     }

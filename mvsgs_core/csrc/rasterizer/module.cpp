@@ -71,7 +71,7 @@ std::unique_ptr<Pass> forward(nb::handle settings, Array<const double> pose, con
 // on_splats: of the fields of Splats. Returns how many splats had a gradient that is not finite: theirs are 0.
 int64_t backward(Pass& pass, const SplatArrays& splats, In color, In depth, In opacity, In on_color,
                  std::optional<In> on_depth, std::optional<In> on_opacity, const std::array<Out, 6>& on_splats,
-                 Out on_means2d, Array<double> on_pose) {
+                 Out on_means2d, Written<double> on_pose) {
     Frame& frame = *pass.frame;
     const Parameters p = parameters(frame, splats);
     const auto& [means, log_scales, quaternions, opacity_logits, sh, betas] = on_splats;
@@ -102,9 +102,9 @@ using Moved = std::tuple<int, Out, Out, float, float, float, float, int, float>;
 // are not finite: those are left as they were.
 std::tuple<int64_t, int64_t> backward_step(Pass& pass, const std::array<Out, 6>& values, In color, In depth, In opacity,
                                            In on_color, std::optional<In> on_depth, std::optional<In> on_opacity,
-                                           const std::vector<Moved>& moved, Array<int32_t> ages,
+                                           const std::vector<Moved>& moved, Written<int32_t> ages,
                                            const std::tuple<float, float, float>& constants, int decay_steps,
-                                           Out means2d_gradient, Out means2d_views, Array<double> on_pose) {
+                                           Out means2d_gradient, Out means2d_views, Written<double> on_pose) {
     Frame& frame = *pass.frame;
     const auto& [means, log_scales, quaternions, opacity_logits, sh, betas] = values;
     const Parameters p{means.data(), log_scales.data(), quaternions.data(), opacity_logits.data(), sh.data(), betas.data(),
