@@ -24,6 +24,7 @@ from rich.progress import DownloadColumn, Progress, TransferSpeedColumn
 from .cache_folder import cache_folder
 
 _BLOCK = 1 << 20  # bytes
+_HEAD = 512  # bytes that tell what a file is
 
 
 @dataclass(frozen=True)
@@ -137,10 +138,18 @@ def checksum(file: Path) -> str:
     return digest.hexdigest()
 
 
+def is_web_page(file: Path) -> bool:
+    """Whether a file is HTML or XML: what a download gives where the link leads to a question, not to the weights."""
+    with file.open("rb") as data:
+        return data.read(_HEAD).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+
+
 def check(file: Path) -> str:
     """Says which registered weights a file is. Raises FileNotFoundError, or ValueError if it is none of them."""
     if not file.is_file():
         raise FileNotFoundError(f"there is no file {file}: python -m mvsgs_core.weights list shows what there is")
+    if is_web_page(file):
+        raise ValueError(f"{file}: a web page, no weights, as comes where a link asks something first: use a browser")
     digest = checksum(file)
     for weights in REGISTRY.values():
         if weights.sha256 == digest:

@@ -233,6 +233,10 @@ def test_files_that_come_by_hand_say_where_from(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setenv("MVSGS_WEIGHTS", str(tmp_path / "given"))
     (tmp_path / "given" / "droid.pth").write_bytes(b"x")
     assert weights.find("droid") == tmp_path / "given" / "droid.pth"
+    assert "named as droid" in weights.check(tmp_path / "given" / "droid.pth")
+    (tmp_path / "given" / "droid.pth").write_bytes(b"\n<html>Google Drive - Virus scan warning</html>")
+    with pytest.raises(ValueError, match="a web page, no weights"):
+        weights.check(tmp_path / "given" / "droid.pth")
 
 
 def test_published_files_are_recognized_and_a_truncated_one_is_not(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import pickle
+import re
 import sys
 import types
 from pathlib import Path
@@ -36,9 +38,13 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
     file = tmp_path / "w.pth"
     with pytest.raises(FileNotFoundError, match=r"w\.pth"):
         checkpoints.read(file)
-    torch.save({"weight": torch.zeros(2)}, file)
-    with pytest.raises(ValueError, match="has no 'model'"):
+    torch.save({"epoch": 3, "nets": {"weight": torch.zeros(2)}}, file)
+    with pytest.raises(ValueError, match=r"holds no tensors, .*under state_dict, model, .*its keys: 'epoch', 'nets'"):
         checkpoints.read(file, inside="model")
+    torch.save([torch.zeros(2)], file)
+    with pytest.raises(ValueError, match="holds a list, no state dict"):
+        checkpoints.read(file)
+    torch.save({"weight": torch.zeros(2)}, file)
     with pytest.raises(ValueError, match="does not fit Linear"):
         checkpoints.load(nn.Linear(2, 3), checkpoints.read(file), file)
     whole = file.read_bytes()
@@ -73,11 +79,68 @@ def test_a_pickled_configuration_is_left_out_and_nothing_of_it_runs(
 def test_what_cannot_be_left_out_is_refused_with_a_way_out(tmp_path: Path) -> None:
     file = tmp_path / "w.pth"
     torch.save({"state_dict": {"a": torch.zeros(1)}, "config": _Settings(a=1)}, file)
-    with pytest.raises(ValueError, match=r"not executed.*save its state dict alone"):
+    with pytest.raises(ValueError, match=r"not executed \(.*_Settings\).*weights_only=False\), NEW_FILE"):
         checkpoints.read(file)
+    with pytest.raises(ValueError, match=r"not executed.*save its state dict alone") as refusal:
+        checkpoints.read(file, inside="state_dict")
+    advice = re.search(r"torch\.save\(.*NEW_FILE\)", str(refusal.value))
+    assert advice is not None
+    new = tmp_path / "new.pth"
+    eval(advice[0], {"torch": torch, "FILE": file, "NEW_FILE": new})  # what follows it is taken
+    assert checkpoints.read(new, inside="state_dict").keys() == {"a"}
+
+
+@pytest.mark.parametrize("key", [None, "state_dict", "model", "model_state_dict"])
+@pytest.mark.parametrize("inside", [None, "state_dict"])
+def test_a_state_dict_is_found_where_others_keep_it(key: str | None, inside: str | None, tmp_path: Path) -> None:
+    state = {"module.a": torch.ones(1), "module.spiral": torch.ones(1, dtype=torch.complex64)}
+    torch.save(state if key is None else {key: state, "optimizer": {}}, tmp_path / "w.pth")
+    assert checkpoints.read(tmp_path / "w.pth", inside=inside).keys() == {"a"}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"<!DOCTYPE html><html>Virus scan warning</html>", "is a web page"),
+        (b"\xef\xbb\xbf\r\n<html>", "is a web page"),
+        (b'{"error": "access denied"}', "truncated or no PyTorch checkpoint"),
+        (pickle.dumps(Path("x")), "truncated or no PyTorch checkpoint"),
+        (b"\0" * 1000, "truncated or no PyTorch checkpoint"),
+    ],
+)
+def test_what_a_failed_download_leaves_is_not_taken_for_a_pickle(content: bytes, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "w.pth"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=said) as refusal:
+        checkpoints.read(file)
+    assert "weights_only=False" not in str(refusal.value)
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    state = {"weight": torch.ones(3, 2), "bias": torch.tensor([0.0, torch.nan, 1.0])}
+    with pytest.raises(ValueError, match=r"w\.pth has values that are not finite in 1 of 2 tensors, as in bias"):
+        checkpoints.load(nn.Linear(2, 3), state, tmp_path / "w.pth")
+
+
+def test_a_file_is_checked_without_a_network(tmp_path: Path) -> None:
+    file = str(tmp_path / "w.pth")
+
+    def build() -> nn.Module:
+        assert torch.get_default_device().type == "meta", "its tensors take no memory"
+        return nn.BatchNorm2d(3)
+
+    torch.save({"model": nn.BatchNorm2d(3).state_dict()}, file)
+    checkpoints.check(build, "itermvs", file, inside="model")
+    torch.save({"model": nn.BatchNorm2d(3).state_dict()}, file, _use_new_zipfile_serialization=False)
+    checkpoints.check(build, "itermvs", file, inside="model")
+    torch.save({"model": nn.BatchNorm2d(4).state_dict()}, file)
+    with pytest.raises(ValueError, match=r"does not fit BatchNorm2d: .*size mismatch.*fetch itermvs"):
+        checkpoints.check(build, "itermvs", file, inside="model")
+    checkpoints.check(build, "itermvs", checkpoints.RANDOM)
 
 
 def test_droid_rows() -> None:
+    assert checkpoints.droid_rows({"update.delta.2.bias": torch.tensor(0.0)})["update.delta.2.bias"].ndim == 0
     state = {"update.weight.2.weight": torch.zeros(3, 128, 3, 3), "update.delta.2.bias": torch.zeros(3)}
     state["fnet.conv1.bias"] = torch.zeros(32)
     assert {k: len(v) for k, v in checkpoints.droid_rows(state).items()} == {
