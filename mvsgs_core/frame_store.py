@@ -102,6 +102,9 @@ class FrameStore:
             self._file.close()
         self._file, self._stored, self._end = None, {}, 0
 
+    def __del__(self) -> None:
+        self.close()
+
     def _write(self, data: bytes, offset: int) -> None:
         assert self._file is not None
         rest = memoryview(data)

@@ -9,7 +9,7 @@ from mvsgs_core.droid.proximity import by_proximity
 from mvsgs_core.droid.video import Video
 from mvsgs_core.stats import Stats
 
-_FACTORS_PER_KEYFRAME = 16
+FACTORS_PER_KEYFRAME = 16  # each with a hidden state of its own while the graph is adjusted
 _MIN_KEYFRAMES = 3
 
 
@@ -36,7 +36,7 @@ def adjust_globally(
         nms=constants.backend_nms,
         threshold=constants.backend_threshold,
         beta=constants.beta,
-        limit=_FACTORS_PER_KEYFRAME * len(video),
+        limit=FACTORS_PER_KEYFRAME * len(video),
     )
     stats.count("global edges", graph.add(near))
     for _ in range(steps):
@@ -47,4 +47,4 @@ def adjust_globally(
             stats.warn(f"global bundle adjustment failed: {solution.failure}")
 
 
-__all__ = ["adjust_globally"]
+__all__ = ["FACTORS_PER_KEYFRAME", "adjust_globally"]

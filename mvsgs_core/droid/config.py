@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
@@ -9,9 +10,26 @@ Constant = int | float | tuple[int, ...]
 CorrelationKind = Literal["volume", "on_the_fly"]  # fast, or of little memory
 
 
+LEAST_SIDE = 64  # pixels of the image that the networks see: 8 cells, as the correlation pyramid halves three times
+_LEAST: dict[str, int] = {  # where it is not 0
+    "stride": 1,
+    "warmup": 2,  # two keyframes make an edge
+    "frontend_window": 1,
+    "frontend_radius": 1,  # at 0 a keyframe would be joined to itself
+    "max_factors": 1,
+    "max_age": 1,
+    "first_updates": 1,
+    "backend_radius": 1,
+    "backend_steps": 1,
+}
+
+
 @dataclass(frozen=True)
 class Constants:
-    """The defaults are those of the `demo` preset. All thresholds are in pixels of the 1/8 map."""
+    """The defaults are those of the `demo` preset. All thresholds are in pixels of the 1/8 map.
+
+    Raises ValueError for values that DROID-SLAM cannot run with.
+    """
 
     stride: int = 3  # frames: every which one may become a keyframe
     filter_threshold: float = 2.4  # mean revision of the flow that lets a frame pass the motion filter
@@ -31,6 +49,14 @@ class Constants:
     backend_nms: int = 3  # as frontend_nms
     backend_steps: tuple[int, ...] = (7, 12)  # updates of each global bundle adjustment at the end
     backend_every: int = 0  # keyframes between global bundle adjustments on the way; 0: only at the end
+
+    def __post_init__(self) -> None:
+        for name, given in vars(self).items():
+            least = _LEAST.get(name, 0)
+            if not all(least <= value < math.inf for value in (given if isinstance(given, tuple) else (given,))):
+                raise ValueError(f"constants.{name}={given}: must be {least} or more")
+        if self.beta > 1:
+            raise ValueError(f"constants.beta={self.beta}: is a fraction, 0 to 1")
 
 
 PRESETS = {
@@ -63,7 +89,7 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class DroidConfig:
-    """Raises ValueError for constants that DROID-SLAM does not have."""
+    """Raises ValueError for constants that DROID-SLAM does not have or cannot run with, and for too small an area."""
 
     weights: str | None = None  # file; null: droid.pth in $MVSGS_WEIGHTS or the cache; random: noise, for a trial
     preset: Literal["demo", "tum", "replica"] = "demo"  # the setting that the constants were published for
@@ -85,6 +111,9 @@ class DroidConfig:
             kind = type(defaults[name])
             if type(value) is not kind and not (kind is float and type(value) is int):
                 raise ValueError(f"constants.{name}={value}: must be of the kind of {defaults[name]}")
+        _ = self.chosen  # raises for values out of range
+        if self.area < LEAST_SIDE**2:
+            raise ValueError(f"area={self.area}: must be {LEAST_SIDE**2} or more, for {LEAST_SIDE} pixels each way")
 
     @property
     def chosen(self) -> Constants:
@@ -92,4 +121,4 @@ class DroidConfig:
         return replace(PRESETS[self.preset], **self.constants)  # type: ignore[arg-type]
 
 
-__all__ = ["PRESETS", "Constants", "CorrelationKind", "DroidConfig"]
+__all__ = ["LEAST_SIDE", "PRESETS", "Constants", "CorrelationKind", "DroidConfig"]

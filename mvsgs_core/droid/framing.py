@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from mvsgs_core.camera import resize_image, scale_intrinsics
+from mvsgs_core.droid.config import LEAST_SIDE
 from mvsgs_core.networks.droid import STRIDE
 
-_MIN_CELLS = 8  # each way: the correlation pyramid halves the map three times
+_MIN_CELLS = LEAST_SIDE // STRIDE  # each way
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,12 @@ class Framing:
         h, w = self.grid
         return np.ascontiguousarray(resize_image(image, self.resized)[: STRIDE * h, : STRIDE * w])
 
-    def intrinsics(self, intrinsics: np.ndarray) -> np.ndarray:
-        """(4,) in cells: the receptive field of cell k is centered at pixel 8k, so there is no half-pixel term."""
-        return scale_intrinsics(intrinsics, self.source, self.resized) / STRIDE
+    def intrinsics(self, intrinsics: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
+        """(4,) in cells: the receptive field of cell k is centered at pixel 8k, so there is no half-pixel term.
+
+        size: of the image that they are of, where that is not `source`.
+        """
+        return scale_intrinsics(intrinsics, size or self.source, self.resized) / STRIDE
 
     def whole_view(self, cells: np.ndarray) -> np.ndarray:
         """An (h, w) map of the cells, sampled anew so that h by w equal cells cover the whole source image."""

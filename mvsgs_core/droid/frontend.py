@@ -14,7 +14,7 @@ _START_UPDATES = 8  # with edges to neighbors, and again with edges by proximity
 _START_REACH, _START_RADIUS, _START_NMS, _START_BETA = 3, 2, 2, 0.25
 _KEPT_FROM_START = 4  # keyframes before the end of the start whose edges stay active
 _RECENT = 5  # newest keyframes that get new edges
-_MIN_KEYFRAMES = 4  # of a forced start
+MIN_KEYFRAMES = 4  # of a forced start
 
 
 class Frontend:
@@ -45,7 +45,7 @@ class Frontend:
 
     def force_start(self) -> bool:
         """The stream has ended before the warm-up did. Returns False if there are too few keyframes."""
-        if not self.started and len(self.video) >= _MIN_KEYFRAMES:
+        if not self.started and len(self.video) >= MIN_KEYFRAMES:
             self._start()
         return self.started
 

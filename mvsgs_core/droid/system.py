@@ -12,16 +12,17 @@ import torch
 
 from mvsgs_core import geometry
 from mvsgs_core.devices import torch_device
-from mvsgs_core.droid.backend import adjust_globally
+from mvsgs_core.droid.backend import FACTORS_PER_KEYFRAME, adjust_globally
 from mvsgs_core.droid.confidence import Coarse, coarse_map, consistent_fraction
 from mvsgs_core.droid.config import DroidConfig
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.framing import Framing
-from mvsgs_core.droid.frontend import Frontend
-from mvsgs_core.droid.motion_filter import MotionFilter
+from mvsgs_core.droid.frontend import MIN_KEYFRAMES, Frontend
+from mvsgs_core.droid.motion_filter import Encoded, MotionFilter
 from mvsgs_core.droid.networks import RANDOM, Networks, load
 from mvsgs_core.droid.trajectory_filler import StoredFrame, fill
 from mvsgs_core.droid.video import Video, VideoFrame
+from mvsgs_core.frame_store import FrameStore
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.networks.droid import DroidNet
 from mvsgs_core.stats import Stats
@@ -31,6 +32,8 @@ from mvsgs_core.tracking.publish import Publisher, Update
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
 _DEGENERATE = 0.05  # fraction of cells that agree with a neighbor, below which a keyframe's depth is none
+_MANY = 512  # keyframes beyond which is said what they cost: the buffer of the published system
+_EDGE = 128  # bytes a cell that an edge of the global graph takes beside its hidden state, about
 
 
 class DroidSlam:
@@ -46,6 +49,7 @@ class DroidSlam:
             self.stats.warn("DROID-SLAM runs on random weights: its poses and depths are noise")
         self.framing: Framing | None = None
         self.frames: list[StoredFrame] = []
+        self._store = FrameStore()  # of their images, until the end
         self._states: list[TrackingState] = []
         self.nothing = "no frame came"  # why there is no pose at all, after `finish`; empty where there is one
         self._trajectory = Trajectory.empty()
@@ -55,9 +59,12 @@ class DroidSlam:
         if self.framing is None:
             self._set_up(image.shape[0], image.shape[1], intrinsics)
         assert self.framing is not None
+        cells = self.framing.intrinsics(intrinsics, (image.shape[0], image.shape[1]))
+        if not np.allclose(cells, self.video.intrinsics, rtol=1e-3):
+            self.stats.warn("the intrinsics change between frames: the tracker goes on with those of the first")
         with self.stats.time("image"):
             small = self.framing.image(image)
-            self.frames.append(StoredFrame.of(index, timestamp, small))
+            self._keep(StoredFrame(index, timestamp, self._store), small)
         self.stats.count("frames")
         self._states.append(TrackingState.TRACKED if self.frontend.started else TrackingState.NOT_INITIALIZED)
         if (len(self.frames) - 1) % self.constants.stride:
@@ -72,6 +79,8 @@ class DroidSlam:
         self.video.frames.append(
             VideoFrame(index, timestamp, pose, np.full(self.framing.grid, inverse_depth), *encoded)
         )
+        if len(self.video) > _MANY:
+            self.stats.warn(_told_memory(encoded))
         kept = self.frontend.advance()
         every = self.constants.backend_every
         if kept and every and self.frontend.started and len(self.video) % every == 0:
@@ -95,12 +104,10 @@ class DroidSlam:
         if not self.frontend.started and self.frontend.force_start():
             self.stats.warn("the start was forced at the end of the stream, on fewer keyframes than the warm-up takes")
         if not self.frontend.started:
-            self.nothing = (
-                f"tracking never started: too little motion: {len(self.video)} of {len(self.frames)} frames moved by "
-                f"{self.constants.filter_threshold:g} cells or more (filter_threshold) since the one before"
-            )
+            self.nothing = f"tracking never started: {self._why_not_started()}"
             self.stats.warn(self.nothing)
             self._trajectory = self._collect({})
+            self._store.close()
             yield Update(TrackingState.NOT_INITIALIZED)
             return
         self.nothing = ""
@@ -110,6 +117,7 @@ class DroidSlam:
         self.stats.count(HELD_OUT, sum(is_held_out(index) for index in self.video.keyframes))
         if self.networks.not_finite:
             self.stats.warn(f"{self.networks.not_finite} network outputs were not finite and were ignored")
+        self._store.close()
         yield Update(TrackingState.TRACKED, (), self.publisher.corrections(True))
 
     def trajectory(self) -> Trajectory:
@@ -124,6 +132,28 @@ class DroidSlam:
         assert self.framing is not None
         position = [frame.index for frame in self.video.frames].index(index)
         return coarse_map(self.video, self.graph, position, self.framing)
+
+    def _keep(self, frame: StoredFrame, image: np.ndarray) -> None:
+        """A disk that is full costs poses of frames between keyframes, not the run."""
+        self.frames.append(frame)
+        try:
+            frame.put(image)
+        except OSError as error:
+            self.stats.refuse(
+                "frames", 1, f"frames that the disk of TMPDIR had no room for get no pose ({error.strerror or error})"
+            )
+
+    def _why_not_started(self) -> str:
+        constants = self.constants
+        tried = len(range(0, len(self.frames), constants.stride))
+        of = f"{tried} frames" + (f" (of {len(self.frames)}, stride={constants.stride})" if constants.stride > 1 else "")
+        if tried < MIN_KEYFRAMES:
+            return f"too few frames: {of} may become keyframes, of which a start takes {MIN_KEYFRAMES}"
+        wrong = self.networks.not_finite
+        return (f"{wrong} network outputs were not finite, which is taken for no motion; " if wrong else "") + (
+            f"too little motion: {len(self.video)} of {of} moved by {constants.filter_threshold:g} cells or more "
+            f"(filter_threshold) since the one before, of which a start takes {MIN_KEYFRAMES}"
+        )
 
     def _set_up(self, height: int, width: int, intrinsics: np.ndarray) -> None:
         config = self.config
@@ -162,9 +192,9 @@ class DroidSlam:
                 adjust_globally(self.video, self.networks, self.constants, count, kind, self.threads, self.stats)
 
     def _fill(self) -> dict[int, np.ndarray]:
-        """cam_from_world of every frame."""
+        """cam_from_world of every frame whose image is there."""
         own = self.video.keyframes
-        others = [frame for frame in self.frames if frame.index not in own]
+        others = [frame for frame in self.frames if frame.index not in own and frame.is_there]
         with self.stats.time("frames between keyframes"):
             found = fill(self.video, self.networks, others, self.config.correlation, self.threads, self.stats)
         poses = {frame.index: pose for frame, pose in zip(others, found)}
@@ -176,7 +206,8 @@ class DroidSlam:
         keyframes: dict[int, VideoFrame] = {}
         if cam_from_world:
             keyframes = self.video.keyframes
-            poses = geometry.inverse(np.stack([cam_from_world[frame.index] for frame in self.frames]))
+            missing = np.full((4, 4), np.nan)
+            poses = geometry.inverse(np.stack([cam_from_world.get(frame.index, missing) for frame in self.frames]))
             states[states == TrackingState.NOT_INITIALIZED] = TrackingState.TRACKED
             unknown = ~np.isfinite(poses).all(axis=(1, 2))
             poses[unknown], states[unknown] = np.nan, TrackingState.LOST
@@ -188,6 +219,16 @@ class DroidSlam:
             state=states,
             segment=np.where(np.isnan(poses[:, 0, 0]), -1, 0).astype(np.int32),
         )
+
+
+def _told_memory(keyframe: Encoded) -> str:
+    each = sum(tensor.nbytes for tensor in keyframe)
+    edge = keyframe.hidden.nbytes + _EDGE * keyframe.hidden[0].numel()
+    return (
+        f"more than {_MANY} keyframes: DROID-SLAM keeps {each / 1e6:.1f} MB of each in memory, and the global bundle "
+        f"adjustment takes up to {FACTORS_PER_KEYFRAME * edge / 1e6:.0f} MB each besides; fewer are kept with a larger "
+        "constants.keyframe_threshold, and tracker=dense has a bound"
+    )
 
 
 __all__ = ["DroidSlam"]

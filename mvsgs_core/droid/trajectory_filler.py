@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from mvsgs_core import geometry
@@ -13,6 +12,7 @@ from mvsgs_core.droid.config import CorrelationKind
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.networks import Networks
 from mvsgs_core.droid.video import Video, VideoFrame
+from mvsgs_core.frame_store import FrameStore
 from mvsgs_core.stats import Stats
 
 BATCH = 16  # frames solved together
@@ -21,21 +21,26 @@ _UPDATES = 6  # motion only
 
 @dataclass(frozen=True)
 class StoredFrame:
-    """A frame as the networks see it, losslessly packed: the whole stream is needed again at the end."""
+    """A frame of the stream, whose image as the networks see it lies in a file: all are needed again at the end."""
 
     index: int
     timestamp: float  # seconds
-    packed: np.ndarray
+    store: FrameStore
 
-    @staticmethod
-    def of(index: int, timestamp: float, image: np.ndarray) -> StoredFrame:
-        """From an image (8h, 8w, 3) uint8."""
-        _, packed = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        return StoredFrame(index, timestamp, packed)
+    def put(self, image: np.ndarray) -> None:
+        """Stores its image (8h, 8w, 3) uint8. Raises OSError where the disk takes no more."""
+        self.store.put(self.index, {"image": image})
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the disk took it."""
+        return self.index in self.store
 
     @property
     def image(self) -> np.ndarray:
-        return np.asarray(cv2.imdecode(self.packed, cv2.IMREAD_UNCHANGED))
+        image = self.store.get(self.index, "image")
+        assert image is not None, "the disk did not take it"
+        return image
 
 
 def fill(

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from mvsgs_core import geometry, weights
-from mvsgs_core.droid.config import PRESETS, DroidConfig
+from mvsgs_core.droid.config import PRESETS, Constant, DroidConfig
 from mvsgs_core.droid.factor_graph import FactorGraph
 from mvsgs_core.droid.framing import Framing
 from mvsgs_core.droid.motion_filter import MotionFilter
@@ -18,6 +18,7 @@ from mvsgs_core.droid.networks import Networks, load, random_net
 from mvsgs_core.droid.proximity import by_proximity, neighborhood
 from mvsgs_core.droid.trajectory_filler import StoredFrame, between, fill
 from mvsgs_core.droid.video import Video, VideoFrame
+from mvsgs_core.frame_store import FrameStore
 from mvsgs_core.networks.droid import DroidNet, Update
 from mvsgs_core.stats import Stats
 from tests.support.golden import folder, rule_weights
@@ -78,6 +79,32 @@ def test_presets() -> None:
     for name, wrong in (("warmup", 2.5), ("stride", True), ("backend_steps", 3)):
         with pytest.raises(ValueError, match=rf"constants\.{name}="):
             DroidConfig(constants={name: wrong})
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "said"),
+    [
+        ("stride", 0, "1 or more"),
+        ("warmup", 1, "2 or more"),
+        ("frontend_radius", 0, "1 or more"),
+        ("backend_radius", 0, "1 or more"),
+        ("backend_nms", -1, "0 or more"),
+        ("backend_steps", (7, 0), "1 or more"),
+        ("backend_every", -1, "0 or more"),
+        ("beta", 1.5, "0 to 1"),
+        ("filter_threshold", float("nan"), "0 or more"),
+        ("keyframe_threshold", float("inf"), "0 or more"),
+    ],
+)
+def test_constants_that_cannot_run_are_refused(name: str, wrong: Constant, said: str) -> None:
+    with pytest.raises(ValueError, match=rf"constants\.{name}=.*{said}"):
+        DroidConfig(constants={name: wrong})
+
+
+def test_an_area_too_small_for_any_image_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"area=4095: must be 4096 or more"):
+        DroidConfig(area=64 * 64 - 1)
+    assert Framing.of(480, 480, DroidConfig(area=64 * 64).area).grid == (8, 8)
 
 
 def near(made: Video, **options: float) -> set[tuple[int, int]]:
@@ -219,7 +246,8 @@ def test_a_frame_whose_adjustment_fails_has_no_pose(monkeypatch: pytest.MonkeyPa
     nets = Networks(random_net(), torch.device("cpu"))
     made = video([0.0, 0.4, 0.8])
     del made.frames[1]
-    frame = StoredFrame.of(1, 0.1, np.zeros((64, 80, 3), np.uint8))
+    frame = StoredFrame(1, 0.1, FrameStore())
+    frame.put(np.zeros((64, 80, 3), np.uint8))
     poses = fill(made, nets, [frame], "volume", 1, stats)
     assert poses.shape == (1, 4, 4)
     assert np.isnan(poses).all()
@@ -251,7 +279,11 @@ def test_poses_between_keyframes_lie_on_the_screw_motion() -> None:
 
 def test_frames_are_stored_without_loss() -> None:
     image = np.random.default_rng(0).integers(0, 255, (16, 24, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(StoredFrame.of(0, 0.0, image).image, image)
+    frame = StoredFrame(0, 0.0, FrameStore())
+    assert not frame.is_there
+    frame.put(image)
+    assert frame.is_there
+    np.testing.assert_array_equal(frame.image, image)
 
 
 def test_an_official_file_loads_and_a_missing_one_says_what_to_do(

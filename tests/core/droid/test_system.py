@@ -7,13 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from mvsgs_core import geometry
+from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.droid.config import DroidConfig
 from mvsgs_core.droid.system import DroidSlam
+from mvsgs_core.networks.droid import Update as Revised
 from mvsgs_core.tracking.tracker import Update
 from mvsgs_core.trajectory import TrackingState, Trajectory
 from tests.support import droid_oracle as oracle
+from tests.support.full_disk import full_after
 
 pytestmark = pytest.mark.slow
 
@@ -152,3 +156,75 @@ def test_the_global_adjustment_on_the_way_rescales_consistently() -> None:
     list(system.finish())
     distance, _ = errors(system.trajectory())
     assert distance[system.trajectory().keyframe].max() < 0.008
+
+
+def started(constants: dict[str, object], frames: int, net: oracle.Oracle | None = None) -> DroidSlam:
+    """After the first frames of the path, without what comes at the end."""
+    config = DroidConfig(constants=SMALL | constants, area=HEIGHT * WIDTH, device="cpu")  # type: ignore[arg-type]
+    system = DroidSlam(config, net=net or oracle.Oracle(oracle.path(COUNT), INTRINSICS / 8))
+    for n in range(frames):
+        system.add(n, n / 30, oracle.image(n, HEIGHT, WIDTH), INTRINSICS)
+    return system
+
+
+@pytest.mark.parametrize(
+    ("constants", "frames", "said"),
+    [
+        ({"stride": 4}, 9, "too few frames: 3 frames (of 9, stride=4) may become keyframes, of which a start takes 4"),
+        ({"stride": 1}, 2, "too few frames: 2 frames may become keyframes"),
+        ({"stride": 2, "filter_threshold": 50}, 9, "too little motion: 1 of 5 frames (of 9, stride=2) moved by 50 cells"),
+    ],
+)
+def test_what_never_started_says_what_it_lacked(constants: dict[str, object], frames: int, said: str) -> None:
+    system = started(constants, frames)
+    list(system.finish())
+    assert said in system.nothing
+    assert said in "".join(system.stats.warnings)
+
+
+class Void(oracle.Oracle):
+    """Its revisions are not finite."""
+
+    def _update(self, *given: torch.Tensor, **named: torch.Tensor) -> Revised:
+        update = super()._update(*given, **named)
+        return update._replace(delta=torch.full_like(update.delta, torch.nan))
+
+
+def test_a_network_that_gives_nothing_finite_is_named() -> None:
+    system = started({"stride": 1}, 6, Void(oracle.path(COUNT), INTRINSICS / 8))
+    list(system.finish())
+    assert "5 network outputs were not finite, which is taken for no motion" in system.nothing
+
+
+def test_intrinsics_that_change_are_warned_of() -> None:
+    system = started({}, 1)
+    half = np.ascontiguousarray(oracle.image(1, HEIGHT, WIDTH)[::2, ::2])
+    system.add(1, 1 / 30, half, scale_intrinsics(INTRINSICS, (HEIGHT, WIDTH), half.shape[:2]))
+    assert not system.stats.warnings, "the same lens at another size"
+    system.add(3, 3 / 30, oracle.image(3, HEIGHT, WIDTH), INTRINSICS * [2, 2, 1, 1])
+    assert any("the intrinsics change between frames" in warning for warning in system.stats.warnings)
+
+
+def test_frames_lie_in_a_file_and_a_full_disk_costs_their_poses_alone() -> None:
+    config = replace(CONFIG, constants=SMALL | {"warmup": 4, "backend_steps": (1,)})
+    system = DroidSlam(config, net=oracle.Oracle(oracle.path(COUNT), INTRINSICS / 8))
+    with full_after(0):
+        system.add(0, 0.0, oracle.image(0, HEIGHT, WIDTH), INTRINSICS)
+        system.add(1, 1 / 30, oracle.image(1, HEIGHT, WIDTH), INTRINSICS)
+    for n in range(2, 9):
+        system.add(n, n / 30, oracle.image(n, HEIGHT, WIDTH), INTRINSICS)
+    assert [frame.is_there for frame in system.frames] == [False] * 2 + [True] * 7
+    list(system.finish())
+    trajectory = system.trajectory()
+    assert trajectory.keyframe[0], "what the networks made of it was there"
+    assert (trajectory.state == TrackingState.LOST).nonzero()[0].tolist() == [1]
+    assert any("frames that the disk of TMPDIR had no room for" in warning for warning in system.stats.warnings)
+
+
+def test_more_keyframes_than_the_published_buffer_are_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvsgs_core.droid.system._MANY", 2)
+    system = started({"stride": 1, "filter_threshold": 0.01}, 3)
+    cells = HEIGHT * WIDTH / 64
+    (warning,) = system.stats.warnings
+    assert f"keeps {3 * 128 * 4 * cells / 1e6:.1f} MB of each in memory" in warning
+    assert len(system.video) == 3
