@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from msgs import Frame, Keyframe
-from mvsgs_core import geometry, weights
+from mvsgs_core import geometry
+from mvsgs_core.droid import networks
 from mvsgs_core.droid.config import DroidConfig
 from mvsgs_core.droid.system import DroidSlam
-from mvsgs_core.networks.checkpoints import RANDOM
 from mvsgs_core.tracking.publish import Update
 from nodes.tracking import TrackerNode, warn_of_guessed_focal
 
@@ -25,8 +25,7 @@ class DroidTracker(TrackerNode):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        if config.weights != RANDOM:
-            weights.find("droid", config.weights)
+        networks.check(config.weights)
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mvsgs_core import weights
-from mvsgs_core.fusion.learned import LearnedOnlineFusion, VFuseConfig
+from mvsgs_core.fusion.learned import LearnedOnlineFusion, VFuseConfig, check_weights
 from mvsgs_core.networks.checkpoints import RANDOM
 from nodes.depth_fusion import FusionNode
 
@@ -22,8 +21,7 @@ class LearnedFusion(FusionNode):
     @classmethod
     def check(cls, config: Config) -> None:
         super().check(config)
-        if config.weights != RANDOM:
-            weights.find("vfuse", config.weights)
+        check_weights(config.weights)
 
     def _make_core(self) -> LearnedOnlineFusion:
         if self.config.weights == RANDOM:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mvsgs_core import weights
-from mvsgs_core.mvs.learned import NETWORKS, LearnedStereo, LearnedStereoConfig
+from msgs import Depth
+from mvsgs_core.mvs.cascade import CascadeDepth
+from mvsgs_core.mvs.learned import NOT_FINITE, LearnedStereo, LearnedStereoConfig, check_network
 from mvsgs_core.networks.checkpoints import RANDOM
 from nodes.mvs import StereoNode
 
@@ -21,11 +22,15 @@ class LearnedMvs(StereoNode):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        if config.weights != RANDOM:
-            weights.find(NETWORKS[config.network].weights, config.weights)
+        check_network(config.network, config.weights)
 
     def _make_core(self) -> LearnedStereo:
         c = self.config
         if c.weights == RANDOM:
             self.stats.warn(f"{c.network} runs untrained, with random weights: its depth is noise")
         return LearnedStereo(c)
+
+    def _message(self, found: CascadeDepth) -> Depth:
+        if wrong := found.result.counts.get(NOT_FINITE, 0.0):
+            self.stats.refuse("pixels", wrong, f"{NOT_FINITE} have none in the map")
+        return super()._message(found)

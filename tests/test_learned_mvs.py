@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from msgs import Depth, Keyframe
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.mvs.learned import calibrated
+from mvsgs_core.networks.itermvs import IterMvs
 from nodes.learned_mvs import LearnedMvs
 from tests.support.shared_data import shared
 
@@ -79,6 +82,34 @@ def test_keyframes_of_photographs_come_in_any_order() -> None:
     frames = list(open_dataset("synthetic", frames=8, size=(48, 64)))[::-1]
     found = _depths(config, [_keyframe(frame) for frame in frames])
     assert [depth.index for depth in found] == [frame.index for frame in frames]
+
+
+def test_keyframes_of_images_of_several_sizes_are_neighbors() -> None:
+    """Of one size in the cascade's eyes, of another in the network's, which enlarges none."""
+    config = LearnedMvs.Config(weights="random", network_area=128 * 160, area=48 * 64, device="cpu", threads=1)
+    sizes = ((96, 128), (192, 256))
+    frames = [list(open_dataset("synthetic", frames=6, size=size)) for size in sizes]
+    found = _depths(config, [_keyframe(frames[n % 2][n]) for n in range(6)])
+    assert [depth.depth.shape for depth in found] == [(48, 64)] * 6
+    assert all((depth.depth > 0).any() for depth in found)
+
+
+def test_what_a_network_gives_that_is_not_finite_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = LearnedMvs.Config(weights="random", network_area=64 * 64, area=64 * 64, device="cpu", threads=1)
+    whole = IterMvs.forward
+
+    def holed(net: IterMvs, *given: Any) -> Any:
+        found = whole(net, *given)
+        found.depth[:8, :4], found.confidence[-1, -2:] = torch.nan, torch.nan
+        return found
+
+    monkeypatch.setattr(IterMvs, "forward", holed)
+    node = LearnedMvs(config)
+    frames = list(open_dataset("synthetic", frames=3, size=(64, 64)))
+    depths = [d for f in frames for d in node.on_keyframe(_keyframe(f))] + list(node.on_end())
+    assert node.stats.counts["refused_pixels"] == 3 * (8 * 4 + 2)
+    assert any("no finite depth or confidence" in warning for warning in node.stats.warnings)
+    assert all(not d.depth[:8, :4].any() and np.isfinite(d.confidence).all() for d in depths)
 
 
 def test_missing_weights_say_what_to_fetch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

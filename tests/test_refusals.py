@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from launch import run_directory
@@ -76,6 +77,7 @@ def fill(folder: Path) -> None:
         (["photos", "dataset.stride=0"], "stride >= 1"),
         (["photos", "dataset.start=7"], "no frame left: the sequence has 3"),
         (["photos", "dataset.intrinsics=[1,2,3]"], "intrinsics is [fx, fy, cx, cy] in pixels of the original image"),
+        (["photos", "tracker=droid", "tracker.constants.stride=0"], "constants.stride=0: must be 1 or more"),
         (["photos", "mapper.iterations=many"], "mapper.iterations=many: must be int"),
         (["photos", "device=cuda:77"], "device=cuda:77: this machine has"),
         (["photos", "evaluator=of"], "evaluator has no choice 'of' (did you mean off?)"),
@@ -241,5 +243,9 @@ def test_a_network_needs_its_weights(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert answer in said("photos", choice)
     assert f"{weights}: weights of " in said("photos", choice, f"{weights}.weights=nothing.pth")
+    torch.save({"a": torch.zeros(1)}, tmp_path / "other.pth")
+    assert f"{weights}: other.pth does not fit " in said("photos", choice, f"{weights}.weights=other.pth")
+    (tmp_path / "page.pth").write_text("<!DOCTYPE html>")
+    assert f"{weights}: page.pth is a web page" in said("photos", choice, f"{weights}.weights=page.pth")
     slot = compose([choice, f"{weights}.weights=random"]).slots[weights]
     slot.node.check(slot.parameters)

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from mvsgs_core.droid.config import CorrelationKind
 from mvsgs_core.networks import checkpoints
+from mvsgs_core.networks.checkpoints import RANDOM
 from mvsgs_core.networks.correlation import CorrelationVolume, OnTheFlyCorrelation
 from mvsgs_core.networks.droid import DroidNet
 
-RANDOM = "random"  # instead of a file: what comes out is noise
 Correlation = CorrelationVolume | OnTheFlyCorrelation
 CORRELATIONS: dict[str, type[CorrelationVolume] | type[OnTheFlyCorrelation]] = {
     "volume": CorrelationVolume,
@@ -32,6 +32,11 @@ def load(file: str | None) -> DroidNet:
     net = DroidNet()
     checkpoints.load_registered(net, "droid", file, convert=checkpoints.droid_rows)
     return net
+
+
+def check(file: str | None) -> None:
+    """Raises what `load` would, before the network is needed."""
+    checkpoints.check(DroidNet, "droid", file, convert=checkpoints.droid_rows)
 
 
 def random_net(seed: int = 0) -> DroidNet:
@@ -128,4 +133,4 @@ class Networks:
         return Revision(after, delta.cpu().numpy(), weight.cpu().numpy(), damping)
 
 
-__all__ = ["CORRELATIONS", "RANDOM", "Correlation", "Networks", "Revision", "load", "random_net"]
+__all__ = ["CORRELATIONS", "RANDOM", "Correlation", "Networks", "Revision", "check", "load", "random_net"]

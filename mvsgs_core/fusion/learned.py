@@ -15,6 +15,7 @@ from mvsgs_core.fusion.keyframe_depth import KeyframeDepth
 from mvsgs_core.networks import checkpoints
 from mvsgs_core.networks.vfuse import FusionInput, VFuse, check_choices
 
+_INSIDE = "model_state_dict"  # key of the state dict in the published files
 _PERCENTILES, _MARGIN = (1.0, 99.0), 1.1  # of the known depths, for the range that the network normalizes by
 
 
@@ -27,6 +28,11 @@ class VFuseConfig(FusionConfig):
     confidence_mode: Literal["swr", "single", "pns", "pns_swr", "pkrn"] = "swr"  # see networks.vfuse_confidence
 
 
+def check_weights(file: str | None) -> None:
+    """Raises what `LearnedOnlineFusion` would for these weights, before it is made."""
+    checkpoints.check(VFuse, "vfuse", file, inside=_INSIDE)
+
+
 class LearnedOnlineFusion(OnlineFusion):
     """Raises ValueError for an unknown center or confidence mode, and what `checkpoints.make` raises."""
 
@@ -34,7 +40,7 @@ class LearnedOnlineFusion(OnlineFusion):
         super().__init__(replace(config, refine=False))
         check_choices(config.center, config.confidence_mode)
         self._learned = config
-        self._net = checkpoints.make(VFuse, "vfuse", config.weights, inside="model_state_dict")
+        self._net = checkpoints.make(VFuse, "vfuse", config.weights, inside=_INSIDE)
         self._net.to(torch_device(config.device))
 
     def _prepared(self, reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> KeyframeDepth:

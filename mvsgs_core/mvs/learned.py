@@ -20,6 +20,8 @@ from mvsgs_core.mvs.keyframe import StereoKeyframe
 from mvsgs_core.mvs.stereo import StereoDepth
 from mvsgs_core.networks import checkpoints, itermvs, mvsformer
 
+NOT_FINITE = "pixels that the network gave no finite depth or confidence"  # in the counts of a StereoDepth
+
 
 class _Output(Protocol):
     @property
@@ -60,10 +62,20 @@ class LearnedStereoConfig(OnlineStereoConfig):
 def make_network(name: str, file: str | None) -> nn.Module:
     """The network with its weights. Raises ValueError for an unknown name and what `weights.find` and the checkpoint
     reader raise, saying what to fetch from where."""
+    entry = _network(name)
+    return checkpoints.make(entry.make, entry.weights, file, inside=entry.inside)
+
+
+def check_network(name: str, file: str | None) -> None:
+    """Raises what `make_network` would, before the network is needed."""
+    entry = _network(name)
+    checkpoints.check(entry.make, entry.weights, file, inside=entry.inside)
+
+
+def _network(name: str) -> Network:
     if name not in NETWORKS:
         raise ValueError(f"no network '{name}'; there are: {', '.join(NETWORKS)}")
-    entry = NETWORKS[name]
-    return checkpoints.make(entry.make, entry.weights, file, inside=entry.inside)
+    return NETWORKS[name]
 
 
 class LearnedStereo(OnlineStereo):
@@ -99,7 +111,7 @@ class LearnedStereo(OnlineStereo):
     ) -> StereoDepth:
         views = [reference, *neighbors]
         size = self._images[reference.index].shape[:2]
-        images = np.stack([self._images[v.index] for v in views])
+        images = np.stack([camera.resize_image(self._images[v.index], size) for v in views])  # theirs may be another
         cameras = np.stack([camera.matrix(camera.scale_intrinsics(v.intrinsics, v.size, size)) for v in views])
         cam_from_world = np.stack([geometry.inverse(v.world_from_cam) for v in views])
         # around the reference and at unit median depth: in a far or tiny world float32 has no digits to spare
@@ -132,9 +144,11 @@ def logit(confidence: np.ndarray) -> np.ndarray:
 
 
 def _at_size(depth: np.ndarray, confidence: np.ndarray, size: tuple[int, int]) -> StereoDepth:
-    """Maps at the cascade's size; depths are not averaged across edges. What is not finite is unknown."""
+    """Maps at the cascade's size; depths are not averaged across edges. What is not finite is unknown, and counted."""
     shape = (size[1], size[0])
     depth = cv2.resize(depth.astype(np.float32), shape, interpolation=cv2.INTER_NEAREST_EXACT)
     confidence = cv2.resize(confidence.astype(np.float32), shape, interpolation=cv2.INTER_NEAREST_EXACT)
-    good = np.isfinite(depth) & (depth > 0) & np.isfinite(confidence)
-    return StereoDepth(np.where(good, depth, np.float32(0)), np.where(good, confidence, np.float32(0)), None)
+    finite = np.isfinite(depth) & np.isfinite(confidence)
+    good = finite & (depth > 0)
+    counts = {NOT_FINITE: float((~finite).sum())}
+    return StereoDepth(np.where(good, depth, np.float32(0)), np.where(good, confidence, np.float32(0)), None, counts)
