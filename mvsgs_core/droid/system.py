@@ -144,14 +144,14 @@ class DroidSlam:
             )
 
     def _why_not_started(self) -> str:
-        constants = self.constants
-        tried = len(range(0, len(self.frames), constants.stride))
-        of = f"{tried} frames" + (f" (of {len(self.frames)}, stride={constants.stride})" if constants.stride > 1 else "")
+        count, stride = len(self.frames), self.constants.stride
+        tried = len(range(0, count, stride))
+        of = f"{tried} frames" + (f" (of {count}, stride={stride})" if stride > 1 else "")
         if tried < MIN_KEYFRAMES:
             return f"too few frames: {of} may become keyframes, of which a start takes {MIN_KEYFRAMES}"
         wrong = self.networks.not_finite
         return (f"{wrong} network outputs were not finite, which is taken for no motion; " if wrong else "") + (
-            f"too little motion: {len(self.video)} of {of} moved by {constants.filter_threshold:g} cells or more "
+            f"too little motion: {len(self.video)} of {of} moved by {self.constants.filter_threshold:g} cells or more "
             f"(filter_threshold) since the one before, of which a start takes {MIN_KEYFRAMES}"
         )
 

@@ -172,7 +172,7 @@ def started(constants: dict[str, object], frames: int, net: oracle.Oracle | None
     [
         ({"stride": 4}, 9, "too few frames: 3 frames (of 9, stride=4) may become keyframes, of which a start takes 4"),
         ({"stride": 1}, 2, "too few frames: 2 frames may become keyframes"),
-        ({"stride": 2, "filter_threshold": 50}, 9, "too little motion: 1 of 5 frames (of 9, stride=2) moved by 50 cells"),
+        ({"stride": 2, "filter_threshold": 50}, 9, "too little motion: 1 of 5 frames (of 9, stride=2) moved by 50"),
     ],
 )
 def test_what_never_started_says_what_it_lacked(constants: dict[str, object], frames: int, said: str) -> None:
