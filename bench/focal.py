@@ -28,6 +28,8 @@ VIDEOS = {
     HEAD: Case("tum", {"size": (180, 270)}, HEAD),
     **{name: CASES[name] for name in ("tum_fr3_structure_notexture_far", "room", "room, loop", "aerial")},
 }
+AHEAD = "tum_fr1_xyz, 24 frames, straight ahead at first"  # whose first keyframes want another focal length
+STRAIGHT = Case("tum", {"stride": 2, "stop": 48}, "tum_fr1_xyz")
 PART = 80  # frames
 WRONG = 0.05  # fraction by which a calibration that is given is off
 ZOOMS, ZOOMING = (1.1, 1.2, 1.5), 30  # times; frames that a zoom takes
@@ -147,6 +149,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
             known += [given(name, items, off) for off in (0.0, -WRONG, WRONG)]
             zooms += [given(name, items, 0.0, zoomed) for zoomed in ZOOMS]
             print(found[-1], *known[-3:], *zooms[-len(ZOOMS) :], sep="\n", flush=True)
+    if not options.quick and STRAIGHT.there:
+        known.append(given(AHEAD, [replace(item, depth=None) for item in STRAIGHT.items()], 0.0))
     exact = [one for one in known if one.off == 0.0 and one.name.startswith("room")]  # of rendered images
     wrong = [one for one in known if one.off != 0.0 and one.name.startswith("room")]
     still, said = sum(one.zoom is not None for one in known), [one for one in zooms if one.zoom is not None]

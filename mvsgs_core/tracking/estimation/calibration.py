@@ -107,7 +107,7 @@ class Calibration:
         if len(members) < self.config.min_keyframes:
             return
         with self.stats.time("calibration"):
-            zoom = find_zoom(self.graph, members, self.config.probe, self.threads)
+            zoom = find_zoom(self.graph, members, self.config, self.threads)
         if zoom is not None:
             self._say_zoomed(zoom)
             return

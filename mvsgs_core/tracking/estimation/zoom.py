@@ -2,7 +2,9 @@
 that moves forward: it bends poses and map with hardly a residual.
 
 So short parts of the stream are asked alone, each for the focal length that its own keyframes would rather have, and
-how sure they are of it.
+how sure they are of it. One part may be wrong by more than it says: the matches of six keyframes of a camera that moves
+straight ahead hardly mind a wrong focal length, and what they have in common decides. So two others must say the same,
+or the two that do be surer, all the more where their matches do not mind.
 """
 
 from __future__ import annotations
@@ -13,18 +15,17 @@ from itertools import combinations
 
 import numpy as np
 
-from mvsgs_core.tracking.estimation.focal import curvature_sigma, focal_of_all, observability
+from mvsgs_core.tracking.estimation.focal import FocalConfig, curvature_sigma, focal_of_all, observability
 from mvsgs_core.tracking.graph import KeyframeGraph
 
 PART = 6  # keyframes that are asked together: few, so that a part lies before a zoom or after it
 PARTS = 16  # at most, spread evenly over the stream
 STEPS = 30  # of their bundle adjustment: they may begin far from what they want
 LEAST = 0.06  # by how much two parts differ, as a logarithm, ...
-CLEAR = 3.0  # ... and by how many standard deviations, with
-ALIKE = 0.015  # the deviation of one part that matches of a still lens have beyond what they say (measured)
-# By how many where one part alone differs from the others. It may be wrong by itself: six keyframes of a camera that
-# moves straight ahead were by 3.2, and those of a video whose wrong timestamps hide how long its shutter rolls.
-ALONE = 3.5
+CLEAR = 3.0  # ... and by how many standard deviations, where
+ALIKE = 2.0  # two other parts differ by so many in the same direction,
+ALONE = 4.0  # or by how many without such; twice as many where one is not `certain` of its focal length; with
+BEYOND = 0.015  # the deviation of one part that matches of a still lens have beyond what they say (measured)
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Part:
     frames: tuple[int, int]  # indices of the first and the last
     factor: float  # on the focal length that was used
     sigma: float  # standard deviation of its logarithm
+    certain: bool  # a wrong focal length would fit its matches clearly worse
 
 
 @dataclass(frozen=True)
@@ -56,10 +58,15 @@ class Zoom:
     def clear(self, deviations: float) -> bool:
         return abs(float(np.log(self.factor))) > max(LEAST, deviations * self.sigma)
 
+    def told_by(self, other: Zoom) -> bool:
+        """Whether the other is in the same direction, and of two other parts."""
+        apart = {self.before, self.after}.isdisjoint({other.before, other.after})
+        return apart and (self.factor > 1.0) == (other.factor > 1.0)
 
-def find_zoom(graph: KeyframeGraph, members: list[int], probe: float, threads: int) -> Zoom | None:
+
+def find_zoom(graph: KeyframeGraph, members: list[int], config: FocalConfig, threads: int) -> Zoom | None:
     """The zoom that parts of these keyframes, in their order, say there was; None where none is clear. The graph stays
-    as it is. probe: fraction by which a focal length is made wrong to see how sure a part is."""
+    as it is."""
     members = [index for index in members if index >= 0]  # frames of this run, not of a map that it goes on with
     count = len(members) // PART
     if count < 2:
@@ -73,21 +80,26 @@ def find_zoom(graph: KeyframeGraph, members: list[int], probe: float, threads: i
         return None
     parts = list[Part]()
     for part, factor in asked:
-        rise = observability(graph, part, probe, threads, factor)
-        parts.append(Part((part[0], part[-1]), factor, curvature_sigma(graph, part, rise, probe)))
+        rise = observability(graph, part, config.probe, threads, factor)
+        sigma = curvature_sigma(graph, part, rise, config.probe)
+        parts.append(Part((part[0], part[-1]), factor, sigma, rise > config.certain))
+    return clear_zoom(parts)
+
+
+def clear_zoom(parts: Sequence[Part]) -> Zoom | None:
+    """Between the two of these, in their order, that are surest of themselves; None where none is clear."""
     zooms = [Zoom(a, b) for a, b in combinations(parts, 2)]
-    return surest([zoom for zoom in zooms if zoom.clear(CLEAR)])
+    alike = [zoom for zoom in zooms if zoom.clear(ALIKE)]
 
+    def believed(zoom: Zoom) -> bool:
+        certain = zoom.before.certain and zoom.after.certain
+        return zoom.clear(ALONE if certain else 2.0 * ALONE) or (zoom.clear(CLEAR) and any(map(zoom.told_by, alike)))
 
-def surest(zooms: Sequence[Zoom]) -> Zoom | None:
-    """Of those that are clear by `CLEAR`; by `ALONE` where one part is in all of them."""
-    if zooms and set.intersection(*({zoom.before, zoom.after} for zoom in zooms)):
-        zooms = [zoom for zoom in zooms if zoom.clear(ALONE)]
-    return min(zooms, key=lambda zoom: zoom.sigma, default=None)
+    return min(filter(believed, zooms), key=lambda zoom: zoom.sigma, default=None)
 
 
 def _sigma(part: Part) -> float:
-    return float(np.hypot(part.sigma, ALIKE))
+    return float(np.hypot(part.sigma, BEYOND))
 
 
-__all__ = ["Part", "Zoom", "find_zoom"]
+__all__ = ["Part", "Zoom", "clear_zoom", "find_zoom"]

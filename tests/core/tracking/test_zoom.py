@@ -11,14 +11,14 @@ import pytest
 
 from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.datasets.lens import guess_lens
-from mvsgs_core.tracking.estimation.zoom import ALONE, CLEAR, PART, Part, Zoom, find_zoom, surest
+from mvsgs_core.tracking.estimation.zoom import ALONE, CLEAR, PART, Part, Zoom, clear_zoom, find_zoom
 from mvsgs_core.tracking.tracker import Tracker
 from tests.support.sequences import synthetic, tracked_room
 from tests.support.shared_data import shared
 
 pytestmark = pytest.mark.slow
 
-PROBE = Tracker().config.focal.probe
+FOCAL = Tracker().config.focal
 
 
 def zoomed(item: Item, times: float) -> Item:
@@ -56,10 +56,10 @@ def test_a_camera_that_does_not_zoom_is_not_said_to() -> None:
     graph, members = tracker.session.graph, tracker.session.members
     assert len(members) >= 2 * PART
     before = {index: graph.keyframes[index].cam_from_world.copy() for index in members}
-    assert find_zoom(graph, members, PROBE, 1) is None
+    assert find_zoom(graph, members, FOCAL, 1) is None
     assert "zoom" not in tracker.stats.values
-    assert find_zoom(graph, members[: 2 * PART - 1], PROBE, 1) is None, "too few to tell"
-    assert find_zoom(graph, [-1 - n for n in range(2 * PART)], PROBE, 1) is None, "of a map that it goes on with"
+    assert find_zoom(graph, members[: 2 * PART - 1], FOCAL, 1) is None, "too few to tell"
+    assert find_zoom(graph, [-1 - n for n in range(2 * PART)], FOCAL, 1) is None, "of a map that it goes on with"
     assert all(np.array_equal(graph.keyframes[index].cam_from_world, pose) for index, pose in before.items())
 
 
@@ -75,15 +75,24 @@ def test_a_camera_that_moves_straight_ahead_at_first_is_not_said_to_zoom(guessed
     assert not any("zoomed" in warning for warning in tracker.stats.warnings)
 
 
-def test_one_part_that_differs_from_all_others_must_do_so_more_clearly() -> None:
-    first, second, third, fourth = (
-        Part((n, n + 9), factor, 0.01) for n, factor in zip((0, 10, 20, 30), (1, 1, 1, 1.08))
+def parts(*factors: float, certain: bool = True) -> list[Part]:
+    return [Part((10 * n, 10 * n + 9), factor, 0.01, certain) for n, factor in enumerate(factors)]
+
+
+def test_two_parts_alone_must_be_surer() -> None:
+    sigma = Zoom(*parts(1.0, 1.0)).sigma
+    clear, sure, surer = np.exp([0.5 * (CLEAR + ALONE) * sigma, 1.1 * ALONE * sigma, 2.1 * ALONE * sigma])
+    assert clear_zoom(parts(1.0, clear)) is None
+    assert clear_zoom(parts(1.0, sure)) is not None
+    assert clear_zoom(parts(1.0, sure, certain=False)) is None
+    assert clear_zoom(parts(1.0, surer, certain=False)) is not None
+
+
+def test_two_other_parts_are_needed_that_say_the_same() -> None:
+    clear = np.exp(0.5 * (CLEAR + ALONE) * Zoom(*parts(1.0, 1.0)).sigma)
+    assert clear_zoom(parts(1.0, 1.0, 1.0, clear, certain=False)) is None, (
+        "one that differs from all may be wrong alone"
     )
-    sigma = Zoom(first, fourth).sigma
-    assert CLEAR < np.log(1.08) / sigma < ALONE
-    alone = [Zoom(part, fourth) for part in (first, second, third)]
-    assert surest(alone) is None
-    assert surest([*alone, Zoom(first, Part((40, 49), 1.08, 0.01))]) is not None, "another part says the same"
-    sure = Zoom(second, Part((30, 39), 1.2, 0.01))
-    assert surest([alone[1], sure]) == sure
-    assert surest([]) is None
+    assert clear_zoom(parts(1.0, 1.0, clear, clear, certain=False)) is not None
+    assert clear_zoom(parts(1.0, clear, clear, 1.0, certain=False)) is None, "it would have zoomed in and out"
+    assert clear_zoom([]) is None
