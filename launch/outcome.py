@@ -33,6 +33,7 @@ class Outcome:
     failed: Failure | None = None  # the stage that ended it
     observers: tuple[Failure, ...] = ()  # who failed alone
     nothing: Mapping[str, str] = field(default_factory=dict)  # reasons by node for an empty result, in graph order
+    cut_off: Mapping[str, str] = field(default_factory=dict)  # what Ctrl-C left of a source's stream, by node
 
     @property
     def whole(self) -> bool:
@@ -40,7 +41,9 @@ class Outcome:
         return not self.reason
 
 
-def finished(observers: tuple[Failure, ...], nothing: Mapping[str, str]) -> Outcome:
+def finished(
+    observers: tuple[Failure, ...], nothing: Mapping[str, str], cut_off: Mapping[str, str] | None = None
+) -> Outcome:
     """Of a run whose stages all reached their end."""
     code = NOTHING if nothing else OBSERVER_FAILED if observers else DONE
-    return Outcome(code, observers=observers, nothing=nothing)
+    return Outcome(code, observers=observers, nothing=nothing, cut_off=cut_off or {})

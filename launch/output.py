@@ -86,9 +86,8 @@ class Output:
 
     def _settle(self, outcome: Outcome, scored: bool) -> None:
         alone = {failure.node: failure.error for failure in outcome.observers}
-        beside = ({"observers": alone} if alone else {}) | (
-            {"nothing": dict(outcome.nothing)} if outcome.nothing else {}
-        )
+        said = {"observers": alone, "nothing": dict(outcome.nothing), "cut_off": dict(outcome.cut_off)}
+        beside = {key: by_node for key, by_node in said.items() if by_node}
         report = read_report(self.path)
         if report and report.get("finished", True):
             if not beside.items() <= report.items():

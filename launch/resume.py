@@ -88,8 +88,12 @@ def _interrupted(folder: Path) -> DictConfig:
         raise GraphError(f"{WORD}{folder}: {file} cannot be read: {error}") from error
     if not isinstance(config, DictConfig):
         raise GraphError(f"{WORD}{folder}: {file} is no configuration of a run")
-    if read_report(folder).get("finished"):
-        raise GraphError(f"{WORD}{folder}: that run has reached its end (see {folder / REPORT}): nothing is left to do")
+    report = read_report(folder)
+    if report.get("finished"):
+        cut_off = "".join(f"; {text}: for all of it, run it again" for text in report.get("cut_off", {}).values())
+        raise GraphError(
+            f"{WORD}{folder}: that run has reached its end (see {folder / REPORT}): nothing is left to do{cut_off}"
+        )
     return config
 
 

@@ -16,10 +16,11 @@ FILES = ("report.html", "report.json", "map.ply", "cameras.json", "transforms.js
 def summary(output: Path) -> str:
     """What the run reached and where its files are."""
     report = json.loads((output / "report.json").read_text())
-    lines = ["", *_figures(report)]
+    figures = _figures(report)
+    lines = ["", *figures, *(f"{node:11} {text}" for node, text in (_get(report, "cut_off") or {}).items())]
     if not report.get("finished", True):
         lines.append(f"no report: {report.get('reason')}")
-    elif len(lines) == 1:
+    elif not figures:
         lines.append("no report: the graph has no evaluator here, or it had nothing to score")
     there = [name for name in FILES if (output / name).exists()]
     return "\n".join([*lines, f"in {output}: {', '.join(there)}"])

@@ -170,12 +170,14 @@ class Supervisor:
         for child in self._children.values():
             with suppress(ValueError, OSError):
                 child.read_status()
-        nothing = {
-            name: str(child.status.values["nothing"])
-            for name, child in sorted(self._children.items(), key=lambda item: list(self._graph.slots).index(item[0]))
-            if child.status.values.get("nothing")
-        }
-        return finished(tuple(self._failed_observers.values()), nothing)
+        cut_off, nothing = self._said("cut_off"), self._said("nothing")
+        # where there is nothing to show, the footage is not all that there is to blame
+        return finished(tuple(self._failed_observers.values()), cut_off | nothing if nothing else {}, cut_off)
+
+    def _said(self, key: str) -> dict[str, str]:
+        """A value that is text, by node, of those that have it, in the graph's order."""
+        statuses = {name: self._children[name].status for name in self._graph.slots if name in self._children}
+        return {name: str(status.values[key]) for name, status in statuses.items() if status.values.get(key)}
 
     def _stopped(self, number: int) -> Outcome:
         self._stop_by = time.monotonic() + TERMINATE_SECONDS

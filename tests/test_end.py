@@ -12,6 +12,7 @@ from msgs import End
 from msgs.codec import decode, encode
 from nodes import Node, Stats
 from nodes.runtime.plain import SHORTENED
+from nodes.runtime.process import _say_cut_off
 from nodes.runtime.runner import STATS_KEYS, end_of
 
 
@@ -103,3 +104,18 @@ def test_counts_without_end_stay_counts() -> None:
     node = Counting()
     node.stats = Stats(counts={f"{'c' * 500}{i}": float(i) for i in range(20_000)})
     types(sent(node)["node"])
+
+
+@pytest.mark.parametrize(
+    ("frames", "expected", "said"),
+    [(8, 24, " after 8 of 24 frames"), (8, 0, " after 8 frames"), (None, None, ""), (24, 24, None)],
+)
+def test_a_stream_that_was_cut_off_is_said_to_be(frames: int | None, expected: int | None, said: str | None) -> None:
+    node = Counting(Counting.Config())
+    if frames is not None:
+        node.stats.count("frames", frames)
+    node.stats.values["frames_expected"] = expected
+    _say_cut_off(node)
+    text = None if said is None else f"the stream was ended by Ctrl-C{said}"
+    assert node.stats.values.get("cut_off") == text
+    assert list(node.stats.warnings) == ([] if text is None else [text])

@@ -136,6 +136,10 @@ def test_the_first_ctrl_c_ends_the_stream_and_finishes_the_run(launch: type[Laun
     assert arrived["keyframes"] == list(range(sent))
     assert arrived["truths"] in (list(range(sent)), list(range(sent - 1)))
     assert sent > 5
+    said = f"the stream was ended by Ctrl-C after {sent} frames"
+    assert run.report()["cut_off"] == {"source": said}
+    assert f"warning: source: {said}\n" in out
+    assert re.search(rf"^source +{said}$", out, re.MULTILINE)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])

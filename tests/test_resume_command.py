@@ -136,8 +136,12 @@ def test_what_cannot_be_resumed_is_refused_with_the_reason(tmp_path: Path) -> No
 
     assert "no such directory" in refusal(tmp_path / "nowhere")
     assert "no config.yaml there" in refusal(tmp_path)
-    folder = interrupted(tmp_path, report='{"finished": true}')
-    assert "has reached its end" in refusal(folder)
+    folder = interrupted(tmp_path, report='{"finished": true, "cut_off": {"dataset": "ended after 8 of 24 frames"}}')
+    assert refusal(folder).endswith("ended after 8 of 24 frames: for all of it, run it again")
+    (folder / "report.json").write_text('{"finished": true}')
+    assert refusal(folder).endswith(
+        "has reached its end (see " + str(folder / "report.json") + "): nothing is left to do"
+    )
     (folder / "report.json").write_text("{")  # cut off: not finished
     assert resumed_config(folder, ()).mapper.resume == str(folder)
     state_file(folder, 3).write_bytes(b"nonsense")

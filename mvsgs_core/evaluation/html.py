@@ -220,15 +220,16 @@ def document(title: str, body: Sequence[str]) -> str:
 
 
 def sorted_warnings(report: Mapping[str, Any]) -> list[str]:
-    """What was warned of, by what it costs: no result at all, then the poses on which all else stands, then the stages
-    after them, then what only watches, of which the map does not depend."""
+    """What was warned of, by what it costs: a stream that was cut off, as it may explain the rest, no result at all,
+    then the poses on which all else stands, the stages after them, and what only watches, of which no map depends."""
     said = {str(node): list(texts) for node, texts in report.get("warnings", {}).items()}
     last = [node for node in said if node in _WATCHING]
     order = [node for node in _FIRST if node in said]
     order += [node for node in said if node not in (*order, *last)]
-    warnings = [f"{node}: {text}" for node, text in report.get("nothing", {}).items()]
+    warnings = [f"{node}: {text}" for key in ("cut_off", "nothing") for node, text in report.get(key, {}).items()]
     warnings += [f"{node}: {text}" for node in order for text in said[node]]
-    return warnings + list(report.get("notes", [])) + [f"{node}: {text}" for node in last for text in said[node]]
+    warnings += [*report.get("notes", []), *(f"{node}: {text}" for node in last for text in said[node])]
+    return list(dict.fromkeys(warnings))
 
 
 def _settings(text: str | None) -> str:

@@ -12,12 +12,12 @@ from typing import Any
 
 
 def collected(stats: Mapping[str, Any]) -> dict[str, Any]:
-    """Parts of the report, from the statistics of each node by name; "nothing" where a node had nothing to show."""
+    """Parts of the report, from the statistics of each node by name; "nothing" where a node had nothing to show,
+    "cut_off" where Ctrl-C ended a source's stream."""
     nodes = {str(name): s for name, s in stats.items() if isinstance(s, Mapping)}
     cpu = {name: _number(s.get("cpu_seconds")) for name, s in nodes.items()}
     peak = {name: _number(s.get("peak_bytes")) for name, s in nodes.items()}
-    reasons = {name: _mapping(s.get("values")).get("nothing") for name, s in nodes.items()}
-    nothing = {name: str(reason) for name, reason in reasons.items() if reason}
+    reasons = {key: _said(nodes, key) for key in ("cut_off", "nothing")}
     latency = {name: waited for name, s in nodes.items() if (waited := _latencies(_mapping(s.get("values"))))}
     return {
         "time": {
@@ -29,8 +29,14 @@ def collected(stats: Mapping[str, Any]) -> dict[str, Any]:
         "counts": {name: found for name, s in nodes.items() if (found := _numbers(s.get("counts")))},
         "warnings": {name: texts for name, s in nodes.items() if (texts := _texts(s.get("warnings")))},
         **({"latency": latency} if latency else {}),
-        **({"nothing": nothing} if nothing else {}),
+        **{key: by_node for key, by_node in reasons.items() if by_node},
     }
+
+
+def _said(nodes: Mapping[str, Mapping[Any, Any]], key: str) -> dict[str, str]:
+    """Text by node, of those that have one."""
+    texts = {name: _mapping(s.get("values")).get(key) for name, s in nodes.items()}
+    return {name: str(text) for name, text in texts.items() if text}
 
 
 def _skipped(stats: Mapping[Any, Any]) -> dict[str, float]:

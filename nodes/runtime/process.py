@@ -256,6 +256,8 @@ class _Process:
                 inbox.watch()
                 continue
             if message is None:
+                if source.cut_off and not runner.node.live:  # a camera's stream has no other end
+                    _say_cut_off(runner.node)
                 return
             self._step.next("working")
             if not requests.pause.leaves_out(message):
@@ -323,6 +325,16 @@ class _Process:
         }
 
 
+def _say_cut_off(node: Node) -> None:
+    """That Ctrl-C ended its stream, unless all that was expected had come: what there is of the rest is not known."""
+    frames, expected = node.stats.counts.get("frames"), node.stats.values.get("frames_expected")
+    if frames is not None and expected and frames >= expected:
+        return
+    come = "" if frames is None else f" after {frames:.0f}{f' of {expected}' if expected else ''} frames"
+    node.stats.values["cut_off"] = f"the stream was ended by Ctrl-C{come}"
+    node.stats.warn(node.stats.values["cut_off"])
+
+
 def _of_a_camera(given: Input) -> bool:
     """Whether it is of frames that nobody waits for."""
     return given.best_effort and given.type == Frame.__name__
@@ -335,6 +347,7 @@ class _Source:
         self._messages: queue.Queue[Message | None] = queue.Queue(maxsize=1)
         self._runner = runner
         self._stopping = False
+        self.cut_off = False  # by `stop`, before it had come to its own end
         self._error: BaseException | None = None
         threading.Thread(target=self._run, name="source", daemon=True).start()
 
@@ -354,6 +367,7 @@ class _Source:
             for message in self._runner.source():
                 self._messages.put(message)
                 if self._stopping:
+                    self.cut_off = True
                     break
         except BaseException as error:
             self._error = error

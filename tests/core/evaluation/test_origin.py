@@ -11,6 +11,7 @@ from mvsgs_core import machine
 from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.evaluation.html import sorted_warnings
 from mvsgs_core.evaluation.origin import SETTINGS, in_words, origin
+from mvsgs_core.evaluation.statistics import collected
 from mvsgs_core.export.source_camera import LENS, lens_values
 from mvsgs_core.trajectory import Trajectory
 
@@ -58,3 +59,12 @@ def test_warnings_stand_in_the_order_of_what_they_cost() -> None:
     assert sorted_warnings(report) == [
         "mapper: no depth", "tracker: lost", "dataset: a guess", "mapper: full", "no true poses", "evaluator: no LPIPS",
     ]  # fmt: skip
+    report |= collected(
+        {"dataset": {"values": {"cut_off": "ended by Ctrl-C"}, "warnings": ["a guess", "ended by Ctrl-C"]}}
+    )
+    assert sorted_warnings(report) == [
+        "dataset: ended by Ctrl-C",
+        "mapper: no depth",
+        "dataset: a guess",
+        "no true poses",
+    ]
