@@ -1,8 +1,13 @@
-"""A robot whose reader, or the link to it, is slower than its frames: the newest come, and nobody holds it back."""
+"""A robot whose reader, or the link to it, is slower than its frames: the newest come, and nobody holds it back. A link
+that is only long costs none."""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +19,7 @@ from mvsgs_core.stats import Stats
 from nodes import stream_frames
 from nodes.runtime.transport import LivePublisher
 from nodes.stream_frames import StreamFrames
+from tests.support import long_link
 from tests.support.patience import until
 from tests.support.ports import tcp_address
 
@@ -47,6 +53,18 @@ def test_few_old_frames_wait_for_a_reader_that_is_behind() -> None:
             waiting.append(message.index)
     publisher.close()
     assert 1 <= len(waiting) <= 6, waiting  # two at either end, and what is on its way
+
+
+@pytest.mark.slow
+def test_a_long_link_costs_no_frame(tmp_path: Path) -> None:
+    if shutil.which("ip") is None:
+        pytest.skip("a long link needs network namespaces: there is no ip here")
+    command = [sys.executable, "-m", "tests.support.long_link", str(tmp_path / "keys")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    if done.returncode == long_link.NOT_PERMITTED:
+        pytest.skip(f"a long link needs network namespaces, which are not permitted here: {done.stderr}")
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) >= 0.8 * long_link.COUNT  # all but some at once: a connection begins slowly
 
 
 def test_a_reader_of_every_frame_is_not_served() -> None:

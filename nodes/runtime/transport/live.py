@@ -6,6 +6,7 @@ up for good, without a word; here it connects anew. An XPUB socket turns readers
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from contextlib import suppress
@@ -23,7 +24,7 @@ from nodes.runtime.transport.sockets import open_monitor, readable
 RETRY = 0.3  # s without ZeroMQ's own attempt after which a lost connection is made anew
 FASTEST = 1000  # frames a second: a larger jump of the sequence numbers is no loss, but a sender that counts anew
 BURST = 100  # frames that may come at once
-KERNEL_BYTES = 2**18  # that a publisher's kernel holds: enough for 25 MB/s where an answer takes 10 ms
+UNSENT_BYTES = 2**17  # that wait in a publisher's kernel; what is on its way, which a long link needs more of, is not
 TURNED_AWAY = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | REFUSED
 
 
@@ -100,26 +101,38 @@ class LivePublisher(Publisher):
     """
 
     served = (NEWEST,)
-    kernel_bytes = KERNEL_BYTES
 
     def __init__(self, address: str, **options: Any) -> None:
-        self._count: threading.Thread | None = None
+        self._attending: threading.Thread | None = None
         super().__init__(address, buffer=1, **options)
         self.refused = 0  # attempts of readers without the right keys; one tries again several times a second
-        monitor = open_monitor(self.socket, TURNED_AWAY | zmq.EVENT_MONITOR_STOPPED)
-        self._count = threading.Thread(target=self._count_refused, args=(monitor,), name="refused", daemon=True)
-        self._count.start()
+        monitor = open_monitor(self.socket, TURNED_AWAY | zmq.EVENT_ACCEPTED | zmq.EVENT_MONITOR_STOPPED)
+        self._attending = threading.Thread(target=self._attend, args=(monitor,), name="readers", daemon=True)
+        self._attending.start()
 
-    def _count_refused(self, monitor: zmq.Socket[bytes]) -> None:
-        """As they come, whatever the program does meanwhile: strangers must not fill its memory."""
+    def _attend(self, monitor: zmq.Socket[bytes]) -> None:
+        """To readers as they come, whatever the program does meanwhile: strangers must not fill its memory."""
         with monitor:
-            while recv_monitor_message(monitor)["event"] != zmq.EVENT_MONITOR_STOPPED:
-                self.refused += 1
+            while (met := recv_monitor_message(monitor))["event"] != zmq.EVENT_MONITOR_STOPPED:
+                if met["event"] == zmq.EVENT_ACCEPTED:
+                    self._let_little_wait(met["value"])
+                else:
+                    self.refused += 1
+
+    def _let_little_wait(self, descriptor: int) -> None:
+        """In the kernel, for the reader of that connection."""
+        if self._file is not None or not hasattr(socket, "TCP_NOTSENT_LOWAT"):  # not over TCP; not Linux or macOS
+            return
+        with (
+            suppress(OSError),  # the connection, which is ZeroMQ's, has ended
+            socket.fromfd(descriptor, socket.AF_INET, socket.SOCK_STREAM) as connection,  # of its own: to be closed
+        ):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
 
     def close(self, *, farewell: bool = True) -> None:
-        if self._count is not None and not self.socket.closed:
+        if self._attending is not None and not self.socket.closed:
             self.socket.disable_monitor()
-            self._count.join()
+            self._attending.join()
         super().close(farewell=farewell)
 
 

@@ -44,7 +44,6 @@ class Publisher:
     """
 
     served: tuple[bytes, ...] = (RELIABLE, NEWEST)  # deliveries: a reader of another gets nothing
-    kernel_bytes: int | None = None  # that the kernel holds on their way to one reader; None: as it sees fit
 
     def __init__(
         self,
@@ -81,8 +80,6 @@ class Publisher:
             guard.enter(keys)
         self.socket = open_socket(zmq.XPUB, address, keys, MAX_SUBSCRIPTION_BYTES)
         self.socket.sndhwm = max(1, buffer)
-        if self.kernel_bytes is not None:
-            self.socket.sndbuf = self.kernel_bytes
         self.socket.sndtimeo = HELD_BACK_MS
         self.socket.setsockopt(zmq.XPUB_NODROP, 1)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
