@@ -61,13 +61,18 @@ def _check_output(graph: Graph) -> None:
     for name in graph.sources:
         for key in FILES:
             value = graph.slots[name].config.get(key)
-            if isinstance(value, str) and value and _in_results(Path(value).resolve(), output.resolve()):
+            if isinstance(value, str) and value and _in_results(_real(value), _real(output)):
                 raise GraphError(f"output={output}: has {name}.{key}={value} in it; give another output=DIR")
     if others := others_files(output):
         raise GraphError(
             f"output={output}: has {', '.join(others)}, which no run has left there and this one would replace; give "
             "another output=DIR"
         )
+
+
+def _real(path: str | Path) -> Path:
+    """Without links; of one that leads to itself, as it is (`Path.resolve` raises RuntimeError for that)."""
+    return Path(os.path.realpath(path))
 
 
 def _in_results(read: Path, output: Path) -> bool:

@@ -6,6 +6,7 @@ choices and edges all come from `conf/`.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -160,8 +161,8 @@ def _settings(config: Mapping[str, Any]) -> tuple[Settings, dict[str, Mapping[st
     if settings.map is not None:
         read = Path(settings.map).expanduser().absolute()
         settings = replace(settings, map=str(read))
-        written = None if settings.output is None else Path(settings.output).resolve()
-        if read.resolve() == written:  # by a link, too: the map would be moved aside
+        written = None if settings.output is None else os.path.realpath(settings.output)
+        if os.path.realpath(read) == written:  # by a link, too: the map would be moved aside
             raise GraphError(f"map={settings.map} is the output too: a new map is written, give another output=DIR")
     if settings.keep_map is None:
         settings = replace(settings, keep_map=settings.map is not None)

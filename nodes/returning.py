@@ -34,7 +34,9 @@ class Returning:
         self.newest = -1  # keyframe that the earlier process sent
         self._sent: set[int] = set()  # keyframes of the map that it had
         self._log = folder / "sent"
-        self.returned = self._log.exists()  # in an earlier process's place
+        self._gap = folder / "not all of it"  # there: the log lacks lines, which a full disk has cost
+        self._lost = self._gap.exists()
+        self.returned = self._lost or self._log.exists()  # in an earlier process's place
         self.another = False  # map than the run began on was asked for
         for line in self._log.read_text().splitlines() if self._log.exists() else ():
             kind, _, number = line.removesuffix(";").partition(" ")
@@ -54,7 +56,12 @@ class Returning:
                 self.another = True
 
     def known(self) -> KnownMap | None:
-        """The map as the earlier process saved it last; None: there was none. Raises ValueError for a damaged file."""
+        """The map as the earlier process saved it last; None: there was none. Raises ValueError for a damaged file, and
+        where it is not known what was sent: readers would take two maps for one."""
+        if self._lost:
+            raise ValueError(
+                "the disk was full when this tracker ran before: what it sent is not known, and it cannot go on"
+            )
         if not self._file.exists():
             if self._sent:
                 raise ValueError("this tracker was killed before it had saved its map, and cannot go on in it")
@@ -91,7 +98,7 @@ class Returning:
 
     def save(self, tracker: Tracker) -> None:
         """Between two frames, where it is time."""
-        if not self._changed or not tracker.mapped or self._clock() < self._due:
+        if self._lost or not self._changed or not tracker.mapped or self._clock() < self._due:
             return
         began = self._clock()
         try:
@@ -102,11 +109,16 @@ class Returning:
         self._changed, self._due = False, now + (now - began) / SHARE
 
     def _write(self, line: str) -> None:
-        """A disk that is full costs the return, not the run."""
+        """A disk that is full costs the return, not the run. Raises OSError where not even that can be left behind."""
+        if self._lost:
+            return
         try:
             with self._log.open("a") as log:
                 log.write(f"\n{line};")  # begins a line: one that was cut off stays by itself
         except OSError as error:
+            self._lost = True
+            self._file.unlink(missing_ok=True)  # it makes room, and is of no use without the log
+            self._gap.touch()
             self._stats.warn(f"if this tracker is killed it cannot go on: {error}")
 
 

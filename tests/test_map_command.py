@@ -48,6 +48,8 @@ def test_a_map_is_not_overwritten_by_its_own_run(tmp_path: Path) -> None:
     for read, written in (("link", "out"), ("out", "link"), ("out", "out/../out")):
         with pytest.raises(GraphError, match="another output"):
             compose([f"map={tmp_path / read}", f"output={tmp_path / written}"])
+    (tmp_path / "loop").symlink_to("loop")
+    assert compose([f"map={tmp_path / 'loop'}", f"output={tmp_path}"])  # for the nodes to refuse, which look inside
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,10 @@ def test_it_costs_the_return_and_not_the_run(tmp_path: Path) -> None:
             returning.note(keyframe(index))
     (warning,) = stats.warnings
     assert warning.startswith("if this tracker is killed it cannot go on: ")
-    assert Returning(tmp_path, stats).newest == 0
+    again = Returning(tmp_path, stats)
+    assert again.returned
+    with pytest.raises(ValueError, match="the disk was full"):
+        again.known()  # what it does not know of would be laid over with another map
 
 
 def test_it_costs_lines_and_is_said_once(tmp_path: Path) -> None:

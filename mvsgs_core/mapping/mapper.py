@@ -331,13 +331,14 @@ class OnlineMapper:
         if self.frame.adopt(other.frame):
             self.keyframes.place_anew(self.frame.local, self.frame.length)
         change = self.frame.from_other(other.frame)
+        larger = max(len(self.state), len(other.state))  # a known map may have more than is allowed
         with self.log.time("joining"):
             move_with_anchors(other.state, dict.fromkeys(other.state.anchors.unique().tolist(), change))
             self.state.take_over(other.state)
         other.keyframes.place_anew(self.frame.local)
         self.keyframes.take_over(other.keyframes, change.scale)
         self.trainer.background = self.keyframes.background.color
-        self.trainer.bound(self.keyframes.with_image, self.median_depth)
+        self.trainer.bound(self.keyframes.with_image, self.median_depth, larger)
         self.schedule.reset()
         self.schedule.add_budget(other.schedule.drop())
         self.schedule.spared += other.schedule.spared

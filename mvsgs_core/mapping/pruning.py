@@ -23,6 +23,7 @@ from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.interface import Render
 from mvsgs_core.rasterizer.splats import Splats
 
+JUDGES = 64  # images of which a map that is to become smaller is judged by at most, as the stream goes on meanwhile
 PASSES = 12  # backward passes in all, at least: each image has one, of a few images each has more, with other signs
 OPAQUE = 0.98  # an opacity above is taken as this: near the rasterizer's greatest alpha no color depends on it
 HIDDEN = 0.3  # light that reaches the camera past what is before a splat, where most does: with less, it is hidden
@@ -51,12 +52,14 @@ def bound(
     state: MapState, views: list[TrainingView], render: Callable[[Splats, TrainingView], Render], count: int,
     generator: torch.Generator,
 ) -> int:  # fmt: skip
-    """Removes all but `count` splats, those first that would add least to the squared error of the views' images, those
-    last that none of them says anything of; returns their number. render: as in `prune`."""
+    """Removes all but `count` splats, those first that would add least to the squared error of the images of some of
+    the views, spread over all, those last that none of them says anything of; returns their number. render: as in
+    `prune`."""
     beyond = len(state) - count
     if beyond <= 0:
         return 0
-    cost, _ = removal_cost(state, views, render, generator)
+    judges = views[:: -(-len(views) // JUDGES)]
+    cost, _ = removal_cost(state, judges, render, generator)
     return _remove(state, torch.argsort(cost, stable=True)[:beyond])
 
 

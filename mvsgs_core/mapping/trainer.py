@@ -131,15 +131,17 @@ class Trainer:
             render = self._judged(median_depth)
             self.log.count("needless", prune(self.state, views, render, config.needless, generator))
 
-    def bound(self, views: list[TrainingView], median_depth: float) -> None:
-        """Of a map that has become larger than may be, the splats go that the images of these keyframes miss least."""
-        most = self.config.density_control.max_splats
+    def bound(self, views: list[TrainingView], median_depth: float, known: int) -> None:
+        """Of a map that has more splats than `max_splats`, and than the `known` that may stay, those go that the images
+        of these keyframes miss least."""
+        most = max(self.config.density_control.max_splats, known)
         if len(self.state) <= most:
             return
         with self.log.time("density_control"):
             generator = torch.Generator().manual_seed(self.config.seed)
             removed = bound(self.state, views, self._judged(median_depth), most, generator)
-        text = f"two maps that were joined had more than max_splats={most}: what their images miss least was taken out"
+        limit = f"max_splats={self.config.density_control.max_splats}"
+        text = f"two maps that were joined had more than {limit}: what their images miss least was taken out"
         self.log.refuse("splats", removed, text)
 
     def _judged(self, median_depth: float) -> Callable[[Splats, TrainingView], Render]:

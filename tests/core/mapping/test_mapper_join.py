@@ -14,10 +14,12 @@ from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.map_state import PARAMETERS
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.pruning import JUDGES, bound
 from mvsgs_core.mapping.trainer import Trainer
 from mvsgs_core.photometry import compose
 from mvsgs_core.rasterizer.rasterize import Render
 from mvsgs_core.rasterizer.spherical_harmonics import C0
+from mvsgs_core.rasterizer.splats import Splats
 from mvsgs_core.stats import Stats
 from tests.support.small_atlas import gain
 from tests.support.small_atlas import view as keyframe
@@ -187,6 +189,31 @@ def test_a_join_keeps_to_max_splats_by_what_the_images_miss_least() -> None:
     one.state.take_over(part(full, 4, 6).state)  # as a map of a run that might have more
     assert one.add_keyframe(keyframe(7)) == 0
     assert 0 < one.log.counts["refused_splats"] - new <= SIZE[0] * SIZE[1], "no more than the keyframe's own"
+
+
+def test_a_join_leaves_a_known_map_that_has_more_than_max_splats_as_large() -> None:
+    """One that was made with a higher `max_splats`, and is gone on with."""
+    free = replace(CONFIG, iterations=0)
+    one = OnlineMapper(replace(free, density_control=DensityControlConfig(max_splats=40)))
+    one.add_keyframe(keyframe(0))
+    larger = mapped([1, 2], np.eye(4), 1.0, {}).state.tensors()
+    one.state.become(larger)
+    one.join(mapped([4], np.eye(4), 1.0, {}))
+    assert len(one.state) == len(larger["means"]) > 40
+
+
+def test_a_map_that_becomes_smaller_is_judged_by_a_bounded_number_of_images() -> None:
+    mapper = mapped([0, 2], np.eye(4), 1.0, {})
+    judged: list[int] = []
+
+    def render(splats: Splats, view: TrainingView) -> Render:
+        judged.append(view.index)
+        return mapper.trainer._judged(mapper.median_depth)(splats, view)
+
+    views = [replace(mapper.views[i % 2], index=i) for i in range(3 * JUDGES)]
+    assert bound(mapper.state, views, render, len(mapper.state) - 1, torch.Generator()) == 1
+    assert JUDGES / 2 <= len(judged) <= JUDGES
+    assert max(judged) >= len(views) - 4, "spread over all"
 
 
 def test_what_late_splats_brought_is_joined_too() -> None:
