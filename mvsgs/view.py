@@ -27,6 +27,7 @@ from mvsgs_core.mapping.preview import as_bytes, covariances
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes.keyframe_pictures import KeyframePictures, depth_points, difference, pictures
 from nodes.map_page import MapPage, check_address
+from nodes.page_guard import check_names
 from nodes.seen_keyframes import goodness
 
 FIGURES = ("coverage", "error")  # that can color keyframes
@@ -180,12 +181,13 @@ def _outside(means: np.ndarray) -> np.ndarray:
 def view(options: argparse.Namespace) -> str:
     """Shows the map until it is closed. Raises ValueError, OSError."""
     check_address(options.host, options.port, dashes="--")
+    check_names(options.name, "--name")
     final, left_out = read_map(options)
     if not len(final.splats):
         raise ValueError(f"{options.map} has no splats: there is nothing to show")
     cameras = known_cameras(options)
     with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
-        page = MapPage(options.host, options.port)
+        page = MapPage(options.host, options.port, options.name)
     shown = SavedMapView(page, final, cameras, options.map.with_name(keyframe_images.FOLDER), str(options.map))
     print(f"{options.map}: {page.url}{left_out}; the page's button Close or Ctrl-C ends it", flush=True)
     signal.signal(signal.SIGINT, lambda *_: shown.closed.set())
@@ -199,4 +201,7 @@ def main(arguments: list[str] | None = None, prog: str = "mvsgs view") -> int:
     input_arguments(parser)
     parser.add_argument("--host", default="127.0.0.1", help="0.0.0.0 opens the page to the whole network")
     parser.add_argument("--port", type=int, default=8080, help="of the page; the next free one if it is taken")
+    parser.add_argument(
+        "--name", action="append", default=[], help="at which a proxy shows the page, such as maps.example.org"
+    )
     return run(parser, arguments, view)

@@ -39,10 +39,11 @@ class MapPage:
     far planes; what it is given is in the map's own unit, relative to one origin. No other page can read it.
     """
 
-    def __init__(self, host: str, port: int) -> None:
-        """Listens at `port`, or at the next free one if it is taken. Raises ValueError, see `check_address`."""
+    def __init__(self, host: str, port: int, names: Sequence[str] = ()) -> None:
+        """Listens at `port`, or at the next free one if it is taken. names: at which a proxy shows it. Raises
+        ValueError, see `check_address`."""
         check_address(host, port)
-        with guarded(host):
+        with guarded(host, names):
             self.server = viser.ViserServer(host=host, port=port, label="MVS-GS", verbose=False)
         self.url = f"http://{host}:{self.server.get_port()}"
         self.unit: float | None = None  # map units in one unit of the page

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
@@ -19,11 +19,21 @@ from websockets.http11 import Request, Response
 from nodes.runtime.addresses import is_loopback
 
 _making = threading.Lock()
+_PORTS = {"http": 80, "https": 443}  # of an address that names none
+_ADVICE = "give the name at which a proxy shows it: viewer.names=[NAME], or `mvsgs view --name NAME`"
+
+
+def check_names(names: Sequence[str], option: str) -> None:
+    """Raises ValueError for what can be no name of a host."""
+    for name in names:
+        if not name or _place(f"//{name}") != (name.lower(), None):
+            raise ValueError(f"{option}: {name!r} is no host's name, such as maps.example.org, without scheme and port")
 
 
 @contextmanager
-def guarded(host: str) -> Iterator[None]:
-    """The servers that are made in here, listening at `host`, answer no other page: viser has no option for that.
+def guarded(host: str, names: Sequence[str] = ()) -> Iterator[None]:
+    """The servers that are made in here, listening at `host` and shown by a proxy at `names`, answer no other page:
+    viser has no option for that.
 
     Raises RuntimeError where none was made in the way that viser does it.
     """
@@ -31,7 +41,7 @@ def guarded(host: str) -> Iterator[None]:
     plain: Callable[..., Any] = websocket_server.serve
 
     def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        guards.append(_Guard(host, process_request))
+        guards.append(_Guard(host, names, process_request))
         return plain(*arguments, process_request=guards[-1], **options)
 
     with _making:
@@ -45,13 +55,15 @@ def guarded(host: str) -> Iterator[None]:
 
 
 class _Guard:
-    def __init__(self, host: str, answer: Callable[[ServerConnection, Request], Any] | None) -> None:
+    def __init__(
+        self, host: str, names: Sequence[str], answer: Callable[[ServerConnection, Request], Any] | None
+    ) -> None:
         """answer: the server's own, of what is let in."""
-        self._host, self._answer = host, answer
+        self._host, self._names, self._answer = host, names, answer
         self._told = False
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
-        why = refusal(request.headers, self._host)
+        why = refusal(request.headers, self._host, self._names)
         if why is None:
             answer: Response | None = self._answer(connection, request) if self._answer else None
             return answer
@@ -61,18 +73,30 @@ class _Guard:
         return connection.respond(HTTPStatus.FORBIDDEN, f"refused: {why}\n")
 
 
-def refusal(headers: Headers, host: str) -> str | None:
-    """Why a server that listens at `host` does not answer a request with these headers; None: it does."""
+def refusal(headers: Headers, host: str, names: Sequence[str] = ()) -> str | None:
+    """Why a server that listens at `host`, and that a proxy shows at `names`, does not answer a request with these
+    headers; None: it does. A proxy keeps the header Host or puts its own there."""
     asked, origin = headers.get("Host", ""), headers.get("Origin")
-    if is_loopback(host) and not is_loopback(_name(asked)):  # else a name of another's that leads here
-        return f"it is at {host}, and was asked for at {asked!r}: open it at http://{host}, or at localhost"
-    if origin is not None and origin.lower().partition("://")[2] != asked.lower():
-        return f"a page of {origin!r} asked for it, at {asked!r}; a proxy before it must keep the header Host"
-    return None
+    known = {name.lower() for name in names}
+    name, _ = _place(f"//{asked}")
+    if is_loopback(host) and not is_loopback(name) and name not in known:  # else a name of another's that leads here
+        return f"it is at {host}, and was asked for at {asked!r}: open it at http://{host} or localhost, or {_ADVICE}"
+    if origin is None or _place(origin)[0] in known or _same_place(origin, asked):
+        return None
+    return f"a page of {origin!r} asked for it, at {asked!r}; if that is its own, {_ADVICE}"
 
 
-def _name(asked: str) -> str:
+def _same_place(origin: str, asked: str) -> bool:
+    scheme = origin.partition("://")[0].lower()
+    (name, port), (asked_name, asked_port) = _place(origin), _place(f"//{asked}")
+    usual = _PORTS.get(scheme)
+    return name != "" and (name, port or usual) == (asked_name, asked_port or usual)
+
+
+def _place(address: str) -> tuple[str, int | None]:
+    """Name and port of an address, the name in small letters; no name where it is none."""
     try:
-        return urlsplit(f"//{asked}").hostname or ""
+        parts = urlsplit(address)
+        return parts.hostname or "", parts.port
     except ValueError:
-        return ""
+        return "", None

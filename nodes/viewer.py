@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from mvsgs_core.rasterizer.splats import Splats
 from nodes import Node
 from nodes.keyframe_pictures import KeyframePictures, depth_points, pictures
 from nodes.map_page import MapPage, check_address
+from nodes.page_guard import check_names
 from nodes.seen_keyframes import SeenKeyframe, SeenKeyframes
 
 _FIGURES = ("nothing", "coverage", "error")  # that can color keyframes
@@ -37,6 +38,7 @@ class Viewer(Node):
     class Config:
         host: str = "127.0.0.1"  # address to listen at; 0.0.0.0 opens the page to the whole network, without password
         port: int = 8080  # of the page; the next free one if it is taken
+        names: list[str] = field(default_factory=list)  # at which a proxy shows the page, such as maps.example.org
         keep_open: bool = False  # after the end of the run, until the page's button or Ctrl-C closes it
         max_frustums: int = 200  # keyframes drawn; beyond, the oldest go
         max_splats: int = 1000000  # of the refined map that are shown, spread over it
@@ -46,11 +48,12 @@ class Viewer(Node):
     @classmethod
     def check(cls, config: Config) -> None:
         check_address(config.host, config.port)
+        check_names(config.names, "names")
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
         c = self.config
-        self.page = MapPage(c.host, c.port)
+        self.page = MapPage(c.host, c.port, c.names)
         self.server, self.url = self.page.server, self.page.url
         self.stats.values["url"] = self.url
         if c.port and self.server.get_port() != c.port:
