@@ -62,8 +62,7 @@ class Camera(LiveSource):
         camera_mask(config.mask)
         number = device_number(config.path)
         device = Path(f"/dev/video{number}")
-        if Path(config.path).is_file():
-            raise CameraError(f"{config.path} is a file and no camera: use dataset=video dataset.path={config.path}")
+        _refuse_file(config.path)
         if number is not None and sys.platform == "linux" and not device.exists():
             there = sorted(str(path) for path in device.parent.glob("video*"))
             found = f"there is {', '.join(there)}" if there else "no camera is connected"
@@ -184,9 +183,15 @@ def device_number(path: str) -> int | None:
     return None if found is None else int(found[1])
 
 
+def _refuse_file(path: str) -> None:
+    """Which would begin anew whenever it ended, as a camera that was lost."""
+    file = re.sub("^file:(//)?", "", path, flags=re.IGNORECASE)  # an address that OpenCV opens, too
+    if file != path or Path(path).is_file():
+        raise CameraError(f"{path} is a file and no camera: use dataset=video dataset.path={file}")
+
+
 def _open(config: Camera.Config) -> cv2.VideoCapture:
-    if Path(config.path).is_file():
-        raise CameraError(f"{config.path} is a file and no camera: use dataset=video dataset.path={config.path}")
+    _refuse_file(config.path)
     number = device_number(config.path)
     if number is not None:
         capture = cv2.VideoCapture(number)  # by its name with limits of time, as below, OpenCV does not open it
@@ -199,11 +204,11 @@ def _open(config: Camera.Config) -> cv2.VideoCapture:
     if not capture.isOpened():
         capture.release()
         raise CameraError(f"{_called(config)} cannot be opened: {hint}")
-    if number is None and config.path.lower().startswith("http") and 0 < capture.get(cv2.CAP_PROP_FRAME_COUNT) < MANY:
+    if number is None and 0 < capture.get(cv2.CAP_PROP_FRAME_COUNT) < MANY:
         capture.release()
         raise CameraError(
-            f"{_called(config)} is a video file, which ends, and no camera: download it and give the file, as in "
-            "`mvsgs walk.mp4`"
+            f"{_called(config)} is a video file, which ends, and no camera: give the file, downloaded if need be, "
+            "as in `mvsgs walk.mp4`"
         )
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # drivers that queue pictures would deliver old ones
     if config.resolution is not None:

@@ -30,6 +30,7 @@ class FakeCapture:
     interval = 0.01
     lost_after: int | None = None  # pictures, then no more until opened again
     dead_after: int | None = None  # pictures over all captures, then never again
+    count = -2.8e11  # frames, as OpenCV counts those of a stream without an end
     opened = 0
     pictures = 0
 
@@ -50,6 +51,9 @@ class FakeCapture:
 
     def set(self, *_: object) -> bool:
         return True
+
+    def get(self, what: int) -> float:
+        return self.count if what == cv2.CAP_PROP_FRAME_COUNT else 0.0
 
     def release(self) -> None:
         pass
@@ -373,5 +377,27 @@ def test_the_address_of_a_video_file_is_refused_as_it_would_begin_anew_for_ever(
         def log_message(self, *_: object) -> None:
             pass
 
-    with serving(Folder) as address, pytest.raises(CameraError, match=r"is a video file, which ends, .* download it"):
+    with (
+        serving(Folder) as address,
+        pytest.raises(CameraError, match=r"is a video file, which ends, .* downloaded if need be"),
+    ):
         list(Camera(Camera.Config(path=address, timeout=3.0, stop=5)).run())
+
+
+@pytest.mark.parametrize("path", ["rtsp://host/film", "/data/%03d.jpg", "concat:walk.mp4"])
+def test_whatever_has_a_last_frame_is_no_camera(capture: type[FakeCapture], path: str) -> None:
+    capture.count = 900.0
+    with pytest.raises(CameraError, match="is a video file, which ends"):
+        list(Camera(Camera.Config(path=path, timeout=0.3)).run())
+
+
+@pytest.mark.parametrize("count", [-1.0, 0.0, -2.8e11, 2.0**62, float("nan")])
+def test_a_stream_whose_frames_nobody_can_count_is_a_camera(capture: type[FakeCapture], count: float) -> None:
+    capture.count, capture.dead_after = count, 3
+    assert [m for m in Camera(Camera.Config(path="rtsp://host/2", timeout=0.3)).run() if isinstance(m, Frame)]
+
+
+@pytest.mark.parametrize("scheme", ["file://", "file:", "FILE://"])
+def test_the_address_of_a_file_is_refused_before_anything_starts(scheme: str) -> None:
+    with pytest.raises(CameraError, match=r"is a file and no camera: use dataset=video dataset.path=/data/walk\.mp4"):
+        Camera.check(Camera.Config(path=f"{scheme}/data/walk.mp4"))
