@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mvsgs_core.bad_file import BadFileError
-from mvsgs_core.datasets.exif import exif_contradiction, read_exif_lens
+from mvsgs_core.datasets.exif import exif_doubt, read_exif_lens
 from mvsgs_core.datasets.files import UnreadableImageError, opened_image, upright_size
 from mvsgs_core.datasets.lens import Lens, guess_lens
 
@@ -74,11 +74,11 @@ def with_distortion(lens: Lens, distortion: Sequence[float | str]) -> Lens:
 
 def exif_notices(path: Path, lens: Lens, distortion: Sequence[float | str]) -> list[str]:
     """What to say of a lens whose focal length is of the EXIF header of the image `path`."""
-    contradiction = exif_contradiction(path)
+    doubt = exif_doubt(path)
     return [
         f"intrinsics are from EXIF: focal length {lens.intrinsics[0]:.0f} pixels for {lens.size[1]}x{lens.size[0]}, "
         f"good to a few percent, distortion {'as given' if len(distortion) else 'unknown'}",
-        *([contradiction] if contradiction else []),
+        *([doubt] if doubt else []),
     ]
 
 

@@ -23,6 +23,7 @@ _GPS_IFD = 0x8825
 _LATITUDE, _LONGITUDE, _ALTITUDE = (1, 2), (3, 4), (5, 6)  # tags of reference and value
 _BELOW = (1, 3)  # references of altitudes below the sea, below the ellipsoid (EXIF 3.0)
 _APART = 1.15  # or its inverse, of two focal lengths: rounding and another shape of sensor make less
+_SHAPES = (3 / 2, 4 / 3, 16 / 9)  # of sensors
 _NARROW = math.radians(10.0)  # across the longer side: as a 200 mm lens has
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)  # CIPA DCG-001: "35 mm equivalent" compares diagonals
 
@@ -32,8 +33,9 @@ def read_exif_lens(path: Path, *, turn_upright: bool = True) -> Lens | None:
 
     A header that cannot be read, or tells of a focal length that no camera has, is one that lacks it.
     Prefers focal length times the resolution of the sensor, which is exact for a picture that was scaled but not
-    cropped, over the 35 mm equivalent, which is rounded to whole millimeters; where both contradict each other, the
-    resolution is of another size of the picture. Alone, it must be of no narrower view than nearly all lenses have.
+    cropped, over the 35 mm equivalent, which is rounded to whole millimeters and is of the whole sensor. Where both
+    contradict each other in a picture of a sensor's shape, the resolution is of another size of the picture; one of
+    another shape was cropped. Alone, the resolution must be of no narrower view than nearly all lenses have.
     turn_upright: the lens is of the image as the header says it should be shown.
     """
     try:
@@ -42,10 +44,7 @@ def read_exif_lens(path: Path, *, turn_upright: bool = True) -> Lens | None:
             height, width = upright_size(image) if turn_upright else (image.height, image.width)
     except UnreadableImageError:
         return None  # reading the sequence reports it
-    by_sensor, by_35mm = _focal_lengths(header, (height, width))
-    if by_sensor is not None and by_35mm is None and 2.0 * math.atan(0.5 * max(height, width) / by_sensor) < _NARROW:
-        return None
-    focal = by_35mm if by_sensor is None or _apart(by_sensor, by_35mm) else by_sensor
+    focal, _ = _focal_length(header, (height, width))
     if focal is None:
         return None
     try:
@@ -54,31 +53,37 @@ def read_exif_lens(path: Path, *, turn_upright: bool = True) -> Lens | None:
         return None
 
 
-def exif_contradiction(path: Path) -> str:
-    """What to say of a header that names two focal lengths; empty where it does not."""
+def exif_doubt(path: Path) -> str:
+    """What to say of a header that names two focal lengths, or one that is hardly true; empty where it does not."""
     try:
         with opened_image(path, path.name) as image:
-            header = image.getexif().get_ifd(_EXIF_IFD)
-            by_sensor, by_35mm = _focal_lengths(header, (image.height, image.width))
+            _, doubt = _focal_length(image.getexif().get_ifd(_EXIF_IFD), (image.height, image.width))
     except UnreadableImageError:
         return ""
-    if by_sensor is None or not _apart(by_sensor, by_35mm):
-        return ""
-    return (
-        f"EXIF of {path.name} contradicts itself: by the sensor's resolution the focal length is {by_sensor:.0f} "
-        f"pixels, as of a picture that was scaled; that of the 35 mm equivalent is taken, {by_35mm:.0f}"
-    )
+    return f"EXIF of {path.name} {doubt}" if doubt else ""
 
 
-def _focal_lengths(header: dict[int, object], size: tuple[int, int]) -> tuple[float | None, float | None]:
-    """Pixels of an image (height, width): by the resolution of the sensor, and by the 35 mm equivalent."""
+def _focal_length(header: dict[int, object], size: tuple[int, int]) -> tuple[float | None, str]:
+    """Pixels of an image (height, width), None where it is not known; and what is doubtful in it, for a notice."""
     equivalent = _positive(header.get(_FOCAL_LENGTH_35MM))
     by_35mm = None if equivalent is None else equivalent * math.hypot(*size) / _DIAGONAL_35MM
-    return _from_sensor(header, max(size)), by_35mm
-
-
-def _apart(by_sensor: float, by_35mm: float | None) -> bool:
-    return by_35mm is not None and not 1.0 / _APART < by_sensor / by_35mm < _APART
+    by_sensor = _from_sensor(header, max(size))
+    if by_sensor is None:
+        return by_35mm, ""
+    if by_35mm is None:
+        angle = 2.0 * math.atan(0.5 * max(size) / by_sensor)
+        if angle >= _NARROW:
+            return by_sensor, ""
+        return None, (
+            f"names a focal length of {by_sensor:.0f} pixels, {math.degrees(angle):.1f} degrees across the picture, as "
+            "of one that was scaled: it is taken to be unknown"
+        )
+    if 1.0 / _APART < by_sensor / by_35mm < _APART:
+        return by_sensor, ""
+    told = f"contradicts itself: by the sensor's resolution the focal length is {by_sensor:.0f} pixels"
+    if any(math.isclose(max(size) / min(size), shape, rel_tol=0.01) for shape in _SHAPES):
+        return by_35mm, f"{told}, as of a picture that was scaled; that of the 35 mm equivalent is taken, {by_35mm:.0f}"
+    return by_sensor, f"{told}, which is taken, as the picture was cropped; by the 35 mm equivalent {by_35mm:.0f}"
 
 
 def read_exif_time(path: Path) -> datetime | None:

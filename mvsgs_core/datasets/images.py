@@ -15,7 +15,7 @@ from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets import dataset
 from mvsgs_core.datasets.calibration import exif_notices, image_size, lens_from_option, with_distortion
 from mvsgs_core.datasets.colmap import find_colmap, read_colmap
-from mvsgs_core.datasets.exif import read_exif_exposure, read_exif_lens, read_exif_place, read_exif_time
+from mvsgs_core.datasets.exif import exif_doubt, read_exif_exposure, read_exif_lens, read_exif_place, read_exif_time
 from mvsgs_core.datasets.files import (
     IMAGE_SUFFIXES,
     Layout,
@@ -46,6 +46,7 @@ LAYOUT = Layout(
 )
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
 _LOOKED_AT = 1000  # images of which the header is read for their sizes, at most
+_FEW = 0.2  # of the images: so many of another shape than the first are left out rather than all read without turns
 _MANY = 3  # times as many as beside such a subfolder: those are a preview, a plan, a logo
 
 
@@ -81,39 +82,60 @@ class Images(ImageSequence):
         images = _find_images(folder, self.warnings)
         sizes = _Sizes.of(images)
         model = None if self.intrinsics is not None else _find_model(folder, images, self.model, sizes.taken)
-        masks = masks_of(images, folder) if self.mask is None else [None] * len(images)
+        mask = None if self.mask is None else Path(self.mask).expanduser()
+        one = mask is not None and mask.is_file()
+        masks = [mask] * len(images) if one else masks_of(images, folder, mask)
         self._find_times(images)
         if model is not None:
             records = _from_model(model, folder, images, self.rate, self.warnings)
             known = dict(zip(images, masks))
             records = [replace(record, mask=record.mask or known[record.image]) for record in records]
             return Found(records, turn_upright=False, size=_Sizes.of([record.image for record in records]).taken)
-        sizes.check()
-        if sizes.unturned:
+        turn_upright = sizes.turn_upright(self._given_shapes(sizes, dict(zip(images, masks))))
+        if turn_upright:
+            sizes.check()
+        else:
             self.warnings.append(
-                f"EXIF turns some of the images by a quarter and others not, such as {sizes.usual.name}: all are read "
-                "as the camera took them, without a turn, so that intrinsics and masks are of one shape"
+                "EXIF turns some of the images by a quarter and others not: all are read as the camera took them, "
+                "without a turn, so that intrinsics and masks are of one shape; evaluator.camera_up=true is not for "
+                "them, as the upper side of such an image need not be up"
             )
-        lenses = self._lenses(images, sizes)
-        found = enumerate(zip(images, lenses, masks))
+        size = sizes.shown(turn_upright)
+        found = enumerate(zip(images, self._lenses(images, size, turn_upright), masks))
         records = [Record(i / self.rate, image, lens, mask=mask) for i, (image, lens, mask) in found]
-        return Found(records, turn_upright=not sizes.unturned, size=sizes.shown)
+        return Found(records, turn_upright=turn_upright, size=size)
 
-    def _lenses(self, images: list[Path], sizes: _Sizes) -> list[Lens]:
-        if self.intrinsics is not None:
-            return [self._given_lens([sizes.usual, *images], self.intrinsics)] * len(images)
-        found = [read_exif_lens(image, turn_upright=not sizes.unturned) for image in images]
+    def _given_shapes(self, sizes: _Sizes, masks: dict[Path, Path | None]) -> list[tuple[float, float]]:
+        """(height, width) that the given intrinsics, and a mask of an image that EXIF turns, are for; to a factor."""
+        shapes: list[tuple[float, float]] = []
+        if self.intrinsics is not None and not isinstance(self.intrinsics, str):
+            _, _, cx, cy = lens_from_option(self.intrinsics, self.distortion, sizes.taken)[0].intrinsics
+            shapes.append((cy, cx))
+        for path in (masks[image] for image in sizes.turned):
+            if path is not None:
+                with suppress(UnreadableImageError), opened_image(path, path.name) as opened:
+                    return [*shapes, (opened.height, opened.width)]
+        return shapes
+
+    def _lenses(self, images: list[Path], size: tuple[int, int], turn_upright: bool) -> list[Lens]:
+        """size: (height, width) of an image whose lens is given or guessed."""
+        if self.intrinsics not in (None, "auto"):
+            return [lens_from_option(self.intrinsics, self.distortion, size)[0]] * len(images)
+        found = [read_exif_lens(image, turn_upright=turn_upright) for image in images]
         known = [(image, lens) for image, lens in zip(images, found) if lens is not None]
+        unknown = [image for image, lens in zip(images, found) if lens is None]
+        doubt = exif_doubt(unknown[0]) if unknown else ""
+        self.warnings += [doubt] if doubt else []
         if not known:
-            lens, warnings = lens_from_option("auto", self.distortion, sizes.shown)
+            lens, warnings = lens_from_option("auto", self.distortion, size)
             where = f"{images[0].parent}: neither a COLMAP model (sparse/0), a {NAMES[0]} nor EXIF focal lengths"
-            self.warnings += [f"no calibration for {where} were found", *warnings]
+            nothing = [f"no calibration for {where} were found"] if self.intrinsics is None else []
+            self.warnings += [*nothing, *warnings]
             return [lens] * len(images)
         image, first = known[0]
         self.warnings += exif_notices(image, first, self.distortion)
-        if len(known) < len(images):
-            without = len(images) - len(known)
-            self.warnings.append(f"images without an EXIF focal length, which take the first one's: {without}")
+        if unknown:
+            self.warnings.append(f"images without an EXIF focal length, which take the first one's: {len(unknown)}")
         return [with_distortion(lens if lens is not None else first, self.distortion) for lens in found]
 
     def _find_times(self, images: list[Path]) -> None:
@@ -206,37 +228,55 @@ def _is_aside(path: Path, folder: Path) -> bool:
 class _Sizes:
     """What sizes (height, width) the images have, of many some; those that cannot be read are no matter."""
 
-    taken: tuple[int, int]  # the most frequent one on disk
-    shown: tuple[int, int]  # and as images are read, of those in the first image's shape
-    usual: Path  # an image of that size, not turned where others are
-    unturned: bool  # the images have one shape as the camera took them, of which EXIF turns some by a quarter
-    upright: dict[Path, tuple[int, int]]
+    on_disk: dict[Path, tuple[int, int]]  # as the camera took them
+    upright: dict[Path, tuple[int, int]]  # as EXIF says that they should be shown
 
     @classmethod
     def of(cls, images: list[Path]) -> _Sizes:
         """Raises BadFileError where none can be read."""
-        taken, upright = {}, {}
+        on_disk, upright = {}, {}
         for path in images[:: -(-len(images) // _LOOKED_AT)]:
             with suppress(UnreadableImageError), opened_image(path, path.name) as opened:
-                taken[path] = opened.height, opened.width
-                upright[path] = taken[path][::-1] if is_turned(opened) else taken[path]
-        if not taken:
-            size = image_size(images)
-            return cls(size, size, images[0], False, {})
-        unturned = not _of_one_shape(upright) and _of_one_shape(taken)
-        shown = taken if unturned else upright
-        first = next(iter(shown.values()))
-        size = _most_frequent([size for size in shown.values() if same_shape(size, first)])
-        usual = next(path for path, own in upright.items() if own == size)
-        return cls(_most_frequent(taken.values()), size, usual, unturned, upright)
+                on_disk[path] = opened.height, opened.width
+                upright[path] = on_disk[path][::-1] if is_turned(opened) else on_disk[path]
+        if not on_disk:
+            on_disk = upright = {images[0]: image_size(images)}
+        return cls(on_disk, upright)
+
+    @property
+    def taken(self) -> tuple[int, int]:
+        """The most frequent one on disk."""
+        return _most_frequent(self.on_disk.values())
+
+    @property
+    def turned(self) -> list[Path]:
+        """Images that EXIF turns by a quarter."""
+        return [path for path, size in self.on_disk.items() if size != self.upright[path]]
+
+    def turn_upright(self, given: list[tuple[float, float]]) -> bool:
+        """Whether to read images as EXIF says: unless they have one shape only as the camera took them.
+
+        given: (height, width) of what was given for the images, which then decides. Without it, few that are held
+        otherwise are no reason to let the cameras of all others lie.
+        """
+        if not _of_other_shape(self.upright) or _of_other_shape(self.on_disk):
+            return True
+        height, width = self.taken
+        if given:
+            return any((h > w) != (height > width) for h, w in given)
+        return len(_of_other_shape(self.upright)) < _FEW * len(self.upright)
+
+    def shown(self, turn_upright: bool) -> tuple[int, int]:
+        """The most frequent one as images are read, of those in the first image's shape."""
+        sizes = self.upright if turn_upright else self.on_disk
+        first = next(iter(sizes.values()))
+        return _most_frequent(size for size in sizes.values() if same_shape(size, first))
 
     def check(self) -> None:
         """Raises ValueError where most images would be left out, as they have another shape than the first."""
-        if self.unturned or not self.upright:
-            return
-        first, shape = next(iter(self.upright.items()))
-        others = [path for path, other in self.upright.items() if not same_shape(other, shape)]
+        others = _of_other_shape(self.upright)
         if 2 * len(others) > len(self.upright):
+            first, shape = next(iter(self.upright.items()))
             height, width = self.upright[others[0]]
             raise ValueError(
                 f"{len(others)} of {len(self.upright)} images have another shape than the first, {first.name} of "
@@ -249,9 +289,10 @@ def _most_frequent(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
     return Counter(sizes).most_common(1)[0][0]
 
 
-def _of_one_shape(sizes: dict[Path, tuple[int, int]]) -> bool:
+def _of_other_shape(sizes: dict[Path, tuple[int, int]]) -> list[Path]:
+    """Than the first."""
     first = next(iter(sizes.values()))
-    return all(same_shape(size, first) for size in sizes.values())
+    return [path for path, size in sizes.items() if not same_shape(size, first)]
 
 
 def _find_model(folder: Path, images: list[Path], given: str | Path | None, size: tuple[int, int]) -> Model | None:

@@ -18,11 +18,17 @@ TAKEN, OFFSET, FRACTION = 0x9003, 0x9011, 0x9291
 HEIGHT_ON_DISK, WIDTH_ON_DISK = 48, 64
 
 
-def photograph(path: Path, exif: dict[int, object] | None = None, orientation: int = 1, right: int = 200) -> Path:
+def photograph(
+    path: Path,
+    exif: dict[int, object] | None = None,
+    orientation: int = 1,
+    right: int = 200,
+    size: tuple[int, int] = (HEIGHT_ON_DISK, WIDTH_ON_DISK),
+) -> Path:
     """Black, and `right` in its right half, as the camera took it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    pixels = np.zeros((HEIGHT_ON_DISK, WIDTH_ON_DISK, 3), np.uint8)
-    pixels[:, WIDTH_ON_DISK // 2 :] = right
+    pixels = np.zeros((*size, 3), np.uint8)
+    pixels[:, size[1] // 2 :] = right
     header = Image.Exif()
     header[0x0112] = orientation
     header.get_ifd(0x8769).update(exif or {})
@@ -98,6 +104,51 @@ def test_upright_and_lying_photographs_of_one_camera_are_all_read(turned: tuple[
     np.testing.assert_allclose(given[0].intrinsics, [50, 51, 31, 23])
 
 
+def test_turned_photographs_beside_smaller_ones_that_are_not(tmp_path: Path) -> None:
+    for n in range(6):
+        photograph(tmp_path / f"{n}.jpg", orientation=6 if n < 4 else 1, size=(48, 64) if n < 4 else (24, 32))
+    for options in ({}, {"intrinsics": [50, 51, 31, 23]}, {"intrinsics": "auto"}):
+        found, warnings = opened(tmp_path, **options)
+        assert [item.image.shape[:2] for item in found] == 6 * [(48, 64)]
+        assert any("EXIF turns some" in w and "evaluator.camera_up=true is not for them" in w for w in warnings)
+
+
+def test_few_lying_photographs_turn_no_folder_of_upright_ones(tmp_path: Path) -> None:
+    for n in range(9):
+        photograph(tmp_path / f"{n}.jpg", orientation=6 if n < 8 else 1)
+    found, warnings = opened(tmp_path)
+    assert [item.image.shape[:2] for item in found] == 8 * [(64, 48)]
+    assert any("images left out because" in w and "8.jpg" in w for w in warnings)
+    photograph(tmp_path / "0.jpg")  # others than the first are not few
+    assert len(opened(tmp_path)[0]) == 9
+
+
+@pytest.mark.parametrize("lying", [1, 3])
+@pytest.mark.parametrize("what", ["intrinsics", "mask", "masks"])
+def test_what_is_given_for_upright_photographs_keeps_them_upright(what: str, lying: int, tmp_path: Path) -> None:
+    photos, options = tmp_path / "photos", {}
+    for n in range(9):
+        photograph(photos / f"{n}.jpg", orientation=1 if n >= 9 - lying else 6)
+    mask = Image.fromarray((255 * (np.arange(64) > 20)[:, None].repeat(48, 1)).astype(np.uint8))
+    if what == "intrinsics":
+        options = {"intrinsics": [50, 50, 23, 31]}
+    elif what == "mask":
+        mask.save(tmp_path / "mask.png")
+        options = {"mask": tmp_path / "mask.png"}
+    else:
+        (photos / "masks").mkdir()
+        for n in range(9):
+            mask.save(photos / f"masks/{n}.png")
+    found, _ = opened(photos, **options)
+    assert [item.image.shape[:2] for item in found] == (9 - lying) * [(64, 48)]
+    if what == "intrinsics":
+        np.testing.assert_allclose(found[0].intrinsics, [50, 50, 23, 31])
+    else:
+        assert found[0].mask is not None
+        assert found[0].mask[21:].all()
+        assert not found[0].mask[:20].any()
+
+
 def test_turned_photographs_beside_a_file_that_does_not_say_their_size(tmp_path: Path) -> None:
     """A model is of images as they are on disk."""
     for n in range(3):
@@ -139,6 +190,19 @@ def test_a_focal_length_of_another_size_of_the_picture_is_not_taken(tmp_path: Pa
     assert read_exif_lens(photograph(path, {EQUIVALENT: 400})) is not None, "a long lens that says so"
     warnings = open_dataset("images", path=tmp_path).warnings
     assert not any("contradicts" in w for w in warnings)
+    photograph(path, scaled)
+    warnings = open_dataset("images", path=tmp_path).warnings
+    assert any("EXIF of a.jpg names a focal length of 720 pixels, 5.1 degrees across" in w for w in warnings)
+
+
+def test_a_cropped_picture_has_the_focal_length_of_its_sensor(tmp_path: Path) -> None:
+    """The middle of a picture of 96x64: an editor wrote its new size, and left what is of the whole sensor."""
+    cropped = {FOCAL: 24.0, RESOLUTION: 96 / 36 * 10, UNIT: 3, WIDTH: 64, HEIGHT: 64, EQUIVALENT: 24}
+    lens = read_exif_lens(photograph(tmp_path / "a.jpg", cropped, size=(64, 64)))
+    assert lens is not None
+    np.testing.assert_allclose(lens.intrinsics[0], 64.0)
+    warnings = open_dataset("images", path=tmp_path).warnings
+    assert any("EXIF of a.jpg contradicts itself" in w and "64 pixels, which is taken" in w for w in warnings)
 
 
 def test_times_of_photographs(tmp_path: Path) -> None:
