@@ -1,7 +1,7 @@
 """Masks: which pixels of an image count. 0 is to be ignored and all else counts, as for COLMAP and nerfstudio.
 
 People, cars, the robot's own body, a watermark, a fisheye's rim. A mask belongs to one image, or to all of a camera; an
-image that was cut out has its own, where it is transparent.
+image that was cut out has its own, where it is transparent; one that is transparent everywhere has none.
 """
 
 from __future__ import annotations

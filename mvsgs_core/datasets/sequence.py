@@ -310,6 +310,10 @@ class ImageSequence(FileReader, ABC):
             return self._camera_mask.framed(self._framing, lens, size)
         if record.mask is None:
             source, mask = record.image, read_alpha(record.image, turn_upright=self._turn_upright)
+            if mask is not None and not mask.any():  # a program filled the channel with zeros
+                what = "images that are transparent everywhere, which is taken for no mask: every pixel counts"
+                self._notices.tally(what, source.name)
+                return None
         else:
             source, mask = record.mask, None
             if record.mask.is_file():

@@ -143,12 +143,11 @@ def test_what_is_transparent_is_ignored_where_there_is_no_mask(tmp_path: Path) -
         cut[..., 3] = 255 * alpha
         Image.fromarray(cut).save(tmp_path / f"photo{i}.png")
     found, warnings = items_of(tmp_path)
-    assert [item.image[0, 0, 0] for item in found] == [20, 21]
+    assert [item.image[0, 0, 0] for item in found] == [20, 21, 22]
     np.testing.assert_array_equal(found[0].mask, LEFT)
-    assert found[1].mask is None
-    assert any(
-        line.startswith("images left out because of their masks: 1 (first: photo2.png leaves no") for line in warnings
-    )
+    assert [item.mask for item in found[1:]] == [None, None]
+    (told,) = (line for line in warnings if "transparent everywhere" in line)
+    assert told.endswith("no mask: every pixel counts: 1 (first: photo2.png)")
     write_mask(tmp_path / "masks/photo0.png", ~LEFT)
     found, _ = items_of(tmp_path)
     np.testing.assert_array_equal(found[0].mask, ~LEFT)
