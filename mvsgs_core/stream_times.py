@@ -18,7 +18,8 @@ class StreamTimes:
 
     A frame from before the last one is late, one from hours after it no better. Where several in a row are, it is the
     sender's clock that was set, as when its program starts again: the stream's time then goes on by as much as passed
-    here, and from there by the sender's clock again. So it does where that clock stands still.
+    here, and from there by the sender's clock again. So it does where that clock stands still. Where it then goes on as
+    if it had not, as where one stamp was given twice, the stream's time goes on by it as before.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -26,6 +27,7 @@ class StreamTimes:
         self.repaired = 0
         self._clock = clock
         self._shift = 0.0  # s added to the sender's times
+        self._before: tuple[float, float, float] | None = None  # of a standstill: shift, time and coming, at its begin
         self._last: float | None = None
         self._came = 0.0
         self._odd = 0  # frames in a row that did not follow
@@ -44,8 +46,16 @@ class StreamTimes:
                 if not restarted and abs(step) >= MIN_STEP and not self._jumped(now):
                     return None
                 self.repaired += 1
+                stands = not restarted and abs(step) < MIN_STEP
+                self._before = (self._before or (self._shift, self._last, self._came)) if stands else None
                 shown = self._last + max(passed, MIN_STEP)
                 self._shift = shown - timestamp
+            elif self._before is not None:
+                shift, begin, came = self._before
+                expected = begin + now - came
+                if abs(timestamp + shift - expected) < abs(shown - expected):  # only stamps stood still, and no clock
+                    self._shift, shown = shift, max(timestamp + shift, self._last + MIN_STEP)
+                self._before = None
         self._last, self._came, self._odd = shown, now, 0
         return shown
 
@@ -57,4 +67,4 @@ class StreamTimes:
         return self._odd >= ENOUGH or (self._odd > 1 and now - self._odd_since >= PATIENCE)
 
 
-__all__ = ["LATEST", "StreamTimes"]
+__all__ = ["LATEST", "LEAP", "StreamTimes"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
 from mvsgs_core.datasets.ros import calibrated, lens_of, rectified, rgb_of
 from mvsgs_core.datasets.sequence import FileReader, Notices
-from mvsgs_core.stream_times import StreamTimes
+from mvsgs_core.stream_times import LEAP, StreamTimes
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -32,6 +33,7 @@ LAYOUT = Layout(
 )
 _SUFFIXES = (".bag", ".db3")  # that only bags have; an .mcap file is one by its content (mcap_file.ROS_2)
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_Picture = tuple[float, float, np.ndarray]  # seconds by the bag's clock and by the camera's, and RGB
 _INFO = "sensor_msgs/msg/CameraInfo"
 _NOT_COLOR = ("depth", "infra", "disparity", "mask")
 
@@ -40,7 +42,7 @@ _NOT_COLOR = ("depth", "infra", "disparity", "mask")
 @dataclass(kw_only=True, eq=False)
 class Bag(FileReader):
     """Images of one topic, undistorted, with the time stamps of their headers; where these stand still, go back or
-    leap, as a clock that is set makes them, time goes on by the bag's own.
+    leap, as a clock that is set makes them, time goes on by the bag's own. A first one that is hours off is replaced.
 
     intrinsics (or "auto") and distortion replace its calibration; where there is none, or an empty one, the lens is the
     guess of "auto", for the tracker to estimate.
@@ -87,27 +89,12 @@ class Bag(FileReader):
 
     def __iter__(self) -> Iterator[Item]:
         self._notices.truncate(self._opening_warnings)
-        wanted = range(self._count)[self.wanted]
         index, received = 0, 0.0
         times = StreamTimes(lambda: received)
         with opened_bag(self._path) as bag:
-            connections = [c for c in bag.connections if c.topic == self._topic]
-            for number, (connection, nanoseconds, data) in enumerate(messages(bag, connections, self._notices)):
-                if number >= wanted.stop:
-                    break
-                if number not in wanted:
-                    continue
-                try:
-                    seconds, image = _picture(bag, connection, nanoseconds, data)
-                except BadFileError as error:
-                    self._notices.tally("images left out because they could not be read", str(error))
-                    continue
-                native = image.shape[0], image.shape[1]
-                if not same_shape(native, self._lens.size):
-                    what = "images left out because their calibration is for another aspect ratio"
-                    self._notices.tally(what, f"{native} for {self._lens.size}")
-                    continue
-                received, repaired = 1e-9 * nanoseconds, times.repaired
+            for picture in self._with_first_time(self._pictures(bag)):
+                received, seconds, image = picture
+                repaired = times.repaired
                 shown = times.accept(seconds)
                 if shown is None:
                     what = "images left out because their time stamps are from before, or hours after, those before"
@@ -121,6 +108,40 @@ class Bag(FileReader):
         self._end_places()
         if index == 0:
             raise BadFileError(f"no image of {self._topic} could be read: " + "; ".join(self.warnings))
+
+    def _pictures(self, bag: AnyReader) -> Iterator[_Picture]:
+        wanted = range(self._count)[self.wanted]
+        connections = [c for c in bag.connections if c.topic == self._topic]
+        for number, (connection, nanoseconds, data) in enumerate(messages(bag, connections, self._notices)):
+            if number >= wanted.stop:
+                break
+            if number not in wanted:
+                continue
+            try:
+                seconds, image = _picture(bag, connection, nanoseconds, data)
+            except BadFileError as error:
+                self._notices.tally("images left out because they could not be read", str(error))
+                continue
+            native = image.shape[0], image.shape[1]
+            if not same_shape(native, self._lens.size):
+                what = "images left out because their calibration is for another aspect ratio"
+                self._notices.tally(what, f"{native} for {self._lens.size}")
+                continue
+            yield 1e-9 * nanoseconds, seconds, image
+
+    def _with_first_time(self, pictures: Iterator[_Picture]) -> Iterator[_Picture]:
+        """The same, the first at the time that the next two agree on, by the bag's, where its own is hours off."""
+        first = list(islice(pictures, 3))
+        if len(first) == 3:
+            ahead = [seconds - received for received, seconds, _ in first]
+            if abs(ahead[0] - ahead[1]) > LEAP > abs(ahead[1] - ahead[2]):
+                received, seconds, image = first[0]
+                first[0] = received, received + ahead[1], image
+                self._notices.append(
+                    f"the first time stamp, {seconds:.3f} s, is hours off those after it: it is taken to be "
+                    f"{received + ahead[1]:.3f} s, by the bag's times"
+                )
+        return chain(first, pictures)
 
     def _item(self, index: int, seconds: float, image: np.ndarray, stamp: float) -> Item:
         """stamp: by the camera's clock, as GPS has it, which the time in the stream may be off from."""

@@ -176,6 +176,31 @@ def test_stamps_that_stand_still_are_replaced_and_a_late_image_is_left_out(tmp_p
     assert [round(item.timestamp, 6) for item in sequence] == [100.0, 100.1, 100.3, 100.4]
 
 
+@pytest.mark.parametrize("late", [0.0, 0.04])
+def test_a_stamp_that_was_given_twice_shifts_no_time_after_it(tmp_path: Path, ros: Messages, late: float) -> None:
+    """late: seconds by which the bag got every tenth image later than the others."""
+    messages = []
+    for i in range(60):
+        image = ros.image(i - (i % 10 == 9), "rgb8", picture(i), 3 * WIDTH)
+        messages.append(("/camera/image_raw", 7 + i / 10 + late * (i % 10 == 9), image))
+    items = list(open_dataset("bag", path=ros.write(bag_path(tmp_path, ros), messages)))
+    assert len(items) == 60
+    np.testing.assert_allclose([item.timestamp for item in items], 100 + np.arange(60) / 10, atol=late + 1e-6)
+    np.testing.assert_allclose(items[58].timestamp, 105.8, atol=1e-6)
+
+
+def test_a_first_stamp_that_is_hours_off_is_replaced(tmp_path: Path, ros: Messages) -> None:
+    messages = [("/camera/image_raw", 7 + i / 10, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in range(9)]
+    messages[0][2].header.stamp.sec += 1_700_000_000
+    sequence = open_dataset("bag", path=ros.write(bag_path(tmp_path, ros), messages))
+    for _ in range(2):
+        np.testing.assert_allclose([item.timestamp for item in sequence], 100 + np.arange(9) / 10, atol=1e-6)
+        told = [
+            warning for warning in sequence.warnings if "the first time stamp, 1700000100.000 s, is hours" in warning
+        ]
+        assert len(told) == 1
+
+
 def test_compressed_and_rectified_images(tmp_path: Path, ros: Messages) -> None:
     topic = "/front/image_rect_color/compressed"
     contents = [png(picture(0)), png(picture(1))[:-40], png(picture(2))]
