@@ -57,7 +57,8 @@ class GpsTrack:
         """Places of the frames that are named, and frames that have none because their names are of several.
 
         A frame is found under its name with or without its suffix, where there are several by the longest end of both
-        paths. A name is of the frames of one folder: of several that it would suit, those that it suits best have it.
+        paths; one in another folder suits less than one without a folder. A name is of the frames of one folder: of
+        several that it would suit, those that it suits best have it.
         """
         names: dict[str, list[int]] = defaultdict(list)
         for n, (name, _) in enumerate(self.named):
@@ -67,7 +68,8 @@ class GpsTrack:
         for frame in frames:
             found = names.get(frame.name.lower()) or names.get(frame.stem.lower(), [])
             folders = frame.parent.as_posix().lower()
-            fit = [_common_end(self.named[n][0].rpartition("/")[0], folders) for n in found]
+            ends = [self.named[n][0].rpartition("/")[0] for n in found]
+            fit = [_common_end(end, folders) or -bool(end) for end in ends]
             best = [n for n, length in zip(found, fit) if length == max(fit)]
             if len({tuple(self.named[n][1]) for n in best}) == 1:
                 suits[best[0]].append((max(fit), frame))

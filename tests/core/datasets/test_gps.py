@@ -101,6 +101,9 @@ def test_equal_names_in_several_folders_are_told_apart_by_their_folders(tmp_path
         f"images without a place, as several have the name in {table}, which should have their folders too: 2 (first:"
     )
     assert any(w.startswith(told) for w in sequence.warnings)
+    table.write_text("SourceFile,lat,lon,alt\nIMG_0.jpg,40,8,1\n101MEDIA/IMG_0.jpg,41,8,2\n")
+    found = places(tmp_path, gps=table)
+    assert [None if place is None else place[0] for place in found] == [40, None, 41, None], "each the one that suits"
     table.write_text("SourceFile,lat,lon,alt\nIMG_0.jpg,40,8,1\nIMG_0.jpg,41,8,2\n")
     assert places(tmp_path / "100MEDIA", gps=table) == [None, None], "it has two places"
 
