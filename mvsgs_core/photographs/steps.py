@@ -64,10 +64,8 @@ class Steps:
     @property
     def wide(self) -> bool:
         """False where none tells anything, too."""
-        moving = self.moving
-        # few that move say little: a camera may have stood, and then have moved fast
-        told = len(moving) if len(moving) == len(self.steps) else PAIRS
-        return bool(sum(step.wide for step in moving) > WIDE * told)
+        # few of many that move say little: a camera may have stood, and then have moved fast
+        return sum(step.wide for step in self.moving) > WIDE * min(PAIRS, len(self.steps))
 
     def __str__(self) -> str:
         moving = self.moving

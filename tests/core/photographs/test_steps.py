@@ -78,6 +78,12 @@ def test_photographs_that_were_taken_several_times_are_photographs(times: int) -
     assert f"; in {len(found.steps) - len(found.moving)} others nothing moves" in str(found)
 
 
+@pytest.mark.parametrize("count", [3, 5])
+def test_few_photographs_with_a_copy_are_photographs(count: int) -> None:
+    scenes = [texture(n) for n in range(count)]
+    assert steps_of(scenes[:1] + scenes).wide
+
+
 def test_a_video_of_a_camera_that_stands_is_a_video() -> None:
     scene = texture(0)
     assert not steps_of([scene] * 40).wide
