@@ -24,11 +24,12 @@ def write_trajectory(file: Path, timestamps: np.ndarray, world_from_cam: np.ndar
 
 def read_trajectory(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Timestamps (N,) and world_from_cam (N, 4, 4) float64, sorted by time. Raises BadFileError for a malformed line,
-    and where times are in other units than seconds.
+    and where half of the times or more are in other units than seconds.
 
-    Rows that are no pose are left out: motion capture writes zeros where it lost its markers.
+    Rows that are no pose, or at no time, are left out: motion capture writes zeros where it lost its markers.
     """
-    rows = []
+    rows: list[list[float]] = []
+    count, late = 0, []  # rows, and those at no time in seconds
     for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
         text = line.split("#")[0].replace(",", " ").split()
         if not text:
@@ -37,13 +38,16 @@ def read_trajectory(file: Path) -> tuple[np.ndarray, np.ndarray]:
             row = [float(v) for v in text]
             if len(row) != 8:
                 raise ValueError(f"{len(row)} numbers")
+        count += 1
         if LATEST <= abs(row[0]) < np.inf:
-            raise BadFileError(
-                f"{file} has a line {number} whose time, {text[0]}, is not in seconds: divide times by 1e9 where they "
-                "are nanoseconds, by 1e6 or 1e3 where they are micro- or milliseconds"
-            )
+            late.append(f"{file} has a line {number} whose time, {text[0]}, is not in seconds")
         if np.all(np.abs(row) < LATEST) and np.linalg.norm(row[4:]) > 0.5:
             rows.append(row)
+    if late and 2 * len(late) >= count:
+        raise BadFileError(
+            f"{late[0]}: divide times by 1e9 where they are nanoseconds, by 1e6 or 1e3 where they are micro- or "
+            "milliseconds"
+        )
     data = np.array(rows, dtype=np.float64).reshape(-1, 8)
     data = data[np.argsort(data[:, 0], kind="stable")]
     poses = np.tile(np.eye(4), (len(data), 1, 1))

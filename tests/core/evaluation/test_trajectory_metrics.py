@@ -113,3 +113,8 @@ def test_times_that_are_no_seconds_are_refused(tmp_path: Path, time: str) -> Non
     (tmp_path / "t.txt").write_text(f"0.5 1 0 0 0 0 0 1\n{time} 1 0 0 0 0 0 1\n")
     with pytest.raises(BadFileError, match=rf"t\.txt has a line 2 whose time, {time}, is not in seconds: divide"):
         trajectory_file.read_trajectory(tmp_path / "t.txt")
+
+
+def test_one_time_that_is_no_seconds_is_damage(tmp_path: Path) -> None:
+    (tmp_path / "t.txt").write_text("".join(f"{t} 1 0 0 0 0 0 1\n" for t in ("0.1", "9e15", "0.3")))
+    np.testing.assert_allclose(trajectory_file.read_trajectory(tmp_path / "t.txt")[0], [0.1, 0.3])
