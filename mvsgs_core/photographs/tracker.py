@@ -175,9 +175,8 @@ class PhotographTracker:
         factor = self._models[0].lens.factor
         if not self._guessed and not 1.0 / FAR_OFF < factor < FAR_OFF:
             self.stats.warn(
-                f"by the photographs, the focal length is {factor:.2f} times the one that EXIF or dataset.intrinsics "
-                "says; if that is wrong, and the map bent by it, begin with a better one: "
-                "dataset.intrinsics=[fx,fy,cx,cy]"
+                f"by the photographs, the focal length is {factor:.2f} times the one that is said to be known; if that "
+                "is wrong, and the map bent by it, begin with a better one: dataset.intrinsics=[fx,fy,cx,cy]"
             )
 
     def _unit(self, model: Model, order: list[int]) -> float:
