@@ -47,6 +47,7 @@ LAYOUT = Layout(
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
 _LOOKED_AT = 1000  # images of which the header is read for their sizes, at most
 _FEW = 0.2  # of the images: so many of another shape than the first are left out rather than all read without turns
+_COMMAND = b"# mvsgs "  # begins a run's settings
 _MANY = 3  # times as many as beside such a subfolder: those are a preview, a plan, a logo
 
 
@@ -220,8 +221,19 @@ def _find_images(folder: Path, notes: list[str]) -> list[Path]:
 
 
 def _is_aside(path: Path, folder: Path) -> bool:
-    """Whether it is in a folder of masks, or a hidden one."""
-    return any(part.lower() in FOLDERS or part.startswith(".") for part in path.relative_to(folder).parts[:-1])
+    """Whether it is in a folder of masks, a hidden one, or one in which a run has left pictures of its map."""
+    names = path.relative_to(folder).parts[:-1]
+    named = any(name.lower() in FOLDERS or name.startswith(".") for name in names)
+    return named or any(_is_output(parent) for parent in path.parents[: len(names)])
+
+
+def _is_output(folder: Path) -> bool:
+    """Whether a run's settings lie there, under the command that composed them."""
+    try:
+        with (folder / "config.yaml").open("rb") as file:
+            return file.read(len(_COMMAND)) == _COMMAND
+    except OSError:
+        return False
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,15 @@ def test_a_picture_beside_the_folder_of_images_is_none_of_them(tmp_path: Path) -
     assert told.format(tmp_path, tmp_path, "6 (first: images/photo0.png)") in warnings
 
 
+def test_a_runs_pictures_of_its_map_are_no_images(tmp_path: Path) -> None:
+    for folder, settings in (("first", "sharp: true\n"), ("output", "# mvsgs photos\ndataset: {}\n")):
+        write_photos(tmp_path / folder / "keyframes", 4)
+        (tmp_path / folder / "config.yaml").write_text(settings)
+    found, warnings = opened(tmp_path)
+    assert len(found) == 4
+    assert not [text for text in warnings if "output" in text]
+
+
 def test_hidden_files_masks_depth_and_normals_are_no_images(tmp_path: Path) -> None:
     for camera in ("100MEDIA", "101MEDIA"):
         photograph(tmp_path / camera / "DJI_0001.JPG")
