@@ -16,13 +16,15 @@ FOCAL_RANGE = 0.02, 100.0  # of the larger side of the image: beyond a fisheye a
 MIN_SIDE, MAX_SIDE = 16, 16384  # pixels of a side
 CLOCKS_END = 2.0**31  # seconds: what ROS 2 can say
 BEHIND = 2.0  # s of delay that a user should know of
+DRIFT = 5e-4  # that two clocks may run apart, one of them being set gently: 50 ppm alone make 2 s in 11 hours
 
 
 class StreamFrames:
     """The frames of one sender, whom warnings name as `sender`.
 
     In the counts: `unusable` ones in all, and of these those that were `doubled`, late (`out_of_order`) or of an
-    `other_size`. In the values: `delay`, seconds that the newest took longer to come than the promptest, by its stamp.
+    `other_size`. In the values: `delay`, seconds that the newest took longer to come than the promptest, by its stamp,
+    less what two clocks may have run apart since.
     stamped: the sender says when it took them; one that only hands pictures on may give the same one again.
     """
 
@@ -36,6 +38,7 @@ class StreamFrames:
         self._newest: Frame | None = None  # as it came
         self._restarted = False
         self._promptest = math.inf  # s from a frame's time to its coming, by two clocks
+        self._timed = 0.0  # by time.monotonic: when the last frame's delay was taken
 
     def restarted(self) -> None:
         """The sender's program started again: its clock may be another."""
@@ -74,11 +77,12 @@ class StreamFrames:
                 f"{self._sender}'s timestamps stood still, went back or leapt: there the time here was taken"
             )
         if self._stamped:
-            self._note_delay(time.monotonic() - shown)
+            self._note_delay(time.monotonic(), shown)
         return shown
 
-    def _note_delay(self, lag: float) -> None:
-        self._promptest = min(self._promptest, lag)
+    def _note_delay(self, now: float, shown: float) -> None:
+        lag = now - shown
+        self._promptest, self._timed = min(self._promptest + DRIFT * (now - self._timed), lag), now
         delay = lag - self._promptest
         self._stats.values["delay"] = round(delay, 2)
         if delay > BEHIND:

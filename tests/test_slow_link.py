@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,4 +91,21 @@ def test_the_delay_of_a_stream_is_told_and_warned_of(monkeypatch: pytest.MonkeyP
     now[0] = 50.0 + 3 / 30 + 2.5
     assert stream.accept(frame(3)) is not None
     assert stats.values["delay"] == 2.5
+    assert "slower than the stream" in stats.warnings[0]
+
+
+@pytest.mark.parametrize("drift", [5e-5, -5e-5])
+def test_two_clocks_that_run_apart_are_no_slow_link(monkeypatch: pytest.MonkeyPatch, drift: float) -> None:
+    stats, now = Stats(), [50.0]
+    monkeypatch.setattr(stream_frames.time, "monotonic", lambda: now[0])
+    stream = StreamFrames(stats, "the robot")
+    for seconds in range(0, 24 * 3600, 60):
+        now[0] = 50.0 + seconds * (1 + drift)
+        assert stream.accept(replace(frame(seconds), timestamp=float(seconds))) is not None
+    assert stats.values["delay"] == 0.0
+    assert not stats.warnings
+    for late in range(600):  # ten minutes on a slow link
+        now[0] = 50.0 + seconds * (1 + drift) + late + 4.0
+        assert stream.accept(replace(frame(0), timestamp=float(seconds + late + 1))) is not None
+    assert 2.6 < stats.values["delay"] < 3.0
     assert "slower than the stream" in stats.warnings[0]
