@@ -27,6 +27,19 @@ def flush(stream: IO[str]) -> None:
         discard(stream)
 
 
+def open_closed() -> None:
+    """Standard streams that whoever started this program has closed (`>&-`) lead nowhere: no file that is opened later
+    takes their place, neither here nor in a program that is started."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            os.set_inheritable(number, True)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r"))
+
+
 def discard(stream: IO[str]) -> None:
     """From now on nothing that is written there is kept, what waits to be written included."""
     with suppress(OSError):  # it is no file: then nothing waits

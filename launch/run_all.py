@@ -21,8 +21,11 @@ import signal
 from collections.abc import Sequence
 from pathlib import Path
 
+from launch.printing import flush, open_closed, say
+
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # before a run there is nothing to finish: no traceback of an import
+    open_closed()
 
 try:
     import hydra
@@ -38,7 +41,6 @@ try:
     from launch.jobs import Job, RunFailed, refused, run
     from launch.named_input import SLOT, with_named_input
     from launch.outcome import FAILED
-    from launch.printing import flush, say
     from launch.refusal import GraphError
     from launch.resume import WORD as RESUME
     from launch.resume import leave_out_refused, resumed_config

@@ -81,7 +81,8 @@ def usage() -> str:
 
 def run_all(words: Sequence[str]) -> int:
     """Replaces this process by the launcher's."""
-    sys.stdout.flush()
+    if sys.stdout is not None:  # closed by who started this, as by `>&-`
+        sys.stdout.flush()
     os.execv(sys.executable, [sys.executable, str(RUN_ALL), *words])
 
 

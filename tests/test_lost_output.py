@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -46,6 +47,24 @@ def test_a_run_that_prints_to_a_full_disk_goes_on(tmp_path: Path, screen: str) -
     assert done.stderr.count("nothing more can be shown (No space left on device)") == 1
     assert "Traceback" not in done.stderr
     assert (tmp_path / "out" / "sink.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_run_whose_streams_were_closed_before_it_began_goes_on(tmp_path: Path, closed: str) -> None:
+    words = [sys.executable, str(ROOT / "launch/run_all.py"), "--config-path", str(FAKE), f"output={tmp_path / 'out'}"]
+    command = f"{shlex.join([*words, *COUNTED])} {closed}"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=LONG)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert (tmp_path / "out" / "sink.json").exists()
+
+
+def test_a_command_whose_output_was_closed_has_no_traceback() -> None:
+    words = [sys.executable, "-c", "from mvsgs.command import main; main(['graph'])"]
+    command = f"{shlex.join(words)} >&-"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=LONG, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.slow
