@@ -79,7 +79,8 @@ def _run(job: Job) -> int:
     except GraphError as error:
         return refused(error)
     try:
-        output.begin(lasting(graph), job.command, resumed=job.resumed)
+        if moved := output.begin(lasting(graph), job.command, resumed=job.resumed):
+            say(f"note: {moved}")
         screen = make_screen(graph.settings.screen)
         said: list[Outcome] = []
 

@@ -28,10 +28,10 @@ from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info
 from mvsgs_core.passwords import without_passwords
 
 LOCK, PREVIOUS, REPORT, CONFIG = ".lock", "previous", "report.json", "config.yaml"
-FOUND = ("map.ply", "localization.csv")  # either, or a checkpoint, is worth keeping of an earlier run
-IMAGES = "keyframes"
+FOUND = ("map.ply", "localization.csv")  # either, a checkpoint or a pose is worth keeping of an earlier run
+IMAGES, TRAJECTORY = "keyframes", "trajectory.txt"
 RESULTS = (  # all that a run leaves, but for the two files that say that it is one's
-    *FOUND, FOLDER, "trajectory.txt", "report.html", "comparison.png", "cameras.json", "transforms.json", IMAGES,
+    *FOUND, FOLDER, TRAJECTORY, "report.html", "comparison.png", "cameras.json", "transforms.json", IMAGES,
     "georeference.json",
 )  # fmt: skip
 RUN_ALL = Path(__file__).resolve().parent / "run_all.py"
@@ -56,17 +56,17 @@ class Output:
         except OSError as error:
             raise GraphError(f"output={path}: {error.strerror}") from error
 
-    def begin(self, config: Mapping[str, Any], command: str, *, resumed: bool) -> None:
+    def begin(self, config: Mapping[str, Any], command: str, *, resumed: bool) -> str | None:
         """Moves what an earlier run found aside (a resumed one's stays), and writes this run's configuration, under the
-        command that composed it.
+        command that composed it. Returns where what was moved is.
 
         Raises GraphError where that cannot be written.
         """
         try:
-            if not resumed:
-                self._move_previous()
+            aside = None if resumed else self._move_previous()
             self.write_report({"finished": False, "reason": "still running, or killed with its launcher"})
             write_settings(self.path / CONFIG, config, command)
+            return f"what the run before found is now in {aside} ({self._previous()})" if aside else None
         except OSError as error:
             raise GraphError(f"output={self.path}: {error.strerror or error}") from error
 
@@ -102,7 +102,7 @@ class Output:
             report["reason"] = failed or ("no report came" if scored else "no slot of this graph writes a report")
             report["finished"] = not scored
         if not report["finished"]:
-            report["resume"] = self.resume = self._resume_command()
+            report["resume"] = self.resume = _resume_command(self.path)
         self.write_report(report)
 
     def write_report(self, content: Mapping[str, Any]) -> None:
@@ -110,26 +110,18 @@ class Output:
         stamp = {"written": time.strftime("%Y-%m-%d %H:%M:%S %z")}
         replace_text(self.path / REPORT, json.dumps(without_passwords({**content, **stamp}), indent=1) + "\n")
 
-    def _resume_command(self) -> str | None:
-        """What goes on with an unfinished run; None where it left no checkpoint."""
-        try:
-            checkpoint_info(self.path)
-        except ValueError:
-            return None
-        return shlex.join([sys.executable, str(RUN_ALL), f"resume={self.path}"])
-
     def release(self) -> None:
         (self.path / LOCK).unlink(missing_ok=True)
         os.close(self._lock)
 
-    def _move_previous(self) -> None:
-        """What an earlier run found goes to a folder of its own, so that no run takes another's place; what it left
-        without having found anything goes, as it would pass for this run's."""
+    def _move_previous(self) -> Path | None:
+        """What an earlier run found goes to a folder of its own, which is returned, so that no run takes another's
+        place; what it left without having found anything goes, as it would pass for this run's."""
         if not is_of_a_run(self.path):
-            return
+            return None
         if not _worth_keeping(self.path):
             _remove_results(self.path)
-            return
+            return None
         aside = next(folder for folder in _numbered(self.path / PREVIOUS) if not folder.exists())
         aside.mkdir()
         for name in (REPORT, CONFIG):  # copies: at any time both folders say whose they are
@@ -138,6 +130,24 @@ class Output:
         for name in RESULTS:
             if (self.path / name).exists():
                 (self.path / name).rename(aside / name)
+        if (report := read_report(aside)).get("resume"):  # from there, now
+            replace_text(aside / REPORT, json.dumps(report | {"resume": _resume_command(aside)}, indent=1) + "\n")
+        return aside
+
+    def _previous(self) -> str:
+        """How many earlier runs' results lie beside this one's, and how large they are."""
+        kept = [folder for folder in self.path.glob(f"{PREVIOUS}*") if is_of_a_run(folder)]
+        size = sum(file.stat().st_size for folder in kept for file in folder.rglob("*") if file.is_file())
+        return f"{len(kept)} of them, " + (f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB")
+
+
+def _resume_command(output: Path) -> str | None:
+    """What goes on with an unfinished run; None where it left no checkpoint."""
+    try:
+        checkpoint_info(output)
+    except ValueError:
+        return None
+    return shlex.join([sys.executable, str(RUN_ALL), f"resume={output}"])
 
 
 def others_files(output: Path) -> list[str]:
@@ -159,13 +169,21 @@ def is_of_a_run(output: Path) -> bool:
 
 
 def _worth_keeping(output: Path) -> bool:
-    if any((output / name).exists() for name in FOUND):
+    if any((output / name).exists() for name in FOUND) or _has_a_pose(output / TRAJECTORY):
         return True
     try:
         checkpoint_info(output)
     except ValueError:
         return False
     return True
+
+
+def _has_a_pose(trajectory: Path) -> bool:
+    try:
+        with trajectory.open("rb") as lines:
+            return any(line.strip() and not line.startswith(b"#") for line in lines)
+    except OSError:
+        return False
 
 
 def _remove_results(output: Path) -> None:

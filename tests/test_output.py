@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from launch.compose import compose
 from launch.jobs import _scored
 from launch.outcome import Outcome
 from launch.output import Output, is_of_a_run, others_files, read_report
+from mvsgs_core.trajectory_file import write_trajectory
 
 
 @pytest.fixture
@@ -47,6 +49,41 @@ def test_no_later_run_costs_an_earlier_ones_map(output: Output) -> None:
     assert kept == {"previous-2": "good", "previous-3": "partial"}
     assert is_of_a_run(output.path / "previous-2")
     assert list((output.path / "previous").iterdir()) == []
+
+
+def test_poses_without_a_map_are_worth_keeping(output: Output) -> None:
+    output.begin({}, "mvsgs mapper=off", resumed=False)
+    write_trajectory(output.path / "trajectory.txt", np.array([0.5]), np.eye(4)[None])
+    output.begin({}, "mvsgs mapper=off", resumed=False)
+    assert (output.path / "previous" / "trajectory.txt").exists()
+    write_trajectory(output.path / "trajectory.txt", np.zeros(0), np.zeros((0, 4, 4)))
+    assert output.begin({}, "mvsgs mapper=off", resumed=False) is None
+    assert not (output.path / "previous-2").exists()
+
+
+def test_where_earlier_results_went_and_how_many_there_are_is_said(output: Output) -> None:
+    assert output.begin({}, "mvsgs", resumed=False) is None
+    (output.path / "previous-notes").mkdir()  # the user's own
+    for name, said in (("previous", "1 of them, 3 MB"), ("previous-2", "2 of them, 6 MB")):
+        (output.path / "map.ply").write_bytes(bytes(3_000_000))
+        assert output.begin({}, "mvsgs", resumed=True) is None
+        moved = output.begin({}, "mvsgs", resumed=False)
+        assert moved == f"what the run before found is now in {output.path / name} ({said})"
+
+
+def test_what_goes_on_with_an_earlier_run_names_the_folder_where_it_is_now(
+    output: Output, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: None)
+    output.begin({}, "mvsgs", resumed=False)
+    (output.path / "map.ply").touch()
+    output.settle(Outcome(1, "tracker failed"))
+    before = read_report(output.path)
+    assert before["resume"].endswith(f"resume={output.path}")
+    output.begin({}, "mvsgs", resumed=False)
+    after = read_report(output.path / "previous")
+    assert after.pop("resume").endswith(f"resume={output.path / 'previous'}")
+    assert after.items() <= before.items()
 
 
 def test_what_no_run_has_left_is_not_touched(output: Output) -> None:
