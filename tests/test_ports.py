@@ -106,7 +106,7 @@ def test_a_program_that_shuts_down_with_publishers_and_readers_open_ends_in_sile
         f"    readers = [kind('{address}', Frame) for kind in (LiveReader, NewestReader, ReliableReader)]\n"
         "    shut_down()\n"
         "    assert publisher.socket.closed and all(reader._socket.closed for reader in readers)\n"
-        "    assert not any(thread.is_alive() for thread in (publisher._count, readers[0]._thread))\n"
+        "    assert not any(thread.is_alive() for thread in (publisher._attending, readers[0]._thread))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

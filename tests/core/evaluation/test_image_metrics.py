@@ -74,5 +74,5 @@ def test_lpips_refuses_other_weights() -> None:
 )
 def test_lpips_weights_that_are_none_are_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "trunk.pth").write_bytes(content)
-    with pytest.raises(BadFileError, match=r"trunk\.pth (is truncated|holds Python)"):
+    with pytest.raises(BadFileError, match=r"trunk\.pth (is truncated|is a web page|holds Python)"):
         Lpips(tmp_path / "trunk.pth", tmp_path / "trunk.pth")
