@@ -24,6 +24,7 @@ _LATITUDE, _LONGITUDE, _ALTITUDE = (1, 2), (3, 4), (5, 6)  # tags of reference a
 _BELOW = (1, 3)  # references of altitudes below the sea, below the ellipsoid (EXIF 3.0)
 _APART = 1.15  # or its inverse, of two focal lengths: rounding and another shape of sensor make less
 _SHAPES = (3 / 2, 4 / 3, 16 / 9)  # of sensors
+_CROPPED = 2.0  # the first over the second at most, where a picture was cropped: half of what the sensor saw is left
 _NARROW = math.radians(10.0)  # across the longer side: as a 200 mm lens has
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)  # CIPA DCG-001: "35 mm equivalent" compares diagonals
 
@@ -34,8 +35,8 @@ def read_exif_lens(path: Path, *, turn_upright: bool = True) -> Lens | None:
     A header that cannot be read, or tells of a focal length that no camera has, is one that lacks it.
     Prefers focal length times the resolution of the sensor, which is exact for a picture that was scaled but not
     cropped, over the 35 mm equivalent, which is rounded to whole millimeters and is of the whole sensor. Where both
-    contradict each other in a picture of a sensor's shape, the resolution is of another size of the picture; one of
-    another shape was cropped. Alone, the resolution must be of no narrower view than nearly all lenses have.
+    contradict each other, the resolution is of another size of the picture, unless its shape is no sensor's and a crop
+    explains the difference. Alone, the resolution must be of no narrower view than nearly all lenses have.
     turn_upright: the lens is of the image as the header says it should be shown.
     """
     try:
@@ -70,8 +71,8 @@ def _focal_length(header: dict[int, object], size: tuple[int, int]) -> tuple[flo
     by_sensor = _from_sensor(header, max(size))
     if by_sensor is None:
         return by_35mm, ""
+    angle = 2.0 * math.atan(0.5 * max(size) / by_sensor)
     if by_35mm is None:
-        angle = 2.0 * math.atan(0.5 * max(size) / by_sensor)
         if angle >= _NARROW:
             return by_sensor, ""
         return None, (
@@ -81,9 +82,10 @@ def _focal_length(header: dict[int, object], size: tuple[int, int]) -> tuple[flo
     if 1.0 / _APART < by_sensor / by_35mm < _APART:
         return by_sensor, ""
     told = f"contradicts itself: by the sensor's resolution the focal length is {by_sensor:.0f} pixels"
-    if any(math.isclose(max(size) / min(size), shape, rel_tol=0.01) for shape in _SHAPES):
-        return by_35mm, f"{told}, as of a picture that was scaled; that of the 35 mm equivalent is taken, {by_35mm:.0f}"
-    return by_sensor, f"{told}, which is taken, as the picture was cropped; by the 35 mm equivalent {by_35mm:.0f}"
+    of_a_sensor = any(math.isclose(max(size) / min(size), shape, rel_tol=0.01) for shape in _SHAPES)
+    if not of_a_sensor and angle >= _NARROW and 1.0 < by_sensor / by_35mm <= _CROPPED:
+        return by_sensor, f"{told}, which is taken, as the picture was cropped; by the 35 mm equivalent {by_35mm:.0f}"
+    return by_35mm, f"{told}, as of a picture that was scaled; that of the 35 mm equivalent is taken, {by_35mm:.0f}"
 
 
 def read_exif_time(path: Path) -> datetime | None:

@@ -46,7 +46,6 @@ LAYOUT = Layout(
 )
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
 _LOOKED_AT = 1000  # images of which the header is read for their sizes, at most
-_FEW = 0.2  # of the images: so many of another shape than the first are left out rather than all read without turns
 _COMMAND = b"# mvsgs "  # begins a run's settings
 _MANY = 3  # times as many as beside such a subfolder: those are a preview, a plan, a logo
 
@@ -123,7 +122,9 @@ class Images(ImageSequence):
         if self.intrinsics not in (None, "auto"):
             return [lens_from_option(self.intrinsics, self.distortion, size)[0]] * len(images)
         found = [read_exif_lens(image, turn_upright=turn_upright) for image in images]
-        known = [(image, lens) for image, lens in zip(images, found) if lens is not None]
+        known = [
+            (image, lens) for image, lens in zip(images, found) if lens is not None and same_shape(lens.size, size)
+        ]
         unknown = [image for image, lens in zip(images, found) if lens is None]
         doubt = exif_doubt(unknown[0]) if unknown else ""
         self.warnings += [doubt] if doubt else []
@@ -268,15 +269,12 @@ class _Sizes:
     def turn_upright(self, given: list[tuple[float, float]]) -> bool:
         """Whether to read images as EXIF says: unless they have one shape only as the camera took them.
 
-        given: (height, width) of what was given for the images, which then decides. Without it, few that are held
-        otherwise are no reason to let the cameras of all others lie.
+        given: (height, width) of what was given for the images, which then decides.
         """
         if not _of_other_shape(self.upright) or _of_other_shape(self.on_disk):
             return True
         height, width = self.taken
-        if given:
-            return any((h > w) != (height > width) for h, w in given)
-        return len(_of_other_shape(self.upright)) < _FEW * len(self.upright)
+        return any((h > w) != (height > width) for h, w in given)
 
     def shown(self, turn_upright: bool) -> tuple[int, int]:
         """The most frequent one as images are read, of those in the first image's shape."""

@@ -18,6 +18,7 @@ from mvsgs_core.datasets.bag_file import opened_bag
 from mvsgs_core.datasets.files import UnreadableImageError
 from mvsgs_core.datasets.mcap_file import ROS_2, profile_of
 from mvsgs_core.datasets.ros import rgb_of
+from mvsgs_core.stream_times import StreamTimes
 from tests.support.dataset_folders import huge_png
 
 pytest.importorskip("rosbags")
@@ -187,6 +188,21 @@ def test_a_stamp_that_was_given_twice_shifts_no_time_after_it(tmp_path: Path, ro
     assert len(items) == 60
     np.testing.assert_allclose([item.timestamp for item in items], 100 + np.arange(60) / 10, atol=late + 1e-6)
     np.testing.assert_allclose(items[58].timestamp, 105.8, atol=1e-6)
+
+
+def test_stamps_in_pairs_of_images_that_come_unevenly_cost_no_image() -> None:
+    """A camera of 15 images a second that is read 30 times: an image that came late is shown when it came, and the next
+    ones are from before that by their stamps."""
+    now = [0.0]
+    times, late = StreamTimes(lambda: now[0]), np.random.default_rng(0).exponential(0.03, 1800)
+    came = np.maximum.accumulate(np.arange(1800) / 30 + late)
+    shown = []
+    for i, at in enumerate(came):
+        now[0] = at
+        shown.append(times.accept(100 + (i // 2) / 15))
+    assert None not in shown
+    assert (np.diff(np.array(shown)) > 0).all()
+    assert abs(shown[-1] - shown[0] - 60) < 5
 
 
 def test_a_first_stamp_that_is_hours_off_is_replaced(tmp_path: Path, ros: Messages) -> None:

@@ -122,14 +122,21 @@ def test_turned_photographs_beside_smaller_ones_that_are_not(tmp_path: Path) -> 
         assert any("EXIF turns some" in w and "evaluator.camera_up=true is not for them" in w for w in warnings)
 
 
-def test_few_lying_photographs_turn_no_folder_of_upright_ones(tmp_path: Path) -> None:
+@pytest.mark.parametrize("few", [1, 6])
+def test_few_that_were_held_otherwise_are_read_too(few: int, tmp_path: Path) -> None:
     for n in range(9):
-        photograph(tmp_path / f"{n}.jpg", orientation=6 if n < 8 else 1)
-    found, warnings = opened(tmp_path)
+        photograph(tmp_path / f"{n}.jpg", {EQUIVALENT: 26} if n == 8 else {}, orientation=few if n == 8 else 7 - few)
+    found, _ = opened(tmp_path)
+    assert [item.image.shape[:2] for item in found] == 9 * [(48, 64)]
+
+
+def test_an_exif_focal_length_of_a_picture_held_otherwise_is_not_that_of_all(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    for n in range(9):
+        photograph(tmp_path / f"{n}.jpg", {EQUIVALENT: 26} if n == 8 else {}, orientation=1 if n == 8 else 6)
+        Image.fromarray(np.full((64, 48), 255, np.uint8)).save(tmp_path / f"masks/{n}.png")  # of upright ones
+    found, _ = opened(tmp_path)
     assert [item.image.shape[:2] for item in found] == 8 * [(64, 48)]
-    assert any("images left out because" in w and "8.jpg" in w for w in warnings)
-    photograph(tmp_path / "0.jpg")  # others than the first are not few
-    assert len(opened(tmp_path)[0]) == 9
 
 
 @pytest.mark.parametrize("lying", [1, 3])
@@ -212,6 +219,10 @@ def test_a_cropped_picture_has_the_focal_length_of_its_sensor(tmp_path: Path) ->
     np.testing.assert_allclose(lens.intrinsics[0], 64.0)
     warnings = open_dataset("images", path=tmp_path).warnings
     assert any("EXIF of a.jpg contradicts itself" in w and "64 pixels, which is taken" in w for w in warnings)
+    cropped[RESOLUTION] *= 3  # it was scaled, too: no crop leaves so little
+    lens = read_exif_lens(photograph(tmp_path / "a.jpg", cropped, size=(64, 64)))
+    assert lens is not None
+    np.testing.assert_allclose(lens.intrinsics[0], 24 * 64 * np.sqrt(2) / np.hypot(36, 24))
 
 
 def test_times_of_photographs(tmp_path: Path) -> None:
