@@ -98,7 +98,7 @@ def _interrupted(folder: Path) -> DictConfig:
 
 
 def _moved(config: DictConfig, folder: Path) -> DictConfig:
-    """Where the run's directory has another name now: with that in every path that led into it."""
+    """Where the run's directory has another name now: with that in every path that led into it, but to what stayed."""
     before = str(config.get("output") or folder)
 
     def moved(value: Any) -> Any:
@@ -106,8 +106,10 @@ def _moved(config: DictConfig, folder: Path) -> DictConfig:
             return {key: moved(item) for key, item in value.items()}
         if isinstance(value, list):
             return [moved(item) for item in value]
-        inside = isinstance(value, str) and (value == before or value.startswith(f"{before}/"))
-        return f"{folder}{value[len(before) :]}" if inside else value
+        if not isinstance(value, str) or not (value == before or value.startswith(f"{before}/")):
+            return value
+        there = f"{folder}{value[len(before) :]}"
+        return value if Path(value).exists() and not Path(there).exists() else there
 
     found = OmegaConf.create(moved(OmegaConf.to_container(config)))
     assert isinstance(found, DictConfig)

@@ -120,6 +120,19 @@ def test_a_run_whose_directory_has_another_name_now_goes_on_in_it(tmp_path: Path
     assert graph.slots["recorder"].config["path"] == f"{after}/recording.mcap"
 
 
+def test_a_run_that_was_moved_aside_reads_what_stayed(tmp_path: Path) -> None:
+    """A video in the folder that results were written to, from where another run has moved them."""
+    scene = interrupted(tmp_path / "scene", "dataset=player", f"dataset.path={tmp_path / 'scene' / 'a.mcap'}")
+    (scene / "a.mcap").touch()
+    aside = scene / "previous"
+    aside.mkdir()
+    for path in [path for path in scene.iterdir() if path.name not in ("previous", "a.mcap")]:
+        path.rename(aside / path.name)
+    graph = resumed(aside)
+    assert graph.slots["dataset"].config["path"] == str(scene / "a.mcap")
+    assert graph.settings.output == graph.slots["tracker"].config["output"] == str(aside)
+
+
 def test_a_file_of_a_relative_path_is_found_from_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.mcap").touch()
     monkeypatch.chdir(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image, UnidentifiedImageError
 
-from mvsgs_core import camera, geometry
+from mvsgs_core import atomic_file, camera, geometry
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.keyframe_images import image_name, there
 from mvsgs_core.export.keyframe_render import near_plane
@@ -166,12 +167,14 @@ def _copy(images: Path, target: Path, cameras: Cameras, *, replacing: bool) -> N
             raise ValueError(f"{found[index]} is no image that can be read: {error}") from None
         if size != (width, height):
             raise ValueError(f"{found[index]} has {size[0]}x{size[1]} pixels, its camera {width}x{height}")
-        if not replacing and (target / found[index].name).exists():
+        there = target / found[index].name
+        if not replacing and there.exists() and not filecmp.cmp(found[index], there, shallow=False):
             raise ValueError(f"{target} has another {found[index].name}: give another folder")
     target.mkdir(parents=True, exist_ok=True)
     for path in found.values():
-        shutil.copyfile(path, target / path.name)
+        with atomic_file.replacing(target / path.name, sync=False) as aside:  # what is cut off can be done again
+            shutil.copyfile(path, aside)
 
 
 def _write(path: Path, lines: list[str]) -> None:
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    atomic_file.replace_text(path, "\n".join(lines) + "\n")

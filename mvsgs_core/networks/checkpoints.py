@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,6 +16,7 @@ from mvsgs_core import weights
 from mvsgs_core.bad_file import BadFileError, reading
 
 RANDOM = "random"  # instead of a file
+_MAGIC = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19"  # with which files that PyTorch wrote before 2020 begin
 _LONGEST = 400  # characters of what does not fit
 _PLACES = ("state_dict", "model", "model_state_dict")  # keys under which state dicts are kept beside other things
 
@@ -66,7 +68,10 @@ def _content(file: Path, inside: str | None, mapped: bool) -> Any:
     try:
         return load()
     except pickle.UnpicklingError as error:
-        names = torch.serialization.get_unsafe_globals_in_checkpoint(file) if zipped else []
+        if zipped:
+            names = torch.serialization.get_unsafe_globals_in_checkpoint(file)
+        else:
+            names = re.findall(r"GLOBAL ([\w.]+)", str(error)) if _begins_with(file, _MAGIC) else []
         if not names:  # what PyTorch says then is to load it with all that it holds, whatever it is
             raise BadFileError(f"{file} is truncated or no PyTorch checkpoint of tensors") from error
     try:
@@ -79,6 +84,11 @@ def _content(file: Path, inside: str | None, mapped: bool) -> Any:
             "); save its state dict alone, in an environment that you trust: "
             f"torch.save(torch.load(FILE, weights_only=False){taken}, NEW_FILE)"
         ) from error
+
+
+def _begins_with(file: Path, content: bytes) -> bool:
+    with file.open("rb") as opened:
+        return opened.read(len(content)) == content
 
 
 class _Placeholder:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -233,3 +235,36 @@ def test_an_earlier_export_is_replaced_with_its_images_and_no_other_images_are(
     assert "has another 000007.png: give another folder" in capsys.readouterr().err
     assert photo.read_bytes() == b"a user's"
     assert not (tmp_path / "project" / "sparse").exists()
+
+
+@pytest.mark.parametrize("at", ["an image", "a text file"])
+def test_an_export_that_a_full_disk_cut_off_can_be_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], at: str
+) -> None:
+    save_cameras(tmp_path, TIMES)
+    write_ply(tmp_path / "map.ply", final_map())
+    for k in range(len(TIMES)):
+        write_image(tmp_path / "keyframes", 7 * k, np.zeros((*SIZE, 3), dtype=np.uint8))
+    words = [str(tmp_path / "map.ply"), str(tmp_path / "model"), "--images"]
+    copy, write = shutil.copyfile, Path.write_text
+
+    def copyfile(source: Path, target: Path) -> None:
+        copy(source, target)
+        if source.name == "000007.png":
+            target.write_bytes(b"half of it")
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    def write_text(path: Path, text: str, **options: str) -> int:
+        if "images" in path.name:
+            write(path, "")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, text, **options)
+
+    with monkeypatch.context() as full:
+        if at == "an image":
+            full.setattr(shutil, "copyfile", copyfile)
+        else:
+            full.setattr(Path, "write_text", write_text)
+        assert export.main(words) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert export.main(words) == 0, capsys.readouterr().err

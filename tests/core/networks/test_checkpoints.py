@@ -90,6 +90,14 @@ def test_what_cannot_be_left_out_is_refused_with_a_way_out(tmp_path: Path) -> No
     assert checkpoints.read(new, inside="state_dict").keys() == {"a"}
 
 
+def test_an_older_files_python_objects_are_told_from_a_file_that_was_cut_off(tmp_path: Path) -> None:
+    file = tmp_path / "w.pth"
+    content = {"state_dict": {"a": torch.zeros(1)}, "config": _Settings(a=1)}
+    torch.save(content, file, _use_new_zipfile_serialization=False)
+    with pytest.raises(ValueError, match=r"not executed.*save its state dict alone"):
+        checkpoints.read(file)
+
+
 @pytest.mark.parametrize("key", [None, "state_dict", "model", "model_state_dict"])
 @pytest.mark.parametrize("inside", [None, "state_dict"])
 def test_a_state_dict_is_found_where_others_keep_it(key: str | None, inside: str | None, tmp_path: Path) -> None:
