@@ -21,13 +21,14 @@ from typing import Any
 
 from launch.outcome import Outcome
 from launch.refusal import GraphError
-from launch.settings_file import HEADER, write_settings
+from launch.settings_file import write_settings
 from mvsgs_core.atomic_file import replace_text
 from mvsgs_core.kept_map import FOLDER, TRACKER
 from mvsgs_core.mapping.checkpoints.files import KEYFRAMES, checkpoint_info
 from mvsgs_core.passwords import without_passwords
+from mvsgs_core.run_folder import CONFIG, has_settings
 
-LOCK, PREVIOUS, REPORT, CONFIG = ".lock", "previous", "report.json", "config.yaml"
+LOCK, PREVIOUS, REPORT = ".lock", "previous", "report.json"
 FOUND = ("map.ply", "localization.csv")  # either, a checkpoint or a pose is worth keeping of an earlier run
 IMAGES, TRAJECTORY = "keyframes", "trajectory.txt"
 RESULTS = (  # all that a run leaves, but for the two files that say that it is one's
@@ -159,13 +160,7 @@ def others_files(output: Path) -> list[str]:
 
 def is_of_a_run(output: Path) -> bool:
     """Whether a run has written there: its report or its settings say so."""
-    if "finished" in read_report(output):
-        return True
-    try:
-        with (output / CONFIG).open("rb") as file:
-            return file.read(len(HEADER)) == HEADER.encode()
-    except OSError:
-        return False
+    return "finished" in read_report(output) or has_settings(output)
 
 
 def _worth_keeping(output: Path) -> bool:

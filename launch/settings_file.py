@@ -13,7 +13,6 @@ from mvsgs_core.atomic_file import replacing
 from mvsgs_core.passwords import without_passwords
 
 FILES = ("path", "mask", "gps")  # parameters of sources that name a file or folder
-HEADER = "# mvsgs "  # which tells a run's settings from another program's
 
 
 def lasting(graph: Graph) -> dict[str, Any]:

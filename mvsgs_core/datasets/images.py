@@ -35,6 +35,7 @@ from mvsgs_core.datasets.scannetpp import read_scannetpp, scannetpp_images
 from mvsgs_core.datasets.sequence import Found, ImageSequence, Record
 from mvsgs_core.datasets.strecha import find_strecha, read_strecha
 from mvsgs_core.datasets.transforms import NAMES, find_transforms, read_transforms
+from mvsgs_core.run_folder import has_settings
 
 LAYOUT = Layout(
     "A folder of images",
@@ -46,7 +47,6 @@ LAYOUT = Layout(
 )
 _SUBFOLDERS = ("images", "rgb", "input", "frames")
 _LOOKED_AT = 1000  # images of which the header is read for their sizes, at most
-_COMMAND = b"# mvsgs "  # begins a run's settings
 _MANY = 3  # times as many as beside such a subfolder: those are a preview, a plan, a logo
 
 
@@ -225,16 +225,7 @@ def _is_aside(path: Path, folder: Path) -> bool:
     """Whether it is in a folder of masks, a hidden one, or one in which a run has left pictures of its map."""
     names = path.relative_to(folder).parts[:-1]
     named = any(name.lower() in FOLDERS or name.startswith(".") for name in names)
-    return named or any(_is_output(parent) for parent in path.parents[: len(names)])
-
-
-def _is_output(folder: Path) -> bool:
-    """Whether a run's settings lie there, under the command that composed them."""
-    try:
-        with (folder / "config.yaml").open("rb") as file:
-            return file.read(len(_COMMAND)) == _COMMAND
-    except OSError:
-        return False
+    return named or any(has_settings(parent) for parent in path.parents[: len(names)])
 
 
 @dataclass(frozen=True)

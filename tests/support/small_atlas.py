@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from mvsgs_core import geometry
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.between import FrameBetween
+from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import RGBDKeyframe
 from mvsgs_core.mapping.mapper import OnlineMapper
+from tests.support.patience import LONG
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
 
 SIZE = (24, 32)
@@ -64,3 +67,12 @@ def begun(config: MapperConfig) -> Atlas:
     atlas.segment_of.update({3: 1, 2: 0})
     atlas.revision = 4
     return atlas
+
+
+def written(atlas: Atlas, output: Path) -> Path:
+    """The folder with its checkpoint."""
+    writer = CheckpointWriter(output, atlas.current.config)
+    writer.submit(atlas.frozen(), sync=False)
+    assert writer.wait(LONG)
+    assert writer.problems.empty(), writer.problems.get()
+    return output

@@ -32,7 +32,7 @@ from mvsgs_core.mapping.density_control import DensityControlConfig
 from mvsgs_core.mapping.keyframes import ConvergenceConfig
 from mvsgs_core.stats import Stats
 from tests.support.patience import LONG
-from tests.support.small_atlas import PLAIN, VIGNETTING, begun, view
+from tests.support.small_atlas import PLAIN, VIGNETTING, begun, view, written
 from tests.support.tiny_scene import pose_on_arc
 
 EVERYTHING = replace(
@@ -62,15 +62,6 @@ def ended(atlas: Atlas) -> dict[str, torch.Tensor]:
     final = atlas.current.snapshot()
     poses = {"poses": torch.from_numpy(final.world_from_cam), "exposures": torch.from_numpy(final.exposures)}
     return atlas.current.state.tensors() | poses
-
-
-def written(atlas: Atlas, output: Path) -> Path:
-    """The folder with its checkpoint."""
-    writer = CheckpointWriter(output, atlas.current.config)
-    writer.submit(atlas.frozen(), sync=False)
-    assert writer.wait(LONG)
-    assert writer.problems.empty(), writer.problems.get()
-    return output
 
 
 @pytest.mark.slow

@@ -13,13 +13,11 @@ import torch
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints import checkpoint
 from mvsgs_core.mapping.checkpoints.begun import begin_on
-from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.stats import Stats
 from tests.support.full_disk import full_after
-from tests.support.patience import LONG
-from tests.support.small_atlas import PLAIN, between, view
+from tests.support.small_atlas import PLAIN, between, view, written
 
 FEW = replace(PLAIN, iterations=2, images_in_memory=3, window=2)
 
@@ -34,14 +32,6 @@ def mapped(config: MapperConfig, halvings: int = 0) -> Atlas:
     for index in (6, 7, 8):
         atlas.add(view(index), 1, halvings)
     return atlas
-
-
-def written(atlas: Atlas, output: Path) -> Path:
-    writer = CheckpointWriter(output, atlas.current.config)
-    writer.submit(atlas.frozen(), sync=False)
-    assert writer.wait(LONG)
-    assert writer.problems.empty(), writer.problems.get()
-    return output
 
 
 def resting(atlas: Atlas) -> dict[int, bool]:
