@@ -151,7 +151,7 @@ def test_any_name_reaches_the_reader_as_it_is(name: str, tmp_path: Path) -> None
         ("empty", "is an empty folder"),
         ("texts", "has neither images nor a data set in it, but a.txt"),
         ("sequences", "is no data set itself; give sequences/a or 1 more in it"),
-        ("killed", "is no data set itself; give killed/walk_0.db3"),  # a bag whose recorder wrote no metadata.yaml
+        ("bags", "is no data set itself; give bags/evening.db3 or 1 more in it"),
         ("photos/photo0.png", "one image makes no map; give the folder that it is in: photos"),
         ("map.ply", "is a map; `mvsgs view map.ply` shows it"),
         ("run", "is the output of a run; `mvsgs view run` shows its map, resume=run goes on"),
@@ -171,7 +171,9 @@ def test_what_cannot_be_told_is_said_in_one_line(
     for name in ("a", "b"):
         write_image(tmp_path / "sequences" / name / "0.png", 3)
     write_replica(write_tum(tmp_path / "both"))
-    bag_file(tmp_path / "killed")
+    for name in ("morning", "evening"):
+        (tmp_path / "bags").mkdir(exist_ok=True)
+        bag_file(tmp_path / name).rename(tmp_path / f"bags/{name}.db3")
     with pytest.raises(GraphError) as refused:
         meant(word)
     assert said in str(refused.value)

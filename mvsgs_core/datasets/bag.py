@@ -12,8 +12,9 @@ import numpy as np
 
 from mvsgs_core.bad_file import BadFileError, reading
 from mvsgs_core.datasets import Item, dataset
-from mvsgs_core.datasets.bag_file import messages, opened_bag
+from mvsgs_core.datasets.bag_file import is_bag_folder, messages, opened_bag
 from mvsgs_core.datasets.calibration import lens_from_option
+from mvsgs_core.datasets.cut_off_bag import CutOffBag
 from mvsgs_core.datasets.files import Layout
 from mvsgs_core.datasets.framing import same_shape
 from mvsgs_core.datasets.lens import Lens
@@ -22,16 +23,19 @@ from mvsgs_core.datasets.sequence import FileReader, Notices
 from mvsgs_core.stream_times import LEAP, StreamTimes
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
-    from rosbags.interfaces import Connection
+    from mvsgs_core.datasets.bag_file import BagTopic, OpenBag
 
 LAYOUT = Layout(
     "A bag",
     "a ROS 1 file (.bag), a ROS 2 folder (metadata.yaml with .db3 or .mcap) or one .db3 or .mcap by itself, with an "
-    "image topic and its camera_info",
+    "image topic and its camera_info; also one that was cut off",
     "your own robot (ros2 bag record /camera/image_raw /camera/camera_info), or the bags of TUM RGB-D and many others",
 )
-_SUFFIXES = (".bag", ".db3")  # that only bags have; an .mcap file is one by its content (mcap_file.ROS_2)
+_SUFFIXES = (
+    ".bag",
+    ".active",
+    ".db3",
+)  # (.bag.active: while it is recorded) that only bags have; an .mcap file is one by its content (mcap_file.ROS_2)
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _Picture = tuple[float, float, np.ndarray]  # seconds by the bag's clock and by the camera's, and RGB
 _INFO = "sensor_msgs/msg/CameraInfo"
@@ -55,12 +59,14 @@ class Bag(FileReader):
 
     @staticmethod
     def recognizes(path: Path) -> bool:
-        return path.suffix.lower() in _SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
+        return path.suffix.lower() in _SUFFIXES if path.is_file() else is_bag_folder(path)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._path = LAYOUT.present(self.path)
         with opened_bag(self._path) as bag:
+            if isinstance(bag, CutOffBag):
+                self._notices += bag.warnings
             self._topic = _image_topic(bag, self.topic)
             self._count = sum(c.msgcount for c in bag.connections if c.topic == self._topic)
             lens, native = None, _first_size(bag, self._topic)
@@ -109,7 +115,7 @@ class Bag(FileReader):
         if index == 0:
             raise BadFileError(f"no image of {self._topic} could be read: " + "; ".join(self.warnings))
 
-    def _pictures(self, bag: AnyReader) -> Iterator[_Picture]:
+    def _pictures(self, bag: OpenBag) -> Iterator[_Picture]:
         wanted = range(self._count)[self.wanted]
         connections = [c for c in bag.connections if c.topic == self._topic]
         for number, (connection, nanoseconds, data) in enumerate(messages(bag, connections, self._notices)):
@@ -153,7 +159,7 @@ class Bag(FileReader):
         return Item(index, seconds, framed, intrinsics, intrinsics_guessed=guessed, place=place, mask=mask)
 
 
-def _image_topic(bag: AnyReader, given: str | None) -> str:
+def _image_topic(bag: OpenBag, given: str | None) -> str:
     topics = sorted({c.topic for c in bag.connections if c.msgtype in _IMAGES and c.msgcount})
     if given is not None:
         if given not in topics:
@@ -167,7 +173,7 @@ def _image_topic(bag: AnyReader, given: str | None) -> str:
     raise ValueError(f"the bag has several image topics; set dataset.options.topic to one of: {', '.join(topics)}")
 
 
-def _recorded_lens(bag: AnyReader, topic: str, given: str | None, notices: Notices) -> Lens | None:
+def _recorded_lens(bag: OpenBag, topic: str, given: str | None, notices: Notices) -> Lens | None:
     """The lens of the camera_info beside the images, or of the topic `given`; None, said in `notices`, without one."""
     topics = sorted({c.topic for c in bag.connections if c.msgtype == _INFO and c.msgcount})
     if given is not None and given not in topics:
@@ -188,7 +194,7 @@ def _recorded_lens(bag: AnyReader, topic: str, given: str | None, notices: Notic
     return None
 
 
-def _first_size(bag: AnyReader, topic: str) -> tuple[int, int]:
+def _first_size(bag: OpenBag, topic: str) -> tuple[int, int]:
     ignored = Notices()  # reading the sequence reports it
     for connection, _, data in messages(bag, [c for c in bag.connections if c.topic == topic], ignored):
         try:
@@ -199,7 +205,7 @@ def _first_size(bag: AnyReader, topic: str) -> tuple[int, int]:
     raise BadFileError(f"no image of {topic} can be read")
 
 
-def _picture(bag: AnyReader, connection: Connection, nanoseconds: int, data: bytes) -> tuple[float, np.ndarray]:
+def _picture(bag: OpenBag, connection: BagTopic, nanoseconds: int, data: bytes) -> tuple[float, np.ndarray]:
     """Seconds and (H, W, 3) uint8 RGB of a message. Raises BadFileError for a damaged one."""
     with reading("a message", "cannot be read"):
         message = bag.deserialize(data, connection.msgtype)

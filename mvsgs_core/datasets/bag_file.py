@@ -1,4 +1,5 @@
-"""Opens a bag with `rosbags`, bounds what it decompresses, and reads on behind a damaged part.
+"""Opens a bag with `rosbags`, bounds what it decompresses, and reads on behind a damaged part. Bags that were cut off,
+which the library does not read, are walked.
 
 `rosbags` decompresses without a bound, and its messages end at the first damaged byte. Its tables of decompressors take
 ours; what it compresses by the message is decompressed here; and behind damage the messages go on at the end of the
@@ -14,17 +15,21 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import zstandard
 
 from mvsgs_core.bad_file import BadFileError, brief, reading
 from mvsgs_core.datasets.compression import decompress
+from mvsgs_core.datasets.cut_off_bag import CutOffBag, Topic, cut_off_files, of_one_bag
 from mvsgs_core.datasets.sequence import Notices
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
+
+    OpenBag: TypeAlias = AnyReader | CutOffBag
+    BagTopic: TypeAlias = Connection | Topic
 
 MAX_BYTES = 2**28 + 2**21  # of a chunk or message, decompressed: an image of 89 million pixels, and what is beside it
 _MAX_FILE_BYTES = 2**36  # of a file that is compressed as a whole, decompressed into the folder for temporary files
@@ -35,7 +40,7 @@ _BLOCK = 2**20
 
 
 @contextmanager
-def opened_bag(path: Path) -> Iterator[AnyReader]:
+def opened_bag(path: Path) -> Iterator[OpenBag]:
     """The bag at `path`. Raises ImportError without rosbags, BadFileError for a bag that cannot be read."""
     try:
         from rosbags.highlevel import AnyReader
@@ -43,22 +48,39 @@ def opened_bag(path: Path) -> Iterator[AnyReader]:
     except ImportError as error:
         raise ImportError("bags are read by rosbags, which is optional: pip install rosbags") from error
     _bound_decompression()
-    with reading(path, f"is no bag that can be read (if it was cut off, {_repair(path)} mends it)"):
-        _check_metadata(path / "metadata.yaml")
-        _check_compressed_files(path)
-        # ROS 2 bags before Iron hold no message definitions; image and camera_info have not changed since
-        bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        bag.open()
+    bag: OpenBag
+    try:
+        with reading(path, f"is no bag that can be read{_repair(path)}"):
+            _check_metadata(path / "metadata.yaml")
+            _check_compressed_files(path)
+            # ROS 2 bags before Iron hold no message definitions; image and camera_info have not changed since
+            bag = AnyReader(_files(path), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            bag.open()
+    except BadFileError:
+        if not (walkable := cut_off_files(path)):
+            raise
+        bag = CutOffBag(walkable, MAX_BYTES)
     try:
         if any(not isinstance(c.msgcount, int) or not 0 <= c.msgcount < _MAX_COUNT for c in bag.connections):
             raise BadFileError(f"{path} is no bag that can be read: it counts messages by what is no number of them")
         yield bag
     finally:
-        bag.close()
+        if isinstance(bag, AnyReader):
+            bag.close()
 
 
-def messages(bag: AnyReader, connections: Sequence[Connection], notices: Notices) -> Iterator[tuple[Any, int, bytes]]:
-    """(connection, nanoseconds, data) in the order of time. What is damaged is left out, and counted in `notices`."""
+def is_bag_folder(path: Path) -> bool:
+    """Whether a folder is one of ROS 2, also one without metadata.yaml, which a recorder that was killed has not
+    written."""
+    return (path / "metadata.yaml").is_file() or bool(_storage_files(path))
+
+
+def messages(bag: OpenBag, topics: Sequence[BagTopic], notices: Notices) -> Iterator[tuple[BagTopic, int, bytes]]:
+    """(topic, nanoseconds, data) in the order of time. What is damaged is left out, and counted in `notices`."""
+    if isinstance(bag, CutOffBag):
+        yield from bag.messages([topic for topic in topics if isinstance(topic, Topic)])
+        return
+    connections = [topic for topic in topics if not isinstance(topic, Topic)]
     by_message = _decompresses_messages(bag)
     ends = _chunk_ends(bag)
     since: int | None = None
@@ -87,15 +109,21 @@ def messages(bag: AnyReader, connections: Sequence[Connection], notices: Notices
             yield connection, nanoseconds, data
 
 
+def _files(path: Path) -> list[Path]:
+    """What is to be opened: the bag, or the files of one without metadata.yaml."""
+    return _storage_files(path) if path.is_dir() and not (path / "metadata.yaml").is_file() else [path]
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    return of_one_bag(folder.glob("*.db3")) or cut_off_files(folder)
+
+
 def _repair(path: Path) -> str:
-    """The command that makes a whole bag of one whose recorder was killed: the libraries read no other."""
-    kind, beside = path.suffix.lower(), shlex.quote(str(path.with_stem(f"{path.stem}_whole")))
-    commands = {
-        ".mcap": f"mcap recover {shlex.quote(str(path))} -o {beside}",
-        ".bag": f"rosbag reindex {shlex.quote(str(path))}",
-        ".db3": f'sqlite3 {shlex.quote(str(path))} ".recover" | sqlite3 {beside}',
-    }
-    return f"`{commands.get(kind, f'ros2 bag reindex {shlex.quote(str(path))}')}`"
+    """The command that makes a whole bag of a database that is damaged."""
+    if path.suffix.lower() == ".db3":
+        mended = shlex.quote(str(path.with_stem(f"{path.stem}_whole")))
+        return f' (if it was cut off, `sqlite3 {shlex.quote(str(path))} ".recover" | sqlite3 {mended}` mends it)'
+    return f" (if it was cut off, `ros2 bag reindex {shlex.quote(str(path))}` mends it)" if path.is_dir() else ""
 
 
 def _bound_decompression() -> None:

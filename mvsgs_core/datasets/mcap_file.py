@@ -19,7 +19,7 @@ from typing import BinaryIO
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Header, Message
+from mcap.records import Channel, Chunk, Header, Message, Schema
 
 from mvsgs_core.bad_file import BadFileError, brief, reading
 from mvsgs_core.datasets.compression import decompress
@@ -38,8 +38,10 @@ class Recorded:
     """One message."""
 
     topic: str
+    kind: str  # name of its schema, "" without one
     encoding: str
     sequence: int
+    nanoseconds: int  # when it was recorded
     data: bytes
 
 
@@ -69,6 +71,7 @@ class McapFile:
     def __init__(self, path: Path, max_message: int) -> None:
         self._path = path
         self._largest = max_message + _BESIDE
+        self._schemas: dict[int, str] = {}  # their names
         self._channels: dict[int, Channel] = {}
         self.warnings = Notices()
         with path.open("rb") as file:
@@ -90,7 +93,7 @@ class McapFile:
         self.warnings.tally(f"parts of {self._path.name} left out because they are damaged", what)
 
     def _records(self, file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-        """Channels, messages and chunks."""
+        """Schemas, channels, messages and chunks."""
         size = self._path.stat().st_size
         at = len(MAGIC)
         while True:
@@ -109,7 +112,7 @@ class McapFile:
                 self.leave_out(f"bytes {at} to {following}")
                 at = following
                 continue
-            if opcode in (Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
                 if length <= self._largest:
                     yield opcode, file.read(length)
                 else:
@@ -142,16 +145,22 @@ class McapFile:
             at += length
 
     def _message(self, opcode: int, data: bytes) -> Recorded | None:
-        """What a record is if it is a message; a channel is kept for the messages to come."""
+        """What a record is if it is a message; schemas and channels are kept for the messages to come."""
         stream = ReadDataStream(BytesIO(data))
         try:
-            if opcode == Opcode.CHANNEL:
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                self._schemas.setdefault(schema.id, schema.name)
+            elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(stream)
                 self._channels.setdefault(channel.id, channel)
             elif opcode == Opcode.MESSAGE:
                 message = Message.read(stream, len(data))
                 channel = self._channels[message.channel_id]
-                return Recorded(channel.topic, channel.message_encoding, message.sequence, message.data)
+                return Recorded(
+                    channel.topic, self._schemas.get(channel.schema_id, ""), channel.message_encoding,
+                    message.sequence, message.log_time, message.data,
+                )  # fmt: skip
         except Exception as error:  # as above
             self.leave_out(f"a record of {len(data)} bytes: {brief(error)}")
         return None
@@ -165,6 +174,7 @@ class McapFile:
             summary = None
         if summary is None:
             return set(), []
+        self._schemas = {number: schema.name for number, schema in summary.schemas.items()}
         self._channels = dict(summary.channels)
         topics = {channel.topic for channel in summary.channels.values()}
         return topics, sorted({chunk.chunk_start_offset for chunk in summary.chunk_indexes})

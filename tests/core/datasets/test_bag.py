@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -26,60 +25,8 @@ pytest.importorskip("rosbags")
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
 
-HEIGHT, WIDTH = 24, 32
-K = np.array([40.0, 0, 15.5, 0, 41.0, 11.5, 0, 0, 1])
-P = np.array([50.0, 0, 16.5, 0, 0, 51.0, 12.5, 0, 0, 0, 1, 0])
-D = (0.1, 0.02, 0.0, 0.0, 0.0)
-
-
-def picture(number: int) -> np.ndarray:
-    image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
-    image[...] = (20 + number, 100, 200)
-    return image
-
-
-class Messages:
-    """Messages of either ROS version."""
-
-    def __init__(self, ros: int) -> None:
-        self.ros = ros
-        self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
-
-    def header(self, seconds: float) -> Any:
-        t = self.store.types
-        time = t["builtin_interfaces/msg/Time"](int(seconds), round(1e9 * (seconds % 1)))
-        header = t["std_msgs/msg/Header"]
-        return header(0, time, "camera") if self.ros == 1 else header(time, "camera")
-
-    def image(self, number: int, encoding: str, data: np.ndarray, step: int) -> Any:
-        cls = self.store.types["sensor_msgs/msg/Image"]
-        return cls(self.header(100 + number / 10), HEIGHT, WIDTH, encoding, 0, step, data.ravel())
-
-    def compressed(self, number: int, data: bytes) -> Any:
-        cls = self.store.types["sensor_msgs/msg/CompressedImage"]
-        return cls(self.header(100 + number / 10), "png", np.frombuffer(data, dtype=np.uint8))
-
-    def info(self) -> Any:
-        t = self.store.types
-        region = t["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        cls = t["sensor_msgs/msg/CameraInfo"]
-        return cls(
-            self.header(100), HEIGHT, WIDTH, "plumb_bob", np.array(D), K.copy(), np.eye(3).ravel(), P, 0, 0, region
-        )
-
-    def write(self, path: Path, messages: list[tuple[str, float, Any]]) -> Path:
-        store, ros = self.store, self.ros
-        with Writer1(path) if ros == 1 else Writer2(path, version=9) as writer:
-            connections: dict[str, Any] = {}
-            for topic, seconds, message in messages:
-                kind = message.__msgtype__
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
-                data = store.serialize_ros1(message, kind) if ros == 1 else store.serialize_cdr(message, kind)
-                writer.write(connections[topic], int(1e9 * seconds), data)
-        return path
+from tests.support.bag_messages import HEIGHT, WIDTH, Messages, picture, walk, write_walk
 
 
 @pytest.fixture(params=[1, 2])
@@ -140,30 +87,6 @@ def test_a_camera_whose_clock_was_set_goes_on_by_the_bags_times(tmp_path: Path, 
         np.testing.assert_allclose([item.timestamp for item in items], [100 + i / 10 for i in numbers], atol=1e-6)
         assert any("time stamps stood still, went back or leapt" in warning for warning in sequence.warnings)
         assert any("those before: 4" in warning for warning in sequence.warnings)
-
-
-def test_a_bag_that_was_cut_off_says_what_mends_it(tmp_path: Path) -> None:
-    ros = Messages(2)
-    with Writer2(tmp_path / "walk", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/camera/image_raw", "sensor_msgs/msg/Image", typestore=ros.store)
-        for i in range(9):
-            message = ros.image(i, "rgb8", picture(i), 3 * WIDTH)
-            writer.write(connection, 10**9 * i, ros.store.serialize_cdr(message, message.__msgtype__))
-    (whole,) = (tmp_path / "walk").glob("*.mcap")
-    cut = tmp_path / "cut off.mcap"
-    cut.write_bytes(whole.read_bytes()[:-900])
-    command = f"mcap recover '{cut}' -o '{tmp_path}/cut off_whole.mcap'"
-    with pytest.raises(BadFileError, match=re.escape(command)):
-        open_dataset("bag", path=cut)
-    one = ros.write(tmp_path / "other", [("/camera/image_raw", 1.0, message)])
-    next(one.glob("*.db3")).write_bytes(b"SQLite format 3\0")
-    with pytest.raises(BadFileError, match="ros2 bag reindex"):
-        open_dataset("bag", path=one)
-    first = Messages(1)
-    old = first.write(tmp_path / "old.bag", [("/camera/image_raw", 1.0, first.image(0, "rgb8", picture(0), 3 * WIDTH))])
-    old.write_bytes(old.read_bytes()[:-900])
-    with pytest.raises(BadFileError, match="rosbag reindex"):
-        open_dataset("bag", path=old)
 
 
 def test_stamps_that_stand_still_are_replaced_and_a_late_image_is_left_out(tmp_path: Path, ros: Messages) -> None:
@@ -300,11 +223,6 @@ def test_damaged_or_unknown_images_are_refused(encoding: str, size: int) -> None
         rgb_of(Messages(2).image(0, encoding, np.zeros(size, np.uint8), 3 * WIDTH))
 
 
-def walk(ros: Messages, path: Path, frames: int = 6) -> Path:
-    images = [("/camera/image_raw", 1.0 + i, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in range(frames)]
-    return ros.write(path, [("/camera/camera_info", 1.0, ros.info()), *images])
-
-
 def test_an_empty_calibration_is_a_guess(tmp_path: Path, ros: Messages) -> None:
     zeros = ros.info()
     (zeros.K if ros.ros == 1 else zeros.k)[:] = 0
@@ -332,14 +250,7 @@ def test_behind_a_damaged_chunk_of_ros_1_the_rest_is_read(tmp_path: Path, compre
     writer.set_compression(getattr(Writer1.CompressionFormat, compression.upper()))
     writer.chunk_threshold = 1  # a chunk a message
     with writer:
-        connections: dict[str, Any] = {}
-        messages = [("/c/camera_info", 1.0, ros.info())]
-        messages += [("/c/image_raw", 2.0 + i, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in range(6)]
-        for topic, seconds, message in messages:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
-            data = ros.store.serialize_ros1(message, message.__msgtype__)
-            writer.write(connections[topic], int(1e9 * seconds), data)
+        write_walk(ros, writer)
     with opened_bag(path) as bag:
         chunk = list(bag.readers[0].chunks.values())[3]
     content = bytearray(path.read_bytes())

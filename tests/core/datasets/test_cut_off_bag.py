@@ -1,0 +1,94 @@
+"""Bags whose recorder was killed: they have no index, ROS 2's no metadata.yaml either."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from shutil import rmtree
+
+import pytest
+
+from mvsgs_core.bad_file import BadFileError
+from mvsgs_core.datasets import open_dataset, recognized
+from mvsgs_core.datasets.bag_file import opened_bag
+
+pytest.importorskip("rosbags")
+
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+
+from tests.support.bag_messages import Messages, walk, write_walk
+
+
+@pytest.mark.parametrize("metadata", [True, False])
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_a_bag_of_ros_2_whose_recorder_was_killed_is_read(
+    tmp_path: Path, plugin: StoragePlugin, metadata: bool
+) -> None:
+    """It has no metadata.yaml, and of MCAP no index."""
+    ros = Messages(2)
+    with Writer2(tmp_path / "walk", version=9, storage_plugin=plugin) as writer:
+        write_walk(ros, writer)
+    if not metadata:
+        (tmp_path / "walk/metadata.yaml").unlink()
+    if plugin is StoragePlugin.MCAP:
+        (file,) = (tmp_path / "walk").glob("*.mcap")
+        file.write_bytes(file.read_bytes()[:-1700])
+    assert recognized(tmp_path / "walk") == ["bag"]
+    sequence = open_dataset("bag", path=tmp_path / "walk")
+    assert any("was cut off" in warning for warning in sequence.warnings) == (plugin is StoragePlugin.MCAP)
+    assert [int(item.image[0, 0, 0]) - 20 for item in sequence] == list(range(6))
+    assert sequence.lens.intrinsics[0] == 40
+
+
+def test_the_files_of_a_bag_of_ros_2_follow_one_another(tmp_path: Path) -> None:
+    (tmp_path / "walk").mkdir()
+    for part in (0, 1):
+        with Writer2(tmp_path / "part", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            write_walk(Messages(2), writer, range(6 * part, 6 * part + 6))
+        (file,) = (tmp_path / "part").glob("*.mcap")
+        (tmp_path / f"walk/walk_{part + 9}.mcap").write_bytes(file.read_bytes()[:-1700])
+        rmtree(tmp_path / "part")
+    sequence = open_dataset("bag", path=tmp_path / "walk")
+    assert [int(item.image[0, 0, 0]) - 20 for item in sequence] == list(range(12))
+
+
+@pytest.mark.parametrize("end", ["no index", "within a chunk", "within a chunk that is open"])
+def test_a_bag_of_ros_1_whose_recorder_was_killed_is_read(tmp_path: Path, end: str) -> None:
+    ros, path = Messages(1), tmp_path / "walk.bag"
+    writer = Writer1(path)
+    writer.chunk_threshold = 1  # a chunk a message
+    with writer:
+        write_walk(ros, writer)
+    with opened_bag(path) as bag:
+        chunks = list(bag.readers[0].chunks.values())
+    last, content = chunks[-1], bytearray(path.read_bytes())
+    if end == "within a chunk that is open":  # its lengths are filled in when it is closed
+        last = chunks[-2]
+        content[last.datapos - 4 : last.datapos] = bytes(4)
+        at = content.rindex(b"size=", 0, last.datapos)
+        content[at + 5 : at + 9] = bytes(4)
+        del content[last.datapos + last.datasize + 200 :]
+    else:
+        del content[last.datapos + (last.datasize if end == "no index" else 200) :]
+    path.unlink()
+    path = path.with_name("walk.bag.active")
+    path.write_bytes(content)
+    assert recognized(path) == ["bag"]
+    sequence = open_dataset("bag", path=path)
+    assert any("was cut off" in warning or "has no index" in warning for warning in sequence.warnings)
+    assert [int(item.image[0, 0, 0]) - 20 for item in sequence] == list(range(6 if end == "no index" else 5))
+    assert sequence.lens.intrinsics[0] == 40
+
+
+def test_what_is_too_damaged_to_be_walked_is_refused(tmp_path: Path) -> None:
+    ros = Messages(2)
+    one = walk(ros, tmp_path / "other")
+    next(one.glob("*.db3")).write_bytes(b"SQLite format 3\0")
+    with pytest.raises(BadFileError, match="ros2 bag reindex"):
+        open_dataset("bag", path=one)
+    first = Messages(1)
+    old = walk(first, tmp_path / "old.bag")
+    old.write_bytes(old.read_bytes()[:900])
+    with pytest.raises(BadFileError, match=r"old\.bag: no message could be read; old\.bag was cut off"):
+        open_dataset("bag", path=old)
