@@ -104,8 +104,8 @@ class Child:
         return Failure(self.name, error or self.failure() or "failed", self.last_words(), self.log)
 
     def last_words(self, lines: int = 30) -> str:
-        """The traceback that the node reported, else the end of its log."""
-        if self.status.traceback:
+        """The traceback that the node reported, "" where it could explain itself without; else the end of its log."""
+        if self.status.traceback is not None:
             return self.status.traceback.rstrip()
         return printable_lines(self.log.read_text(errors="replace"), lines)
 

@@ -2,8 +2,9 @@
 
 Life: start, wait for the readers of its topics, ask for a camera's frames, run, `on_end` once every input has ended (a
 source: once `run` is exhausted, or SIGINT has come), End on each topic, wait for the goodbyes, done. A failure at any
-point is reported with its traceback, the node saves what it has (`on_abort`), and the process ends with exit code 1;
-the neighbors notice and fail as well. SIGTERM ends it in the same way at the next safe point, with exit code 143.
+point is reported, with its traceback unless it is of bad input, which its message explains; the node saves what it has
+(`on_abort`), and the process ends with exit code 1; the neighbors notice and fail as well. SIGTERM ends it in the same
+way at the next safe point, with exit code 143.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 
 import msgs
 from msgs import Frame, Message
+from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.named_modules import import_named
 from nodes import Node, is_source, outputs
 from nodes.parameters import build
@@ -55,16 +57,22 @@ def run(spec: Spec, signals: Signals) -> int:
     except Exception as error:
         logging.exception("failed")
         line = next(iter(str(error).splitlines()), "")
+        explained = _is_explained(error)
         process.abort(
             "failed",
-            f"{type(error).__name__}: {line}",
-            traceback=traceback.format_exc(),
+            line if explained else f"{type(error).__name__}: {line}",
+            traceback="" if explained else traceback.format_exc(),
             peer=isinstance(error, PeerLost),  # the consequence of another node's failure
         )
         return 1
     finally:
         process.close()
     return 0
+
+
+def _is_explained(error: Exception) -> bool:
+    """Whether it is of the input, in a sentence of our own: the user is not helped by where in the code that was."""
+    return isinstance(error, BadFileError) or (isinstance(error, OSError) and error.errno is None and bool(error.args))
 
 
 def load_node(target: str) -> type[Node]:
