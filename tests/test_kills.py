@@ -63,7 +63,9 @@ def test_observers_without_room_on_their_disk_cost_no_map(tmp_path: Path) -> Non
         assert run.wait() == 4, run.said()
         said = run.said()
     for observer in ("recorder", "evaluator"):
-        assert re.search(rf"{observer} failed: (OSError: \[Errno|could not write) .*; the run goes on without it", said), said
+        assert re.search(
+            rf"{observer} failed: (OSError: \[Errno|could not write) .*; the run goes on without it", said
+        ), said
     report = json.loads((output / "report.json").read_text())
     assert set(report["observers"]) == {"recorder", "evaluator"}
     assert map_opens(output)

@@ -18,7 +18,6 @@ from mvsgs_core.tracking.steps import Steps, timed, whole
 
 BENT_LENS = "the lens bends, and the focal length makes up for it"
 UNKNOWN_LENS = "these images hardly tell a focal length from a lens that bends"
-CONTRADICTION = 2.0  # standard deviations by which the matches contradict a calibration that was given
 FEW = 128  # keyframes, the first ones, that a given calibration is checked with
 MANY = 300  # keyframes, the first ones, that a guess is: their adjustment takes the square of their number in memory
 REESTIMATED_AT = (10, 20, 40)  # keyframes of the map at which the readout time is estimated again
@@ -119,7 +118,7 @@ class Calibration:
         factor = focal_of_all(self.graph, members, self.threads)
         if factor is None:
             return
-        sigma = uncertainty(self.graph, members, self.config.probe, self.threads, factor)
+        sigma = uncertainty(self.graph, members, self.config.probe, self.threads, factor).sigma
         if not np.isfinite(sigma):
             return
         used = self.focal_factor * self.pixels
@@ -145,9 +144,10 @@ class Calibration:
                 return
             if observability(self.graph, members, self.config.probe, self.threads, factor) <= self.config.certain:
                 return
-            sigma = uncertainty(self.graph, members, self.config.probe, self.threads, factor)
-        if abs(np.log(factor)) <= CONTRADICTION * sigma:
+            certainty = uncertainty(self.graph, members, self.config.probe, self.threads, factor)
+        if abs(np.log(factor)) <= certainty.interval:
             return
+        sigma = certainty.sigma
         self._say_checked(factor, sigma)
         self.stats.values["focal_doubt"] = f"the keyframes want {factor:.4f} times as much"
         used = self.focal_factor * self.pixels
@@ -222,7 +222,7 @@ class Calibration:
         self.stats.counts["focal length over its guess"] = self.focal_factor
         if not members:
             return
-        alone = uncertainty(self.graph, members, self.config.probe, self.threads)
+        alone = uncertainty(self.graph, members, self.config.probe, self.threads).sigma
         radial = estimate_radial(lens_problem(self.graph, members), self.threads)
         self._report_radial(radial, alone)
         self.stats.values["focal length"] += f", give or take {self.stats.values['focal_sigma_percent']:.1f} %"

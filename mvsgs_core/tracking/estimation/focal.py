@@ -18,6 +18,7 @@ from mvsgs_core.tracking.steps import Steps
 
 PARTS = 3  # of the keyframes, in their order, each of which is asked alone ...
 MIN_KEYFRAMES = 4  # ... where it has so many
+NORMAL, STUDENT = 1.96, {2: 12.71, 3: 4.30}  # standard deviations that 95 % lie within: Student's, by number of parts
 
 
 @dataclass(frozen=True)
@@ -118,17 +119,35 @@ def curvature_sigma(graph: KeyframeGraph, members: list[int], rise: float, probe
     return TOGETHER**0.5 * probe / float(np.sqrt(matches * rise))
 
 
-def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0) -> float:
-    """Standard deviation of the focal length that these keyframes give a pinhole camera, as a fraction; infinite where
-    they don't tell. What the lens adds is in radial.py.
+@dataclass(frozen=True)
+class Uncertainty:
+    """Of the logarithm of a focal length that keyframes give a pinhole camera; what the lens adds is in radial.py."""
 
-    factor: what they give, on the graph's focal length.
+    curvature: float  # standard deviation from the curvature of the cost; infinite where they don't tell
+    spread: float = 0.0  # that from how far parts of the keyframes, each alone, disagree
+    parts: int = 0  # that could be asked
 
-    From the curvature of the cost, and from how far parts of the keyframes, each alone, disagree.
-    """
+    @property
+    def sigma(self) -> float:
+        """Standard deviation: as a fraction, nearly."""
+        return float(np.hypot(self.curvature, self.spread))
+
+    @property
+    def interval(self) -> float:
+        """Half of the interval in which the truth lies with 95 %: a spread of few is itself uncertain. Infinite where
+        fewer than two parts could be asked: what errs in all matches alike is then not seen."""
+        if self.parts not in STUDENT:
+            return float("inf")
+        return float(np.hypot(NORMAL * self.curvature, STUDENT[self.parts] * self.spread))
+
+
+def uncertainty(
+    graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0
+) -> Uncertainty:
+    """That of the focal length that these keyframes give. factor: what they give, on the graph's focal length."""
     curvature = curvature_sigma(graph, members, observability(graph, members, probe, threads, factor), probe)
     if curvature == float("inf"):
-        return curvature
+        return Uncertainty(curvature)
     found, weights = [], []
     for part in np.array_split(np.array(members), PARTS):
         if len(part) < MIN_KEYFRAMES:
@@ -139,14 +158,15 @@ def uncertainty(graph: KeyframeGraph, members: list[int], probe: float, threads:
             found.append(float(np.log(own)))
             weights.append(part_rise)
     if len(found) < 2:
-        return curvature
+        return Uncertainty(curvature)
     logs, fractions = np.array(found), np.array(weights) / sum(weights)
     spread = float(np.sqrt(fractions @ np.square(logs - fractions @ logs) / (len(logs) - 1)))
-    return float(np.hypot(curvature, spread))
+    return Uncertainty(curvature, spread, len(logs))
 
 
 __all__ = [
     "FocalConfig",
+    "Uncertainty",
     "curvature_sigma",
     "focal_of_all",
     "observability",

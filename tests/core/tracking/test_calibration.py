@@ -1,4 +1,4 @@
-"""What the check of a guessed focal length asks at the end of a long stream."""
+"""What the check of a focal length at the end of a stream asks, and what it says."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mvsgs_core.datasets import open_dataset
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation import calibration
 from mvsgs_core.tracking.estimation.calibration import MANY, Calibration
-from mvsgs_core.tracking.estimation.focal import FocalConfig
+from mvsgs_core.tracking.estimation.focal import FocalConfig, Uncertainty
 from mvsgs_core.tracking.estimation.radial import Radial
 from mvsgs_core.tracking.graph import KeyframeGraph
+from mvsgs_core.tracking.tracker import Tracker
+from tests.support.shared_data import shared
 
 
 @pytest.mark.parametrize(
@@ -29,7 +32,7 @@ def test_a_contradiction_is_told_of_the_focal_length_that_was_used(
     monkeypatch.setattr(calibration, "find_zoom", lambda *_: None)
     monkeypatch.setattr(calibration, "focal_of_all", lambda *_: 1.3)
     monkeypatch.setattr(calibration, "observability", lambda *_: np.inf)
-    monkeypatch.setattr(calibration, "uncertainty", lambda *_: 0.01)
+    monkeypatch.setattr(calibration, "uncertainty", lambda *_: Uncertainty(0.01, 0.01, 3))
     stats, graph = Stats(), KeyframeGraph(np.array([150.0, 150.0, 160.0, 120.0]))
     checked = Calibration(graph, FocalConfig(), stats, 300.0, (480, 640), False, 0.0, False, 1)
     if of_map:
@@ -39,6 +42,30 @@ def test_a_contradiction_is_told_of_the_focal_length_that_was_used(
     for text in said:
         assert text in warning
     assert stats.values["focal_checked_px"] == pytest.approx(325.0 if of_map else 390.0)
+
+
+@pytest.mark.parametrize(
+    ("parts", "spread", "said"), [(3, 0.01, True), (3, 0.02, False), (2, 0.01, False), (0, 0.0, False)]
+)
+def test_what_few_parts_of_a_stream_want_contradicts_nothing(
+    parts: int, spread: float, said: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The spread of two or three is itself uncertain, and where there is none nobody knows what errs alike."""
+    monkeypatch.setattr(calibration, "find_zoom", lambda *_: None)
+    monkeypatch.setattr(calibration, "focal_of_all", lambda *_: 1.06)
+    monkeypatch.setattr(calibration, "observability", lambda *_: np.inf)
+    monkeypatch.setattr(calibration, "uncertainty", lambda *_: Uncertainty(0.01, spread, parts))
+    stats, graph = Stats(), KeyframeGraph(np.array([150.0, 150.0, 160.0, 120.0]))
+    Calibration(graph, FocalConfig(), stats, 300.0, (480, 640), False, 0.0, False, 1).check(list(range(20)))
+    assert bool(stats.warnings) == said
+
+
+def test_a_few_frames_of_a_real_video_contradict_no_calibration() -> None:
+    tracker = Tracker()
+    for item in open_dataset("tum", path=shared("data/tum_fr1_xyz"), size=(240, 320), stride=2, stop=48):
+        tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
+    list(tracker.finish())
+    assert not any("contradict" in warning for warning in tracker.stats.warnings)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +86,7 @@ def test_adjustments_of_a_long_stream_are_of_no_more_keyframes_than_memory_is_fo
 
     monkeypatch.setattr(calibration, "find_zoom", lambda *_: None)  # of parts of the stream
     monkeypatch.setattr(calibration, "focal_of_all", says(1.2))
-    monkeypatch.setattr(calibration, "uncertainty", says(0.001))
+    monkeypatch.setattr(calibration, "uncertainty", says(Uncertainty(0.001)))
     monkeypatch.setattr(calibration, "lens_problem", says(None))
     monkeypatch.setattr(calibration, "estimate_radial", lambda *_: Radial(0.0, 0.01, 1.0, 1.5))
     stats, graph = Stats(), KeyframeGraph(np.array([300.0, 300.0, 160.0, 120.0]))
