@@ -1,4 +1,4 @@
-"""Addresses with a user and a password (rtsp://user:password@host) as reports and logs may show them."""
+"""Addresses with a password (rtsp://user:password@host, http://host/video?pwd=...) as reports and logs may show them."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import re
 from typing import Any
 
 _USER = re.compile(r"://[^/?#\s]*@")
+_WORDS = "password|passwd|pass|pwd|passphrase|token|access_token|auth|key|apikey|api_key|secret|signature|sig"
+_ADDRESS, _SECRET = re.compile(r"://\S+"), re.compile(rf"([?&;_/](?:{_WORDS})=)[^&;#\s]+", re.IGNORECASE)
 
 
 def without_passwords(value: Any) -> Any:
-    """A text, or all texts in a report, with addresses that name no user."""
+    """A text, or all texts in a report, with addresses that name no user and hide what is secret in their query."""
     if isinstance(value, str):
-        return _USER.sub("://", value)
+        return _ADDRESS.sub(lambda address: _SECRET.sub(r"\1***", address[0]), _USER.sub("://", value))
     if isinstance(value, dict):
         return {key: without_passwords(item) for key, item in value.items()}
     return [without_passwords(item) for item in value] if isinstance(value, list) else value
