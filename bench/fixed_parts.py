@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.table import Row, at_least, at_most, main
 from bench.tracking.__main__ import run
-from bench.tracking.cases import CASES, Case
+from bench.tracking.cases import CASES, Case, skipped
 from mvsgs_core.datasets import Item
 from mvsgs_core.stats import Stats
 from nodes.fixed_mask import FixedMask
@@ -105,8 +105,9 @@ def with_drawn(name: str, items: Sequence[Item], draw: Callable[[np.ndarray, flo
 
 def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
-    rows = list[Row]()
-    for name, case in (QUICK if options.quick else VIDEOS).items():
+    videos = QUICK if options.quick else VIDEOS
+    rows = skipped(videos)
+    for name, case in videos.items():
         if not case.there:
             continue
         items = [replace(item, depth=None) for item in case.items()]

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from bench.table import Row, at_least, at_most, main
-from bench.tracking.cases import CASES, Case
+from bench.tracking.cases import CASES, Case, skipped
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.tracking.tracker import Tracker
@@ -142,7 +142,8 @@ def summary(found: Sequence[Estimate]) -> list[Row]:
 def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
     found, known, zooms = list[Estimate](), list[Given](), list[Given]()
-    for name, case in (QUICK if options.quick else VIDEOS).items():
+    videos = QUICK if options.quick else VIDEOS
+    for name, case in videos.items():
         if case.there:
             items = [replace(item, depth=None) for item in case.items()]
             found += [estimate(part, chosen) for part, chosen in parts(name, items)]
@@ -157,6 +158,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     blamed = sum(one.found is not None for one in exact)
     told = sum(one.found is not None and abs(one.found) < WRONG / 2.0 for one in wrong)
     return [
+        *skipped(videos),
         *(one.row() for one in found),
         *summary(found),
         *(one.row() for one in known),

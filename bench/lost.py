@@ -24,7 +24,7 @@ import numpy as np
 
 from bench.known_map import errors, tracked
 from bench.table import Row, all_of, at_least, at_most, main, names
-from bench.tracking.cases import CASES, Case
+from bench.tracking.cases import CASES, Case, skipped
 from launch.compose import compose
 from launch.inline import run_inline
 from launch.ports import free_ports
@@ -287,7 +287,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
     if options.quick:
         return [row for name, case in QUICK.items() for row in rows_of(name, case, QUICK_AWAY)]
     wanted = SCENES if options.scenes is None else {name: SCENES[name] for name in options.scenes}
-    return [row for name, case in wanted.items() if case.there for row in rows_of(name, case, AWAY)]
+    there = {name: case for name, case in wanted.items() if case.there}
+    return [row for name, case in there.items() for row in rows_of(name, case, AWAY)] + skipped(wanted)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

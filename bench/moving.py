@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.fixed_parts import AGREES, TIMES, tracked
 from bench.table import Row, at_most, main
-from bench.tracking.cases import CASES, Case
+from bench.tracking.cases import CASES, Case, skipped
 from mvsgs_core.datasets import Item
 
 VIDEOS = {name: CASES[name] for name in ("redkitchen", "tum_fr1_xyz", "room")}
@@ -63,9 +63,10 @@ def with_person(items: Sequence[Item], share: float, period: int) -> tuple[list[
 
 def measure(options: argparse.Namespace) -> list[Row]:
     cv2.setNumThreads(1)
-    rows, errors, ideals = list[Row](), list[float](), list[float]()
+    videos = QUICK if options.quick else VIDEOS
+    rows, errors, ideals = skipped(videos), list[float](), list[float]()
     widths, periods = ((0.35,), (60,)) if options.quick else (WIDTHS, PERIODS)
-    for name, case in (QUICK if options.quick else VIDEOS).items():
+    for name, case in videos.items():
         if not case.there:
             continue
         items = [replace(item, depth=None) for item in case.items()]

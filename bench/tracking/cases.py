@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bench.runs import DATA
+from bench.table import Row
 from mvsgs_core.datasets import Item, open_dataset
 
 NOISE = 1.5  # gray levels, of a sensor in the dark
@@ -46,6 +47,11 @@ class Case:
         items = list(open_dataset(self.reader, **options))
         clear = self.light == 1.0 and self.haze == 0.0
         return items if clear else [_dimmed(item, self.light, self.haze) for item in items]
+
+
+def skipped(cases: Mapping[str, Case]) -> list[Row]:
+    """A row for each whose data is not on this machine: no table leaves one out in silence."""
+    return [Row(f"{name}: skipped", f"{case.path} is not there") for name, case in cases.items() if not case.there]
 
 
 def _dimmed(item: Item, light: float, haze: float) -> Item:

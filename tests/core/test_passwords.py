@@ -12,12 +12,15 @@ from mvsgs_core.passwords import without_passwords
     [
         ("rtsp://me:secret@host/live?a=1", "rtsp://host/live?a=1"),
         ("rtsp://host/live?a=1&password=x&Token=y#f", "rtsp://host/live?a=1&password=***&Token=***#f"),
-        ("http://host/video.cgi?user=admin&pwd=x does not answer", "http://host/video.cgi?user=admin&pwd=*** does not answer"),
+        (
+            "http://host/video.cgi?user=admin&pwd=x does not answer",
+            "http://host/video.cgi?user=admin&pwd=*** does not answer",
+        ),
         ("rtsp://host:554/user=admin_password=x", "rtsp://host:554/user=admin_password=***"),
         ("http://host/monkey=3?keyboard=2", "http://host/monkey=3?keyboard=2"),
         ("no address: password=x", "no address: password=x"),
     ],
-)  # fmt: skip
+)
 def test_an_address_is_shown_without_its_password(said: str, shown: str) -> None:
     assert without_passwords(said) == shown
     assert without_passwords({"path": [said, 3]}) == {"path": [shown, 3]}
