@@ -1,4 +1,4 @@
-"""Addresses with a password (rtsp://user:password@host, http://host/video?pwd=...) as reports and logs may show them."""
+"""A camera's address with a password (rtsp://user:password@host, http://host/video?pwd=...), as reports may show it."""
 
 from __future__ import annotations
 

@@ -29,8 +29,8 @@ from tests.support.shared_data import ROOT
 @pytest.mark.parametrize(
     "choice",
     [
-        "synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "euroc", "kitti", "scannet", "images", "video",
-        "bag", "camera", "robot", "ros2",
+        "synthetic", "tum", "replica", "seven_scenes", "icl_nuim", "euroc", "kitti", "scannet", "sens", "images",
+        "video", "bag", "camera", "robot", "ros2",
     ],
 )  # fmt: skip
 def test_every_dataset_choice_composes(choice: str) -> None:
@@ -80,7 +80,20 @@ def test_a_missing_gpu_of_one_slot_is_refused_too(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "choice",
-    ["tum", "replica", "seven_scenes", "icl_nuim", "euroc", "kitti", "scannet", "images", "video", "bag", "player"],
+    [
+        "tum",
+        "replica",
+        "seven_scenes",
+        "icl_nuim",
+        "euroc",
+        "kitti",
+        "scannet",
+        "sens",
+        "images",
+        "video",
+        "bag",
+        "player",
+    ],
 )
 @pytest.mark.parametrize("path", [None, "/nowhere/at/all"])
 def test_a_missing_path_is_refused_before_a_process_starts(

@@ -304,6 +304,33 @@ def message_bomb(folder: Path) -> None:
 
 
 # kind -> how it is opened ("DATASET", or what `file_worker` calls it), what is opened in its folder, how it is made
+def _cut_off(make: Callable[[Path], None]) -> Callable[[Path], None]:
+    """A bag whose recorder was killed: what is written at the end is not there."""
+
+    def cut(folder: Path) -> None:
+        make(folder)
+        for file in [path for path in folder.rglob("*") if path.is_file()]:
+            if file.name == "metadata.yaml":
+                file.unlink()
+            else:
+                file.write_bytes(file.read_bytes()[:-100])
+
+    return cut
+
+
+def sens(folder: Path) -> None:
+    """Version 4, of one camera for color and depth."""
+    camera, there = np.diag([_FOCAL, _FOCAL, 1.0, 1.0]).astype("<f4"), np.eye(4, dtype="<f4").tobytes()
+    camera[:2, 2] = 16.0, 12.0
+    parts = [struct.pack("<IQ", 4, 6) + b"camera", 2 * (camera.tobytes() + there)]
+    parts.append(struct.pack("<iiIIIIfQ", 2, 1, WIDTH, HEIGHT, WIDTH, HEIGHT, 1000.0, FRAMES))
+    for number in range(FRAMES):
+        color = cv2.imencode(".jpg", picture(number))[1].tobytes()
+        depth = zlib.compress(np.full((HEIGHT, WIDTH), 2000, dtype="<u2").tobytes())
+        parts += [there, struct.pack("<4Q", number, number, len(color), len(depth)), color, depth]
+    (folder / "scan.sens").write_bytes(b"".join(parts))
+
+
 SEEDS: dict[str, tuple[str, str, Callable[[Path], None]]] = {
     "images": ("images", ".", images),
     "transforms.json": ("images", ".", transforms),
@@ -314,6 +341,7 @@ SEEDS: dict[str, tuple[str, str, Callable[[Path], None]]] = {
     "Replica": ("replica", ".", replica),
     "7-Scenes": ("seven_scenes", ".", seven_scenes),
     "ICL-NUIM": ("icl_nuim", ".", icl_nuim),
+    "ScanNet .sens": ("sens", "scan.sens", sens),
     "video mp4": ("video", "walk.mp4", _video("mp4", "mp4v")),
     "video avi": ("video", "walk.avi", _video("avi", "MJPG")),
     "video mkv": ("video", "walk.mkv", _video("mkv", "mp4v")),
@@ -324,6 +352,8 @@ SEEDS: dict[str, tuple[str, str, Callable[[Path], None]]] = {
     "bag db3 zstd file": ("bag", "walk", _bag2("SQLITE3", "FILE")),
     "bag mcap": ("bag", "walk", _bag2("MCAP", "NONE")),
     "bag mcap zstd": ("bag", "walk", _bag2("MCAP", "STORAGE")),
+    "bag cut off": ("bag", "walk.bag", _cut_off(_bag(""))),
+    "bag mcap cut off": ("bag", "walk", _cut_off(_bag2("MCAP", "NONE"))),
     "ply": ("ply", "map.ply", ply),
     "cameras.json": ("cameras", "cameras.json", cameras),
     "checkpoint": ("checkpoint", ".", checkpoint),

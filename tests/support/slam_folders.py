@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +106,29 @@ def write_scannet(folder: Path, frames: int = 12) -> Path:
         k[0, 0], k[1, 1], k[:2, 2] = focal, focal, middle
         (folder / f"intrinsic/intrinsic_{name}.txt").write_text("\n".join(" ".join(map(str, row)) for row in k))
     return folder
+
+
+def write_sens(path: Path, frames: int = 4) -> Path:
+    """What `write_scannet` writes, in one file: color as PNG, depth by zlib; image 1 was lost."""
+
+    def camera(focal: float, middle: tuple[float, float]) -> bytes:
+        k = np.eye(4, dtype="<f4")
+        k[0, 0], k[1, 1], k[:2, 2] = focal, focal, middle
+        return k.tobytes() + np.eye(4, dtype="<f4").tobytes()
+
+    name = b"StructureSensor"
+    parts = [struct.pack("<IQ", 4, len(name)), name, camera(200, (127.5, 95.5)), camera(110, (63.5, 47.5))]
+    parts.append(struct.pack("<iiIIIIfQ", 1, 1, 256, 192, 128, 96, 1000.0, frames))
+    for i in range(frames):
+        color = BytesIO()
+        Image.fromarray(np.full((192, 256, 3), 20 + i, dtype=np.uint8)).save(color, "png")
+        depth = zlib.compress(np.full((96, 128), 2000, dtype="<u2").tobytes())
+        world_from_cam = np.full((4, 4), -np.inf) if i == 1 else pose(i)
+        parts.append(world_from_cam.astype("<f4").tobytes())
+        parts += [struct.pack("<QQQQ", 0, 0, len(color.getvalue()), len(depth)), color.getvalue(), depth]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"".join(parts))
+    return path
 
 
 def write_kitti_raw(root: Path, frames: int = 4) -> Path:
