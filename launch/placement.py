@@ -69,4 +69,5 @@ def thread_environment(threads: int) -> dict[str, str]:
         "OPENCV_FOR_THREADS_NUM": str(threads),
         "OMP_WAIT_POLICY": "PASSIVE",
         "GOMP_SPINCOUNT": "0",
+        "OPENBLAS_THREAD_TIMEOUT": "4",  # 2**4 cycles, the least there is; by default it is 2**26
     }

@@ -78,7 +78,7 @@ class Calibration:
                 rise = observability(self.graph, members, self.config.probe, self.threads)
                 if rise > self.config.certain and self._sensible():
                     self.settled = True
-                    self._report(members)
+                    self._report(members, rise)
             if not self.settled and len(members) >= self.config.max_keyframes:
                 self.settle(members)
 
@@ -89,11 +89,11 @@ class Calibration:
         self.settled = True
         rise = observability(self.graph, members, self.config.probe, self.threads) if len(members) > 2 else 0.0
         if rise > self.config.usable and self._sensible():
-            self._report(members)
+            self._report(members, rise)
             return
         self.graph.intrinsics = self.given.copy()
         self.graph.optimize(members, set(members[1:]), set(members), Solver(steps=15, threads=self.threads))
-        self._report([])
+        self._report([], rise)
         self.stats.values["focal_doubt"] = "it can't be told from these images, and the guess is kept"
         self.stats.warn(
             "the focal length can't be told from these images (a camera that hardly turns, or a flat scene): the guess "
@@ -118,7 +118,8 @@ class Calibration:
         factor = focal_of_all(self.graph, members, self.threads)
         if factor is None:
             return
-        sigma = uncertainty(self.graph, members, self.config.probe, self.threads, factor).sigma
+        rise = observability(self.graph, members, self.config.probe, self.threads, factor)
+        sigma = uncertainty(self.graph, members, rise, self.config.probe, self.threads, factor).sigma
         if not np.isfinite(sigma):
             return
         used = self.focal_factor * self.pixels
@@ -142,9 +143,10 @@ class Calibration:
                 return
             if abs(np.log(factor)) <= self.config.drift:
                 return
-            if observability(self.graph, members, self.config.probe, self.threads, factor) <= self.config.certain:
+            rise = observability(self.graph, members, self.config.probe, self.threads, factor)
+            if rise <= self.config.certain:
                 return
-            certainty = uncertainty(self.graph, members, self.config.probe, self.threads, factor)
+            certainty = uncertainty(self.graph, members, rise, self.config.probe, self.threads, factor)
         if abs(np.log(factor)) <= certainty.interval:
             return
         sigma = certainty.sigma
@@ -214,15 +216,15 @@ class Calibration:
     def _sensible(self) -> bool:
         return self.config.bounds[0] < self.focal_factor < self.config.bounds[1]
 
-    def _report(self, members: list[int]) -> None:
-        """members: keyframes that the focal length was found from; none: it is the guess."""
+    def _report(self, members: list[int], rise: float) -> None:
+        """members: keyframes that the focal length was found from; none: it is the guess. rise: their observability."""
         used = self.focal_factor * self.pixels
         self.stats.values["focal length"] = f"{used:.1f} px, {self.focal_factor:.3f} x the guess"
         self.stats.values["focal_px"] = used
         self.stats.counts["focal length over its guess"] = self.focal_factor
         if not members:
             return
-        alone = uncertainty(self.graph, members, self.config.probe, self.threads).sigma
+        alone = uncertainty(self.graph, members, rise, self.config.probe, self.threads).sigma
         radial = estimate_radial(lens_problem(self.graph, members), self.threads)
         self._report_radial(radial, alone)
         self.stats.values["focal length"] += f", give or take {self.stats.values['focal_sigma_percent']:.1f} %"

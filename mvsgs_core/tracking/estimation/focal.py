@@ -142,10 +142,13 @@ class Uncertainty:
 
 
 def uncertainty(
-    graph: KeyframeGraph, members: list[int], probe: float, threads: int, factor: float = 1.0
+    graph: KeyframeGraph, members: list[int], rise: float, probe: float, threads: int, factor: float = 1.0
 ) -> Uncertainty:
-    """That of the focal length that these keyframes give. factor: what they give, on the graph's focal length."""
-    curvature = curvature_sigma(graph, members, observability(graph, members, probe, threads, factor), probe)
+    """That of the focal length that these keyframes give.
+
+    rise: their `observability`. factor: what they give, on the graph's focal length.
+    """
+    curvature = curvature_sigma(graph, members, rise, probe)
     if curvature == float("inf"):
         return Uncertainty(curvature)
     found, weights = [], []

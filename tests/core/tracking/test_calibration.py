@@ -86,6 +86,7 @@ def test_adjustments_of_a_long_stream_are_of_no_more_keyframes_than_memory_is_fo
 
     monkeypatch.setattr(calibration, "find_zoom", lambda *_: None)  # of parts of the stream
     monkeypatch.setattr(calibration, "focal_of_all", says(1.2))
+    monkeypatch.setattr(calibration, "observability", says(0.1))
     monkeypatch.setattr(calibration, "uncertainty", says(Uncertainty(0.001)))
     monkeypatch.setattr(calibration, "lens_problem", says(None))
     monkeypatch.setattr(calibration, "estimate_radial", lambda *_: Radial(0.0, 0.01, 1.0, 1.5))
@@ -93,6 +94,6 @@ def test_adjustments_of_a_long_stream_are_of_no_more_keyframes_than_memory_is_fo
     checked = Calibration(graph, FocalConfig(), stats, 300.0, (240, 320), True, 0.0, False, 1)
     stats.values["focal_sigma_percent"] = 1.0
     checked.check(list(range(keyframes)))
-    assert seen == [list(range(asked))] * 3
+    assert seen == [list(range(asked))] * 4
     (warning,) = stats.warnings
     assert warning.startswith(f"{who} want a focal length of 360 px")
