@@ -262,8 +262,6 @@ class Tracker:
         stats.count(HELD_OUT, sum(is_held_out(index) for index in graph.keyframes if index >= 0))
         tell_what_moves(stats, graph)
         tracking = session.phase is not Phase.INITIALIZING
-        if tracking and not self._frozen:
-            session.calibration.check(session.members)
         if session.choice.spacing is not None and (spared := round(session.choice.spacing.spared)):
             stats.skip(SPARED, spared)
         stats.counts["matches"] = session.matcher.calls
@@ -283,6 +281,8 @@ class Tracker:
                 correction, velocity=velocity, readout_time=graph.readout_time, reads_columns=graph.reads_columns
             )
         yield Update(state, correction=correction)
+        if tracking and not self._frozen:  # after what the map waits for
+            session.calibration.check(session.members)
 
 
 __all__ = ["Tracker", "TrackerConfig", "Update"]
