@@ -23,6 +23,7 @@ from nodes.mapper import Mapper
 MIN_COVERED = 0.99  # fraction of a frame's pixels above half opacity
 MAX_TIME = 5.0  # % of the mapper's
 PERIOD = 1e-9  # s between previews: one for each message
+WHOLE = 10**7  # splats: more than there are, so that a preview shows all of the map, then what is provisional
 
 
 def measure(quick: bool) -> list[Row]:
@@ -40,7 +41,7 @@ def measure(quick: bool) -> list[Row]:
 
 def _live(sent: list[Keyframe | FusedKeyframe | Poses]) -> list[Row]:
     """A mapper that gets keyframes when the tracker has them, four of them before their depth."""
-    mapper = Mapper(Mapper.Config(preview_period=PERIOD))
+    mapper = Mapper(Mapper.Config(preview_period=PERIOD, preview_splats=WHOLE))
     covered, without, delays = [], [], []
     for message in sent:
         if isinstance(message, FusedKeyframe):

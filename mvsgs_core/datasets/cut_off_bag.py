@@ -97,7 +97,8 @@ class CutOffBag:
                     if length > size - file.tell():
                         raise ValueError("a record ends early")
                 except ValueError as error:
-                    notices.append(f"{path.name} was cut off: read are {at} of {size} bytes ({brief(error)})")
+                    what = f"{path.name} was cut off or is damaged: read are {at} of {size} bytes"
+                    notices.append(f"{what} ({brief(error)})")
                     return
                 after = file.tell() + length
                 try:
@@ -140,7 +141,7 @@ def cut_off_files(path: Path) -> list[Path]:
 def of_one_bag(files: Iterable[Path]) -> list[Path]:
     """The same in their order, where a recorder of ROS 2 has numbered them (walk_0, walk_1) or there is but one; else
     none: several bags that lie in one folder."""
-    found = sorted(files, key=lambda file: natural_order(file.name))
+    found = sorted(filter(Path.is_file, files), key=lambda file: natural_order(file.name))
     names = {_NUMBERED.sub("", file.stem) if _NUMBERED.search(file.stem) else None for file in found}
     return found if len(found) == 1 or (len(names) == 1 and None not in names) else []
 
