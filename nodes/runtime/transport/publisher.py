@@ -62,6 +62,7 @@ class Publisher:
         self.topic = topic or address
         self.sent = 0
         self._arrived: Counter[bytes] = Counter()  # attempts of readers that were served, by what they said
+        self.readers: Counter[bytes] = Counter()  # that are there, by delivery: one each, however often it has said so
         self.observers: dict[str, bytes] = {}  # delivery of those readers that only observe, by name
         self._essential = 0  # reliable readers that were there at the start
         self._held_back = held_back
@@ -94,14 +95,6 @@ class Publisher:
         """Whether that many readers, of either kind, are there, and these observers beside them."""
         self.watch()
         return self.readers.total() - len(self.observers) >= readers and set(observers) <= self.observers.keys()
-
-    @property
-    def readers(self) -> Counter[bytes]:
-        """Those that are there, by delivery. A reader is one however often it has said so."""
-        there = [what for what, count in self._arrived.items() if count > 0]
-        named = {what[: 1 + NAME_BYTES] for what in there if len(what) > 1}
-        nameless = {what: self._arrived[what] for what in there if len(what) == 1}
-        return Counter(what[:1] for what in named) + Counter(nameless)
 
     def start(self) -> None:
         self._started = True
@@ -156,7 +149,14 @@ class Publisher:
             if arrived and not repeated and what[:1] == RELIABLE and self._started:
                 self._send_again()
             self._arrived[what] = max(0, self._arrived[what] + (1 if arrived else -1))
+            self.readers = self._counted()
             self.socket.setsockopt(zmq.SUBSCRIBE if arrived else zmq.UNSUBSCRIBE, what[:1])  # of the one who just spoke
+
+    def _counted(self) -> Counter[bytes]:
+        there = [what for what, count in self._arrived.items() if count > 0]
+        named = {what[: 1 + NAME_BYTES] for what in there if len(what) > 1}
+        nameless = {what: self._arrived[what] for what in there if len(what) == 1}
+        return Counter(what[:1] for what in named) + Counter(nameless)
 
     def _reliable_readers(self) -> int:
         """Without observers."""
