@@ -13,9 +13,8 @@ import torch
 import viser
 
 from msgs import Preview, SplatMap, TrackerPhase
-from mvsgs_core.mapping.preview import as_bytes, covariances
+from mvsgs_core.mapping.preview import as_bytes, covariances, thinned
 from mvsgs_core.rasterizer.spherical_harmonics import C0
-from mvsgs_core.rasterizer.splats import Splats
 from nodes import Node
 from nodes.keyframe_pictures import KeyframePictures, depth_points, pictures
 from nodes.map_page import MapPage, check_address
@@ -133,8 +132,7 @@ class Viewer(Node):
                 final = self.seen.finish(message)
                 if self.page.unit is None:
                     self.page.begin(final.relative_pose(message.world_from_cam[-1]), message.means)
-                stride = -(-len(message.means) // self.config.max_splats)
-                shown = Splats(**{name: value[::stride] for name, value in final.splats.tensors().items()})
+                shown = thinned(final.splats, self.config.max_splats)
                 self._move(dict(zip(final.keyframes.tolist(), map(final.relative_pose, final.world_from_cam))))
                 self._show_splats(
                     shown.means.numpy(), covariances(shown.quaternions, shown.log_scales, 1.0).numpy(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,10 +31,7 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
     """
     newest, origin, unit = mapper.views[-1], mapper.frame.origin, mapper.frame.length
     assert origin is not None
-    final = mapper.state.detached()
-    more = 0 if provisional is None else len(provisional)
-    stride = max(1, -(-len(final) // max(1, limit - more)))
-    shown = {name: value[::stride] for name, value in final.tensors().items()}
+    shown = thinned(mapper.state.detached(), limit - (0 if provisional is None else len(provisional))).tensors()
     if provisional is not None:
         shown = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in shown.items()}
     keyframes = np.array([view.index for view in mapper.views], dtype=np.int64)
@@ -53,6 +51,16 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
         "keyframe_poses": poses,
         "origin": origin,
     }
+
+
+def thinned(splats: Splats, limit: int) -> Splats:
+    """At most `limit` of them, or one, spread over the map; each covers the area of those that it stands for, too, so
+    that no holes are seen."""
+    stride = max(1, -(-len(splats) // max(1, limit)))
+    if stride == 1:
+        return splats
+    kept = {name: value[::stride] for name, value in splats.tensors().items()}
+    return Splats(**kept | {"log_scales": kept["log_scales"] + 0.5 * math.log(stride)})
 
 
 def seen(mapper: OnlineMapper, view: TrainingView) -> dict[str, np.ndarray]:
