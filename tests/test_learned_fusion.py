@@ -10,6 +10,7 @@ import pytest
 
 from msgs import Depth
 from mvsgs_core.datasets import open_dataset
+from mvsgs_core.networks.vfuse import VFuse
 from nodes.learned_fusion import LearnedFusion
 
 pytestmark = pytest.mark.slow
@@ -41,6 +42,22 @@ def test_untrained_it_runs_and_says_so(center: str) -> None:
     kept = views[2].depth > 0
     assert kept.mean() > 0.3
     assert np.median(np.abs(views[2].depth - depths[2].depth)[kept] / depths[2].depth[kept]) < 0.05
+
+
+def test_pixels_without_a_finite_depth_are_counted_and_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = VFuse.forward
+
+    def broken(net: VFuse, *args: Any, **options: Any) -> Any:
+        fused = whole(net, *args, **options)
+        fused.depth[:10] = float("nan")
+        return fused
+
+    monkeypatch.setattr(VFuse, "forward", broken)
+    node = LearnedFusion(LearnedFusion.Config(**RANDOM))
+    views = [v for d in _depths(1.0) for v in node.on_depth(d)] + list(node.on_end())
+    assert all(np.isfinite(v.depth).all() and not v.depth[:10].any() for v in views)
+    assert node.stats.counts["refused_pixels"] == 10 * 160 * len(views)
+    assert any("V-FUSE gave no finite depth" in w for w in node.stats.warnings)
 
 
 def test_the_worlds_scale_does_not_matter() -> None:

@@ -42,15 +42,21 @@ class LearnedOnlineFusion(OnlineFusion):
         self._learned = config
         self._net = checkpoints.make(VFuse, "vfuse", config.weights, inside=_INSIDE)
         self._net.to(torch_device(config.device))
+        self.not_finite = 0  # pixels that the network gave no finite depth or confidence
 
     def _prepared(self, reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> KeyframeDepth:
         if not neighbors or not (reference.depth > 0).any():
             return reference
-        return refine(self._net, reference, neighbors, self._learned)
+        refined, wrong = refine(self._net, reference, neighbors, self._learned)
+        self.not_finite += wrong
+        return refined
 
 
-def refine(net: VFuse, reference: KeyframeDepth, neighbors: list[KeyframeDepth], config: VFuseConfig) -> KeyframeDepth:
-    """The reference with V-FUSE's depth and confidence (what it means: networks.vfuse_confidence)."""
+def refine(
+    net: VFuse, reference: KeyframeDepth, neighbors: list[KeyframeDepth], config: VFuseConfig
+) -> tuple[KeyframeDepth, int]:
+    """The reference with V-FUSE's depth and confidence (what it means: networks.vfuse_confidence), and how many pixels
+    have none because one of both was not finite."""
     views, device = [reference, *neighbors], torch_device(config.device)
     depths = np.stack([v.depth for v in views]).astype(np.float32)
     # around the reference and at unit median depth: float32 has no digits to spare in a far or tiny world
@@ -68,7 +74,7 @@ def refine(net: VFuse, reference: KeyframeDepth, neighbors: list[KeyframeDepth],
     )
     fused = net(given, config.center, confidence=config.confidence_mode)
     depth, confidence = fused.depth.cpu().numpy() * np.float32(unit), fused.confidence.cpu().numpy()
-    good = np.isfinite(depth) & (depth > 0) & (confidence >= 0)
-    return replace(
-        reference, depth=np.where(good, depth, np.float32(0)), confidence=np.where(good, confidence, np.float32(0))
-    )
+    finite = np.isfinite(depth) & np.isfinite(confidence)
+    good = finite & (depth > 0) & (confidence >= 0)
+    depth, confidence = (np.where(good, value, np.float32(0)) for value in (depth, confidence))
+    return replace(reference, depth=depth, confidence=confidence), int((~finite).sum())
