@@ -16,9 +16,11 @@ from mvsgs_core.tracking.estimation.structure_from_motion import Reconstruction,
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.steps import Steps
 
-PARTS = 3  # of the keyframes, in their order, each of which is asked alone ...
-MIN_KEYFRAMES = 4  # ... where it has so many
-NORMAL, STUDENT = 1.96, {2: 12.71, 3: 4.30}  # standard deviations that 95 % lie within: Student's, by number of parts
+# Parts of the keyframes, in their order, each of which is asked alone where it has the least number of keyframes; more
+# than the fewest where each has enough.
+FEWEST, MOST, LEAST, ENOUGH = 3, 6, 4, 12
+# Standard deviations that 95 % lie within: the normal distribution's, and Student's by the number of parts.
+NORMAL, STUDENT = 1.96, {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57}
 
 
 @dataclass(frozen=True)
@@ -152,8 +154,8 @@ def uncertainty(
     if curvature == float("inf"):
         return Uncertainty(curvature)
     found, weights = [], []
-    for part in np.array_split(np.array(members), PARTS):
-        if len(part) < MIN_KEYFRAMES:
+    for part in np.array_split(np.array(members), min(MOST, max(FEWEST, len(members) // ENOUGH))):
+        if len(part) < LEAST:
             continue
         part_rise = observability(graph, part.tolist(), probe, threads, factor)
         own = focal_of_all(graph, part.tolist(), threads)
