@@ -31,7 +31,7 @@ LAYOUT = Layout(
     "image topic and its camera_info; also one that was cut off",
     "your own robot (ros2 bag record /camera/image_raw /camera/camera_info), or the bags of TUM RGB-D and many others",
 )
-# That only bags have, .bag.active while one of ROS 1 is recorded; an .mcap file is one by its content (mcap_file.ROS_2).
+# That only bags have, .bag.active while one of ROS 1 is recorded; an .mcap file is one by its content, see mcap_file.
 _SUFFIXES = (".bag", ".active", ".db3")
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _Picture = tuple[float, float, np.ndarray]  # seconds by the bag's clock and by the camera's, and RGB
