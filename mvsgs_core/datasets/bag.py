@@ -62,8 +62,8 @@ class Bag(FileReader):
         super().__post_init__()
         self._path = LAYOUT.present(self.path)
         with opened_bag(self._path) as bag:
-            if isinstance(bag, CutOffBag):
-                self._notices += bag.warnings
+            self._walked = bag.connections if isinstance(bag, CutOffBag) else []
+            self._notices += bag.warnings if isinstance(bag, CutOffBag) else []
             self._topic = _image_topic(bag, self.topic)
             self._count = sum(c.msgcount for c in bag.connections if c.topic == self._topic)
             lens, native = None, _first_size(bag, self._topic)
@@ -94,7 +94,7 @@ class Bag(FileReader):
         self._notices.truncate(self._opening_warnings)
         index, received = 0, 0.0
         times = StreamTimes(lambda: received)
-        with opened_bag(self._path) as bag:
+        with opened_bag(self._path, self._walked) as bag:
             for picture in self._with_first_time(self._pictures(bag)):
                 received, seconds, image = picture
                 repaired = times.repaired

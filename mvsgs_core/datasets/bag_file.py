@@ -40,8 +40,11 @@ _BLOCK = 2**20
 
 
 @contextmanager
-def opened_bag(path: Path) -> Iterator[OpenBag]:
-    """The bag at `path`. Raises ImportError without rosbags, BadFileError for a bag that cannot be read."""
+def opened_bag(path: Path, known: Sequence[Topic] = ()) -> Iterator[OpenBag]:
+    """The bag at `path`. Raises ImportError without rosbags, BadFileError for a bag that cannot be read.
+
+    known: topics of a bag that was opened before and had to be walked.
+    """
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -56,10 +59,10 @@ def opened_bag(path: Path) -> Iterator[OpenBag]:
             # ROS 2 bags before Iron hold no message definitions; image and camera_info have not changed since
             bag = AnyReader(_files(path), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             bag.open()
-    except BadFileError:
+    except BadFileError as error:
         if not (walkable := cut_off_files(path)):
             raise
-        bag = CutOffBag(walkable, MAX_BYTES)
+        bag = CutOffBag(walkable, MAX_BYTES, brief(error.__cause__ or error), known)
     try:
         if any(not isinstance(c.msgcount, int) or not 0 <= c.msgcount < _MAX_COUNT for c in bag.connections):
             raise BadFileError(f"{path} is no bag that can be read: it counts messages by what is no number of them")
@@ -72,11 +75,12 @@ def opened_bag(path: Path) -> Iterator[OpenBag]:
 def is_bag_folder(path: Path) -> bool:
     """Whether a folder is one of ROS 2, also one without metadata.yaml, which a recorder that was killed has not
     written."""
-    return (path / "metadata.yaml").is_file() or bool(_storage_files(path))
+    return path.is_dir() and ((path / "metadata.yaml").is_file() or bool(_storage_files(path)))
 
 
 def messages(bag: OpenBag, topics: Sequence[BagTopic], notices: Notices) -> Iterator[tuple[BagTopic, int, bytes]]:
-    """(topic, nanoseconds, data) in the order of time. What is damaged is left out, and counted in `notices`."""
+    """(topic, nanoseconds, data) in the order of time, of a bag that was cut off in that of its records. What is
+    damaged is left out, and counted in `notices`."""
     if isinstance(bag, CutOffBag):
         yield from bag.messages([topic for topic in topics if isinstance(topic, Topic)])
         return
@@ -115,6 +119,9 @@ def _files(path: Path) -> list[Path]:
 
 
 def _storage_files(folder: Path) -> list[Path]:
+    """None where some are compressed as a whole: which parts there are is then known to metadata.yaml alone."""
+    if any(folder.glob("*.zstd")):
+        return []
     return of_one_bag(folder.glob("*.db3")) or cut_off_files(folder)
 
 

@@ -10,6 +10,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _CHUNK, _CONNECTION = b"\2", b"\5", b"\7"  # op of a record of ROS 1 (wiki.ros.org/Bags/Format/2.0)
+_OP_OF_A_CHUNK = b"op=" + _CHUNK  # none lies in another
 _LENGTH, _TIME = struct.Struct("<I"), struct.Struct("<II")
 _MAX_HEADER = 2**20  # bytes
 _NUMBERED = re.compile(r"_\d+$")
@@ -46,22 +48,27 @@ _Message = tuple[Topic, int, bytes]  # with nanoseconds
 class CutOffBag:
     """One or more files of ROS 1 or ROS 2, in the order in which they are given and in that of their records.
 
-    `connections`: topics and how many messages of each there are. `warnings`: where the files end too early, and
-    what of them was left out.
+    `connections`: topics and how many messages of each there are. `warnings`: why it is walked, where the files end too
+    early, and what of them was left out.
     Raises BadFileError where not one message can be read.
     """
 
-    def __init__(self, paths: Sequence[Path], largest: int) -> None:
-        """largest: bytes of a chunk or a message, decompressed."""
+    def __init__(self, paths: Sequence[Path], largest: int, why: str, known: Sequence[Topic] = ()) -> None:
+        """largest: bytes of a chunk or a message, decompressed. why: it cannot be opened. known: `connections`, where
+        the same bag was walked before: counting reads all of it."""
         from rosbags.typesys import Stores, get_typestore
 
         self._paths, self._largest = paths, largest
         self._ros_1 = _is_ros_1(paths[0])
         self._types: Typestore = get_typestore(Stores.ROS1_NOETIC if self._ros_1 else Stores.ROS2_HUMBLE)
         self.warnings = Notices()
+        self.warnings.append(f"read record by record, in their order, as it cannot be opened: {why}")
+        self.connections = list(known)
+        if known:
+            return
         counts = Counter((topic.topic, topic.msgtype) for topic, _, _ in self._walked(self.warnings))
         if not counts:
-            raise BadFileError(f"{paths[0]}: no message could be read; " + "; ".join(self.warnings))
+            raise BadFileError(f"{paths[0]}: no message could be read: " + "; ".join(self.warnings))
         self.connections = [Topic(topic, kind, number) for (topic, kind), number in counts.items()]
 
     def messages(self, connections: Collection[Topic]) -> Iterator[_Message]:
@@ -101,28 +108,39 @@ class CutOffBag:
                     notices.append(f"{what} ({brief(error)})")
                     return
                 after = file.tell() + length
-                try:
-                    if header.get(b"op") in (_CHUNK, _CONNECTION, _MESSAGE):
-                        if length > self._largest:
-                            raise ValueError(f"it has {length} bytes")
-                        yield from self._of_record(header, file.read(length), topics)
-                except Exception as error:  # what damaged bytes make of the libraries' code
-                    notices.tally(f"parts of {path.name} left out because they are damaged", brief(error))
+                yield from self._of_record(header, file, length, topics, notices)
                 file.seek(after)
-        notices.append(f"{path.name} has no index: its recorder did not come to its end; all of it was read")
 
-    def _of_record(self, header: dict[bytes, bytes], data: bytes, topics: dict[int, Topic]) -> Iterator[_Message]:
-        """topics: by the number of their connection, to which what is met is added."""
+    def _of_record(
+        self, header: bytes, file: BinaryIO, length: int, topics: dict[int, Topic], notices: Notices
+    ) -> Iterator[_Message]:
+        """The messages of a record, of which `length` bytes follow; none of a damaged one, which is counted.
+
+        topics: by the number of their connection, to which what is met is added.
+        """
+        try:
+            fields = _fields(header)
+            if fields.get(b"op") in (_CHUNK, _CONNECTION, _MESSAGE):
+                if length > self._largest:
+                    raise ValueError(f"it has {length} bytes")
+                yield from self._of_data(fields, file.read(length), topics, notices)
+        except Exception as error:  # what damaged bytes make of the libraries' code
+            notices.tally("records of the bag left out because they are damaged", brief(error))
+
+    def _of_data(
+        self, header: dict[bytes, bytes], data: bytes, topics: dict[int, Topic], notices: Notices
+    ) -> Iterator[_Message]:
         from rosbags.typesys.msg import normalize_msgtype
 
-        op = header.get(b"op")
+        op = header[b"op"]
         if op == _CHUNK:
             content = BytesIO(decompress(data, header[b"compression"].decode(), self._largest))
             while content.tell() < len(content.getbuffer()):
                 inner, length = _record(content)
-                if inner.get(b"op") == _CHUNK:
-                    raise ValueError("a chunk in a chunk")
-                yield from self._of_record(inner, content.read(length), topics)
+                after = content.tell() + length
+                if _OP_OF_A_CHUNK not in inner:
+                    yield from self._of_record(inner, content, length, topics, notices)
+                content.seek(after)
         elif op == _CONNECTION:
             kind = _fields(data)[b"type"].decode()
             topics.setdefault(_number(header[b"conn"]), Topic(header[b"topic"].decode(), normalize_msgtype(kind)))
@@ -135,7 +153,7 @@ def cut_off_files(path: Path) -> list[Path]:
     """What can be walked of a bag that cannot be opened: the file itself, or those of a folder of ROS 2, in order."""
     if path.is_dir():
         return [file for file in of_one_bag(path.glob("*.mcap")) if _is_ros_2(file)]
-    return [path] if _is_ros_2(path) or _is_ros_1(path) else []
+    return [path] if path.is_file() and (_is_ros_2(path) or _is_ros_1(path)) else []
 
 
 def of_one_bag(files: Iterable[Path]) -> list[Path]:
@@ -147,7 +165,9 @@ def of_one_bag(files: Iterable[Path]) -> list[Path]:
 
 
 def _is_ros_2(path: Path) -> bool:
-    return path.suffix.lower() == ".mcap" and profile_of(path) == ROS_2
+    with suppress(OSError):
+        return path.suffix.lower() == ".mcap" and profile_of(path) == ROS_2
+    return False
 
 
 def _is_ros_1(path: Path) -> bool:
@@ -155,15 +175,16 @@ def _is_ros_1(path: Path) -> bool:
         return file.read(len(_MAGIC)) == _MAGIC
 
 
-def _record(file: BinaryIO) -> tuple[dict[bytes, bytes], int]:
+def _record(file: BinaryIO) -> tuple[bytes, int]:
     """Header of the record that begins here, and how many bytes of data follow. Raises ValueError at damage."""
     length = _number(file.read(_LENGTH.size))
     if length > _MAX_HEADER:
         raise ValueError(f"a header of {length} bytes")
-    return _fields(file.read(length)), _number(file.read(_LENGTH.size))
+    return file.read(length), _number(file.read(_LENGTH.size))
 
 
 def _fields(data: bytes) -> dict[bytes, bytes]:
+    """Of a header. Raises ValueError at damage."""
     found, at = dict[bytes, bytes](), 0
     while at < len(data):
         end = at + _LENGTH.size + _number(data[at : at + _LENGTH.size])

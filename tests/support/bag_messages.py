@@ -74,5 +74,8 @@ def walk(ros: Messages, path: Path, frames: int = 6) -> Path:
 
 def write_walk(ros: Messages, writer: Writer1 | Writer2, frames: Iterable[int] = range(6)) -> None:
     """Calibration and images into a bag that is open."""
-    images = [("/c/image_raw", 2.0 + i, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in frames]
-    ros.write_into(writer, [("/c/camera_info", 1.0, ros.info()), *images])
+    ros.write_into(writer, [("/c/camera_info", 1.0, ros.info()), *images_of(ros, frames)])
+
+
+def images_of(ros: Messages, frames: Iterable[int] = range(6)) -> list[tuple[str, float, Any]]:
+    return [("/c/image_raw", 2.0 + i, ros.image(i, "rgb8", picture(i), 3 * WIDTH)) for i in frames]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from shutil import rmtree
 
@@ -17,7 +18,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from tests.support.bag_messages import Messages, walk, write_walk
+from tests.support.bag_messages import Messages, images_of, walk, write_walk
 
 
 @pytest.mark.parametrize("metadata", [True, False])
@@ -76,9 +77,41 @@ def test_a_bag_of_ros_1_whose_recorder_was_killed_is_read(tmp_path: Path, end: s
     path.write_bytes(content)
     assert recognized(path) == ["bag"]
     sequence = open_dataset("bag", path=path)
-    assert any("was cut off" in warning or "has no index" in warning for warning in sequence.warnings)
+    assert any("read record by record" in warning for warning in sequence.warnings)
+    assert any("was cut off" in warning for warning in sequence.warnings) == (end != "no index")
     assert [int(item.image[0, 0, 0]) - 20 for item in sequence] == list(range(6 if end == "no index" else 5))
     assert sequence.lens.intrinsics[0] == 40
+
+
+def test_a_part_that_is_missing_is_said(tmp_path: Path) -> None:
+    with Writer2(tmp_path / "walk", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        write_walk(Messages(2), writer)
+    settings = tmp_path / "walk/metadata.yaml"
+    name = next((tmp_path / "walk").glob("*.mcap")).name
+    settings.write_text(settings.read_text().replace(name, "walk_1.mcap"))
+    sequence = open_dataset("bag", path=tmp_path / "walk")
+    assert "walk_1.mcap" in sequence.warnings[0]
+    assert len(list(sequence)) == 6
+    (tmp_path / "walk/walk_1.mcap.zstd").touch()
+    settings.unlink()
+    assert recognized(tmp_path / "walk") == []
+
+
+def test_records_of_a_topic_whose_name_was_lost_cost_no_others(tmp_path: Path) -> None:
+    ros, path = Messages(1), tmp_path / "walk.bag"
+    ros.write(path, [("/imu", 0.5, ros.info()), *images_of(ros), ("/imu", 9.5, ros.info())])
+    content = bytearray(path.read_bytes())
+    at = content.index(b"topic=/imu") - 4  # its connection's record in the chunk, and no index
+    content[at : at + 4] = b"\xff" * 4
+    path.write_bytes(content[: content.rindex(b"topic=/imu") - 100])
+    sequence = open_dataset("bag", path=path)
+    assert [int(item.image[0, 0, 0]) - 20 for item in sequence] == list(range(6))
+    assert any("records of the bag left out because they are damaged" in w for w in sequence.warnings)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert recognized(tmp_path / "pipe") == []
 
 
 def test_what_is_too_damaged_to_be_walked_is_refused(tmp_path: Path) -> None:
@@ -90,5 +123,5 @@ def test_what_is_too_damaged_to_be_walked_is_refused(tmp_path: Path) -> None:
     first = Messages(1)
     old = walk(first, tmp_path / "old.bag")
     old.write_bytes(old.read_bytes()[:900])
-    with pytest.raises(BadFileError, match=r"old\.bag: no message could be read; old\.bag was cut off"):
+    with pytest.raises(BadFileError, match=r"old\.bag: no message could be read: .*; old\.bag was cut off"):
         open_dataset("bag", path=old)
