@@ -91,7 +91,7 @@ class Undistortion:
         return self.depth(mask.astype(np.uint8)) > 0
 
 
-def _distort(lens: Lens, intrinsics: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def distorted(lens: Lens, intrinsics: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Where pixels (N, 2) of the pinhole image lie in the distorted one, (N, 2)."""
     fx, fy, cx, cy = intrinsics
     rays = (pixels - (cx, cy)) / (fx, fy)
@@ -114,7 +114,7 @@ def _smallest_zoom(lens: Lens) -> float:
     fx, fy, cx, cy = lens.intrinsics
 
     def filled(zoom: float) -> bool:
-        source = _distort(lens, np.array([fx * zoom, fy * zoom, cx, cy]), border)
+        source = distorted(lens, np.array([fx * zoom, fy * zoom, cx, cy]), border)
         return bool(np.all((source >= 0) & (source <= (width - 1, height - 1))))
 
     if filled(1.0):

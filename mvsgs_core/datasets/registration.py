@@ -5,16 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from mvsgs_core.camera import project, unproject
-from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.lens import Lens, distorted
 
 
 def register(depth: np.ndarray, source: Lens, target: Lens, baseline: float) -> np.ndarray:
-    """Depth map (H, W) float32 as a camera `baseline` to the right of its own sees it; the nearest surface wins."""
+    """Depth map (H, W) float32 as a camera `baseline` to the right of its own sees it, through its lens; the nearest
+    surface wins."""
     height, width = depth.shape
     v, u = np.nonzero(depth)
     z = depth[v, u]
     points = unproject(depth, np.array(source.intrinsics))[v, u] - (baseline, 0.0, 0.0)
-    pixels = np.rint(project(points, np.array(target.intrinsics))).astype(np.int64)
+    pixels = project(points, np.array(target.intrinsics))
+    if target.distorted and len(pixels):
+        pixels = distorted(target, np.array(target.intrinsics), pixels)
+    pixels = np.rint(pixels).astype(np.int64)
     inside = np.all((pixels >= 0) & (pixels < (width, height)), axis=1)
     result = np.full(height * width, np.inf, dtype=np.float32)
     np.minimum.at(result, pixels[inside, 1] * width + pixels[inside, 0], z[inside])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Iterator
@@ -36,6 +37,7 @@ _RAW_COLOR, _COLOR = 0, (0, 1, 2)  # by a number: raw, PNG, JPEG
 _RAW_DEPTH, _ZLIB_DEPTH = 0, 1
 _UNKNOWN = (0, 65535)  # counts of depth
 _MAX_NAME = 2**16  # bytes, of the sensor
+_MORE = 2**20  # bytes that an image may have beyond those of its pixels
 
 
 @dataclass(frozen=True)
@@ -68,25 +70,27 @@ class Sens(FileReader):
 
     @staticmethod
     def recognizes(path: Path) -> bool:
-        return path.suffix.lower() == ".sens" if path.is_file() else _file_in(path) is not None
+        if path.is_file():
+            return path.suffix.lower() == ".sens"
+        return _file_in(path) is not None and not (path / "color").is_dir()  # else something was exported to it
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._path = _file(LAYOUT.present(self.path))
         with self._path.open("rb") as file, reading(self._path, "is no .sens file that can be read"):
             self._header = _read_header(file)
-            self._frames = list(_read_frames(file, self._path.stat().st_size, self._header.frames))
+            self._frames = list(_read_frames(file, self._path.stat().st_size, self._header))
         if len(self._frames) < self._header.frames:
-            text = f"{self._path.name} was cut off: it has {len(self._frames)} of {self._header.frames} frames"
-            self.warnings.append(text)
+            text = f"{self._path.name} was cut off or is damaged: read are {len(self._frames)} of {self._header.frames}"
+            self.warnings.append(f"{text} frames")
         self._lens = self._header.color
         if self.intrinsics is not None:
             self._lens, notes = lens_from_option(self.intrinsics, self.distortion, self._header.color.size)
             self.warnings += notes
         self._check_distortion(self._lens)
-        self._frames = self._frames[self.wanted]
+        count, self._frames = len(self._frames), self._frames[self.wanted]
         if not self._frames:
-            raise ValueError(f"no frame left: {self._path.name} has {self._header.frames}, wanted from {self.start}")
+            raise ValueError(f"no frame left: {self._path.name} has {count}, wanted from {self.start}")
         missing = sum(frame.world_from_cam is None for frame in self._frames)
         if missing:
             self.warnings.append(f"{missing} of {len(self._frames)} frames have no true pose")
@@ -175,8 +179,8 @@ def _file(path: Path) -> Path:
 
 
 def _file_in(folder: Path) -> Path | None:
-    """The only one of a folder that nothing was exported to."""
-    found = [] if (folder / "color").is_dir() else list(folder.glob("*.sens"))
+    """The only one of a folder."""
+    found = [path for path in folder.glob("*.sens") if path.is_file()]
     return found[0] if len(found) == 1 else None
 
 
@@ -197,15 +201,16 @@ def _read_header(file: BinaryIO) -> _Header:
     return _Header(*cameras, color_kind, depth_kind, per_meter, frames)
 
 
-def _read_frames(file: BinaryIO, size: int, frames: int) -> Iterator[_Frame]:
-    """As many as there are whole."""
-    for _ in range(frames):
+def _read_frames(file: BinaryIO, size: int, header: _Header) -> Iterator[_Frame]:
+    """As many as there are whole, up to one that is longer than an image can be."""
+    most = [_MORE + 3 * math.prod(header.color.size), _MORE + 2 * math.prod(header.depth.size)]
+    for _ in range(header.frames):
         head = file.read(_FRAME.size)
         if len(head) < _FRAME.size:
             return
         *_, color_bytes, depth_bytes = _FRAME.unpack(head)
         pose, at = _matrix(head[: _MATRIX.size]), file.tell()
-        if color_bytes + depth_bytes > size - at:
+        if color_bytes + depth_bytes > size - at or color_bytes > most[0] or depth_bytes > most[1]:
             return
         yield _Frame(pose if is_rigid(pose) else None, at, color_bytes, depth_bytes)
         file.seek(at + color_bytes + depth_bytes)

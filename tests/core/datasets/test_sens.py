@@ -53,8 +53,52 @@ def test_a_file_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> No
     path = write_sens(tmp_path / "scene.sens")
     path.write_bytes(path.read_bytes()[:-10])
     sequence = open_dataset("sens", path=path)
-    assert sequence.warnings[0] == "scene.sens was cut off: it has 3 of 4 frames"
+    assert sequence.warnings[0] == "scene.sens was cut off or is damaged: read are 3 of 4 frames"
+    with pytest.raises(ValueError, match=r"no frame left: scene\.sens has 3, wanted from 3"):
+        open_dataset("sens", path=path, start=3)
     assert len(list(sequence)) == 3
+
+
+def test_a_length_that_no_image_has_ends_it(tmp_path: Path) -> None:
+    path = write_sens(tmp_path / "scene.sens")
+    content = path.read_bytes()
+    second = content.index(b"\x89PNG", content.index(b"\x89PNG") + 1)
+    with path.open("r+b") as file:
+        file.seek(second - 16)
+        file.write(struct.pack("<Q", 2**30))
+        file.truncate(2**31)  # a sparse file, which has as many
+    sequence = open_dataset("sens", path=path)
+    assert len(sequence) == 1
+    assert "read are 1 of 4" in sequence.warnings[0]
+
+
+def test_the_folder_of_an_export_is_that_of_the_file_where_it_is_asked_for(tmp_path: Path) -> None:
+    write_sens(tmp_path / "scene.sens")
+    (tmp_path / "other.sens").mkdir()
+    (tmp_path / "color").mkdir()
+    assert recognized(tmp_path) == []
+    assert len(open_dataset("sens", path=tmp_path)) == 4
+
+
+def test_depth_is_where_a_lens_that_bends_shows_it(tmp_path: Path) -> None:
+    """A step in the depth lies where it lies in the undistorted image, not undistorted twice."""
+    path = write_sens(tmp_path / "scene.sens", 1)
+    depth = np.full((96, 128), 2000, dtype="<u2")
+    content = path.read_bytes()
+    step = depth.copy()
+    step[:, 96:] = 3000
+    before, after = zlib.compress(depth.tobytes()), zlib.compress(step.tobytes())
+    content = content.replace(before, after).replace(struct.pack("<Q", len(before)), struct.pack("<Q", len(after)))
+    path.write_bytes(content)
+    options = {"path": path, "intrinsics": [200, 200, 127.5, 95.5], "crop": 0}
+    (plain,) = open_dataset("sens", **options)
+    (bent,) = open_dataset("sens", distortion=[1.0, 0, 0, 0], **options)
+    edges = []
+    for item in (plain, bent):
+        assert item.depth is not None
+        row = item.depth[96]
+        edges.append(int(np.flatnonzero(row > 2.5)[0]))
+    assert abs(edges[0] - edges[1]) <= 2
 
 
 def test_damaged_images_and_depth_are_left_out(tmp_path: Path) -> None:
