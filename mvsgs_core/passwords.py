@@ -6,8 +6,9 @@ import re
 from typing import Any
 
 _USER = re.compile(r"://[^/?#\s]*@")
-_WORDS = "password|passwd|pass|pwd|passphrase|token|access_token|auth|key|apikey|api_key|secret|signature|sig"
-_ADDRESS, _SECRET = re.compile(r"://\S+"), re.compile(rf"([?&;_/](?:{_WORDS})=)[^&;#\s]+", re.IGNORECASE)
+_ADDRESS = re.compile(r"://\S+")
+_WORDS = "pass|password|passwd|passphrase|pas|pwd|psw|pw|token|secret|signature|auth|api_?key"  # names end in
+_SECRET = re.compile(rf"([?&;_/](?:[\w.-]*(?:{_WORDS})|key|sig)=)[^&;#\s]+", re.IGNORECASE)
 
 
 def without_passwords(value: Any) -> Any:

@@ -303,7 +303,6 @@ def message_bomb(folder: Path) -> None:
         database.execute("UPDATE messages SET data = ? WHERE id = 3", (zstd_bomb(),))
 
 
-# kind -> how it is opened ("DATASET", or what `file_worker` calls it), what is opened in its folder, how it is made
 def _cut_off(make: Callable[[Path], None]) -> Callable[[Path], None]:
     """A bag whose recorder was killed: what is written at the end is not there."""
 
@@ -331,6 +330,7 @@ def sens(folder: Path) -> None:
     (folder / "scan.sens").write_bytes(b"".join(parts))
 
 
+# kind -> how it is opened ("DATASET", or what `file_worker` calls it), what is opened in its folder, how it is made
 SEEDS: dict[str, tuple[str, str, Callable[[Path], None]]] = {
     "images": ("images", ".", images),
     "transforms.json": ("images", ".", transforms),

@@ -69,7 +69,8 @@ def formats() -> list[str]:
 
 
 def recognized(path: Path) -> list[str]:
-    """The formats in whose layout an existing file or folder is, by its names alone; none reads what is in it.
+    """The formats in whose layout an existing file or folder is, by its names; of what is in it at most the first bytes
+    of .mcap files are read.
 
     A folder of images in no other layout is "images". Raises OSError for a folder that cannot be listed.
     """

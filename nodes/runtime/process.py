@@ -28,11 +28,11 @@ import numpy as np
 
 import msgs
 from msgs import Frame, Message
-from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.named_modules import import_named
 from nodes import Node, is_source, outputs
 from nodes.parameters import build
 from nodes.runtime.addresses import PeerLost, load_keys
+from nodes.runtime.explained import is_explained
 from nodes.runtime.freed_memory import FreedMemory
 from nodes.runtime.inbox import Inbox, Reader
 from nodes.runtime.requests import Requests
@@ -57,7 +57,7 @@ def run(spec: Spec, signals: Signals) -> int:
     except Exception as error:
         logging.exception("failed")
         line = next(iter(str(error).splitlines()), "")
-        explained = _is_explained(error)
+        explained = is_explained(error)
         process.abort(
             "failed",
             line if explained else f"{type(error).__name__}: {line}",
@@ -68,11 +68,6 @@ def run(spec: Spec, signals: Signals) -> int:
     finally:
         process.close()
     return 0
-
-
-def _is_explained(error: Exception) -> bool:
-    """Whether it is of the input, in a sentence of our own: the user is not helped by where in the code that was."""
-    return isinstance(error, BadFileError) or (isinstance(error, OSError) and error.errno is None and bool(error.args))
 
 
 def load_node(target: str) -> type[Node]:

@@ -17,6 +17,8 @@ from mvsgs_core.passwords import without_passwords
             "http://host/video.cgi?user=admin&pwd=*** does not answer",
         ),
         ("rtsp://host:554/user=admin_password=x", "rtsp://host:554/user=admin_password=***"),
+        ("http://host/v.cgi?loginuse=me&loginpas=x", "http://host/v.cgi?loginuse=me&loginpas=***"),
+        ("https://host/v?X-Amz-Signature=x&X-Amz-Date=1", "https://host/v?X-Amz-Signature=***&X-Amz-Date=1"),
         ("http://host/monkey=3?keyboard=2", "http://host/monkey=3?keyboard=2"),
         ("no address: password=x", "no address: password=x"),
     ],

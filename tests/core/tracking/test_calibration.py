@@ -65,6 +65,7 @@ def test_a_few_frames_of_a_real_video_contradict_no_calibration() -> None:
     for item in open_dataset("tum", path=shared("data/tum_fr1_xyz"), size=(240, 320), stride=2, stop=48):
         tracker.add(item.index, item.timestamp, item.image, item.intrinsics)
     list(tracker.finish())
+    assert tracker.trajectory().keyframe.sum() >= FocalConfig().min_keyframes, "fewer are not asked"
     assert not any("contradict" in warning for warning in tracker.stats.warnings)
 
 
