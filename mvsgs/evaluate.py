@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from launch.comparison import finished_report
+from launch.named_input import quoted
 from launch.summary import summary
 from mvsgs.command import run_all
 from mvsgs_core.export.command_line import run
@@ -35,5 +36,5 @@ def main(arguments: list[str] | None = None, prog: str = "mvsgs eval") -> int:
     parser.add_argument("run", type=Path, help="output folder of a run, or its map.ply")
     words = sys.argv[1:] if arguments is None else arguments
     if words and not words[0].startswith("-") and words[1:]:
-        return run_all([f"map={output_of(Path(words[0]))}", "mapper=frozen", *words[1:]])
+        return run_all([f"map={quoted(str(output_of(Path(words[0]))))}", "mapper=frozen", *words[1:]])
     return run(parser, arguments, evaluate)

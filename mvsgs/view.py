@@ -7,6 +7,7 @@ import contextlib
 import io
 import signal
 import threading
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.preview import as_bytes, covariances
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes.keyframe_pictures import KeyframePictures, depth_points, difference, pictures
-from nodes.map_page import MapPage, check_address
+from nodes.map_page import MapPage, check_address, escaped
 from nodes.page_guard import check_names
 from nodes.seen_keyframes import goodness
 
@@ -51,7 +52,7 @@ class SavedMapView:
         )
         page.begin(self._poses[0] if len(self._poses) else _outside(means), means)
         left_out = self._show_splats(final)
-        said = f"**{name}**: {len(splats)} splats, {len(self._poses)} keyframes"
+        said = f"**{escaped(name)}**: {len(splats)} splats, {len(self._poses)} keyframes"
         gui.add_markdown(said + (f"; {left_out} splats that are not finite are not shown" if left_out else ""))
         page.add_toggles()
         if cameras is None:
@@ -152,11 +153,10 @@ class SavedMapView:
 
 def _small(cameras: Cameras, k: int, width: int = 160) -> Cameras:
     """Keyframe number k alone, with a picture that is `width` pixels wide at most."""
-    one = {name: value[k : k + 1].copy() for name, value in vars(cameras).items()}
     height, full = (int(side) for side in cameras.sizes[k])
     size = (max(1, round(height * min(width, full) / full)), min(width, full))
-    one["intrinsics"][0], one["sizes"][0] = scale_intrinsics(cameras.intrinsics[k], (height, full), size), size
-    return Cameras(**one)
+    intrinsics = scale_intrinsics(cameras.intrinsics[k], (height, full), size)
+    return replace(cameras.chosen(slice(k, k + 1)), intrinsics=intrinsics[None], sizes=np.array([size]))
 
 
 def _lens(cameras: Cameras) -> tuple[np.ndarray, tuple[int, int]]:

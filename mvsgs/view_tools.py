@@ -24,7 +24,7 @@ from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.splat import write_splat, write_spz
 from mvsgs_core.geometry import rotation_from_quaternion
 from mvsgs_core.video_file import write_video
-from nodes.map_page import MapPage
+from nodes.map_page import MapPage, escaped
 
 _LINE = (230, 90, 40)
 FPS = 30.0
@@ -165,7 +165,7 @@ class Flight:
                 event.client.send_file_download("flight.mp4", (Path(folder) / "flight.mp4").read_bytes())
             self.said.content = f"{count} frames at {FPS:g} a second: flight.mp4"
         except (ValueError, OSError) as error:
-            self.said.content = str(error)
+            self.said.content = escaped(str(error))
         finally:
             self._rendering.release()
 
@@ -210,7 +210,7 @@ class Exporting:
                 event.client.send_file_download(file.name, file.read_bytes())
                 self.said.content = f"{file.name}: {file.stat().st_size} bytes"
         except (ValueError, OSError) as error:
-            self.said.content = str(error)
+            self.said.content = escaped(str(error))
 
     def write(self, file: Path) -> None:
         """In the format of its suffix. Raises ValueError for one that there is not, OSError."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -32,6 +33,11 @@ def check_address(host: str, port: int, dashes: str = "") -> None:
         raise ValueError(
             f"{dashes}host={host}: must be an address of this machine, 127.0.0.1 or 0.0.0.0 ({error})"
         ) from error
+
+
+def escaped(text: str) -> str:
+    """Text from outside, such as a path, as it stands: the page's markdown renders HTML."""
+    return re.sub(r"[^\w ]|_", lambda found: f"&#{ord(found[0])};", text)
 
 
 class MapPage:

@@ -100,7 +100,7 @@ class SeenKeyframes:
             keyframes=np.array([keyframe.index]), timestamps=np.zeros(1),
             world_from_cam=self.final.world_from_cam[k : k + 1],
             intrinsics=scale_intrinsics(keyframe.intrinsics, keyframe.size, size)[None], sizes=np.array([size]),
-            exposures=self.final.exposures[k : k + 1],
+            exposures=self.final.exposures[k : k + 1], vignetting=self.final.vignetting,
         )  # fmt: skip
         color, render = rendered_keyframe(self.final, camera, 0)
         depth = torch.where(render.opacity > 0.5, render.depth, 0.0).numpy()

@@ -17,7 +17,7 @@ from mvsgs_core.mapping.preview import as_bytes, covariances, thinned
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes import Node
 from nodes.keyframe_pictures import KeyframePictures, depth_points, pictures
-from nodes.map_page import MapPage, check_address
+from nodes.map_page import MapPage, check_address, escaped
 from nodes.page_guard import check_names
 from nodes.seen_keyframes import SeenKeyframe, SeenKeyframes
 
@@ -204,7 +204,7 @@ class Viewer(Node):
 
     def _show_status(self) -> None:
         self._status.content = (
-            f"tracker: **{self._phase}**{self._pose_latency}; {self._shown}{self._map_latency}{self._memory}"
+            f"tracker: **{escaped(self._phase)}**{self._pose_latency}; {self._shown}{self._map_latency}{self._memory}"
         )
 
     def _ending(self) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from launch.comparison import compared, comparison_text, names
@@ -157,3 +158,11 @@ def test_eval_of_other_images_asks_how_well_the_map_explains_them(
     monkeypatch.setattr("mvsgs.evaluate.run_all", run_all)
     assert evaluate([str(runs[0] / "map.ply"), "walk.mp4", "dataset.stride=2"]) == 0
     assert typed == [f"map={runs[0]}", "mapper=frozen", "walk.mp4", "dataset.stride=2"]
+
+
+@pytest.mark.parametrize("name", ["kitchen (2)", "kitchen, hall", "it's {here}"])
+def test_eval_takes_a_map_in_a_folder_of_any_name(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    typed: list[str] = []
+    monkeypatch.setattr("mvsgs.evaluate.run_all", lambda words: typed.extend(words) or 0)
+    assert evaluate([f"runs/{name}", "walk.mp4"]) == 0
+    assert OverridesParser.create().parse_override(typed[0]).value() == f"runs/{name}"

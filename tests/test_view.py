@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,7 +20,7 @@ from mvsgs.view import SavedMapView
 from mvsgs_core.export.cameras import read_cameras
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.export.ply import read_ply
-from nodes.map_page import MapPage
+from nodes.map_page import MapPage, escaped
 from tests.support.ports import free_port
 from tests.support.shared_data import ROOT
 from tests.support.tiny_map import SIZE, write_tiny_run
@@ -73,6 +75,25 @@ def test_the_render_is_in_the_photographs_exposure(tmp_path: Path) -> None:
         darker = SavedMapView(opened, final, cameras, run, "tiny").pictures.handles["render"].image.astype(int)
         assert np.abs(plain - 2 * darker)[plain < 255].max() <= 2  # what is brighter is cut
         assert np.median(plain) > 50
+    finally:
+        opened.server.stop()
+
+
+def test_text_from_outside_has_no_markup_in_it() -> None:
+    name = "/maps/<img src=x onerror='alert(1)'>/![a](b.png) **_küche_**\n\n# 1 {&lt;}\udc80.ply"
+    shown = escaped(name)
+    assert not set(re.sub(r"&#\d+;", "", shown)) - set("küche alertmapsonigbyxrcp1 ")
+    assert html.unescape(shown) == name.replace("\udc80", "\ufffd")
+
+
+def test_the_page_has_no_html_of_a_path(tmp_path: Path) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    opened = MapPage("127.0.0.1", free_port())
+    try:
+        SavedMapView(opened, read_ply(run / "map.ply"), None, run, "<b>kitchen</b>/map.ply")
+        got = page(opened.url)
+        assert "<b>" not in got
+        assert "**&#60;b&#62;kitchen&#60;&#47;b&#62;&#47;map&#46;ply**" in got
     finally:
         opened.server.stop()
 

@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from msgs import Preview, SplatMap, TrackerPhase
 from mvsgs_core.mapping.preview import as_bytes
+from mvsgs_core.photometry import vignetting_factor
 from nodes import handlers, outputs
 from nodes.splat_map import splat_map
 from nodes.viewer import Viewer
@@ -285,6 +287,16 @@ def test_the_refined_map_is_shown_whole_and_rendered(viewer: Viewer) -> None:
     )
     show(viewer, preview(1))  # an older state comes late
     assert len(splats.centers) == len(final.splats)
+
+
+def test_a_refined_keyframe_has_the_vignetting_of_its_photograph(viewer: Viewer) -> None:
+    dark, vignetting = np.zeros((*SIZE, 3), np.uint8), np.array([-0.5, 0.1, 0.05], np.float32)
+    show(viewer, replace(preview(0), world_from_cam=np.eye(4), intrinsics=INTRINSICS, image=dark, render=dark))
+    final = replace(final_map(), world_from_cam=poses_around([0.0]), vignetting=vignetting)
+    list(viewer.on_splat_map(splat_map(final, refined=True)))
+    color = final.render(poses_around([0.0])[0], INTRINSICS, SIZE).color
+    expected = as_bytes(color * torch.from_numpy(vignetting_factor(vignetting, INTRINSICS, SIZE))[..., None])
+    assert np.abs(viewer.pictures.handles["render"].image.astype(int) - expected).max() <= 1
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,15 @@ class Cameras:
     intrinsics: np.ndarray  # (K, 4) float64 fx, fy, cx, cy in pixels at `sizes`, as the tracker estimated them
     sizes: np.ndarray  # (K, 2) int64 height, width of the image
     exposures: np.ndarray  # (K, 3, 4) float64 [A | b]: the image shows A color + b of the map's color, both in [0, 1]
+    vignetting: np.ndarray | None = None  # (3,) float64 of the sensor, see `photometry`; None: none
 
     def __len__(self) -> int:
         return len(self.keyframes)
 
     def chosen(self, which: np.ndarray | slice) -> Cameras:
         """Copies of some of them."""
-        return Cameras(**{name: value[which].copy() for name, value in vars(self).items()})
+        of_each = {name: value for name, value in vars(self).items() if name != "vignetting"}
+        return replace(self, **{name: value[which].copy() for name, value in of_each.items()})
 
 
 def write_cameras(path: Path, cameras: Cameras, source: SourceCamera | None = None) -> None:
@@ -51,14 +53,16 @@ def write_cameras(path: Path, cameras: Cameras, source: SourceCamera | None = No
         for k in range(len(cameras))
     ]
     camera = None if source is None else camera_values(source)
-    content = {"format": FORMAT, "version": VERSION, "camera": camera, "keyframes": keyframes}
+    lens = {} if cameras.vignetting is None else {"vignetting": cameras.vignetting.tolist()}
+    content = {"format": FORMAT, "version": VERSION, "camera": camera, **lens, "keyframes": keyframes}
     text = json.dumps(content, allow_nan=False)
     replace_text(path, text.replace(' {"index"', '\n{"index"') + "\n")  # a keyframe a line
 
 
 def read_cameras(path: Path) -> Cameras:
     """The cameras that `write_cameras` wrote. Raises ValueError, saying what is wrong with the file, and OSError."""
-    keyframes = _content(path).get("keyframes")
+    content = _content(path)
+    keyframes = content.get("keyframes")
     if not isinstance(keyframes, list) or not all(isinstance(entry, dict) for entry in keyframes):
         raise ValueError(f"{path}: `keyframes` must be a list of objects")
     result = Cameras(
@@ -68,6 +72,7 @@ def read_cameras(path: Path) -> Cameras:
         intrinsics=_numbers(path, keyframes, "intrinsics", (4,)),
         sizes=_numbers(path, keyframes, "size", (2,)).astype(np.int64),
         exposures=_numbers(path, keyframes, "exposure", (3, 4)),
+        vignetting=_vignetting(path, content.get("vignetting")),
     )
     if (result.sizes < 1).any() or (result.intrinsics[:, :2] <= 0).any():
         raise ValueError(f"{path}: sizes and focal lengths must be positive")
@@ -110,11 +115,24 @@ def _numbers(
             values.append(np.full(shape, np.nan))
             continue
         try:
-            value = np.array(given, dtype=np.float64)
+            value = _finite(given, shape)
         except (TypeError, ValueError, OverflowError):
-            value = np.full((), np.nan)
-        if value.shape != shape or not np.isfinite(value).all():
             wanted = " x ".join(str(n) for n in shape) or "1"
-            raise ValueError(f"{path}: keyframe {k} has no `{name}` of {wanted} finite numbers")
+            raise ValueError(f"{path}: keyframe {k} has no `{name}` of {wanted} finite numbers") from None
         values.append(value)
     return np.array(values, dtype=np.float64).reshape(len(entries), *shape)
+
+
+def _vignetting(path: Path, given: Any) -> np.ndarray | None:
+    try:
+        return None if given is None else _finite(given, (3,))
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{path}: `vignetting` must be 3 finite numbers") from None
+
+
+def _finite(given: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Float64. Raises TypeError, ValueError or OverflowError for what is no such array."""
+    value = np.array(given, dtype=np.float64)
+    if value.shape != shape or not np.isfinite(value).all():
+        raise ValueError("another shape, or not finite")
+    return value

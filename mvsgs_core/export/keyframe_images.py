@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mvsgs_core.atomic_file import replacing
 from mvsgs_core.datasets.files import UnreadableImageError, read_image
 
 FOLDER = "keyframes"  # beside map.ply
@@ -23,12 +24,14 @@ def there(folder: Path, keyframes: np.ndarray) -> np.ndarray:
 
 
 def write_image(folder: Path, index: int, image: np.ndarray) -> None:
-    """Writes an (H, W, 3) uint8 RGB image without loss. Raises OSError where it cannot be written."""
+    """Writes an (H, W, 3) uint8 RGB image without loss. Raises OSError where it cannot be written: no part of it is
+    there then."""
     folder.mkdir(parents=True, exist_ok=True)
     encoded, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not encoded:
         raise OSError(f"the image of keyframe {index} cannot be encoded as PNG")
-    (folder / image_name(index)).write_bytes(data.tobytes())
+    with replacing(folder / image_name(index), sync=False) as aside:
+        aside.write_bytes(data.tobytes())
 
 
 def known_image(folder: Path, index: int) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""A saved map as one of its keyframes saw it, in the exposure of that photograph."""
+"""A saved map as one of its keyframes saw it, in the exposure and the vignetting of that photograph."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import torch
 
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.photometry import vignetting_factor
 from mvsgs_core.rasterizer.rasterize import Render
 
 NEAR = 0.01  # of the typical depth: what is nearer to the camera is not drawn
@@ -17,7 +18,11 @@ def rendered_keyframe(final: Snapshot, cameras: Cameras, k: int) -> tuple[torch.
     pose, (height, width) = cameras.world_from_cam[k], cameras.sizes[k].tolist()
     render = final.render(pose, cameras.intrinsics[k], (height, width), near=near_plane(final, pose))
     affine = torch.from_numpy(cameras.exposures[k]).to(render.color)
-    return render.color @ affine[:, :3].T + affine[:, 3], render
+    color = render.color @ affine[:, :3].T + affine[:, 3]
+    if cameras.vignetting is not None:
+        factor = vignetting_factor(cameras.vignetting, cameras.intrinsics[k], (height, width))
+        color = color * torch.from_numpy(factor).to(color)[..., None]
+    return color, render
 
 
 def near_plane(final: Snapshot, world_from_cam: np.ndarray) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ def cameras(count: int = 3) -> Cameras:
         intrinsics=rng.uniform(20, 30, (count, 4)),
         sizes=np.tile(np.array([[24, 32]]), (count, 1)),
         exposures=rng.normal(size=(count, 3, 4)),
+        vignetting=np.array([-0.3, 0.1, -1.0 / 30.0]),
     )
 
 
@@ -39,6 +41,15 @@ def test_cameras_come_back_to_the_bit(tmp_path: Path, count: int) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["cameras.json"]
 
 
+def test_a_file_without_vignetting_is_as_ever_and_some_of_the_cameras_have_that_of_all(tmp_path: Path) -> None:
+    write_cameras(tmp_path / "cameras.json", replace(cameras(), vignetting=None))
+    assert "vignetting" not in (tmp_path / "cameras.json").read_text()
+    assert read_cameras(tmp_path / "cameras.json").vignetting is None
+    some = cameras().chosen(slice(1, None))
+    assert some.keyframes.tolist() == [7, 14]
+    np.testing.assert_array_equal(some.vignetting, cameras().vignetting)
+
+
 def test_a_map_knows_its_cameras_at_the_size_of_the_images_also_where_these_are_gone() -> None:
     mapper = OnlineMapper(MapperConfig(max_pixels=12 * 16, max_keyframes=2, window=1, iterations=2, device="cpu"))
     views = [rgbd_keyframe(5 * k, pose_on_arc(k / 3), (24, 32), origin=100.0) for k in range(4)]
@@ -51,6 +62,9 @@ def test_a_map_knows_its_cameras_at_the_size_of_the_images_also_where_these_are_
     np.testing.assert_array_equal(found.intrinsics, [view.intrinsics for view in views])
     assert found.sizes.tolist() == [[24, 32]] * 4
     assert np.isnan(found.timestamps).all()
+    assert found.vignetting is None
+    mapper.photometry.vignetting = np.array([-0.5, 0.25, 0.0])
+    np.testing.assert_array_equal(cameras_of(mapper.snapshot(), mapper.views).vignetting, [-0.5, 0.25, 0.0])
 
 
 def changed(**changes: Any) -> dict[str, Any]:
@@ -77,6 +91,9 @@ def changed(**changes: Any) -> dict[str, Any]:
         (json.dumps(changed(world_from_cam=[[1]])), "`world_from_cam` of 4 x 4"),
         (json.dumps(changed(exposure="abc")), "`exposure` of 3 x 4"),
         (json.dumps(changed(intrinsics=[float("nan"), 1, 0, 0])), "`intrinsics` of 4 finite"),
+        (json.dumps(changed() | {"vignetting": [0.1, 0.2]}), "`vignetting` must be 3 finite numbers"),
+        (json.dumps(changed() | {"vignetting": [0.1, 0.2, float("inf")]}), "`vignetting` must be 3 finite numbers"),
+        (json.dumps(changed() | {"vignetting": "none"}), "`vignetting` must be 3 finite numbers"),
     ],
 )
 def test_a_file_that_is_something_else_is_refused_with_the_reason(tmp_path: Path, content: str, message: str) -> None:
