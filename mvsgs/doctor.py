@@ -17,6 +17,7 @@ from pathlib import Path
 import psutil
 import torch
 
+from launch.named_input import quoted
 from mvsgs import WORKSPACE
 from mvsgs_core import machine, native, weights
 from mvsgs_core.devices import lacks_for_gpu
@@ -65,7 +66,7 @@ def self_test(folder: Path) -> tuple[str, bool]:
     command = [
         sys.executable, str(WORKSPACE / "launch/run_all.py"), "dataset=synthetic", "dataset.stop=30",
         "dataset.size=[96,128]", "mapper.iterations=20", "mapper.refinement=40", "evaluator.lpips=off", "device=auto",
-        f"output={output}", "screen=off",
+        f"output={quoted(str(output))}", "screen=off",
     ]  # fmt: skip
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=TOO_LONG, cwd=folder)

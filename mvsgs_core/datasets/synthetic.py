@@ -13,9 +13,11 @@ from ..scene.difficulties import Difficulties, DifficultPath, Sensor
 from ..scene.renderer import Rendering
 from ..scene.stage import SCENES, stage
 from . import Item, dataset
+from .framing import target_size
 from .lens import Lens
 
 FPS = 20.0
+SIZE = (240, 320)  # height, width
 FOCAL = 0.8  # of the image's width: a field of view of 64 degrees
 SUB_FRAMES = 8  # averaged over one exposure
 STRIP = 8  # rows that are read out at once
@@ -27,7 +29,7 @@ class Film:
 
     scene: Literal["room", "aerial", "town"] = "room"
     frames: int = 120  # length of the stream, at 20 a second
-    size: tuple[int, int] = (240, 320)  # height, width
+    size: tuple[int, int] | int = SIZE  # height, width; or a number of pixels at that aspect
     start: int = 0  # first frame of the stream
     stop: int | None = None  # frame to stop before; null: the end
     stride: int = 1  # every which frame
@@ -48,7 +50,7 @@ class Synthetic:
         film, self.difficulties = self.checked(**options)
         scene, frames, seed, loop = film.scene, film.frames, film.seed, film.loop
         self.warnings: list[str] = []
-        self.size = (int(film.size[0]), int(film.size[1]))
+        self.size = target_size(film.size, SIZE)
         self.seed = seed
         self.threads = film.threads
         self.intrinsics = np.array(
@@ -77,12 +79,11 @@ class Synthetic:
                 f"there are: {there}"
             )
         film = Film(**{k: v for k, v in options.items() if k in own})
+        film.size = target_size(film.size, SIZE)
         if film.scene not in SCENES:
             raise ValueError(f"synthetic: no scene {film.scene!r}; there are: {', '.join(SCENES)}")
-        if film.frames < 1 or film.stride < 1 or film.start < 0 or len(film.size) != 2 or min(film.size) < 8:
-            raise ValueError(
-                "synthetic: frames and stride at least 1, start at least 0, size two numbers of at least 8"
-            )
+        if film.frames < 1 or film.stride < 1 or film.start < 0:
+            raise ValueError("synthetic: frames and stride at least 1, start at least 0")
         if film.streets < 2 or film.streets % 2:
             raise ValueError("synthetic: streets must be an even number, so that the outer ones make a ring")
         return film, Difficulties(**{k: v for k, v in options.items() if k in known and v is not None})
