@@ -29,7 +29,7 @@ class Film:
 
     scene: Literal["room", "aerial", "town"] = "room"
     frames: int = 120  # length of the stream, at 20 a second
-    size: tuple[int, int] | int = SIZE  # height, width; or a number of pixels at that aspect
+    size: tuple[int, int] | int = SIZE  # height, width; or at most so many pixels
     start: int = 0  # first frame of the stream
     stop: int | None = None  # frame to stop before; null: the end
     stride: int = 1  # every which frame
