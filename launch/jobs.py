@@ -75,7 +75,8 @@ def _run(job: Job) -> int:
     try:
         graph = graph_of(job.config, job.overrides, job.choices)
         check(graph)
-        output = Output(Path(graph.settings.output))
+        in_order = all(slot.node.in_stream_order for slot in graph.slots.values())
+        output = Output(Path(graph.settings.output), resumable=in_order)
     except GraphError as error:
         return refused(error)
     try:
@@ -165,6 +166,6 @@ def unfinished(output: Output) -> str:
     there = [name for name in ("map.ply", "trajectory.txt") if (output.path / name).exists()]
     lines = [f"\nunfinished: the map so far is {output.path / 'map.ply'}" if "map.ply" in there else "\nno map yet"]
     lines.append(
-        f"go on with it: {output.resume}" if output.resume else f"nothing to go on with: no checkpoint in {output.path}"
+        f"go on with it: {output.resume}" if output.resume else f"nothing to go on with in {output.path}: run it again"
     )
     return "\n".join(lines)

@@ -41,9 +41,10 @@ RUN_ALL = Path(__file__).resolve().parent / "run_all.py"
 class Output:
     """A claimed output directory."""
 
-    def __init__(self, path: Path) -> None:
-        """Raises GraphError where it cannot be made, or where another run is writing to it."""
-        self.path = path
+    def __init__(self, path: Path, *, resumable: bool = True) -> None:
+        """resumable: such a run can be gone on with. Raises GraphError where the directory cannot be made, or where
+        another run is writing to it."""
+        self.path, self._resumable = path, resumable
         self.resume: str | None = None  # the command that goes on with the run, once it has ended early
         if path.exists() and not path.is_dir():
             raise GraphError(f"output={path}: is a file; the output is a folder")
@@ -103,7 +104,7 @@ class Output:
             report["reason"] = failed or ("no report came" if scored else "no slot of this graph writes a report")
             report["finished"] = not scored
         if not report["finished"]:
-            report["resume"] = self.resume = _resume_command(self.path)
+            report["resume"] = self.resume = _resume_command(self.path) if self._resumable else None
         self.write_report(report)
 
     def write_report(self, content: Mapping[str, Any]) -> None:

@@ -86,6 +86,18 @@ def test_what_goes_on_with_an_earlier_run_names_the_folder_where_it_is_now(
     assert after.items() <= before.items()
 
 
+def test_a_run_whose_order_cannot_be_taken_up_again_is_not_said_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photographs are registered in an order of their own; `resume=` would refuse."""
+    monkeypatch.setattr("launch.output.checkpoint_info", lambda folder: None)
+    output = Output(tmp_path / "photographs", resumable=False)
+    output.begin({}, "mvsgs", resumed=False)
+    output.settle(Outcome(1, "mapper failed"))
+    assert read_report(output.path)["resume"] is None
+    assert output.resume is None
+
+
 def test_what_no_run_has_left_is_not_touched(output: Output) -> None:
     (output.path / "checkpoint").mkdir()
     for name in ("transforms.json", "checkpoint/model.pt", "map.ply", "config.yaml"):

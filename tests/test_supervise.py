@@ -124,7 +124,7 @@ def test_a_stage_ended_from_outside_ends_the_run_in_time(launch: type[Launch], v
     assert watch.within(DOWN)
     assert code == 1
     assert f"{victim} failed: stopped (SIGTERM)" in err
-    assert out.rstrip().endswith(f"nothing to go on with: no checkpoint in {run.output}")
+    assert out.rstrip().endswith(f"nothing to go on with in {run.output}: run it again")
 
 
 def test_nodes_share_a_session_so_that_niceness_decides_between_them_but_no_signals(launch: type[Launch]) -> None:
