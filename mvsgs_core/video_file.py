@@ -10,11 +10,13 @@ import av
 import numpy as np
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
+from mvsgs_core.atomic_file import replacing
+
 QUALITY = "18"  # constant rate factor of x264: hardly to be told from the frames
 
 
 def write_video(path: Path, frames: Iterator[np.ndarray], size: tuple[int, int], fps: float) -> int:
-    """Writes frames (H, W, 3) uint8 sRGB of `size` (height, width); returns their number.
+    """Replaces `path` in one step by frames (H, W, 3) uint8 sRGB of `size` (height, width); returns their number.
 
     4:2:0 at BT.709, marked as such, is what all browsers decode; it halves the chroma, so that an odd last row or
     column is left out. The index comes first, so that a page plays the file while it loads. Raises ValueError for a
@@ -27,7 +29,10 @@ def write_video(path: Path, frames: Iterator[np.ndarray], size: tuple[int, int],
         raise ValueError(f"no video has frames of {size[1]}x{size[0]} pixels, {fps:g} a second")
     count = 0
     try:
-        with av.open(path, "w", options={"movflags": "+faststart"}) as container:
+        with (
+            replacing(path, sync=False) as aside,
+            av.open(aside, "w", options={"movflags": "+faststart"}) as container,
+        ):
             stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             stream.options = {"crf": QUALITY, "preset": "medium"}

@@ -13,6 +13,9 @@ import math
 import sys
 from pathlib import Path
 
+import numpy as np
+
+from mvsgs_core.atomic_file import replacing
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import Cameras, read_source_camera, write_cameras
 from mvsgs_core.export.colmap import write_colmap
@@ -24,8 +27,9 @@ from mvsgs_core.export.earth import (
     reference_of,
     write_origin,
 )
+from mvsgs_core.export.image_sizes import check_sizes
 from mvsgs_core.export.mesh import write_mesh
-from mvsgs_core.export.ply import write_ply
+from mvsgs_core.export.ply import relative_origin, write_ply
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.export.splat import write_splat, write_spz
 from mvsgs_core.export.transforms import write_transforms
@@ -47,6 +51,9 @@ def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
         {".splat": write_splat, ".spz": write_spz}[out.suffix](out, final)
     silent = final.antialiased and out.suffix != ".spz"
     told = "; antialiased: a viewer must be told, or shows it too bright" if silent else ""
+    origin = relative_origin(final)
+    if origin.any():
+        told += f"; positions are relative to {' '.join(f'{value:.12g}' for value in origin)}, as float32 holds no more"
     return f"{len(final.splats)} splats, {out.stat().st_size} bytes{told}"
 
 
@@ -69,9 +76,14 @@ def _left_out(count: int, images: Path | None) -> str:
 
 
 def transforms(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
+    if options.trajectory is not None:
+        raise ValueError(
+            f"{out.name} names the keyframes' images, of which a --trajectory knows nothing: leave --trajectory out"
+        )
     given = options.images is not None and options.images is not BESIDE
     images = options.images if given else options.map.with_name(keyframe_images.FOLDER)
     cameras = posed_cameras(options)
+    check_sizes(images, cameras)
     there = write_transforms(out, cameras, images)
     if not there:
         return f"{len(cameras)} cameras, of which 0 have their image in {images}"
@@ -88,14 +100,28 @@ def cameras(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
 
 def trajectory(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
     found = posed_cameras(options)
-    write_trajectory(out, found.timestamps, found.world_from_cam)
-    return f"{len(found)} poses"
+    known = np.isfinite(found.timestamps) & (found.keyframes >= 0)
+    if not known.any():
+        raise ValueError("no keyframe of this stream has a time, without which a trajectory has no poses")
+    with replacing(out, sync=False) as aside:
+        write_trajectory(aside, found.timestamps[known], found.world_from_cam[known])
+    left_out = int((~known).sum())
+    said = f"; {left_out} keyframes of a stream before, or without a time, were left out" if left_out else ""
+    return f"{len(found) - left_out} poses{said}"
 
 
 FORMATS = {  # by the suffix of OUT, of which a folder has none: writes the map, returns what is in the file
     ".ply": splats, ".splat": splats, ".spz": splats, ".glb": mesh, ".obj": mesh, ".stl": mesh, ".off": mesh,
     ".json": cameras, ".txt": trajectory, "": colmap,
 }  # fmt: skip
+
+
+def _check_not_read(out: Path, options: argparse.Namespace) -> None:
+    """Raises ValueError where `out` would replace a file that it is made from."""
+    cameras = options.cameras or options.map.with_name("cameras.json")
+    for path in filter(None, (options.map, cameras, options.trajectory)):
+        if path.exists() and out.resolve() == path.resolve():
+            raise ValueError(f"{out} is read for this export, which would replace it: give another file")
 
 
 def export(options: argparse.Namespace) -> str:
@@ -108,6 +134,7 @@ def export(options: argparse.Namespace) -> str:
     write = mesh if options.mesh else FORMATS.get(out.suffix)
     if write is None:
         raise ValueError(f"no format {out.suffix!r}; there are: {', '.join(filter(None, FORMATS))}, a folder")
+    _check_not_read(out, options)
     final, left_out = read_map(options)
     options.reference = found = reference_of(options)
     if found is None:

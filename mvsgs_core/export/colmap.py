@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
 
 from mvsgs_core import atomic_file, camera, geometry
 from mvsgs_core.export.cameras import Cameras
+from mvsgs_core.export.image_sizes import check_size
 from mvsgs_core.export.keyframe_images import image_name, there
 from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.snapshot import Snapshot
@@ -159,14 +159,9 @@ def _copy(images: Path, target: Path, cameras: Cameras, *, replacing: bool) -> N
     for index, (height, width) in zip(cameras.keyframes.tolist(), cameras.sizes.tolist()):
         found[index] = images / image_name(index)
         try:
-            with Image.open(found[index]) as image:
-                size = image.size
+            check_size(found[index], (height, width))
         except FileNotFoundError:
             raise ValueError(f"{found[index]} is missing: run with mapper.save_images=true") from None
-        except (UnidentifiedImageError, Image.DecompressionBombError) as error:
-            raise ValueError(f"{found[index]} is no image that can be read: {error}") from None
-        if size != (width, height):
-            raise ValueError(f"{found[index]} has {size[0]}x{size[1]} pixels, its camera {width}x{height}")
         there = target / found[index].name
         if not replacing and there.exists() and not filecmp.cmp(found[index], there, shallow=False):
             raise ValueError(f"{target} has another {found[index].name}: give another folder")

@@ -90,15 +90,23 @@ def known_cameras(options: argparse.Namespace) -> Cameras | None:
     return cameras if len(cameras) else None
 
 
+def _given_size(options: argparse.Namespace) -> tuple[int, int] | None:
+    """What --size says. Raises ValueError."""
+    if options.size is None:
+        return None
+    height, width = options.size
+    if min(height, width) < 1:
+        raise ValueError(f"--size {height} {width}: both must be positive")
+    return height, width
+
+
 def lens(options: argparse.Namespace) -> tuple[np.ndarray, tuple[int, int]]:
     """Intrinsics (4,) and size (height, width) for poses that come without: given, or the newest keyframe's.
 
     Raises ValueError where neither says them.
     """
     known = known_cameras(options)
-    size = None if options.size is None else (options.size[0], options.size[1])
-    if size is not None and min(size) < 1:
-        raise ValueError(f"--size {size[0]} {size[1]}: both must be positive")
+    size = _given_size(options)
     if known is not None:
         known_size = (int(known.sizes[-1, 0]), int(known.sizes[-1, 1]))
         size = size or known_size
@@ -124,7 +132,8 @@ def read_path(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cameras_of_map(options: argparse.Namespace) -> Cameras:
-    """Every --every-th keyframe of the map, or pose of --trajectory, at --scale.
+    """Every --every-th keyframe of the map, or pose of --trajectory, at --scale. A --size scales each keyframe's own
+    intrinsics; --intrinsics are those of all.
 
     Raises ValueError where the map has no cameras.json and no trajectory was given, and where that has no poses.
     """
@@ -144,11 +153,20 @@ def cameras_of_map(options: argparse.Namespace) -> Cameras:
             f"a mesh and a COLMAP model need cameras, and there is no cameras.json beside {options.map}: give it with "
             "--cameras, or --trajectory, --intrinsics and --size"
         )
-    if options.trajectory is not None or options.intrinsics is not None or options.size is not None:
+    size = _given_size(options)
+    if options.trajectory is not None or options.intrinsics is not None:
         intrinsics, size = lens(options)
-        found = replace(
-            found, intrinsics=np.tile(intrinsics, (len(found), 1)), sizes=np.tile(np.array(size), (len(found), 1))
-        )
+        found = replace(found, intrinsics=np.tile(intrinsics, (len(found), 1)), sizes=_tiled(size, len(found)))
+    elif size is not None:
+        scaled = [
+            camera.scale_intrinsics(values, (height, width), size)
+            for values, (height, width) in zip(found.intrinsics, found.sizes.tolist())
+        ]
+        found = replace(found, intrinsics=np.array(scaled), sizes=_tiled(size, len(found)))
     chosen = found.chosen(slice(None, None, options.every))
     chosen.world_from_cam[:, :3, 3] *= options.scale
     return chosen
+
+
+def _tiled(size: tuple[int, int], count: int) -> np.ndarray:
+    return np.tile(np.array(size), (count, 1))

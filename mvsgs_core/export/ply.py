@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mvsgs_core.atomic_file import replacing
 from mvsgs_core.bad_file import reading
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.rasterizer.kernels import KERNELS, gaussian_std_ratio, log_scale_shift, neutral_beta
@@ -16,14 +17,16 @@ from mvsgs_core.rasterizer.splats import Splats
 
 _MAX_HEADER = 2**16  # bytes
 CHUNK = 16384  # splats that are written at once: the columns of all would take as much memory as the map
-FAR = 1e3  # origins farther than this many scene extents stay a comment: float32 positions would lose the detail
+ROUNDED = 0.05  # of the median standard deviation of the splats: positions are not rounded to coarser steps
+_SAMPLE = 10_000  # splats that this is measured on
 
 
-def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
-    """Writes the map, binary little endian: x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*, and beta.
+def write_ply(path: Path, final: Snapshot, *, fold: bool = False, sync: bool = False) -> None:
+    """Replaces `path` in one step by the map, binary little endian: x y z nx ny nz f_dc_* f_rest_* opacity scale_*
+    rot_*, and beta. sync: see `replacing`.
 
-    Positions are world coordinates, the origin added in float64 before the cast; only where the origin is so far away
-    that float32 would not hold them are they relative to it. A comment `origin x y z` tells what must be added.
+    Positions are world coordinates, the origin added in float64 before the cast; only where float32 would round them
+    too coarsely for the splats are they relative to it. A comment `origin x y z` tells what must be added.
     fold: for viewers that know only Gaussians; the scales are those of the closest Gaussian, and there is no beta. The
     scale is a logarithm: what multiplies the standard deviation is added to it. Of an antialiased map a comment
     `antialiased` says so to who knows it; other programs must be told, or show it too bright. A comment `background r g
@@ -42,7 +45,7 @@ def write_ply(path: Path, final: Snapshot, *, fold: bool = False) -> None:
         *(["comment antialiased"] if final.antialiased else []), *_background_line(final), f"element vertex {count}",
         *(f"property float {name}" for name in names), "end_header\n",
     ]  # fmt: skip
-    with path.open("wb") as file:
+    with replacing(path, sync=sync) as aside, aside.open("wb") as file:
         file.write("\n".join(header).encode("ascii"))
         for first in range(0, count, CHUNK):
             some = columns(slice(first, first + CHUNK))
@@ -78,10 +81,20 @@ def _background_line(final: Snapshot) -> list[str]:
 
 
 def relative_origin(final: Snapshot) -> np.ndarray:
-    """(3,) float64 that exported positions are relative to: 0 unless float32 could not hold world coordinates."""
-    extent = float(final.splats.means.abs().max()) if len(final.splats) else 0.0
-    far = float(np.abs(final.origin).max()) > FAR * max(extent, 1e-30)
-    return final.origin if far else np.zeros(3)
+    """(3,) float64 that exported positions are relative to: 0 unless float32 would round world coordinates to steps
+    that are coarse beside the splats, and finer ones relative to the origin. Medians: strays do not decide."""
+    chosen = slice(None, None, len(final.splats) // _SAMPLE + 1)
+    means = final.splats.means[chosen].numpy()
+    if not len(means):
+        return np.zeros(3)
+    deviation = float(np.exp(np.nanmedian(final.splats.log_scales[chosen].numpy())))
+    world = _step(means + final.origin)
+    return final.origin if world > ROUNDED * deviation and world > _step(means) else np.zeros(3)
+
+
+def _step(positions: np.ndarray) -> float:
+    """Of float32, at the median of positions (N, 3)."""
+    return float(np.spacing(np.float32(np.nanmedian(np.abs(positions).max(axis=1)))))
 
 
 def folded(splats: Splats, kernel: str) -> Splats:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mvsgs_core.atomic_file import replacing
 from mvsgs_core.export import spz
 from mvsgs_core.export.ply import folded, relative_origin
 from mvsgs_core.export.snapshot import Snapshot
@@ -15,7 +16,8 @@ from mvsgs_core.rasterizer.spherical_harmonics import C0
 
 
 def write_splat(path: Path, final: Snapshot) -> None:
-    """position 3 float32, standard deviation 3 float32, color and opacity 4 uint8, rotation 4 uint8; no directions.
+    """Replaces `path` in one step: position 3 float32, standard deviation 3 float32, color and opacity 4 uint8,
+    rotation 4 uint8; no directions.
 
     Axes as in map.ply: the format names none, and those who convert between the two change none. The largest and most
     opaque splats come first: viewers show a file while it loads.
@@ -33,12 +35,13 @@ def write_splat(path: Path, final: Snapshot) -> None:
     rows["rotation"] = _bytes(torch.nn.functional.normalize(splats.quaternions, dim=1).numpy() * 128.0 + 128.0)
     weight = splats.log_scales.sum(dim=1) + opacity.log()
     order = torch.argsort(weight, descending=True, stable=True).numpy()
-    path.write_bytes(rows[order].tobytes())
+    with replacing(path, sync=False) as aside:
+        aside.write_bytes(rows[order].tobytes())
 
 
 def write_spz(path: Path, final: Snapshot) -> None:
-    """The format's axes are x right, y up, z back ("RUB"): everything is turned by 180 degrees about x,
-    view-dependent colors too.
+    """Replaces `path` in one step. The format's axes are x right, y up, z back ("RUB"): everything is turned by 180
+    degrees about x, view-dependent colors too.
 
     Raises ValueError where the format's fixed steps of 1/4096 unit would blur the map or its 24 bits do not reach as
     far, OSError where the file cannot be written.
@@ -59,7 +62,9 @@ def write_spz(path: Path, final: Snapshot) -> None:
         )
     opacity, harmonics = torch.sigmoid(splats.opacity_logits).numpy(), splats.sh.numpy()
     scales, quaternions = splats.log_scales.numpy(), splats.quaternions.numpy()
-    path.write_bytes(spz.packed(means, scales, quaternions, opacity, harmonics, final.antialiased))
+    data = spz.packed(means, scales, quaternions, opacity, harmonics, final.antialiased)
+    with replacing(path, sync=False) as aside:
+        aside.write_bytes(data)
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

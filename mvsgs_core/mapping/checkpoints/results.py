@@ -40,9 +40,8 @@ def write_results(output: Path, mapper: OnlineMapper, *, source: SourceCamera | 
         there = write_transforms(output / "transforms.json", cameras, output / keyframe_images.FOLDER)
         if 0 < there < len(cameras):
             mapper.log.skip(NOT_THERE, len(cameras) - there)
-    with replacing(output / "map.ply", sync=sync) as aside:
-        write_ply(aside, final)
-        return aside.stat().st_size
+    write_ply(output / "map.ply", final, sync=sync)
+    return (output / "map.ply").stat().st_size
 
 
 def cameras_of(final: Snapshot, views: list[TrainingView]) -> Cameras:
@@ -55,4 +54,5 @@ def cameras_of(final: Snapshot, views: list[TrainingView]) -> Cameras:
         intrinsics=np.array([view.image_intrinsics for view in views], dtype=np.float64).reshape(count, 4),
         sizes=np.array([view.image_size for view in views], dtype=np.int64).reshape(count, 2),
         exposures=final.exposures.astype(np.float64),
+        vignetting=None if final.vignetting is None else final.vignetting.astype(np.float64),
     )

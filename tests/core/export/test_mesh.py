@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +15,12 @@ from plyfile import PlyData
 from mvsgs_core import camera
 from mvsgs_core.export import __main__ as export
 from mvsgs_core.export.glb import linear, write_glb
-from mvsgs_core.export.mesh import write_mesh_ply
+from mvsgs_core.export.mesh import write_mesh, write_mesh_ply
 from mvsgs_core.export.ply import write_ply
+from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.open3d_loader import open3d
-from mvsgs_core.rasterizer.rasterize import rasterize
-from tests.support.tiny_map import ORIGIN, final_map, save_cameras, write_poses
+from mvsgs_core.rasterizer.rasterize import Render, rasterize
+from tests.support.tiny_map import ORIGIN, cameras_around, final_map, save_cameras, write_poses
 
 SIZE, INTRINSICS = (48, 64), np.array([51.2, 51.2, 31.5, 23.5])
 
@@ -131,6 +133,34 @@ def test_linear_light_of_srgb_values() -> None:
     np.testing.assert_allclose(linear(np.array([0.0, 0.04045, 0.5, 1.0])), [0.0, 0.0031308, 0.2140411, 1.0], rtol=1e-5)
     values = np.linspace(0.0, 1.0, 101)
     np.testing.assert_allclose(srgb(linear(values)), values, atol=1e-5)
+
+
+def test_a_format_that_no_mesh_has_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_cameras(tmp_path, [0.5], SIZE, INTRINSICS)
+    write_ply(tmp_path / "map.ply", final_map(1))
+    assert export.main([str(tmp_path / "map.ply"), str(tmp_path / "mesh.splat"), "--mesh"]) == 1
+    assert "no mesh is written as '.splat': there are .glb, .ply" in capsys.readouterr().err
+
+
+def test_views_are_fused_one_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All images of a long run would fill the memory."""
+    grid, done = open3d().t.geometry.VoxelBlockGrid, []
+    render, integrate = Snapshot.render, grid.integrate
+
+    def rendered(self: Snapshot, pose: np.ndarray, lens: np.ndarray, size: tuple[int, int], **options: Any) -> Render:
+        if size == SIZE:
+            done.append("rendered")
+        return render(self, pose, lens, size, **options)
+
+    def fused(*arguments: Any) -> None:
+        done.append("fused")
+        integrate(*arguments)
+
+    monkeypatch.setattr(Snapshot, "render", rendered)
+    monkeypatch.setattr(grid, "integrate", fused)
+    cameras = cameras_around([0.2, 0.5, 0.8], SIZE, INTRINSICS)
+    write_mesh(tmp_path / "mesh.ply", final_map(1, size=SIZE, opacity=0.98), cameras, voxel=0.05)
+    assert done == 3 * ["rendered", "fused"]
 
 
 def test_a_mesh_that_no_camera_sees_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -70,6 +70,20 @@ def test_keyframes_without_an_image_are_left_out_where_others_have_theirs(
     assert "no keyframe's image is in " in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--trajectory", "--size"])
+def test_images_of_other_cameras_are_not_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str) -> None:
+    run = write_tiny_run(tmp_path / "run")
+    write_image(run / "keyframes", 0, np.zeros((*SIZE, 3), np.uint8))
+    values = {"--trajectory": [str(run / "trajectory.txt")], "--size": ["12", "16"]}[option]
+    assert export.main([str(run), str(run / "transforms.json"), option, *values]) == 1
+    message = {
+        "--trajectory": "names the keyframes' images, of which a --trajectory knows nothing",
+        "--size": "000000.png has 32x24 pixels, its camera 16x12",
+    }[option]
+    assert message in capsys.readouterr().err
+    assert not (run / "transforms.json").exists()
+
+
 def test_missing_images_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_tiny_run(tmp_path / "run")
     assert export.main([str(run), str(run / "transforms.json")]) == 0
