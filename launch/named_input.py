@@ -5,6 +5,7 @@ A file or folder is known by its name and layout, an address by its scheme; any 
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -62,13 +63,18 @@ def _exists(word: str) -> bool:
         return False
 
 
+def _is_device(word: str) -> bool:
+    """A camera of this machine by its name, or what links to it now, as in /dev/v4l/by-id."""
+    return word.startswith("/dev/") and re.fullmatch(r"/dev/video\d+", os.path.realpath(word)) is not None
+
+
 def _meaning(word: str, choices: Sequence[str]) -> list[str]:
     scheme, separator, _ = word.partition("://")
     if separator:
         if scheme.lower() not in SCHEMES:
             raise GraphError(f"{word}: no address that is known; there are: {', '.join(f'{s}://' for s in SCHEMES)}")
         return _overrides(SCHEMES[scheme.lower()], word)
-    if (word.isdecimal() and not _exists(word)) or re.fullmatch(r"/dev/video\d+", word):
+    if (word.isdecimal() and not _exists(word)) or _is_device(word):
         return _overrides("camera", word)
     path = Path(word).expanduser()
     try:

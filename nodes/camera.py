@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import threading
@@ -26,6 +27,7 @@ from nodes.stream_presence import Presence, pauses
 
 ANSWER = 5.0  # s for a network camera to answer, before it is tried again
 POLL = 0.5  # s at most between two looks at whether the stream goes on
+DEVICES = "/dev/"
 MANY = 2**40  # frames: no file has as many; OpenCV counts them so, or below zero, where a stream has no end
 
 
@@ -61,10 +63,11 @@ class Camera(LiveSource):
         lens_from_option(config.intrinsics, config.distortion, (480, 640))
         camera_mask(config.mask)
         number = device_number(config.path)
-        device = Path(f"/dev/video{number}")
+        device = Path(f"/dev/video{number}" if config.path.isdecimal() else config.path)
         _refuse_file(config.path)
-        if number is not None and sys.platform == "linux" and not device.exists():
-            there = sorted(str(path) for path in device.parent.glob("video*"))
+        local = number is not None or config.path.startswith(DEVICES)
+        if local and sys.platform == "linux" and not device.exists():
+            there = sorted(str(path) for path in Path(DEVICES).glob("video*"))
             found = f"there is {', '.join(there)}" if there else "no camera is connected"
             raise CameraError(f"camera {config.path}: {device} does not exist; {found}")
 
@@ -178,7 +181,10 @@ def _called(config: Camera.Config) -> str:
 
 
 def device_number(path: str) -> int | None:
-    """Of a camera of this machine: 2 for 2 and /dev/video2. None for an address."""
+    """Of a camera of this machine: 2 for 2, /dev/video2 and what links to it now, as in /dev/v4l/by-id. None for an
+    address."""
+    if path.startswith(DEVICES):
+        path = os.path.realpath(path)
     found = re.fullmatch(r"(?:/dev/video)?([0-9]+)", path)
     return None if found is None else int(found[1])
 
@@ -196,6 +202,8 @@ def _open(config: Camera.Config) -> cv2.VideoCapture:
     if number is not None:
         capture = cv2.VideoCapture(number)  # by its name with limits of time, as below, OpenCV does not open it
         hint = "is it connected, free of other programs, and may you read it (ls -l /dev/video*)?"
+    elif config.path.startswith(DEVICES) and not Path(config.path).exists():
+        raise CameraError(f"{_called(config)} cannot be opened: it does not exist; is it connected?")
     else:
         milliseconds = int(1000 * min(config.timeout, ANSWER))
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]

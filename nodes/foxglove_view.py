@@ -58,13 +58,14 @@ class FoxgloveView:
         self._keyframes: dict[int, _Placed] = {}
         self._waiting: dict[int, list[_Between]] = {}  # by their keyframe, which is still to come
         self._end = 0  # ns, of the newest image
+        self._newest = -1  # keyframe, which says the part that images are of
 
     def of(self, message: Message) -> Iterator[Seen]:
         """What is to be seen of a message; nothing of those that are not in READ."""
         match message:
             case Frame():
                 ns = self._stamp(message.timestamp)
-                yield Seen("/camera/image", ns, foxglove.jpeg(ns, _camera(0), message.image))
+                yield Seen("/camera/image", ns, foxglove.jpeg(ns, _camera(self._segment), message.image))
             case Keyframe():
                 yield from self._keyframe(message)
             case TrackedFrame():
@@ -79,6 +80,11 @@ class FoxgloveView:
                 yield from self._path(message)
             case SplatMap(refined=True):
                 yield self._map(message)
+
+    @property
+    def _segment(self) -> int:
+        newest = self._keyframes.get(self._newest)
+        return 0 if newest is None or newest.segment is None else newest.segment
 
     def _stamp(self, timestamp: float) -> int:
         ns = nanoseconds(timestamp)
@@ -97,6 +103,7 @@ class FoxgloveView:
         elif placed.segment is None:
             placed = placed._replace(segment=message.segment)
         self._keyframes[message.index] = placed
+        self._newest = max(self._newest, message.index)
         for between in self._waiting.pop(message.index, ()):
             yield from self._between(between)
 

@@ -12,7 +12,7 @@ from msgs import Frame
 from mvsgs_core.bad_file import BadFileError
 from mvsgs_core.datasets.calibration import lens_from_option
 from mvsgs_core.datasets.framing import Framing, same_shape
-from mvsgs_core.datasets.lens import Lens
+from mvsgs_core.datasets.lens import Lens, Undistortion
 from mvsgs_core.datasets.ros import COMPRESSED, calibrated, camera_info_topic, lens_of, rectified, rgb_of
 from mvsgs_core.export.source_camera import LENS, lens_values
 from nodes.live import LiveSource, camera_mask
@@ -72,6 +72,7 @@ class Ros2Camera(LiveSource):
         self._lens: Lens | None = None
         self._uncalibrated_since: float | None = None  # the first image without
         self._met = False  # somebody who publishes them
+        self._unstamped = False  # an image came without a time stamp: further ones get the time here
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -181,6 +182,10 @@ class Ros2Camera(LiveSource):
             )
             return None
         stamp = message.header.stamp.nanoseconds
+        if stamp <= 0 and not self._unstamped:
+            self._unstamped = True
+            self._frames.refuse("the first image without a time stamp was left out: a simulation has no clock yet")
+            return None
         stamp = stamp if stamp > 0 else time.time_ns()
         intrinsics = np.array(lens.at(native).intrinsics)
         return Frame(0, stamp / 10**9, image, intrinsics, lens.guessed, stamp=stamp)
@@ -188,7 +193,7 @@ class Ros2Camera(LiveSource):
     def _lens_for(self, native: tuple[int, int]) -> Lens | None:
         """The lens of the stream; None as long as its CameraInfo is waited for."""
         if self._lens is None:
-            self._lens = self._given_lens(native) or self._calibrated_lens() or self._guessed_lens(native)
+            self._lens = self._given_lens(native) or self._calibrated_lens(native) or self._guessed_lens(native)
         if self._lens is None:
             self.stats.count("before_calibration")
         else:
@@ -207,13 +212,15 @@ class Ros2Camera(LiveSource):
             self.stats.warn(note)
         return lens
 
-    def _calibrated_lens(self) -> Lens | None:
-        """Of the first CameraInfo that says anything."""
+    def _calibrated_lens(self, native: tuple[int, int]) -> Lens | None:
+        """Of the first CameraInfo that says anything, and whose distortion can be taken out."""
         for data in self._infos.take():
             try:
                 info = self._infos.decode(data)
                 if calibrated(info):
-                    return lens_of(info, rectified(self._topic))
+                    lens = lens_of(info, rectified(self._topic))
+                    Undistortion(lens.at(native), fill=self.config.crop is None)
+                    return lens
                 self.stats.warn(f"the CameraInfo at {self._info_topic} is empty: the camera was not calibrated")
             except ValueError as error:  # what is no message (CdrError) and what no camera has
                 self.stats.refuse("calibrations", 1, f"a CameraInfo that cannot be used was left out: {error}")

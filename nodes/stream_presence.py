@@ -49,9 +49,9 @@ class Presence:
         self._came, self._lost_since = now, None
 
     def wait(self, since: float) -> None:
-        """Nothing came although it was waited for since then (by the clock)."""
+        """Nothing came although it was waited for since then (by the clock), or since the last frame."""
         silence = min(max(SILENT, SLOW * self._interval), self._timeout / 2)
-        if self._came is not None and self._clock() - since >= silence:
+        if self._came is not None and self._clock() - max(since, self._came) >= silence:
             self.lost(f"nothing came for {silence:.3g} s")
 
     def lost(self, why: str) -> None:

@@ -83,6 +83,18 @@ def test_parts_that_share_no_frame_of_reference_have_their_own(tmp_path: Path) -
     assert topics["/trajectory_1"][0].message.frame_id == "map_1"
 
 
+def test_images_are_of_the_part_of_the_newest_keyframe(tmp_path: Path) -> None:
+    image = np.zeros((24, 32, 3), np.uint8)
+    frames = [Frame(i, 0.1 * i, image, np.ones(4)) for i in range(5)]
+    joined = Poses(1, np.array([2]), moved(7.0)[None], np.array([1.0]), segment=np.array([0], np.int32))
+    topics = seen(
+        frames[0], keyframe(0), frames[1], frames[2], keyframe(2, segment=1), frames[3], joined, frames[4],
+        to=tmp_path / "a.mcap",
+    )  # fmt: skip
+    of = ["camera", "camera", "camera", "camera_1", "camera"]
+    assert [shown.message.frame_id for shown in topics["/camera/image"]] == of
+
+
 def test_what_is_sent_is_bounded(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (1080, 1920, 3), np.uint8)

@@ -117,6 +117,14 @@ def test_addresses_and_numbers_are_cameras_and_robots(word: str, choice: str) ->
     assert compose([chosen, path]).slots["dataset"].config["path"] == word
 
 
+def test_what_links_to_a_device_is_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    links = {"/dev/v4l/by-id/usb-eye": "/dev/video2", "/dev/null": "/dev/null"}
+    monkeypatch.setattr("os.path.realpath", links.__getitem__)
+    assert meant("/dev/v4l/by-id/usb-eye") == ["dataset=camera", "dataset.path=/dev/v4l/by-id/usb-eye"]
+    with pytest.raises(GraphError, match="no such file"):
+        meant("/dev/null")
+
+
 def test_a_folder_of_a_number_is_no_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_kitti(tmp_path).rename(tmp_path / "sequences/00")
     monkeypatch.chdir(tmp_path / "sequences")

@@ -20,6 +20,7 @@ class Lens:
     """A calibrated camera. Raises ValueError for numbers that no camera has.
 
     `distortion` is OpenCV's: (k1, k2, p1, p2[, k3[, k4, k5, k6[, s1 .. s4[, tx, ty]]]]), fisheye (k1, k2, k3, k4).
+    Without any, a fisheye is the ideal one, whose four are zero.
     """
 
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels at `size`, (0, 0) is a pixel's center
@@ -30,6 +31,8 @@ class Lens:
 
     def __post_init__(self) -> None:
         check_intrinsics(np.array(self.intrinsics), self.size)
+        if self.fisheye and not self.distortion:
+            object.__setattr__(self, "distortion", (0.0,) * 4)
         if not all(math.isfinite(v) and abs(v) < _LARGEST_COEFFICIENT for v in self.distortion):
             raise ValueError(f"distortion must be finite and of sensible size, got {self.distortion}")
         allowed = (0, 4) if self.fisheye else (0, 4, 5, 8, 12, 14)
@@ -38,7 +41,7 @@ class Lens:
 
     @property
     def distorted(self) -> bool:
-        return any(k != 0.0 for k in self.distortion)
+        return self.fisheye or any(k != 0.0 for k in self.distortion)
 
     def at(self, size: tuple[int, int]) -> Lens:
         """The same lens for images scaled to `size` (distortion acts on normalized coordinates, so it stays)."""

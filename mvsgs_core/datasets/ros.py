@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from mvsgs_core.bad_file import brief
 from mvsgs_core.camera import scale_intrinsics
-from mvsgs_core.datasets.files import MAX_PIXELS, UnreadableImageError, read_image
+from mvsgs_core.datasets.files import MAX_PIXELS, UnreadableImageError, opened_image, read_image
 from mvsgs_core.datasets.lens import Lens
 
 # channels a pixel, bits a channel, conversion to RGB (None: it is)
@@ -34,6 +35,8 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
 }
+# what image_transport compresses without a conversion: "bayer_rggb8; jpeg compressed "
+_MOSAIC = re.compile(r"(bayer_[bgr]{4})(?:8|16) *; *\w+ +compressed *(?:bayer_\w+)? *")
 COMPRESSED = "/compressed"  # after the topic of images: the same as CompressedImage
 _RADIAL = ("plumb_bob", "rational_polynomial", "")
 _FISHEYE = ("equidistant", "fisheye")
@@ -47,7 +50,14 @@ def rgb_of(message: Any) -> np.ndarray:
     if hasattr(message, "encoding"):
         return _raw(message)
     name = f"compressed image ({brief(ValueError(message.format))})"
-    return read_image(io.BytesIO(bytes(message.data)), name=name, turn_upright=False)
+    data = bytes(message.data)
+    image = read_image(io.BytesIO(data), name=name, turn_upright=False)
+    mosaic = _MOSAIC.fullmatch(message.format)
+    if mosaic is None:
+        return image
+    with opened_image(io.BytesIO(data), name) as opened:
+        channels = len(opened.getbands())
+    return image if channels > 1 else _in_rgb(image[..., 0], f"{mosaic[1]}8")
 
 
 def _raw(message: Any) -> np.ndarray:
@@ -56,7 +66,7 @@ def _raw(message: Any) -> np.ndarray:
         raise UnreadableImageError(
             f"encoding {str(message.encoding)[:40]!r} is no color or gray image; known are {known}"
         )
-    channels, bits, conversion = _ENCODINGS[message.encoding]
+    channels, bits, _ = _ENCODINGS[message.encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * channels * bits // 8
     data = np.ascontiguousarray(message.data, dtype=np.uint8)
@@ -69,10 +79,16 @@ def _raw(message: Any) -> np.ndarray:
     if bits == 16:
         rows = (rows.view(">u2" if message.is_bigendian else "<u2") >> 8).astype(np.uint8)
     pixels = rows.reshape(height, width, channels) if channels > 1 else rows.reshape(height, width)
+    return _in_rgb(pixels, message.encoding)
+
+
+def _in_rgb(pixels: np.ndarray, encoding: str) -> np.ndarray:
+    conversion = _ENCODINGS[encoding][2]
     try:
         return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
     except cv2.error as error:  # a pattern of two by two pixels in an image of one row
-        raise UnreadableImageError(f"a {width}x{height} image in {message.encoding}: {brief(error)}") from error
+        height, width = pixels.shape[:2]
+        raise UnreadableImageError(f"a {width}x{height} image in {encoding}: {brief(error)}") from error
 
 
 def camera_info_topic(topic: str) -> str:
@@ -82,7 +98,7 @@ def camera_info_topic(topic: str) -> str:
 
 def rectified(topic: str) -> bool:
     """Whether images are undistorted already, by ROS's names for them: image_rect, image_rect_color."""
-    return "rect" in topic.split("image")[-1]
+    return re.search(r"(^|[/_])rect(ified)?([/_]|$)", topic.split("image")[-1]) is not None
 
 
 def calibrated(info: Any) -> bool:

@@ -61,21 +61,19 @@ class Connection:
     @property
     def xml(self) -> str:
         """Cyclone DDS's configuration."""
-        if self.interface == ANY:
-            where = 'autodetermine="true"'
-        elif self.interface == LOOPBACK:
+        if self.interface == LOOPBACK:
             where = 'address="127.0.0.1"'
         else:
             where = f'{"address" if _is_address(self.interface) else "name"}="{self.interface}"'
+        interface = f"<General><Interfaces><NetworkInterface {where}/></Interfaces></General>"
+        if self.interface == ANY:  # Cyclone chooses; one of ours would be added to those of $CYCLONEDDS_URI
+            interface = ""
         # beyond the limit a stranger's sample would fill the memory; where this process waits for its turn, images of
         # some time wait in the kernel, as many as it lets (net.core.rmem_max)
         internal = (
             f'<MaxSampleSize>{MAX_SAMPLE_BYTES} B</MaxSampleSize><SocketReceiveBufferSize max="{SOCKET_BUFFER}"/>'
         )
-        ours = (
-            f"<CycloneDDS><Domain><General><Interfaces><NetworkInterface {where}/></Interfaces></General>"
-            f"<Internal>{internal}</Internal></Domain></CycloneDDS>"
-        )
+        ours = f"<CycloneDDS><Domain>{interface}<Internal>{internal}</Internal></Domain></CycloneDDS>"
         theirs = os.environ.get("CYCLONEDDS_URI", "") if self.interface == ANY else ""
         return ours + (f",{theirs}" if theirs else "")
 

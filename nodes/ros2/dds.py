@@ -11,6 +11,7 @@ A service `/mvsgs/pause` is the topics `rq/mvsgs/pauseRequest` and `rr/mvsgs/pau
 from __future__ import annotations
 
 import errno
+import ipaddress
 import os
 import socket
 import struct
@@ -31,7 +32,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from nodes.ros2.cdr import CdrError, Nested, NestedSequence, Number, Numbers, Text, decode, encode, kinds
-from nodes.ros2.connection import DEFAULT, LOOPBACK, Connection, DdsError, Quality
+from nodes.ros2.connection import ANY, DEFAULT, LOOPBACK, Connection, DdsError, Quality
 from nodes.ros2.messages import Message
 from nodes.ros2.services import ServiceMessage, ServiceType
 
@@ -40,6 +41,7 @@ _BLOCKED = 100  # ms that a writer waits for a slow reader before it goes on wit
 _EVERYTHING = SampleState.Any | ViewState.Any | InstanceState.Any
 _TAKEN = 64  # samples at once
 _SO_MEMINFO, _MEMINFO, _ROOM, _DROPS = 55, "9I", 1, 8  # linux/sock_diag.h; Python's socket does not name it
+_SIOCGIFADDR = 0x8915  # linux/sockios.h
 _IDL = {
     "?": bool, "u1": types.uint8, "i4": types.int32, "u4": types.uint32, "f8": types.float64,
     "i8": types.int64, "u8": types.uint64,
@@ -221,6 +223,7 @@ class _Domain:
                 f"DDS cannot use interface={connection.interface} (domain {connection.number}): is it the name or the "
                 f"address of one that is up (ip addr)? {error}"
             ) from error
+        self._device = _device(connection.interface)
         self.confine()
 
     @classmethod
@@ -236,11 +239,11 @@ class _Domain:
         return known
 
     def confine(self) -> None:
-        """Cyclone sends on the interface that it is told, but binds to all: on loopback, the kernel is told as well."""
+        """Cyclone sends on the interface that it is told, but listens on all: the kernel is told as well."""
         self._own = {descriptor for descriptor in _sockets() - self._before if _is_udp(descriptor)}
-        if self._interface == LOOPBACK:
+        if self._device is not None:
             for descriptor in self._own:
-                _bind_to_loopback(descriptor)
+                _bind(descriptor, self._device)
 
     def memories(self) -> list[tuple[int, ...]]:
         """Of each of its sockets what the kernel says of its memory; nothing where the system does not tell."""
@@ -282,15 +285,42 @@ def _memory(descriptor: int) -> tuple[int, ...]:
             return ()
 
 
-def _bind_to_loopback(descriptor: int) -> None:
-    """Nothing that came in by another interface reaches the socket any more."""
+def _device(interface: str) -> str | None:
+    """The device that has it, by its name or address; None: any does. Raises DdsError where none is found."""
+    if interface == ANY:
+        return None
+    try:
+        address = ipaddress.ip_address(interface)
+    except ValueError:
+        return interface.partition(":")[0]  # eth0:1 is a further address of eth0
+    if address.is_loopback:
+        return LOOPBACK
+    for _, name in socket.if_nameindex():
+        if _first_address(name) == address:
+            return name
+    raise DdsError(f"interface={interface}: no device has it as its first address; give the device's name (ip addr)")
+
+
+def _first_address(device: str) -> ipaddress.IPv4Address | None:
+    """None where it has none."""
+    import fcntl  # not on Windows
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        try:
+            told = fcntl.ioctl(asking, _SIOCGIFADDR, struct.pack("256s", os.fsencode(device)))
+        except OSError:
+            return None
+    return ipaddress.IPv4Address(told[20:24])  # of struct ifreq: the name, then the family, port and address
+
+
+def _bind(descriptor: int, device: str) -> None:
+    """Nothing that came in by another device reaches the socket any more."""
     with socket.socket(fileno=os.dup(descriptor)) as own:
         try:
-            own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, LOOPBACK.encode())
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, os.fsencode(device))
         except OSError as error:
-            raise DdsError(
-                f"DDS cannot be kept on this machine ({error}): interface=auto, or an interface's name, lets it listen"
-            ) from error
+            where = "this machine" if device == LOOPBACK else device
+            raise DdsError(f"DDS cannot be kept on {where} ({error}): interface=auto lets it listen on all") from error
 
 
 def _qos(quality: Quality) -> Any:

@@ -1,4 +1,4 @@
-"""DDS: every type there and back with a program that has Cyclone's serializer; on loopback nothing else gets in."""
+"""DDS: every type there and back with a program that has Cyclone's serializer; on an interface nothing else gets in."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,44 @@ def bound() -> dict[int, str]:
     return found
 
 
-def test_nothing_listens_beyond_loopback_unless_it_is_told_to() -> None:
+def others() -> list[tuple[str, str]]:
+    """Name and address of the device by which this machine reaches others; none where it reaches nobody."""
+    from nodes.ros2.dds import _first_address
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        try:
+            asking.connect(("192.0.2.1", 9))  # sends nothing
+        except OSError:
+            return []
+        address = asking.getsockname()[0]
+    return [(name, address) for _, name in socket.if_nameindex() if str(_first_address(name)) == address]
+
+
+def test_a_device_is_known_by_its_name_and_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    from nodes.ros2 import dds
+
+    assert dds._device("auto") is None
+    for loopback in (LOOPBACK, "127.0.0.1", "127.3.2.1"):
+        assert dds._device(loopback) == "lo"
+    assert str(dds._first_address("lo")) == "127.0.0.1"
+    assert dds._device("eth0:1") == "eth0"
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "no0"), (3, "eth3")])
+    known = {"lo": ip_address("127.0.0.1"), "eth3": ip_address("10.0.0.2")}
+    monkeypatch.setattr(dds, "_first_address", known.get)
+    assert dds._device("10.0.0.2") == "eth3"
+    with pytest.raises(dds.DdsError, match=r"interface=10\.0\.0\.3.*give the device's name"):
+        dds._device("10.0.0.3")
+
+
+def test_a_device_that_sockets_cannot_be_bound_to_is_named() -> None:
+    from nodes.ros2 import dds
+
+    kept = pytest.raises(dds.DdsError, match=r"cannot be kept on nosuch0 .*interface=auto")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own, kept:
+        dds._bind(own.fileno(), "nosuch0")
+
+
+def test_nothing_listens_beyond_an_interface_unless_it_is_told_to() -> None:
     code = (
         "import sys; from nodes.ros2.connection import *; from nodes.ros2.dds import *;"
         "from nodes.ros2.messages import Header; from tests.ros2.test_dds import bound;"
@@ -120,8 +158,11 @@ def test_nothing_listens_beyond_loopback_unless_it_is_told_to() -> None:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=LONG)
         return done.stdout.strip()
 
-    assert devices(LOOPBACK) == "{'lo'}"
+    for interface in (LOOPBACK, "127.0.0.1"):
+        assert devices(interface) == "{'lo'}"
     assert devices("auto") == "{''}"
+    for name, address in others():
+        assert devices(name) == devices(address) == f"{{{name!r}}}"
 
 
 def test_an_interface_that_is_none_or_another_is_refused() -> None:

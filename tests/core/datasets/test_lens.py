@@ -132,3 +132,13 @@ def test_impossible_lenses_are_refused(
 def test_a_distortion_that_cannot_be_undone_is_refused() -> None:
     with pytest.raises(ValueError, match="without a border"):
         Undistortion(Lens((100.0, 100.0, 50.0, 50.0), (100, 100), (300.0, 0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize("distortion", [(), (0.0, 0.0, 0.0, 0.0)])
+def test_an_ideal_fisheye_is_undistorted(distortion: tuple[float, ...]) -> None:
+    lens = Lens((180.0, 180.0, 160.0, 120.0), (240, 320), distortion, fisheye=True)
+    angle = np.array([-0.6, -0.2, 0.5])  # of rays to the right of the optical axis, which it sees at focal * angle
+    image = dots(np.stack([160.0 + 180.0 * angle, np.full(3, 120.0)], axis=1), lens.size)
+    undistortion = Undistortion(lens, fill=False)
+    expected = np.stack([160.0 + 180.0 * np.tan(angle), np.full(3, 120.0)], axis=1)
+    assert np.abs(centers(undistortion.image(image), expected) - expected).max() < 0.15
