@@ -13,6 +13,7 @@ from mvsgs_core import camera
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.colmap import write_colmap
 from mvsgs_core.export.command_line import input_arguments, known_cameras, read_map
+from mvsgs_core.export.image_sizes import check_sizes
 from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.ply import write_ply
@@ -89,7 +90,9 @@ class GaussianMap:
         elif out.suffix in MESHES:
             write_mesh(out, self.snapshot, self._keyframes(out), voxel)
         elif out.suffix == ".json":
-            write_transforms(out, self._keyframes(out), out.parent / "keyframes" if images is None else Path(images))
+            folder = out.parent / "keyframes" if images is None else Path(images)
+            check_sizes(folder, self._keyframes(out))
+            write_transforms(out, self._keyframes(out), folder)
         elif not out.suffix:
             given = None if images is None else Path(images)
             write_colmap(out, self.snapshot, self._keyframes(out), given, observations)

@@ -7,8 +7,8 @@ from typing import Any
 
 _USER = re.compile(r"://[^/?#\s]*@")
 _ADDRESS = re.compile(r"://\S+")
-_WORDS = "pass|password|passwd|passphrase|pas|pwd|psw|pw|token|secret|signature|auth|api_?key"  # names end in
-_SECRET = re.compile(rf"([?&;_/](?:[\w.-]*(?:{_WORDS})|key|sig)=)[^&;#\s]+", re.IGNORECASE)
+_WORDS = "pass|password|passwd|passphrase|pas|pwd|psw|pw|token|secret|signature|auth|apikey"  # names end in
+_SECRET = re.compile(rf"([?&;_/](?:[\w.-]*(?:{_WORDS})|(?:[\w.-]*[._-])?(?:key|sig))=)[^&;#\s]+", re.IGNORECASE)
 
 
 def without_passwords(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,6 +26,7 @@ from nodes.stream_presence import Presence
 if TYPE_CHECKING:
     from nodes.ros2.dds import Reader
 
+UNSTAMPED = 1.0  # s for which images without a time stamp are left out: a simulation may have no clock yet
 POLL = 0.1  # s at most between two looks at the clock and at what was lost
 
 
@@ -72,7 +74,8 @@ class Ros2Camera(LiveSource):
         self._lens: Lens | None = None
         self._uncalibrated_since: float | None = None  # the first image without
         self._met = False  # somebody who publishes them
-        self._unstamped = False  # an image came without a time stamp: further ones get the time here
+        # by time.monotonic, when images without a time stamp get the time here; None: none came, inf: others have one
+        self._unstamped_until: float | None = None
 
     @classmethod
     def check(cls, config: Config) -> None:
@@ -181,14 +184,25 @@ class Ros2Camera(LiveSource):
                 f"images left out because their calibration is for another aspect ratio: {native} for {lens.size}"
             )
             return None
-        stamp = message.header.stamp.nanoseconds
-        if stamp <= 0 and not self._unstamped:
-            self._unstamped = True
-            self._frames.refuse("the first image without a time stamp was left out: a simulation has no clock yet")
+        stamp = self._stamp(message.header.stamp.nanoseconds)
+        if stamp is None:
             return None
-        stamp = stamp if stamp > 0 else time.time_ns()
         intrinsics = np.array(lens.at(native).intrinsics)
         return Frame(0, stamp / 10**9, image, intrinsics, lens.guessed, stamp=stamp)
+
+    def _stamp(self, nanoseconds: int) -> int | None:
+        """Of an image, the time here where none comes with one; None where it is not known whether any will."""
+        if nanoseconds > 0:
+            self._unstamped_until = math.inf
+            return nanoseconds
+        if self._unstamped_until is None:
+            self._unstamped_until = time.monotonic() + UNSTAMPED
+        if time.monotonic() >= self._unstamped_until:
+            return time.time_ns()
+        self._frames.refuse(
+            "images without a time stamp were left out, as a simulation sends them that has no clock yet"
+        )
+        return None
 
     def _lens_for(self, native: tuple[int, int]) -> Lens | None:
         """The lens of the stream; None as long as its CameraInfo is waited for."""

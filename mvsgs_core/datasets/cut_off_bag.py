@@ -152,6 +152,8 @@ class CutOffBag:
 def cut_off_files(path: Path) -> list[Path]:
     """What can be walked of a bag that cannot be opened: the file itself, or those of a folder of ROS 2, in order."""
     if path.is_dir():
+        if any(path.glob("*.zstd")):  # parts that are compressed as a whole would be passed over
+            return []
         return [file for file in of_one_bag(path.glob("*.mcap")) if _is_ros_2(file)]
     return [path] if path.is_file() and (_is_ros_2(path) or _is_ros_1(path)) else []
 

@@ -36,7 +36,7 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
 }
 # what image_transport compresses without a conversion: "bayer_rggb8; jpeg compressed "
-_MOSAIC = re.compile(r"(bayer_[bgr]{4})(?:8|16) *; *\w+ +compressed *(?:bayer_\w+)? *")
+_MOSAIC = re.compile(r"(bayer_[bgr]{4})(?:8|16) *; *\w+ +compressed *(?:bayer_\w+ *)?")
 COMPRESSED = "/compressed"  # after the topic of images: the same as CompressedImage
 _RADIAL = ("plumb_bob", "rational_polynomial", "")
 _FISHEYE = ("equidistant", "fisheye")

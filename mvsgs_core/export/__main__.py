@@ -31,8 +31,10 @@ from mvsgs_core.export.image_sizes import check_sizes
 from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.ply import relative_origin, write_ply
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.export.splat import write_splat, write_spz
+from mvsgs_core.export.splat import spz_origin, write_splat, write_spz
 from mvsgs_core.export.transforms import write_transforms
+from mvsgs_core.export.turning import RUB_FROM_RDF
+from mvsgs_core.georeference import FILE as GEOREFERENCE
 from mvsgs_core.trajectory_file import write_trajectory
 
 BESIDE = Path()  # --images without a folder: those beside the map
@@ -51,9 +53,11 @@ def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
         {".splat": write_splat, ".spz": write_spz}[out.suffix](out, final)
     silent = final.antialiased and out.suffix != ".spz"
     told = "; antialiased: a viewer must be told, or shows it too bright" if silent else ""
-    origin = relative_origin(final)
+    origin = RUB_FROM_RDF @ spz_origin(final) if out.suffix == ".spz" else relative_origin(final)
     if origin.any():
-        told += f"; positions are relative to {' '.join(f'{value:.12g}' for value in origin)}, as float32 holds no more"
+        told += (
+            f"; positions are relative to {' '.join(f'{value:.12g}' for value in origin)}, as the format holds no more"
+        )
     return f"{len(final.splats)} splats, {out.stat().st_size} bytes{told}"
 
 
@@ -117,9 +121,11 @@ FORMATS = {  # by the suffix of OUT, of which a folder has none: writes the map,
 
 
 def _check_not_read(out: Path, options: argparse.Namespace) -> None:
-    """Raises ValueError where `out` would replace a file that it is made from."""
+    """Raises ValueError where `out` would replace a file that it is made from, or cannot be."""
+    if not out.absolute().parent.is_dir():
+        raise ValueError(f"{out}: there is no folder {out.parent}")
     cameras = options.cameras or options.map.with_name("cameras.json")
-    for path in filter(None, (options.map, cameras, options.trajectory)):
+    for path in filter(None, (options.map, cameras, options.trajectory, options.map.with_name(GEOREFERENCE))):
         if path.exists() and out.resolve() == path.resolve():
             raise ValueError(f"{out} is read for this export, which would replace it: give another file")
 
@@ -135,6 +141,7 @@ def export(options: argparse.Namespace) -> str:
     if write is None:
         raise ValueError(f"no format {out.suffix!r}; there are: {', '.join(filter(None, FORMATS))}, a folder")
     _check_not_read(out, options)
+    out = out.resolve() if out.is_symlink() else out  # what it leads to is replaced, and not the link
     final, left_out = read_map(options)
     options.reference = found = reference_of(options)
     if found is None:

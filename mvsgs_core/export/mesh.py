@@ -52,13 +52,17 @@ def write_mesh(
         render = _seen(final, cameras, k, min_opacity)
         if not (render.depth > 0).any():
             continue
-        farthest = float(render.depth.max())
+        # what lies as far as the bound is left out, and so would be the field behind a view's farthest surface
+        beyond = float(render.depth.max()) + (truncation + 1.0) * edge
         matrix = o3d.core.Tensor(camera.matrix(cameras.intrinsics[k]))
         extrinsic = o3d.core.Tensor(np.linalg.inv(final.relative_pose(pose)))
         depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(render.depth.numpy())))
         color_image = o3d.t.geometry.Image(o3d.core.Tensor(render.color.clamp(0.0, 1.0).contiguous().numpy()))
-        blocks = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1.0, farthest, truncation)
-        grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, 1.0, farthest, truncation)
+        try:
+            blocks = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1.0, beyond, truncation)
+        except RuntimeError:  # open3d looks at every so many pixels, of which none sees the map
+            continue
+        grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, 1.0, beyond, truncation)
     mesh = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
     if not len(mesh.triangles):
         raise ValueError("the depth makes no surface: try a larger --voxel")

@@ -47,7 +47,7 @@ def write_spz(path: Path, final: Snapshot) -> None:
     far, OSError where the file cannot be written.
     """
     splats = turned(folded(final.splats, final.kernel), RUB_FROM_RDF)
-    means = splats.means.numpy() + RUB_FROM_RDF @ (final.origin - relative_origin(final))
+    means = splats.means.numpy() + RUB_FROM_RDF @ (final.origin - spz_origin(final))
     typical = float(splats.log_scales.max(dim=1).values.median().exp()) if len(splats) else 1.0
     if typical < 2.0 * spz.STEP:
         raise ValueError(
@@ -65,6 +65,14 @@ def write_spz(path: Path, final: Snapshot) -> None:
     data = spz.packed(means, scales, quaternions, opacity, harmonics, final.antialiased)
     with replacing(path, sync=False) as aside:
         aside.write_bytes(data)
+
+
+def spz_origin(final: Snapshot) -> np.ndarray:
+    """(3,) that positions in an .spz are relative to, in the axes of the map: that of map.ply, or the map's own where
+    the format does not reach as far as world coordinates."""
+    relative = relative_origin(final)
+    world = np.abs(final.splats.means.numpy() + final.origin).max(initial=0.0)
+    return relative if relative.any() or world < spz.REACH else final.origin
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ _BLOCKED = 100  # ms that a writer waits for a slow reader before it goes on wit
 _EVERYTHING = SampleState.Any | ViewState.Any | InstanceState.Any
 _TAKEN = 64  # samples at once
 _SO_MEMINFO, _MEMINFO, _ROOM, _DROPS = 55, "9I", 1, 8  # linux/sock_diag.h; Python's socket does not name it
-_SIOCGIFADDR = 0x8915  # linux/sockios.h
+_SIOCGIFADDR, _NAME = 0x8915, 16  # linux/sockios.h; bytes of a device's name
 _IDL = {
     "?": bool, "u1": types.uint8, "i4": types.int32, "u4": types.uint32, "f8": types.float64,
     "i8": types.int64, "u8": types.uint64,
@@ -317,6 +317,8 @@ def _bind(descriptor: int, device: str) -> None:
     """Nothing that came in by another device reaches the socket any more."""
     with socket.socket(fileno=os.dup(descriptor)) as own:
         try:
+            if own.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _NAME).rstrip(b"\0") == os.fsencode(device):
+                return  # a second time needs a privilege
             own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, os.fsencode(device))
         except OSError as error:
             where = "this machine" if device == LOOPBACK else device

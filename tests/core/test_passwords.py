@@ -19,6 +19,7 @@ from mvsgs_core.passwords import without_passwords
         ("rtsp://host:554/user=admin_password=x", "rtsp://host:554/user=admin_password=***"),
         ("http://host/v.cgi?loginuse=me&loginpas=x", "http://host/v.cgi?loginuse=me&loginpas=***"),
         ("https://host/v?X-Amz-Signature=x&X-Amz-Date=1", "https://host/v?X-Amz-Signature=***&X-Amz-Date=1"),
+        ("http://host/v?x-api-key=x&access_key=y", "http://host/v?x-api-key=***&access_key=***"),
         ("http://host/monkey=3?keyboard=2", "http://host/monkey=3?keyboard=2"),
         ("no address: password=x", "no address: password=x"),
     ],

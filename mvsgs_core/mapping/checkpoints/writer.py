@@ -19,7 +19,11 @@ from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 
 AHEAD = 8  # keyframes whose images may wait to be written before their checkpoint is
-ASIDE = (".map.*.ply", ".trajectory.*.txt")  # what a killed process left half written, see `atomic_file`
+ASIDE = (
+    ".map.*.ply",
+    ".trajectory.*.txt",
+    "keyframes/.*.png",
+)  # what a killed process left half written, see `atomic_file`
 
 
 class CheckpointWriter:

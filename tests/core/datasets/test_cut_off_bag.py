@@ -95,6 +95,8 @@ def test_a_part_that_is_missing_is_said(tmp_path: Path) -> None:
     (tmp_path / "walk/walk_1.mcap.zstd").touch()
     settings.unlink()
     assert recognized(tmp_path / "walk") == []
+    with pytest.raises(BadFileError, match="ros2 bag reindex"):
+        open_dataset("bag", path=tmp_path / "walk")
 
 
 def test_records_of_a_topic_whose_name_was_lost_cost_no_others(tmp_path: Path) -> None:

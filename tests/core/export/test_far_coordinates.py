@@ -15,6 +15,7 @@ from mvsgs_core.export.cameras import write_cameras
 from mvsgs_core.export.mesh import write_stl
 from mvsgs_core.export.mesh_text import write_obj, write_off
 from mvsgs_core.export.ply import read_ply, write_ply
+from mvsgs_core.export.splat import spz_origin, write_spz
 from mvsgs_core.open3d_loader import open3d
 from tests.support.tiny_map import ORIGIN, cameras_around, final_map
 
@@ -52,6 +53,20 @@ def test_the_command_says_what_positions_are_relative_to(tmp_path: Path, capsys:
     write_ply(tmp_path / "map.ply", final_map(1, origin=UTM))
     assert export.main([str(tmp_path / "map.ply"), str(tmp_path / "map.splat")]) == 0
     assert "positions are relative to 465000 5240000 400" in capsys.readouterr().out
+
+
+def test_an_spz_reaches_a_map_that_is_far_away_and_says_its_origin_in_its_axes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    final = final_map(1, origin=np.array([3000.0, 400.0, 5.0]))  # float32 holds it, 24 bits do not
+    write_ply(tmp_path / "map.ply", final)
+    assert not read_ply(tmp_path / "map.ply").origin.any()
+    write_spz(tmp_path / "map.spz", final)
+    np.testing.assert_array_equal(spz_origin(final), final.origin)
+    write_ply(tmp_path / "far.ply", final_map(1, origin=UTM))
+    capsys.readouterr()
+    assert export.main([str(tmp_path / "far.ply"), str(tmp_path / "far.spz")]) == 0
+    assert "positions are relative to 465000 -5240000 -400" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".off"])

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from plyfile import PlyData
 
@@ -161,6 +163,29 @@ def test_views_are_fused_one_at_a_time(tmp_path: Path, monkeypatch: pytest.Monke
     cameras = cameras_around([0.2, 0.5, 0.8], SIZE, INTRINSICS)
     write_mesh(tmp_path / "mesh.ply", final_map(1, size=SIZE, opacity=0.98), cameras, voxel=0.05)
     assert done == 3 * ["rendered", "fused"]
+
+
+def test_a_wall_straight_ahead_is_fused_and_a_view_of_one_pixel_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Open3D takes what is nearer than a bound, and fails where none of the pixels that it looks at sees anything."""
+    render, seen = Snapshot.render, []
+
+    def rendered(self: Snapshot, pose: np.ndarray, lens: np.ndarray, size: tuple[int, int], **options: Any) -> Render:
+        found = render(self, pose, lens, size, **options)
+        depth = torch.full_like(found.depth, 2.0)
+        if size == SIZE:
+            seen.append(size)
+            if len(seen) == 2:
+                depth = torch.zeros_like(depth)
+                depth[1, 1] = 2.0
+        return replace(found, depth=depth, opacity=torch.ones_like(found.opacity))
+
+    monkeypatch.setattr(Snapshot, "render", rendered)
+    cameras = cameras_around([0.4, 0.6], SIZE, INTRINSICS)
+    vertices, triangles = write_mesh(tmp_path / "mesh.ply", final_map(1, size=SIZE), cameras, voxel=0.02)
+    assert vertices > 100
+    assert triangles > 100
 
 
 def test_a_mesh_that_no_camera_sees_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,6 +56,7 @@ def test_a_flight_that_is_broken_off_leaves_the_video_of_before(tmp_path: Path) 
         ("../run/map.ply", ["--mesh"]),
         ("cameras.json", ["--every", "2"]),
         ("poses.txt", ["--trajectory", "poses.txt"]),
+        ("georeference.json", []),
     ],
 )
 def test_what_is_read_is_not_replaced(
@@ -63,8 +64,22 @@ def test_what_is_read_is_not_replaced(
 ) -> None:
     run = write_tiny_run(tmp_path / "run")
     (run / "poses.txt").write_bytes((run / "trajectory.txt").read_bytes())
+    (run / "georeference.json").write_text("{}")
     monkeypatch.chdir(run)
     before = Path(out).read_bytes()
     assert export.main([str(run), out, *options]) == 1
     assert f"{out} is read for this export, which would replace it: give another file" in capsys.readouterr().err
     assert Path(out).read_bytes() == before
+
+
+def test_a_link_stays_one_and_a_folder_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, there = write_tiny_run(tmp_path / "run"), tmp_path / "there.ply"
+    link = tmp_path / "link.ply"
+    link.symlink_to(there)
+    assert export.main([str(run), str(link)]) == 0
+    assert link.is_symlink()
+    assert there.stat().st_size > 1000
+    assert export.main([str(run), str(tmp_path / "nowhere/map.ply")]) == 1
+    assert f"there is no folder {tmp_path / 'nowhere'}" in capsys.readouterr().err
