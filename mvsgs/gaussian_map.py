@@ -90,9 +90,9 @@ class GaussianMap:
         elif out.suffix in MESHES:
             write_mesh(out, self.snapshot, self._keyframes(out), voxel)
         elif out.suffix == ".json":
-            folder = out.parent / "keyframes" if images is None else Path(images)
-            check_sizes(folder, self._keyframes(out))
-            write_transforms(out, self._keyframes(out), folder)
+            folder, keyframes = out.parent / "keyframes" if images is None else Path(images), self._keyframes(out)
+            check_sizes(folder, keyframes)
+            write_transforms(out, keyframes, folder)
         elif not out.suffix:
             given = None if images is None else Path(images)
             write_colmap(out, self.snapshot, self._keyframes(out), given, observations)

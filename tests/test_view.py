@@ -86,28 +86,27 @@ def test_text_from_outside_has_no_markup_in_it() -> None:
     assert html.unescape(shown) == name.replace("\udc80", "\ufffd")
 
 
-def test_the_page_has_no_html_of_a_path(tmp_path: Path) -> None:
-    run = write_tiny_run(tmp_path / "run")
+def page_without_cameras(folder: Path, name: str) -> str:
+    """What the page of a map of that name gets, which has no cameras.json."""
+    run = write_tiny_run(folder)
     opened = MapPage("127.0.0.1", free_port())
     try:
-        SavedMapView(opened, read_ply(run / "map.ply"), None, run, "<b>kitchen</b>/map.ply")
-        got = page(opened.url)
-        assert "<b>" not in got
-        assert "**&#60;b&#62;kitchen&#60;&#47;b&#62;&#47;map&#46;ply**" in got
+        SavedMapView(opened, read_ply(run / "map.ply"), None, run, name)
+        return page(opened.url)
     finally:
         opened.server.stop()
+
+
+def test_the_page_has_no_html_of_a_path(tmp_path: Path) -> None:
+    got = page_without_cameras(tmp_path / "run", "<b>kitchen</b>/map.ply")
+    assert "<b>" not in got
+    assert "**&#60;b&#62;kitchen&#60;&#47;b&#62;&#47;map&#46;ply**" in got
 
 
 def test_a_map_of_another_program_is_shown_without_keyframes(tmp_path: Path) -> None:
-    run = write_tiny_run(tmp_path / "run")
-    opened = MapPage("127.0.0.1", free_port())
-    try:
-        SavedMapView(opened, read_ply(run / "map.ply"), None, run, "tiny")
-        got = page(opened.url)
-        assert "/splats" in got
-        assert "no cameras.json beside this map" in got
-    finally:
-        opened.server.stop()
+    got = page_without_cameras(tmp_path / "run", "tiny")
+    assert "/splats" in got
+    assert "no cameras.json beside this map" in got
 
 
 @pytest.mark.slow

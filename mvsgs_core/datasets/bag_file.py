@@ -119,9 +119,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """None where some are compressed as a whole: which parts there are is then known to metadata.yaml alone."""
-    databases = [] if any(folder.glob("*.zstd")) else of_one_bag(folder.glob("*.db3"))
-    return databases or cut_off_files(folder)
+    return of_one_bag(folder, ".db3") or cut_off_files(folder)
 
 
 def _repair(path: Path) -> str:

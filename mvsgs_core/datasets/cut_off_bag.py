@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
@@ -152,16 +152,18 @@ class CutOffBag:
 def cut_off_files(path: Path) -> list[Path]:
     """What can be walked of a bag that cannot be opened: the file itself, or those of a folder of ROS 2, in order."""
     if path.is_dir():
-        if any(path.glob("*.zstd")):  # parts that are compressed as a whole would be passed over
-            return []
-        return [file for file in of_one_bag(path.glob("*.mcap")) if _is_ros_2(file)]
+        return [file for file in of_one_bag(path, ".mcap") if _is_ros_2(file)]
     return [path] if path.is_file() and (_is_ros_2(path) or _is_ros_1(path)) else []
 
 
-def of_one_bag(files: Iterable[Path]) -> list[Path]:
-    """The same in their order, where a recorder of ROS 2 has numbered them (walk_0, walk_1) or there is but one; else
-    none: several bags that lie in one folder."""
-    found = sorted(filter(Path.is_file, files), key=lambda file: natural_order(file.name))
+def of_one_bag(folder: Path, suffix: str) -> list[Path]:
+    """The files of that suffix in their order, where a recorder of ROS 2 has numbered them (walk_0, walk_1) or there is
+    but one. None of several bags that lie in one folder, nor beside parts that are compressed as a whole, which would
+    be passed over: metadata.yaml alone says which parts there are."""
+    if any(folder.glob("*.zstd")):
+        return []
+    files = filter(Path.is_file, folder.glob(f"*{suffix}"))
+    found = sorted(files, key=lambda file: natural_order(file.name))
     names = {_NUMBERED.sub("", file.stem) if _NUMBERED.search(file.stem) else None for file in found}
     return found if len(found) == 1 or (len(names) == 1 and None not in names) else []
 

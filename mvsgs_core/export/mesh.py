@@ -21,6 +21,7 @@ from mvsgs_core.rasterizer.rasterize import Render
 
 SUFFIXES = (".glb", ".ply", ".obj", ".off", ".stl")
 GLANCE = 4  # times smaller than the images: the renders that the size of a voxel is measured on
+UNTOUCHED = "No block is touched"  # as open3d says it
 OFF_BY = 0.01  # of a voxel's edge, by which what is written may be; a tenth where the format has no way out
 
 
@@ -60,8 +61,10 @@ def write_mesh(
         color_image = o3d.t.geometry.Image(o3d.core.Tensor(render.color.clamp(0.0, 1.0).contiguous().numpy()))
         try:
             blocks = grid.compute_unique_block_coordinates(depth_image, matrix, extrinsic, 1.0, beyond, truncation)
-        except RuntimeError:  # open3d looks at every so many pixels, of which none sees the map
-            continue
+        except RuntimeError as error:
+            if UNTOUCHED in str(error):  # open3d looks at every so many pixels, of which none sees the map
+                continue
+            raise
         grid.integrate(blocks, depth_image, color_image, matrix, matrix, extrinsic, 1.0, beyond, truncation)
     mesh = grid.extract_triangle_mesh(weight_threshold=0.5).to_legacy()
     if not len(mesh.triangles):
