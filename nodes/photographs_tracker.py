@@ -14,6 +14,7 @@ from mvsgs_core.photographs.tracker import PhotographTracker
 from mvsgs_core.tracking.publish import Update
 from nodes.tracking import TrackerNode
 
+KEPT = 4  # lenses whose maps are kept: each photograph may have another, and a map takes as much as its image
 VISIBLE = 1.0  # pixels by which a distortion must bend the corner of an image to be taken out of it
 
 
@@ -33,7 +34,8 @@ class PhotographsTracker(TrackerNode):
         super().__init__(config)
         self.core = PhotographTracker(self.config)
         self._bent = False  # a keyframe of the largest part
-        self._lenses: dict[tuple[float, ...], Undistortion] = {}  # by intrinsics, k1, k2, height and width
+        self._lenses: dict[tuple[float, ...], Undistortion] = {}  # the newest, by intrinsics, k1, k2, height and width
+        self._said: set[tuple[float, float, float]] = set()  # lenses whose distortion was told
 
     def _add(self, frame: Frame) -> Update:
         guessed, place = frame.intrinsics_guessed, self._places.get(frame.index)
@@ -79,8 +81,11 @@ class PhotographsTracker(TrackerNode):
         if key not in self._lenses:
             r2 = (max(cx, size[1] - cx) / fx) ** 2 + (max(cy, size[0] - cy) / fy) ** 2
             bent = abs(r2 * (k1 + r2 * k2)) * r2**0.5 * fx
+            if len(self._lenses) == KEPT:
+                del self._lenses[next(iter(self._lenses))]
             self._lenses[key] = Undistortion(Lens((fx, fy, cx, cy), size, (k1, k2, 0.0, 0.0) if bent > VISIBLE else ()))
-            if bent > VISIBLE:
+            if bent > VISIBLE and (factor, k1, k2) not in self._said:
+                self._said.add((factor, k1, k2))
                 self._bent |= (factor, k1, k2) == self.core.lens
                 self.stats.warn(
                     f"the photographs are distorted, by up to {bent:.0f} pixels, which is taken out: "

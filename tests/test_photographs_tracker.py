@@ -28,7 +28,7 @@ from mvsgs_core.datasets import Item, open_dataset
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.photographs.config import PhotographsConfig
 from nodes import handlers, outputs
-from nodes.photographs_tracker import PhotographsTracker
+from nodes.photographs_tracker import KEPT, PhotographsTracker
 from tests.support.photograph_ring import position_error
 from tests.support.shared_data import shared
 
@@ -211,3 +211,15 @@ def test_numbers_of_which_nothing_can_come_are_refused() -> None:
         PhotographsConfig(features=10)
     with pytest.raises(ValueError, match=r"tracker\.neighbors=1"):
         PhotographsConfig(neighbors=1)
+
+
+def test_lenses_that_differ_take_no_more_memory_and_are_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with intrinsics of each photograph."""
+    node = PhotographsTracker()
+    monkeypatch.setattr(node.core, "keyframe_lens", lambda index: (1.0, -0.1, 0.0))
+    image = np.zeros((48, 64, 3), np.uint8)
+    for n in range(10):
+        lens = node._undistortion(Frame(n, float(n), image, np.array([60.0 + n, 60.0 + n, 31.5, 23.5]), False))
+        assert lens.image(image).shape == image.shape
+    assert len(node._lenses) == KEPT
+    assert sum("distorted" in text for text in node.stats.warnings) == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
 from mvsgs_core.geodesy import earth_centered
@@ -11,6 +13,9 @@ RATIO = 0.8  # of the distances to the best and the second best (Lowe 2004)
 BLOCK = 512  # features whose similarities are looked at while they are in the cache
 FIRST = 200  # features of a photograph, of the largest scale, that propose its pairs
 EXHAUSTIVE = 30  # photographs: of so many all pairs are matched
+COPY = 0.7  # of these features are matched between two photographs from one place
+COPIES = 3  # of a photograph that it is matched with
+TOGETHER = 256  # photographs that one is compared with at once, for memory's sake
 
 
 def match(a: Features, b: Features) -> np.ndarray:
@@ -39,16 +44,34 @@ def match(a: Features, b: Features) -> np.ndarray:
 def propose_pairs(features: list[Features], neighbors: int) -> list[tuple[int, int]]:
     """Pairs (i < j) that share enough features of a large scale (preemptive matching, Wu 2013), those most alike first.
 
-    Each photograph brings its `neighbors` most alike; of few photographs all pairs are proposed.
+    Each photograph brings its `neighbors` most alike; of few photographs all pairs are proposed. Copies (bursts, a
+    camera at rest) count as one: however many there are, each place is matched with others.
     """
     count = len(features)
     alike = likeness(features)
-    upper = [(i, j) for i in range(count) for j in range(i + 1, count)]
     if count > EXHAUSTIVE:
-        nearest = np.argsort(-alike, axis=1, kind="stable")[:, :neighbors]
-        chosen = {(min(i, int(j)), max(i, int(j))) for i in range(count) for j in nearest[i] if alike[i, j] > 0}
-        upper = [pair for pair in upper if pair in chosen]
-    return sorted(upper, key=lambda pair: (-alike[pair], pair))
+        pairs = {(min(i, j), max(i, j)) for i in range(count) for j in _most_alike(alike, i, neighbors)}
+    else:
+        pairs = set(combinations(range(count), 2))
+    return sorted(pairs, key=lambda pair: (-alike[pair], pair))
+
+
+def _most_alike(alike: np.ndarray, of: int, count: int) -> list[int]:
+    """Up to `count` photographs, those most alike first: `COPIES` of itself at most, and one of others' copies."""
+    same = alike >= COPY * FIRST
+    chosen: list[int] = []
+    copies = 0
+    for other in np.argsort(-alike[of], kind="stable").tolist():
+        if len(chosen) == count or alike[of, other] <= 0:
+            break
+        if same[of, other]:
+            copies += 1
+            if copies > COPIES:
+                continue
+        elif same[other, chosen].any():
+            continue
+        chosen.append(other)
+    return chosen
 
 
 def near_pairs(places: list[np.ndarray | None], nearest: int) -> list[tuple[int, int]]:
@@ -74,15 +97,16 @@ def likeness(features: list[Features]) -> np.ndarray:
         part = found.descriptors[:FIRST]
         first[n, : len(part)] = part
     alike = np.zeros((count, count))
-    for n in range(count - 1):
-        others = first[n + 1 :]
+    for n, begin in ((n, begin) for n in range(count - 1) for begin in range(n + 1, count, TOGETHER)):
+        others = first[begin : begin + TOGETHER]
         similarity = (others.reshape(-1, 128) @ first[n].T).reshape(len(others), FIRST, FIRST)
         best, back = similarity.argmax(axis=2), similarity.argmax(axis=1)
         value = np.take_along_axis(similarity, best[..., None], axis=2)
         np.put_along_axis(similarity, best[..., None], -1.0, axis=2)
         mutual = np.take_along_axis(back, best, axis=1) == np.arange(FIRST)
         distinct = 1.0 - value[..., 0] < RATIO**2 * (1.0 - similarity.max(axis=2))
-        alike[n, n + 1 :] = alike[n + 1 :, n] = (mutual & distinct & (value[..., 0] > 0.0)).sum(axis=1)
+        shared = (mutual & distinct & (value[..., 0] > 0.0)).sum(axis=1)
+        alike[n, begin : begin + len(others)] = alike[begin : begin + len(others), n] = shared
     return alike
 
 

@@ -6,7 +6,7 @@ from it (PnP), adds points, and bundle adjustment mends what is around it, or ev
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,7 @@ SETTLED = 1e-3  # of the observations: where fewer came or went, adjusting every
 ROUGH = 1e-3  # of the cost: a smaller gain ends an adjustment while the map still grows
 FOR_FOCAL, FOR_DISTORTION = 3, 5  # photographs, from which on these are estimated
 FOR_OTHERS = 10  # photographs of a model whose lens holds for what is put together after it
+SAME_CAMERA = 1.05  # between focal lengths that were given for one camera
 GRIDS = (2, 4, 8, 16)  # boxes along a side, over which a photograph's points are spread
 
 
@@ -97,12 +98,15 @@ class Reconstruction:
         while len(self.order) >= 2:
             chosen = self._next(left)
             if chosen is None:
-                if not self._failed or (len(self.order) <= settled and bent):
+                if not self._failed:
                     return
-                bent = len(self.order) <= settled  # the mended map has brought no more: it may be bent there
                 if len(self.order) > self._adjusted:
-                    self._adjust_all()
-                settled = len(self.order)
+                    self._adjust_all()  # which may take poses back: what came and went again is no gain
+                gained = len(self.order) > settled
+                if bent and not gained:
+                    return
+                bent = not gained  # the mended map has brought no more: it may be bent there
+                settled = max(settled, len(self.order))
                 self._failed.clear()  # once more
                 continue
             index, seen = chosen
@@ -165,8 +169,9 @@ class Reconstruction:
         count = np.bincount(self.tracks.photograph[mapped], minlength=len(left))
         score = np.zeros(len(left))
         for side, box in zip(GRIDS, self._box):
-            key = np.unique(self.tracks.photograph[mapped] * side * side + box[mapped])
-            score += side * np.bincount(key // (side * side), minlength=len(left))
+            filled = np.zeros((len(left), side * side), bool)
+            filled[self.tracks.photograph[mapped], box[mapped]] = True
+            score += side * np.count_nonzero(filled, axis=1)
         for index, seen in self._failed.items():
             if count[index] < AGAIN * seen:
                 open_[index] = False
@@ -328,19 +333,39 @@ def all_models(
     mapped: np.ndarray,
     free_lens: bool,
 ) -> Iterator[Model]:
-    """The model that grows from the best two views, then those of the photographs that it leaves, of `mapped` (P,).
+    """The models that grow from the photographs `mapped` (P,): of each group that pairs tie together, then of its rest.
 
-    All have one lens: that of a model of enough photographs stays, as few views of a part may fit any.
+    A model of enough photographs gives its lens to later ones by the same camera, as few views may fit any.
     """
-    left = mapped.copy()
-    while left.sum() >= 2:
-        model = Reconstruction(tracks, lens, sizes, free_lens).run(pairs, points, left)
+    length = lens.intrinsics[:, :2].mean(axis=1) / sizes.max(axis=1)  # focal lengths as they were given
+    held: list[tuple[np.ndarray, SharedLens]] = []  # the focal lengths in a model, and its lens
+    groups = connected(pairs, mapped)
+    while groups:
+        left = groups.pop(0)
+        known = next((found for of, found in held if _one_camera(of, length[left])), None)
+        model = Reconstruction(tracks, known or lens, sizes, free_lens and known is None).run(pairs, points, left)
         if model is None:
-            return
+            continue
         yield model
         if free_lens and len(model.order) >= FOR_OTHERS:
-            lens, free_lens = model.lens, False
-        left &= ~model.registered
+            held.append((length[model.registered], model.lens))
+        groups = connected(pairs, left & ~model.registered) + groups
 
 
-__all__ = ["Model", "Reconstruction", "all_models"]
+def connected(pairs: Iterable[tuple[int, int]], among: np.ndarray) -> list[np.ndarray]:
+    """The groups of `among` (P,) bool that pairs tie together and that may be a model, as masks, the largest first."""
+    group = np.arange(len(among))
+    for i, j in pairs:
+        if among[i] and among[j] and group[i] != group[j]:
+            group[group == group[j]] = group[i]
+    names, count = np.unique(group[among], return_counts=True)
+    large = np.argsort(-count, kind="stable")
+    return [among & (group == names[n]) for n in large if count[n] >= MIN_PHOTOGRAPHS]
+
+
+def _one_camera(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether focal lengths, over the image's size, may be those of one lens."""
+    return bool(np.median(b) < SAME_CAMERA * a.max() and np.median(b) > a.min() / SAME_CAMERA)
+
+
+__all__ = ["Model", "Reconstruction", "all_models", "connected"]

@@ -17,6 +17,8 @@ from mvsgs_core.tracking.places.retrieval import Retrieval
 from mvsgs_core.tracking.places.thinning import solve_thinned
 from mvsgs_core.tracking.steps import Steps, whole
 
+UNMATCHED = 1e3  # times as loose: neighbors in the stream that no match ties, as where the camera was lost between them
+
 
 @dataclass(frozen=True)
 class LoopConfig:
@@ -117,16 +119,18 @@ class LoopCloser:
         poses = np.stack([self.graph.keyframes[k].cam_from_world for k in order])
         unit = float(np.median([self.graph.keyframes[k].median_depth for k in order]))
         tied = self.graph.edges.of(order)
-        pairs = {(min(a, b), max(a, b)) for a, b in tied if a in number and b in number}
-        pairs |= set(pairwise(order))
-        source, to = np.array([(number[a], number[b]) for a, b in sorted(pairs)]).T
+        matched = {(min(a, b), max(a, b)) for a, b in tied if a in number and b in number}
+        pairs = sorted(matched | set(pairwise(order)))
+        source, to = np.array([(number[a], number[b]) for a, b in pairs]).T
+        sigma = np.tile([0.01 * unit, 0.005, 0.01], (len(pairs) + 1, 1))
+        sigma[[n for n, pair in enumerate(pairs) if pair not in matched]] *= UNMATCHED
         edges = SimilarityEdges(
             source=np.append(source, number[found.index]),
             to=np.append(to, number[index]),
             relative=np.concatenate(
                 [poses[to] @ geometry.inverse(poses[source]), [self._measured(found, index, scale)]]
             ),
-            sigma=np.tile([0.01 * unit, 0.005, 0.01], (len(source) + 1, 1)),
+            sigma=sigma,
         )
         solution = solve_thinned(poses, edges)
         if solution.failure or not np.isfinite(solution.similarities).all():

@@ -32,7 +32,9 @@ def solve_thinned(poses: np.ndarray, edges: SimilarityEdges) -> PoseGraphSolutio
     count = len(poses)
     if count <= MAX_NODES:
         return solve_pose_graph(poses, edges, {0})
-    nodes = thinned(count, {int(edges.source[-1]), int(edges.to[-1])})
+    loose = _loose(edges)
+    ends = [edges.source[-1:], edges.to[-1:], edges.source[:-1][loose], edges.to[:-1][loose]]
+    nodes = thinned(count, {int(end) for end in np.concatenate(ends)})
     solution = solve_pose_graph(poses[nodes], _between(poses, edges, nodes), {0})
     if solution.failure or not np.isfinite(solution.similarities).all():
         return solution
@@ -45,22 +47,33 @@ def thinned(count: int, kept: set[int]) -> np.ndarray:
     return np.array(sorted({*even, *kept}))
 
 
+def _loose(edges: SimilarityEdges) -> np.ndarray:
+    """(E - 1,) bool: the steps that nobody measured, whose sigma is larger. Nodes stand on both sides of each."""
+    return np.asarray(edges.sigma[:-1, 0] > edges.sigma[:-1, 0].min())
+
+
 def _between(poses: np.ndarray, edges: SimilarityEdges, nodes: np.ndarray) -> SimilarityEdges:
     """Edges between the nodes: each step as loose as the steps that it stands for, and where others tie two of them."""
     # An edge counts for the nodes that its ends are nearest to.
     middles = 0.5 * (nodes[1:] + nodes[:-1])
     source, to = (np.searchsorted(middles, ends[:-1]) for ends in (edges.source, edges.to))
-    pairs = {(min(a, b), max(a, b)) for a, b in zip(source.tolist(), to.tolist()) if a != b}
-    pairs |= set(pairwise(range(len(nodes))))
-    a, b = np.array(sorted(pairs)).T
-    steps = np.where(b - a == 1, nodes[b] - nodes[a], len(poses) / len(nodes))
+    sigma = edges.sigma[:-1].min(axis=0)
+    of = {step: sigma * np.sqrt(nodes[step[1]] - nodes[step[0]]) for step in pairwise(range(len(nodes)))}
+    for loose in (True, False):  # what was measured replaces what was not
+        for n in np.flatnonzero(_loose(edges) == loose):
+            a, b = int(source[n]), int(to[n])
+            if a != b:
+                steps = nodes[b] - nodes[a] if b - a == 1 else len(poses) / len(nodes)
+                of[a, b] = edges.sigma[n] * np.sqrt(steps)
+    pairs = sorted(of)
+    a, b = np.array(pairs).T
     relative = poses[nodes[b]] @ geometry.inverse(poses[nodes[a]])
     loop = [int(np.searchsorted(nodes, end[-1])) for end in (edges.source, edges.to)]
     return SimilarityEdges(
         source=np.append(a, loop[0]),
         to=np.append(b, loop[1]),
         relative=np.concatenate([relative, edges.relative[-1:]]),
-        sigma=np.concatenate([edges.sigma[0] * np.sqrt(steps)[:, None], edges.sigma[-1:]]),
+        sigma=np.concatenate([[of[pair] for pair in pairs], edges.sigma[-1:]]),
     )
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+import tracemalloc
 
+import numpy as np
+import pytest
+
+from mvsgs_core.photographs import matching
 from mvsgs_core.photographs.features import Features, find_features
 from mvsgs_core.photographs.matching import EXHAUSTIVE, FIRST, likeness, match, near_pairs, propose_pairs
 from tests.support.sequences import synthetic
@@ -87,6 +91,30 @@ def test_pairs_are_those_that_look_alike_and_few_photographs_are_all_paired() ->
     assert {(n, n + 1) for n in range(count - 1)} <= set(pairs)
     assert len(pairs) <= 2 * count
     assert len(propose_pairs(around[:6], 2)) == 15
+
+
+def test_each_place_is_matched_with_others_however_often_it_was_photographed() -> None:
+    """As bursts, or a camera that rests on a tripod."""
+    places = [random_features(FIRST // 2, seed).descriptors for seed in range(5)]
+    views = [described(np.zeros((FIRST, 2)), np.concatenate([places[n], places[n + 1]])) for n in range(4)]
+    copies = [shuffled(view, 10 * n + k)[0] for n, view in enumerate(views) for k in range(10)]
+    pairs = {(i // 10, j // 10) for i, j in propose_pairs(copies, 5)}
+    assert {(0, 1), (1, 2), (2, 3)} <= pairs
+    assert len(propose_pairs(copies, 5)) <= 5 * len(copies)
+
+
+def test_many_photographs_are_compared_without_a_list_of_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    count = 2000
+    alike = np.zeros((count, count), np.float32)
+    near = np.arange(count - 1)
+    alike[near, near + 1] = alike[near + 1, near] = 10.0
+    monkeypatch.setattr(matching, "likeness", lambda features: alike)
+    tracemalloc.start()
+    pairs = propose_pairs([random_features(2, 0)] * count, 2)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert pairs == list(zip(near.tolist(), (near + 1).tolist()))
+    assert peak < 60e6  # two million tuples take more
 
 
 def test_gps_proposes_the_nearest_and_nothing_where_it_is_not_known() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvsgs_core.photographs.ordering import chain, covisibility
-from mvsgs_core.photographs.reconstruction import Model, all_models
+from mvsgs_core.photographs.reconstruction import Model, Reconstruction, all_models, connected
 from mvsgs_core.photographs.registration import MIN_SEEN, register
 from mvsgs_core.photographs.tracks import link
 from mvsgs_core.photographs.two_views import TwoViews
@@ -67,19 +67,39 @@ def test_a_lens_that_is_known_stays() -> None:
     assert model.lens == of.lens
 
 
-def test_photographs_that_share_nothing_are_two_parts() -> None:
-    one, other = ring(4), ring(4, seed=5)
-    pixels = np.full((8, 800, 2), np.nan)
-    pixels[:4, :400], pixels[4:, 400:] = one.pixels, other.pixels
-    intrinsics = np.concatenate([one.lens.intrinsics, other.lens.intrinsics])
-    both = Ring(
-        np.concatenate([one.cam_from_world, other.cam_from_world]),
-        np.concatenate([one.world, other.world]),
-        pixels,
-        replace(one.lens, intrinsics=intrinsics),
+def beside(*rings: Ring) -> Ring:
+    """Photographs of several places that share nothing; features of one are none of another."""
+    points = [of.pixels.shape[1] for of in rings]
+    first = np.cumsum([0, *points])
+    pixels = [np.full((len(of.pixels), first[-1], 2), np.nan) for of in rings]
+    for n, of in enumerate(rings):
+        pixels[n][:, first[n] : first[n + 1]] = of.pixels
+    return Ring(
+        np.concatenate([of.cam_from_world for of in rings]),
+        np.concatenate([of.world for of in rings]),
+        np.concatenate(pixels),
+        replace(rings[0].lens, intrinsics=np.concatenate([of.lens.intrinsics for of in rings])),
     )
+
+
+def test_photographs_that_share_nothing_are_two_parts() -> None:
+    both = beside(ring(4), ring(4, seed=5))
     models = models_of(both, both.pairs())
     assert sorted(tuple(np.flatnonzero(model.registered)) for model in models) == [(0, 1, 2, 3), (4, 5, 6, 7)]
+
+
+def test_places_that_were_photographed_twice_do_not_keep_a_map_from_growing() -> None:
+    twice = [ring(2, step=24.0, seed=seed) for seed in (1, 2, 3)]  # these match best
+    of = beside(*twice, ring(5, points=120))
+    models = models_of(of, of.pairs())
+    assert [np.flatnonzero(model.registered).tolist() for model in models] == [[6, 7, 8, 9, 10]]
+
+
+def test_groups_are_what_pairs_tie_together() -> None:
+    among = np.ones(9, bool)
+    among[8] = False
+    groups = connected([(0, 1), (3, 4), (4, 5), (6, 2), (1, 2), (5, 8), (7, 8)], among)
+    assert [np.flatnonzero(group).tolist() for group in groups] == [[0, 1, 2, 6], [3, 4, 5]]
 
 
 def test_a_photograph_of_something_else_gets_no_pose() -> None:
@@ -103,18 +123,50 @@ def test_a_photograph_that_the_map_fits_roughly_comes_last() -> None:
 
 
 def test_a_small_part_has_the_lens_of_the_large_one() -> None:
-    large, small = ring(10, k1=-0.05), ring(3, k1=-0.05, seed=5)
-    pixels = np.full((13, 800, 2), np.nan)
-    pixels[:10, :400], pixels[10:, 400:] = large.pixels, small.pixels
-    both = Ring(
-        np.concatenate([large.cam_from_world, small.cam_from_world]),
-        np.concatenate([large.world, small.world]),
-        pixels,
-        replace(large.lens, intrinsics=np.concatenate([large.lens.intrinsics, small.lens.intrinsics])),
-    )
+    both = beside(ring(10, k1=-0.05), ring(3, k1=-0.05, seed=5))
     first, second = models_of(both, both.pairs(), factor=1.15)
     assert [int(model.registered.sum()) for model in (first, second)] == [10, 3]
     assert second.lens == first.lens
+
+
+def test_a_part_by_another_camera_has_a_lens_of_its_own() -> None:
+    one, other = ring(12, k1=-0.05), ring(10, k1=0.08, seed=5)
+    other = replace(other, lens=replace(other.lens, intrinsics=1.4 * other.lens.intrinsics))
+    pixels = (other.pixels - [0.5 * (SIZE[1] - 1), 0.5 * (SIZE[0] - 1)]) * 1.4 + 1.4 * np.array([319.5, 239.5])
+    both = beside(one, replace(other, pixels=pixels))
+    first, second = models_of(both, both.pairs())
+    assert second.registered.sum() == 10
+    assert abs(first.lens.k1 + 0.05) < 0.03
+    assert abs(second.lens.k1 - 0.08) < 0.03
+    assert position_error(second.cam_from_world[12:], other.cam_from_world) < 0.005
+
+
+def test_a_photograph_that_comes_and_goes_does_not_keep_the_map_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that PnP takes and adjustment drops, beside one that never gets a pose: both are tried again."""
+    of, random = ring(8), np.random.default_rng(0)
+    pixels = of.pixels.copy()
+    few = np.flatnonzero(np.isfinite(pixels[3, :, 0]))
+    pixels[3, few[60:]] = np.nan
+    pixels[3] += random.normal(0.0, 8.0, pixels[3].shape)
+    strange = np.flatnonzero(np.isfinite(pixels[6, :, 0]))
+    pixels[6, strange[40:]] = np.nan
+    pixels[6, strange[:40]] = random.uniform(0, 480, (40, 2))
+    odd = replace(of, pixels=pixels)
+    pairs = odd.pairs()
+    for a, b in ((2, 3), (3, 4), (5, 6), (6, 7)):
+        both = np.flatnonzero(np.isfinite(pixels[a, :, 0]) & np.isfinite(pixels[b, :, 0]))
+        pairs[a, b] = replace(next(iter(pairs.values())), matches=np.stack([both, both], axis=1))
+    adjusted, adjust = [0], Reconstruction._adjust_all
+
+    def counted(self: Reconstruction, last: bool = False) -> None:
+        adjusted[0] += 1
+        assert adjusted[0] < 100, "it goes on for ever"
+        adjust(self, last)
+
+    monkeypatch.setattr(Reconstruction, "_adjust_all", counted)
+    (model,) = models_of(odd, pairs)
+    assert {0, 1, 2, 4, 5, 7} <= set(np.flatnonzero(model.registered).tolist())
+    assert not model.registered[6]
 
 
 def test_two_photographs_alone_are_no_model() -> None:

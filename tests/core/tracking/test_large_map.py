@@ -201,6 +201,24 @@ def test_thinned_pose_graph_closes_a_loop_as_the_whole_one(monkeypatch: pytest.M
     assert np.abs(np.diff(steps)).max() < 0.1 * steps.mean()  # no seam at a node
 
 
+@pytest.mark.parametrize("reached_across", [False, True])
+def test_thinned_pose_graph_gives_a_step_that_nobody_measured_the_loops_error(
+    reached_across: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(thinning, "MAX_NODES", 60)
+    monkeypatch.setattr(thinning, "THINNED", 24)
+    true, poses, edges = drifting(90, 1.0)
+    poses[45:] = poses[45:] @ geometry.se3_exp(np.array([0.3, 0.1, -0.2, 0.0, 0.05, 0.0]))
+    source, to = (np.insert(ends, -1, end) for ends, end in ((edges.source, 43), (edges.to, 46)))
+    sigma = np.insert(edges.sigma, -1, edges.sigma[0] if reached_across else 1e9, axis=0)
+    sigma[44] *= 1e3
+    relative = np.concatenate([poses[to[:-1]] @ geometry.inverse(poses[source[:-1]]), edges.relative[-1:]])
+    thin = thinning.solve_thinned(poses, SimilarityEdges(source, to, relative, sigma))
+    before, after = (np.linalg.norm(places(s) - places(true), axis=1).max() for s in (poses, thin.similarities))
+    assert not thin.failure
+    assert (after < 0.05 * before) != reached_across  # where an edge reaches across, it is a step as any other
+
+
 def disturbed() -> KeyframeGraph:
     graph, random = chain(), np.random.default_rng(1)
     for apart in (1, 2):

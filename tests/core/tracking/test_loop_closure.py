@@ -153,6 +153,20 @@ def test_edges_of_the_graph_hold_the_ring_together() -> None:
     assert steps[0] > 3.0 * steps[1], "what edges hold is not bent"
 
 
+def test_a_step_that_no_match_ties_takes_the_loops_error() -> None:
+    """As where the camera was lost and found again: what lies between two such keyframes was never measured."""
+    true, gap = ring(), COUNT // 2
+    graph = drifted(true, 1.0)
+    graph.edges.update({(n, n + 1): NO_EDGE for n in range(COUNT - 1) if n != gap})
+    shift = geometry.se3_exp(np.array([0.3, 0.1, -0.2, 0.0, 0.05, 0.0]))
+    for n in range(gap + 1, COUNT):
+        graph.keyframes[n].cam_from_world = graph.keyframes[n].cam_from_world @ shift
+    position, _ = errors(true, graph)
+    assert position > 0.1
+    closer(graph).close(*between(true, graph, 0, COUNT - 1))
+    assert errors(true, graph)[0] < 0.02 * position
+
+
 def test_a_loop_that_the_map_agrees_with_only_adds_an_edge() -> None:
     graph = ring()
     before = state(graph)
