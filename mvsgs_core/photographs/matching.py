@@ -97,7 +97,7 @@ def likeness(features: list[Features]) -> np.ndarray:
         part = found.descriptors[:FIRST]
         first[n, : len(part)] = part
     alike = np.zeros((count, count))
-    for n, begin in ((n, begin) for n in range(count - 1) for begin in range(n + 1, count, TOGETHER)):
+    for n, begin in ((k, begin) for k in range(count - 1) for begin in range(k + 1, count, TOGETHER)):
         others = first[begin : begin + TOGETHER]
         similarity = (others.reshape(-1, 128) @ first[n].T).reshape(len(others), FIRST, FIRST)
         best, back = similarity.argmax(axis=2), similarity.argmax(axis=1)
