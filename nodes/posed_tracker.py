@@ -38,6 +38,7 @@ class PosedTracker(Node):
         self._truths: dict[int, GroundTruth] = {}  # without their frames yet
         self._joined: dict[int, tuple[float, np.ndarray]] = {}  # timestamp and pose (4, 4), NaN where there is none
         self._keyframes: dict[int, np.ndarray | None] = {}  # with the exposure (3, 4) that was sent
+        self._known: dict[int, object] = {}  # of the same, what their exposures were made of when they were looked at
         self._vignetting: np.ndarray | None = None  # (3,) that was sent
         self._places: dict[int, np.ndarray] = {}  # by GPS
         self._revision = 0
@@ -174,11 +175,12 @@ class PosedTracker(Node):
 
     def _exposed(self, core: CoreTracker) -> Iterator[Poses]:
         """What the light of the keyframes sent is now, where it changed."""
-        now = {index: core.photometer.exposure(index) for index in self._keyframes}
-        vignetting = changed_vignetting(core.photometer.vignetting, self._vignetting)
-        changed = [
-            index for index, sent in self._keyframes.items() if vignetting is not None or differ(now[index], sent)
-        ]
+        light = core.photometer
+        vignetting = changed_vignetting(light.vignetting, self._vignetting)
+        known = {index: light.known(index) for index in self._keyframes}
+        asked = [i for i in known if vignetting is not None or known[i] is not self._known.get(i)]  # of thousands few
+        self._known, now = known, {index: light.exposure(index) for index in asked}
+        changed = [i for i, exposure in now.items() if vignetting is not None or differ(exposure, self._keyframes[i])]
         if not changed:
             return
         self._revision += 1

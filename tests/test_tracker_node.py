@@ -6,6 +6,7 @@ import itertools
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -283,6 +284,31 @@ def run_posed(order: list[Frame | GroundTruth]) -> list[msgs.Message]:
     for message in order:
         sent += node.on_frame(message) if isinstance(message, Frame) else node.on_ground_truth(message)
     return [*sent, *node.on_end()]
+
+
+def test_with_true_poses_only_exposures_that_may_have_changed_are_looked_at() -> None:
+    """Not those of all keyframes at each one: of a long stream that is the square of their number."""
+    made_of = {index: object() for index in range(100)}
+    asked: list[int] = []
+    gains = dict.fromkeys(made_of, 1.0)
+
+    def exposure(index: int) -> np.ndarray:
+        asked.append(index)
+        return np.asarray(gains[index] * np.eye(3, 4, dtype=np.float32))
+
+    core: Any = SimpleNamespace(photometer=SimpleNamespace(vignetting=None, known=made_of.get, exposure=exposure))
+    node = PosedTracker()
+    node._joined = dict.fromkeys(made_of, (0.0, np.eye(4)))
+    node._keyframes = dict.fromkeys(made_of)
+    assert list(node._exposed(core)) == []
+    assert asked == list(made_of), "each of them once"
+    made_of[7], gains[7] = object(), 1.2
+    (sent,) = node._exposed(core)
+    assert asked[100:] == sent.index.tolist() == [7]
+    assert list(node._exposed(core)) == []
+    core.photometer.vignetting = np.array([-0.3, 0.0, 0.0], np.float32)
+    (sent,) = node._exposed(core)
+    assert sent.index.tolist() == list(made_of), "all go with a vignetting"
 
 
 @pytest.mark.slow

@@ -98,7 +98,7 @@ class FactorGraph:
 
     def remove_keyframe(self, position: int) -> None:
         """Removes a keyframe from the video, and its edges; later positions move up by one."""
-        del self.video.frames[position]
+        self.video.remove(position)
         for edges in (self.active, self.inactive):
             edges[:] = [edge for edge in edges if position not in edge.pair]
             for edge in edges:

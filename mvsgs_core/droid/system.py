@@ -5,7 +5,7 @@ What is done with a frame depends on the frames before it alone: the same stream
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import torch
@@ -76,9 +76,7 @@ class DroidSlam:
             self.stats.skip("frames that moved too little")
             return Update(self._states[-1])
         pose, inverse_depth = self.frontend.start_values()
-        self.video.frames.append(
-            VideoFrame(index, timestamp, pose, np.full(self.framing.grid, inverse_depth), *encoded)
-        )
+        self.video.append(VideoFrame(index, timestamp, pose, np.full(self.framing.grid, inverse_depth), *encoded))
         if len(self.video) > _MANY:
             self.stats.warn(_told_memory(encoded))
         kept = self.frontend.advance()
@@ -172,8 +170,8 @@ class DroidSlam:
 
     def _publish(self, settled: int) -> Update:
         """Keyframes that have become settled, after corrections of those before."""
-        correction = self.publisher.corrections()
-        new = [frame for frame in self.video.frames[:settled] if frame.index not in self.publisher.published]
+        correction, published = self.publisher.corrections(), self.publisher.published
+        new = [frame for frame in self.video.frames[:settled] if frame.index not in published]
         for frame in new:
             self.publisher.publish(frame.index)
         self.stats.count("keyframes", len(new))
@@ -203,7 +201,7 @@ class DroidSlam:
     def _collect(self, cam_from_world: dict[int, np.ndarray]) -> Trajectory:
         """By frame: of all of them, or of none where there was no start."""
         poses, states = np.full((len(self.frames), 4, 4), np.nan), np.array(self._states, np.uint8)
-        keyframes: dict[int, VideoFrame] = {}
+        keyframes: Mapping[int, VideoFrame] = {}
         if cam_from_world:
             keyframes = self.video.keyframes
             missing = np.full((4, 4), np.nan)

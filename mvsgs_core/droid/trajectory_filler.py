@@ -63,7 +63,7 @@ def fill(
         for frame, features, a, b in zip(batch, networks.features([f.image for f in batch]), before, after):
             pose = between(video.frames[a], video.frames[b], frame.timestamp)
             depth = np.ones_like(video.frames[a].inverse_depth)
-            video.frames.append(VideoFrame(frame.index, frame.timestamp, pose, depth, features))
+            video.append(VideoFrame(frame.index, frame.timestamp, pose, depth, features))
         graph = FactorGraph(video, networks, correlation=correlation, threads=threads)
         new = range(count, len(video))
         graph.add([*zip(before.tolist(), new), *zip(after.tolist(), new)])
@@ -75,7 +75,8 @@ def fill(
                 break
         found = np.stack([frame.cam_from_world for frame in video.frames[count:]])
         poses.append(np.full_like(found, np.nan) if solution.failure else found)
-        del video.frames[count:]
+        while len(video) > count:
+            video.remove(-1)
     return np.concatenate(poses)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,15 +44,27 @@ class Video:
 
     def __init__(self, intrinsics: np.ndarray) -> None:
         self.intrinsics = np.asarray(intrinsics, dtype=np.float64)  # (4,) in cells
-        self.frames: list[VideoFrame] = []
+        self._frames: list[VideoFrame] = []
+        self._keyframes: dict[int, VideoFrame] = {}  # the same, by index
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self._frames)
 
     @property
-    def keyframes(self) -> dict[int, VideoFrame]:
+    def frames(self) -> Sequence[VideoFrame]:
+        return self._frames
+
+    @property
+    def keyframes(self) -> Mapping[int, VideoFrame]:
         """By index of the stream."""
-        return {frame.index: frame for frame in self.frames}
+        return self._keyframes
+
+    def append(self, frame: VideoFrame) -> None:
+        self._frames.append(frame)
+        self._keyframes[frame.index] = frame
+
+    def remove(self, position: int) -> None:
+        del self._keyframes[self._frames.pop(position).index]
 
     def world_from_cam(self, index: int) -> np.ndarray:
         return geometry.inverse(self.keyframes[index].cam_from_world)

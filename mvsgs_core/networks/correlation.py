@@ -31,7 +31,9 @@ class CorrelationVolume:
 
     def __init__(self, source: Tensor, target: Tensor, levels: int = 4, radius: int = 3, scale: float = 1 / 16) -> None:
         edges, _, h, w = source.shape
-        volume = torch.einsum("ecp,ecq->epq", source.flatten(2), target.flatten(2)) * scale
+        # Scaled before: in half precision the product of unscaled features may be beyond what it can hold.
+        half = scale**0.5
+        volume = torch.einsum("ecp,ecq->epq", half * source.flatten(2), half * target.flatten(2))
         volume = volume.reshape(edges * h * w, 1, *target.shape[2:])
         self.radius, self.shape = radius, (edges, h, w)
         self.pyramid = [volume]

@@ -31,15 +31,20 @@ class BackEnd:
         self.threads = threads
         self.pending = 0  # steps of background bundle adjustment that are still to do
 
-    def work(self, segment: int) -> None:
-        """A portion of the background work, if there is any: one step for each new keyframe."""
-        whole(self.working(segment))
+    def work(self, segment: int) -> str:
+        """A portion of the background work, if there is any: one step for each new keyframe.
 
-    def working(self, segment: int) -> Steps[None]:
+        Returns why it failed, if it did: then the rest of it is given up.
+        """
+        return whole(self.working(segment))
+
+    def working(self, segment: int) -> Steps[str]:
         """`work`: what is to be solved is set up in one step and solved in the other."""
-        if self.pending > 0 and len(self.local_map.members(segment)) >= 3:
-            solution = yield from self._adjusting(segment)
-            self.pending = 0 if solution.failure else self.pending - 1
+        if self.pending == 0 or len(self.local_map.members(segment)) < 3:
+            return ""
+        solution = yield from self._adjusting(segment)
+        self.pending = 0 if solution.failure else self.pending - 1
+        return solution.failure
 
     def extend_edges(self, index: int, segment: int) -> int:
         """Adds edges from one keyframe to those that see the same; returns how many were matched."""

@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
+from mvsgs_core.photometry import is_exposure, is_vignetting
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking.estimation.gray_levels import (
     BESIDE,
@@ -32,6 +33,7 @@ from mvsgs_core.tracking.steps import Steps, timed, whole
 
 GROWTH = 1.1  # of the keyframes, at which all are solved again
 AT_ONCE = 300  # keyframes that are solved together
+NO_LIGHT = "exposures or a vignetting that no camera has were found, and left out"
 
 _OBSERVATION = np.dtype(
     [("reference", "<i8"), ("moments", "<f4", (3, 2, TERMS))]
@@ -73,23 +75,29 @@ class Photometer:
         self._lights: dict[int, np.ndarray] = {}  # (5,) of the keyframes, see `PhotometricCalibration.lights`
         self._moments: dict[tuple[int, int], tuple[Edge, np.ndarray | None]] = {}  # of every edge as it was matched
         self._looked_at = 0  # changes of the graph's edges
+        self._refused: set[int | None] = set()  # frames whose exposure no camera has; None: the vignetting
 
     @property
     def vignetting(self) -> np.ndarray | None:
-        """(3,) float32, see `msgs`; None: there is none."""
+        """(3,) float32, see `msgs`; None: there is none, or none that a lens has."""
         if not np.any(self.photometry.vignetting):
             return None
-        return vignetting_polynomial(self.photometry.vignetting, self.photometry.vignetting_response).astype(np.float32)
+        found = vignetting_polynomial(self.photometry.vignetting, self.photometry.vignetting_response)
+        found = found.astype(np.float32)
+        if not is_vignetting(found):
+            self._refuse(None)
+            return None
+        return found
 
     @property
     def varies(self) -> bool:
         return self.photometry.varies
 
     def exposure(self, index: int) -> np.ndarray | None:
-        """(3, 4) float32 color affine of a keyframe; None where exposures do not vary."""
+        """(3, 4) float32 color affine of a keyframe; None where exposures do not vary, or it is one of no camera."""
         if not self.photometry.varies or index not in self._lights:
             return None
-        return self.photometry.affine(self._lights[index])
+        return self._affine(index, self._lights[index])
 
     def known(self, index: int) -> object:
         """What `exposure` is made of: an object that is another one whenever that changes."""
@@ -103,9 +111,24 @@ class Photometer:
         found = np.full((len(records), 3, 4), np.nan, np.float32)
         for k, record in enumerate(records):
             light = self._of_frame(record) if posed[k] else None
-            if light is not None:
-                found[k] = self.photometry.affine(light)
+            affine = None if light is None else self._affine(record.index, light)
+            if affine is not None:
+                found[k] = affine
         return found
+
+    def _affine(self, index: int, light: np.ndarray) -> np.ndarray | None:
+        """(3, 4) float32 of a frame's light (5,); None for one that no camera has: no reader takes it."""
+        affine = self.photometry.affine(light)
+        if not is_exposure(affine):
+            self._refuse(index)
+            return None
+        return affine
+
+    def _refuse(self, whose: int | None) -> None:
+        """Counts it once, however often it is asked for."""
+        if whose not in self._refused:
+            self._refused.add(whose)
+            self.stats.refuse("exposures", 1, NO_LIGHT)
 
     def update(self, at_the_end: bool = False) -> None:
         """Takes in the graph's new edges and keyframes. at_the_end: the stream has ended, all is solved for again."""
@@ -177,7 +200,8 @@ class Photometer:
         self._solve(order[-AT_ONCE:], False)
         if varied.varies and not self.photometry.varies:
             self.photometry, self._lights, self.graph.vignetting = varied, lights, vignetting
-        self._lights = {index: lights[index] for index in others if index in lights} | self._lights
+        # copies: the response that their affines follow is another one, see `known`
+        self._lights = {index: lights[index].copy() for index in others if index in lights} | self._lights
         self._order = order
         for index in order if self.photometry.varies else ():
             if index not in self._lights:

@@ -46,3 +46,9 @@ def test_frames_of_two_segments_say_nothing_of_each_others_velocity() -> None:
     found = track.velocities_of(np.array([9, 10, 12]))
     np.testing.assert_allclose(found[:2], [VELOCITY, VELOCITY], atol=1e-9)
     assert np.isnan(found[2]).all()
+
+
+def test_of_a_stream_without_frames_no_velocity_is_known() -> None:
+    found = Trajectory.empty().velocities_of(np.array([3]))
+    assert found.shape == (1, 6)
+    assert np.isnan(found).all()

@@ -92,7 +92,11 @@ class Calibration:
             self._report(members, rise)
             return
         self.graph.intrinsics = self.given.copy()
-        self.graph.optimize(members, set(members[1:]), set(members), Solver(steps=15, threads=self.threads))
+        solver = Solver(steps=15, threads=self.threads)
+        solution = self.graph.optimize(members, set(members[1:]), set(members), solver)
+        if solution.failure:
+            self.stats.count("failed bundle adjustments")
+            self.stats.warn(f"poses and depths stay those of another focal length: {solution.failure}")
         self._report([], rise)
         self.stats.values["focal_doubt"] = "it can't be told from these images, and the guess is kept"
         self.stats.warn(

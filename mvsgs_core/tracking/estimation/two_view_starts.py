@@ -43,12 +43,15 @@ def two_view_poses(
     seen = np.flatnonzero(edge.found)
     here, there = graph.keyframes[a].points[seen].astype(np.float64), edge.target.T[seen].astype(np.float64)
     cv2.setRNGSeed(0)
-    essential, mask = cv2.findEssentialMat(here, there, camera, cv2.USAC_MAGSAC, 0.999, epipolar)
-    if essential is None or essential.shape != (3, 3):
+    try:
+        essential, mask = cv2.findEssentialMat(here, there, camera, cv2.USAC_MAGSAC, 0.999, epipolar)
+        if essential is None or essential.shape != (3, 3):
+            return None
+        _, rotation, translation, inside, points = cv2.recoverPose(
+            essential, here, there, camera, distanceThresh=100.0, mask=mask
+        )
+    except cv2.error:  # OpenCV throws where it finds no model at all
         return None
-    _, rotation, translation, inside, points = cv2.recoverPose(
-        essential, here, there, camera, distanceThresh=100.0, mask=mask
-    )
     relative = geometry.rigid(rotation, translation.ravel())
     known = inside.ravel() > 0
     points = (points[:3, known] / points[3, known]).T

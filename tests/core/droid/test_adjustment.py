@@ -82,7 +82,7 @@ def run(stored: dict[str, np.ndarray], scene: str, first_free: int, solver: Solv
         frame.damping = (
             stored[f"{scene}_eta"][n].astype(np.float64) - 1e-7
         ) / 0.2  # what `solve` makes of the network's
-        video.frames.append(frame)
+        video.append(frame)
     edges = [
         Factor(int(i), int(j), target.transpose(1, 2, 0), weight.transpose(1, 2, 0))
         for i, j, target, weight in zip(*(stored[f"{scene}_{key}"] for key in ("ii", "jj", "target", "weight")))

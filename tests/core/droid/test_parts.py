@@ -34,7 +34,7 @@ def video(positions: list[float]) -> Video:
         pose = np.eye(4)
         pose[0, 3] = -x
         features = torch.zeros(128, *GRID)
-        made.frames.append(VideoFrame(n, n / 10, pose, np.ones(GRID), features, features, features))
+        made.append(VideoFrame(n, n / 10, pose, np.ones(GRID), features, features, features))
     return made
 
 
@@ -159,7 +159,7 @@ def test_a_removed_keyframe_takes_its_edges_and_the_others_move_up() -> None:
     g.add([(0, 1), (0, 2), (2, 3), (3, 2), (3, 1)])
     g.retire_before(1)
     g.remove_keyframe(1)
-    assert [frame.index for frame in g.video.frames] == [0, 2, 3]
+    assert [frame.index for frame in g.video.frames] == [0, 2, 3] == list(g.video.keyframes)
     assert [edge.pair for edge in g.inactive] == [(0, 1)]
     assert [edge.pair for edge in g.active] == [(1, 2), (2, 1)]
     g.forget_before(1)
@@ -245,7 +245,7 @@ def test_a_frame_whose_adjustment_fails_has_no_pose(monkeypatch: pytest.MonkeyPa
     stats = Stats()
     nets = Networks(random_net(), torch.device("cpu"))
     made = video([0.0, 0.4, 0.8])
-    del made.frames[1]
+    made.remove(1)
     frame = StoredFrame(1, 0.1, FrameStore())
     frame.put(np.zeros((64, 80, 3), np.uint8))
     poses = fill(made, nets, [frame], "volume", 1, stats)

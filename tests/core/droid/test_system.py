@@ -13,7 +13,9 @@ from mvsgs_core import geometry
 from mvsgs_core.camera import scale_intrinsics
 from mvsgs_core.droid.config import DroidConfig
 from mvsgs_core.droid.system import DroidSlam
+from mvsgs_core.droid.video import VideoFrame
 from mvsgs_core.networks.droid import Update as Revised
+from mvsgs_core.tracking.publish import Publisher
 from mvsgs_core.tracking.tracker import Update
 from mvsgs_core.trajectory import TrackingState, Trajectory
 from tests.support import droid_oracle as oracle
@@ -228,3 +230,25 @@ def test_more_keyframes_than_the_published_buffer_are_warned_of(monkeypatch: pyt
     (warning,) = system.stats.warnings
     assert f"keeps {3 * 128 * 4 * cells / 1e6:.1f} MB of each in memory" in warning
     assert len(system.video) == 3
+
+
+def test_publishing_asks_for_all_keyframes_a_fixed_number_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not once for each keyframe: that is the square of their number, for every frame that passes the filter."""
+    asked: list[int] = []
+    published = vars(Publisher)["published"].fget
+
+    def counted(publisher: Publisher) -> set[int]:
+        asked[-1] += 1
+        return published(publisher)
+
+    monkeypatch.setattr(Publisher, "published", property(counted))
+    for count in (50, 100):
+        system = DroidSlam(CONFIG, net=oracle.Oracle(oracle.path(COUNT), INTRINSICS / 8))
+        system._set_up(HEIGHT, WIDTH, INTRINSICS)
+        system._states.append(TrackingState.TRACKED)
+        for n in range(count):
+            system.video.append(VideoFrame(n, n / 30, np.eye(4), np.ones((HEIGHT // 8, WIDTH // 8)), torch.zeros(1)))
+        assert system.video.keyframes is system.video.keyframes, "it is kept, not made"
+        asked.append(0)
+        assert len(system._publish(count).keyframes) == count
+    assert asked[0] == asked[1]

@@ -49,6 +49,15 @@ def test_both_correlations(net: DroidNet) -> None:
         assert error(seen, stored[f"pyr{level}_edge0_y5x7"]) < TOLERANCE
 
 
+def test_a_correlation_in_half_precision_is_finite_where_its_value_is() -> None:
+    """The product of these features is 115,200, and a half float goes to 65,504."""
+    features = torch.full((1, 128, 8, 8), 30.0)
+    with torch.autocast("cpu", dtype=torch.float16):
+        volume = CorrelationVolume(features, features)
+    assert volume.pyramid[0].dtype == torch.float16
+    assert (volume.pyramid[0] == 7200.0).all()
+
+
 def test_update_operator(net: DroidNet) -> None:
     stored = {k: torch.from_numpy(v) for k, v in _stored("update").items()}
     out = net.update(stored["net"], stored["inp"], stored["corr"], stored["motion"], stored["ii"])

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mvsgs_core import geometry
 from mvsgs_core.stats import Stats
+from mvsgs_core.tracking import graph as keyframe_graph
 from mvsgs_core.tracking.back_end import BackEnd, BackEndConfig
 from mvsgs_core.tracking.edges import Edge
+from mvsgs_core.tracking.estimation.bundle_adjustment import adjust
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.local_map import LocalMap, LocalMapConfig
 from tests.support.true_maps import exact_matches, matcher, pose_error, true_graph, true_pose
@@ -121,6 +125,16 @@ def test_background_work_is_a_step_a_time_while_some_is_left() -> None:
     poses = graph.keyframes[6].cam_from_world
     made.work(0)
     np.testing.assert_array_equal(graph.keyframes[6].cam_from_world, poses)
+
+
+def test_background_work_that_fails_says_why_and_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = back_end(connected())
+    made.pending = 3
+    assert made.work(0) == ""
+    monkeypatch.setattr(keyframe_graph, "adjust", lambda *given: replace(adjust(*given), failure="no step"))
+    assert made.work(0) == "no step"
+    assert made.pending == 0
+    assert made.work(0) == "", "nothing is left to do"
 
 
 def test_the_end_matches_again_adds_edges_and_adjusts() -> None:

@@ -133,4 +133,4 @@ def test_a_frame_that_two_keyframes_see_needs_two_kilobytes() -> None:
         size, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert size / len(records) < 2300, "bytes"
+    assert size / len(records) < 1750, "bytes"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,18 @@ def test_what_few_parts_of_a_stream_want_contradicts_nothing(
     stats, graph = Stats(), KeyframeGraph(np.array([150.0, 150.0, 160.0, 120.0]))
     Calibration(graph, FocalConfig(), stats, 300.0, (480, 640), False, 0.0, False, 1).check(list(range(20)))
     assert bool(stats.warnings) == said
+
+
+def test_a_map_that_could_not_be_solved_with_the_guess_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its poses stay those of another focal length."""
+    monkeypatch.setattr(calibration, "observability", lambda *_: 0.0)
+    for failure in ("", "no step"):
+        stats, graph = Stats(), KeyframeGraph(np.array([150.0, 150.0, 160.0, 120.0]))
+        solved = SimpleNamespace(failure=failure)
+        monkeypatch.setattr(graph, "optimize", lambda *_, solved=solved: solved)
+        Calibration(graph, FocalConfig(), stats, 300.0, (480, 640), True, 0.0, False, 1).settle([0, 1, 2])
+        assert any("no step" in warning for warning in stats.warnings) == bool(failure)
+        assert stats.counts.get("failed bundle adjustments", 0) == bool(failure)
 
 
 def test_a_few_frames_of_a_real_video_contradict_no_calibration() -> None:

@@ -11,6 +11,7 @@ import pytest
 from bench.moving import with_person
 from mvsgs_core import geometry
 from mvsgs_core.tracking.assessment import tell_what_moves
+from mvsgs_core.tracking.edges import Edge
 from mvsgs_core.tracking.estimation.bundle_adjustment import Graph, Solver, adjust
 from mvsgs_core.tracking.estimation.static_points import STILL, static_weights
 from mvsgs_core.tracking.estimation.structure_from_motion import EPIPOLAR, PAIRS, ReconstructionCriteria, reconstruct
@@ -128,6 +129,15 @@ def test_two_views_give_all_keyframes_a_pose_also_where_something_moves(moving: 
     apart, turned = min(worst, key=lambda each: float(each[0]))
     assert apart < (0.03 if moving else 0.005) * length
     assert turned < 0.003
+
+
+def test_two_views_of_too_few_points_give_no_pose() -> None:
+    graph = circling(*FRAMES)
+    edge = graph.edges[0, 16]
+    weight = np.where(np.cumsum(edge.found) <= 3, edge.weight, 0.0)
+    graph.edges[0, 16] = Edge(edge.target, weight, edge.velocity, edge.fraction)
+    assert graph.edges[0, 16].found.sum() == 3, "OpenCV asks for five"
+    assert two_view_poses(graph, list(FRAMES), (0, 16)) is None
 
 
 def test_a_keyframe_that_has_no_pose_of_its_own_is_put_where_the_time_puts_it(monkeypatch: pytest.MonkeyPatch) -> None:
