@@ -12,11 +12,12 @@ from mvsgs_core.evaluation import metrics
 from mvsgs_core.evaluation.metrics import Figure
 
 PARTS = {  # where it is in the report -> how it is called
+    **{place: m.label for place, m in metrics.COUNTS.items()},
     **{f"rendering.held_out.{m.key}": f"held-out {m.label}" for m in metrics.IMAGE},
     **{f"rendering.held_out_fitted.{m.key}": f"held-out, fitted {m.label}" for m in metrics.IMAGE[:1]},
     **{f"rendering.keyframes.{m.key}": f"keyframes {m.label}" for m in metrics.IMAGE[:1]},
     f"rendering.worst.all.{metrics.IMAGE[0].key}": f"worst frame {metrics.IMAGE[0].label}",
-    **{f"trajectory.{m.key}": m.label for m in metrics.TRAJECTORY[:2]},
+    **{f"trajectory.{m.key}": m.label for m in metrics.TRAJECTORY[:3]},
     **{f"depth.{m.key}": f"depth {m.label}" for m in metrics.DEPTH},
     **{
         place: m.name or m.label

@@ -7,15 +7,18 @@ are. Hydra would refuse one that the file does not have, so it is given `++slot.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 from hydra.errors import HydraException
+from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -35,11 +38,24 @@ def compose(overrides: Sequence[str] = (), conf: Path = CONF) -> Graph:
     """
     prepared = prepare(overrides, conf)
     try:
-        with initialize_config_dir(version_base="1.3", config_dir=str(conf)):
+        with _hydra_aside(), initialize_config_dir(version_base="1.3", config_dir=str(conf)):
             config = hydra_compose("config", prepared, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise GraphError(str(error)) from error
     return graph_of(config, prepared, config.hydra.runtime.choices)
+
+
+@contextmanager
+def _hydra_aside() -> Iterator[None]:
+    """Hydra is initialized once in a process: where the program that maps has done so, it finds it as it was."""
+    theirs, base = GlobalHydra.instance(), VersionBase.instance()
+    hydra, version = theirs.hydra, base.getbase()
+    theirs.clear()
+    try:
+        yield
+    finally:
+        theirs.hydra, base.version_base = hydra, version
+        GlobalHydra.set_instance(theirs)
 
 
 def graph_of(config: DictConfig, overrides: Sequence[str], choices: Mapping[str, Any]) -> Graph:

@@ -38,8 +38,10 @@ def _figures(report: Mapping[str, Any]) -> list[str]:
     lines += _worst(report, "rendering") or _worst(report, "rendering_before_refinement")
     trajectory = _get(report, "trajectory") or {}
     if trajectory:
-        ate = metrics.listed(metrics.TRAJECTORY[:1], trajectory)
-        behind = f"(RMSE of {trajectory.get('ate_keyframes')} keyframes, in the true poses' unit)"
+        ate, number = metrics.listed(metrics.TRAJECTORY[:1], trajectory), f"{trajectory.get('ate_keyframes')} keyframes"
+        if not ate:  # too few of them have a true pose
+            ate, number = metrics.listed(metrics.TRAJECTORY[2:3], trajectory), f"{trajectory.get('ate_frames')} frames"
+        behind = f"(RMSE of {number}, in the true poses' unit)"
         lines.append(
             f"trajectory  {trajectory.get('frames_tracked')} of {trajectory.get('frames')} frames, "
             f"{trajectory.get('keyframes')} keyframes" + (f", {ate} {behind}" if ate else "")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,20 +9,23 @@ from pathlib import Path
 import numpy as np
 
 from mvsgs_core import camera
-from mvsgs_core.export.cameras import Cameras
+from mvsgs_core.export import keyframe_images
+from mvsgs_core.export.cameras import Cameras, read_cameras, read_source_camera, write_cameras
 from mvsgs_core.export.colmap import write_colmap
-from mvsgs_core.export.command_line import input_arguments, known_cameras, read_map
+from mvsgs_core.export.command_line import map_file, sound_map
 from mvsgs_core.export.image_sizes import check_sizes
 from mvsgs_core.export.keyframe_render import near_plane
 from mvsgs_core.export.mesh import write_mesh
 from mvsgs_core.export.ply import write_ply
 from mvsgs_core.export.snapshot import Snapshot
+from mvsgs_core.export.source_camera import SourceCamera
 from mvsgs_core.export.splat import write_splat, write_spz
 from mvsgs_core.export.transforms import write_transforms
 from mvsgs_core.mapping.keyframe_checks import is_pose
 from mvsgs_core.mapping.preview import as_bytes
 
-SPLATS = {".ply": write_ply, ".splat": write_splat, ".spz": write_spz}
+CAMERAS = "cameras.json"
+SPLATS = {".splat": write_splat, ".spz": write_spz}
 MESHES = (".glb", ".obj", ".stl", ".off")
 
 
@@ -42,15 +44,23 @@ class GaussianMap:
 
     snapshot: Snapshot
     cameras: Cameras | None  # None: a map.ply without cameras.json
+    source: SourceCamera | None = None  # the camera that took the stream; None: not known
+    file: Path | None = None  # that it was loaded from; None: none
 
     @classmethod
-    def load(cls, path: str | Path) -> GaussianMap:
-        """The map.ply, or the one in a folder, with its cameras.json. Raises OSError, ValueError for damaged files."""
-        parser = argparse.ArgumentParser()
-        input_arguments(parser)
-        options = parser.parse_args([str(path)])
-        snapshot, _ = read_map(options)
-        return cls(snapshot, known_cameras(options))
+    def load(cls, path: str | Path, *, drop_unsound: bool = False, antialiased: bool | None = None) -> GaussianMap:
+        """The map.ply, or the one in a folder, with its cameras.json.
+
+        drop_unsound: leave out splats with NaN or Inf. antialiased: how it was trained, for the files of programs that
+        leave no comment of it; None: as the file says. Raises OSError, ValueError for damaged files.
+        """
+        file = map_file(str(path))
+        snapshot, _ = sound_map(file, drop_unsound, antialiased, "drop_unsound=True")
+        beside = file.with_name(CAMERAS)
+        if not beside.is_file():
+            return cls(snapshot, None, file=file)
+        cameras = read_cameras(beside)
+        return cls(snapshot, cameras if len(cameras) else None, read_source_camera(beside), file)
 
     def __len__(self) -> int:
         """Number of splats."""
@@ -74,32 +84,48 @@ class GaussianMap:
         return View(as_bytes(render.color), depth, opacity)
 
     def export(
-        self, path: str | Path, *, voxel: float = 0.01, images: str | Path | None = None, observations: bool = False
-    ) -> Path:
-        """Writes what the name asks for: .ply, .splat or .spz, a mesh (.glb, .obj, .stl, .off), transforms.json, or,
-        without a suffix, the folder of a COLMAP model.
+        self, path: str | Path, *, voxel: float = 0.01, images: str | Path | None = None, observations: bool = False,
+        fold: bool = False,
+    ) -> Path:  # fmt: skip
+        """Writes what the name asks for: .ply, .splat or .spz, a mesh (.glb, .obj, .stl, .off), cameras.json,
+        transforms.json, or, without a suffix, the folder of a COLMAP model.
 
         voxel: edge of the mesh's grid in median depths. images: folder of the keyframes' images, for a model or
-        transforms, which are without keyframes whose image is not there. observations: a COLMAP model's points say
-        which images show them.
-        Raises ValueError for another name, or where keyframes are needed and not known; OSError.
+        transforms, which are without keyframes whose image is not there; of transforms the default is that beside the
+        map that was loaded, else beside the file. observations: a COLMAP model's points say which images show them.
+        fold: of a .ply the splats' shapes go into their scales, for viewers that know only Gaussians (mapper=paper).
+        Raises ValueError for another name, for a file that the map was loaded from, or where keyframes are needed and
+        not known; OSError.
         """
         out = Path(path).expanduser()
-        if out.suffix in SPLATS:
+        self._check_not_loaded(out)
+        if out.suffix == ".ply":
+            write_ply(out, self.snapshot, fold=fold)
+        elif out.suffix in SPLATS:
             SPLATS[out.suffix](out, self.snapshot)
         elif out.suffix in MESHES:
             write_mesh(out, self.snapshot, self._keyframes(out), voxel)
+        elif out.name == CAMERAS:
+            write_cameras(out, self._keyframes(out), self.source)
         elif out.suffix == ".json":
-            folder, keyframes = out.parent / "keyframes" if images is None else Path(images), self._keyframes(out)
+            beside = (self.file or out).with_name(keyframe_images.FOLDER)
+            folder, keyframes = beside if images is None else Path(images), self._keyframes(out)
             check_sizes(folder, keyframes)
             write_transforms(out, keyframes, folder)
         elif not out.suffix:
             given = None if images is None else Path(images)
             write_colmap(out, self.snapshot, self._keyframes(out), given, observations)
         else:
-            there = ", ".join((*SPLATS, *MESHES, ".json"))
+            there = ", ".join((".ply", *SPLATS, *MESHES, ".json"))
             raise ValueError(f"{out}: no format {out.suffix!r}; there are: {there}, a folder")
         return out
+
+    def _check_not_loaded(self, out: Path) -> None:
+        if self.file is None:
+            return
+        loaded = [self.file, *([] if self.cameras is None else [self.file.with_name(CAMERAS)])]
+        if out.resolve() in [path.resolve() for path in loaded]:
+            raise ValueError(f"{out} is what this map was loaded from: give another file")
 
     def _keyframes(self, out: Path) -> Cameras:
         if self.cameras is None:

@@ -20,12 +20,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor, from_numpy
 
 from mvsgs.rooms import open_workspace
 
@@ -34,7 +35,7 @@ open_workspace()
 from launch.compose import compose, parse
 from launch.inline import InlineGraph
 from launch.named_input import quoted
-from msgs import CameraPose, Keyframe, Poses, Preview, TrackerPhase
+from msgs import CameraPose, FusedKeyframe, Keyframe, Poses, Preview, TrackerPhase
 from msgs import Trajectory as TrajectoryMessage
 from mvsgs.fed import Fed
 from mvsgs.frames import Frames, Numbers
@@ -46,6 +47,7 @@ from mvsgs_core.kept_map import check_kept_map, tracker_file
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.results import cameras_of
 from mvsgs_core.mapping.losses import LossFunction, name_of
+from mvsgs_core.mapping.resting_images import on_disk
 from mvsgs_core.trajectory import Trajectory
 from nodes import Node
 from nodes.frozen_mapper import FrozenMapper
@@ -140,6 +142,7 @@ class Mapping:
         self._pose: CameraPose | None = None  # of the frame that is at work
         self._new: list[int] = []  # keyframes that it brought
         self._keyframes: dict[int, PosedKeyframe] = {}
+        self._came: dict[int, Tensor] = {}  # images of keyframes that are trained on another one
         self._trajectory: Trajectory | None = None  # once the stream is over
         self._map: GaussianMap | None = None  # as it is now, where somebody has asked for it
         self._over = ""  # why no frame is taken any more
@@ -211,7 +214,8 @@ class Mapping:
             return self.trajectory
 
     def refine(self, iterations: int) -> None:
-        """More iterations over all keyframes and the frames between them, after `finish`; no splats are added."""
+        """More iterations over all keyframes and the frames between them, after `finish`; the splats stay the same
+        ones. Learning rates go on from where they are, down to those that a map is finished with."""
         with self._lock:
             if self._trajectory is None:
                 raise RuntimeError("refine is for a finished map: finish() the stream before")
@@ -219,9 +223,11 @@ class Mapping:
                 raise ValueError(f"{iterations} iterations: a number of at least 0")
             if not isinstance(self._mapper, Mapper):
                 raise RuntimeError("mapper=frozen leaves the map as it is")
+            mapper = self._atlas.current
+            rate = mapper.trainer.rate
             with self._at_work():
-                for done in range(iterations):
-                    self._atlas.current.refine(done, iterations)
+                for done in range(1, iterations + 1):
+                    mapper.refine(done, iterations, rate, prune=False)
 
     def render(
         self, world_from_cam: np.ndarray, intrinsics: Numbers | None = None, size: tuple[int, int] | None = None
@@ -233,21 +239,29 @@ class Mapping:
         """Writes the map as it is now: map.ply, cameras.json and trajectory.txt, for `mvsgs view`, `export`, `render`,
         and what `Mapping.load` goes on with and `mvsgs info` shows (not where poses were given).
 
-        images: each keyframe's image, too. Raises OSError; ValueError for the output of a run, RuntimeError where there
-        is no map yet.
+        images: each keyframe's image, too; `warnings` says how many could not be. An earlier save there is replaced.
+        Raises OSError; ValueError for the output of a run and for a folder where files of others would be replaced,
+        RuntimeError where there is no map yet.
         """
         with self._lock:
             self._check_map()
             if not isinstance(self._mapper, Mapper):
                 raise RuntimeError("mapper=frozen leaves the map as it is: there is nothing new to save")
             path, node = Path(folder).expanduser(), self._graph.nodes["tracker"]
-            save_map(path, self._atlas, source_camera(self.statistics), self._trajectory and self.trajectory, images)
+            source, track = source_camera(self.statistics), self._trajectory and self.trajectory
+            if left_out := save_map(path, self._atlas, source, track, images, self._came):
+                self._mapper.stats.warn(
+                    f"{left_out} of {len(self._atlas.largest.views)} keyframes were saved without an image: it was let "
+                    "go (mapper.max_keyframes), found no room on the disk, or is of a stream before and as its rolling "
+                    "shutter took it"
+                )
             if isinstance(node, Tracker):
                 node.core.keep_map(tracker_file(path))
             return path
 
     def export(self, path: str | Path, **options: Any) -> Path:
-        """To .ply, .splat, .spz, .glb, .obj, transforms.json or a COLMAP folder; see `GaussianMap.export`."""
+        """To .ply, .splat, .spz, .glb, .obj, cameras.json, transforms.json or a COLMAP folder; see
+        `GaussianMap.export`."""
         return self.map.export(path, **options)
 
     @property
@@ -258,7 +272,7 @@ class Mapping:
             if self._map is None:
                 shown = self._atlas.largest
                 snapshot = shown.snapshot()
-                self._map = GaussianMap(snapshot, cameras_of(snapshot, shown.views))
+                self._map = GaussianMap(snapshot, cameras_of(snapshot, shown.views), source_camera(self.statistics))
             return self._map
 
     @property
@@ -296,7 +310,9 @@ class Mapping:
         return self._mapper.atlas
 
     def _observe(self, slot: str, node: Node, message: Any) -> None:
-        """What the tracker says on its way to the other nodes."""
+        """What the tracker says on its way to the other nodes, and images on theirs to the mapper."""
+        if isinstance(message, FusedKeyframe):
+            self._keep_image(message)
         if slot != "tracker":
             return
         if isinstance(message, Keyframe):
@@ -316,6 +332,12 @@ class Mapping:
             self._phase = message.phase
         elif isinstance(message, TrajectoryMessage):
             self._trajectory = Trajectory(**vars(message))
+
+    def _keep_image(self, keyframe: FusedKeyframe) -> None:
+        """For `save`, where the mapper is trained on another one: as a rolling shutter took it, or a smaller one."""
+        if keyframe.photograph is not None or self._mapper.config.max_pixels is not None:
+            with suppress(OSError):  # a disk that is full costs images, which `save` says
+                self._came[keyframe.index] = on_disk(from_numpy(np.array(keyframe.image)))
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:

@@ -23,6 +23,7 @@ from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.cameras import Cameras
 from mvsgs_core.export.command_line import input_arguments, known_cameras, read_map, run
 from mvsgs_core.export.keyframe_render import rendered_keyframe
+from mvsgs_core.export.ply import folded
 from mvsgs_core.export.snapshot import Snapshot
 from mvsgs_core.mapping.preview import as_bytes, covariances
 from mvsgs_core.rasterizer.spherical_harmonics import C0
@@ -66,7 +67,7 @@ class SavedMapView:
             self.show(0)
 
     def _show_splats(self, final: Snapshot) -> int:
-        splats = final.splats
+        splats = folded(final.splats, final.kernel)  # browsers know only Gaussians
         return self.page.show_splats(
             splats.means.numpy(), covariances(splats.quaternions, splats.log_scales, 1.0).numpy(),
             as_bytes(0.5 + C0 * splats.sh[:, 0]), torch.sigmoid(splats.opacity_logits).numpy(),

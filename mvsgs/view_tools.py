@@ -29,7 +29,8 @@ from nodes.map_page import MapPage, escaped
 _LINE = (230, 90, 40)
 FPS = 30.0
 VOXEL = 0.01  # of the mesh, in median depths
-FORMATS = (".ply", ".splat", ".spz", ".glb")
+SPLATS = {".splat": write_splat, ".spz": write_spz}
+FORMATS = (".ply", *SPLATS, ".glb")
 AXES = ("left to right", "front to back", "bottom to top")
 
 
@@ -208,23 +209,30 @@ class Exporting:
                 file = Path(folder) / f"map{self._format.value}"
                 self.write(file)
                 event.client.send_file_download(file.name, file.read_bytes())
-                self.said.content = f"{file.name}: {file.stat().st_size} bytes"
+                self.said.content = self.said_of(file)
         except (ValueError, OSError) as error:
             self.said.content = escaped(str(error))
 
+    def said_of(self, file: Path) -> str:
+        """What a user should know of a file that was written."""
+        shaped = file.suffix != ".glb" and self._shown().kernel != "gaussian"
+        told = "; shapes of splats became scales, as other viewers know no shapes" if shaped else ""
+        return f"{file.name}: {file.stat().st_size} bytes{told}"
+
     def write(self, file: Path) -> None:
-        """In the format of its suffix. Raises ValueError for one that there is not, OSError."""
+        """In the format of its suffix, for any viewer. Raises ValueError for one that there is not, OSError."""
         factor = self._factor()
         final = self._shown().scaled(factor)
         if file.suffix == ".glb" and self._cameras is not None:
             poses = self._cameras.world_from_cam.copy()
             poses[:, :3, 3] *= factor
             write_mesh(file, final, Cameras(**{**vars(self._cameras), "world_from_cam": poses}), VOXEL)
-            return
-        write = {".ply": write_ply, ".splat": write_splat, ".spz": write_spz}.get(file.suffix)
-        if write is None:
+        elif file.suffix == ".ply":
+            write_ply(file, final, fold=True)
+        elif file.suffix in SPLATS:
+            SPLATS[file.suffix](file, final)
+        else:
             raise ValueError(f"no format {file.suffix!r} here")
-        write(file, final)
 
 
 __all__ = ["Cropping", "Exporting", "Flight", "Measuring"]

@@ -22,6 +22,7 @@ from mvsgs_core.evaluation import html, pictures, statistics
 from mvsgs_core.evaluation.evaluation import Evaluation
 from mvsgs_core.evaluation.lpips import Lpips
 from mvsgs_core.evaluation.origin import origin
+from mvsgs_core.evaluation.trajectory_metrics import ALIGNED
 from mvsgs_core.georeference import FILE as GEOREFERENCE
 from mvsgs_core.georeference import Georeference, NoReferenceError, georeference, values_of, write_georeference
 from mvsgs_core.held_out import HELD_OUT_EVERY
@@ -164,8 +165,7 @@ class Evaluator(Node):
             "pixels at which the render is more than half opaque. "
             f"LPIPS: {'v0.1, SqueezeNet trunk' if self._lpips else 'not computed'}. "
             f"{_shutter(self.evaluation.trajectory)}{_exposure(self.report['exposure'])}"
-            f"{_masked(self.evaluation.masked)}"
-            "ATE: RMSE of keyframe positions after Sim(3) alignment."
+            f"{_masked(self.evaluation.masked)}{_aligned(self.report['trajectory'])}"
         )
 
     def _write(self, folder: Path) -> None:
@@ -181,7 +181,7 @@ class Evaluator(Node):
         self.evaluation.close()
         replace_text(folder / "report.json", json.dumps(_plain(self.report), indent=1, allow_nan=False))
         found = self.evaluation.final_trajectory
-        if found is not None:
+        if found is not None and self.evaluation.trajectory is not None:  # else the mapper's stays, which has times
             with replacing(folder / "trajectory.txt") as aside:
                 shown = found.main(self.evaluation.keyframes)  # other parts have other frames of reference
                 write_trajectory(aside, found.timestamp[shown], found.world_from_cam[shown])
@@ -220,6 +220,12 @@ def _masked(parts: list[float]) -> str:
     return (
         f"Of {len(parts)} frames, masks leave out {100 * np.mean(parts):.1f} % of the pixels: figures are of the rest. "
     )
+
+
+def _aligned(found: dict[str, Any]) -> str:
+    if found["ate_rmse"] is None and found["ate_rmse_frames"] is not None:
+        return f"ATE: all frames are aligned (Sim(3)), as fewer than {ALIGNED} keyframes have a true pose: RMSE of all."
+    return "ATE: RMSE of keyframe positions after Sim(3) alignment."
 
 
 def _plain(value: Any) -> Any:

@@ -49,6 +49,19 @@ def test_figures_stand_beside_each_other_with_their_differences(runs: list[Path]
     assert len({len(line) for line in lines if not line.endswith("–")}) == 1
 
 
+def test_how_many_frames_the_figures_are_of_is_said(tmp_path: Path) -> None:
+    """A run that lost half of its frames has the better figures."""
+    runs = []
+    for name, psnr, held_out, tracked in (("whole", 30.0, 20, 100), ("half", 32.0, 8, 41)):
+        rendering = {"held_out": {"psnr": psnr, "count": held_out}, "keyframes": {"psnr": 33.0, "count": 2 * held_out}}
+        trajectory = {"frames_tracked": tracked}
+        runs.append(scored(tmp_path / name, psnr, 1000, rendering=rendering, trajectory=trajectory))
+    rows = {row[0]: row[1:] for row in compared(runs)}
+    assert rows["held-out frames scored"] == ["20", "8 (-12)"]
+    assert rows["keyframes scored"] == ["40", "16 (-24)"]
+    assert rows["frames tracked"] == ["100", "41 (-59)"]
+
+
 def test_runs_are_named_by_what_tells_them_apart(tmp_path: Path) -> None:
     assert names([tmp_path / "x/0", tmp_path / "x/1"]) == ["0", "1"]
     assert names([tmp_path / "one/out", tmp_path / "two/out"]) == ["one/out", "two/out"]

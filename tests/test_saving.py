@@ -5,10 +5,95 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
+from torch import from_numpy
 
 from mvsgs.saving import save_map
+from mvsgs_core.export.cameras import read_cameras
+from mvsgs_core.export.keyframe_images import image_name, known_image
+from mvsgs_core.mapping.atlas import Atlas
+from mvsgs_core.mapping.checkpoints.begun import begin_on
+from mvsgs_core.stats import Stats
 from mvsgs_core.trajectory import Trajectory
-from tests.support.small_atlas import PLAIN, begun
+from tests.support.small_atlas import PLAIN, SIZE, begun, written
+
+
+@pytest.fixture(scope="module")
+def atlas() -> Atlas:
+    return begun(PLAIN)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "keyframes/mine.png", "map.ply", "checkpoint/weights.pt"])
+@pytest.mark.parametrize("images", [False, True])
+def test_files_that_no_save_has_left_are_not_replaced(atlas: Atlas, tmp_path: Path, name: str, images: bool) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_bytes(b"of somebody else")
+    (tmp_path / "notes.txt").write_bytes(b"which is in nobody's way")
+    before = files(tmp_path)
+    with pytest.raises(ValueError, match=rf"{name.partition('/')[0]} is there and was left by no save of a map"):
+        save_map(tmp_path, atlas, None, None, images)
+    assert files(tmp_path) == before
+
+
+def test_an_earlier_save_is_replaced_and_what_others_left_beside_it_stays(atlas: Atlas, tmp_path: Path) -> None:
+    save_map(tmp_path, atlas, None, None, images=True)
+    kept = read_cameras(tmp_path / "cameras.json").keyframes.tolist()
+    assert {path.name for path in (tmp_path / "keyframes").iterdir()} == {image_name(index) for index in kept}
+    (tmp_path / "keyframes/mine.png").write_bytes(b"of somebody else")
+    save_map(tmp_path, atlas, None, None, images=False)
+    assert [path.name for path in (tmp_path / "keyframes").iterdir()] == ["mine.png"]
+    assert (tmp_path / "keyframes/mine.png").read_bytes() == b"of somebody else"
+    (tmp_path / "keyframes/mine.png").unlink()
+    save_map(tmp_path, atlas, None, None, images=True)
+    save_map(tmp_path, atlas, None, None, images=False)
+    assert not (tmp_path / "keyframes").exists()
+    assert not (tmp_path / "transforms.json").exists()  # it would name images that are not there
+
+
+def test_a_save_that_was_cut_off_can_be_done_again(
+    atlas: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("mvsgs_core.mapping.checkpoints.writer.save", full)
+        with pytest.raises(OSError, match="No space left"):
+            save_map(tmp_path, atlas, None, None, images=True)
+    save_map(tmp_path, atlas, None, None, images=True)
+    assert (tmp_path / "map.ply").exists()
+
+
+def test_images_are_those_that_came_and_what_is_left_out_is_counted(tmp_path: Path) -> None:
+    """Of a rolling shutter the map is trained on the photograph as it was taken; a run saves the image without it."""
+    atlas = begun(PLAIN)
+    views = atlas.largest.views
+    rectified = np.full((*SIZE, 3), 77, np.uint8)
+    views[1].take_photograph(np.full((*SIZE, 3), 200, np.uint8), np.zeros(6), 0.01)
+    views[2].drop_image()
+    views[3].image = views[3].image[::2, ::2]  # as of mapper.max_pixels
+    images = {views[1].index: from_numpy(rectified), views[3].index: from_numpy(rectified + 1)}
+    assert save_map(tmp_path / "a", atlas, None, None, True, images) == 1
+    folder = tmp_path / "a/keyframes"
+    for view, level in ((views[1], 77), (views[3], 78)):
+        found = known_image(folder, view.index)
+        assert found is not None
+        assert (found == level).all()
+    assert not (folder / image_name(views[2].index)).exists()
+    np.testing.assert_array_equal(known_image(folder, views[0].index), views[0].image.numpy())
+    assert save_map(tmp_path / "b", atlas, None, None, False) == 0
+
+
+def test_photographs_of_a_map_that_is_gone_on_with_are_left_out(tmp_path: Path) -> None:
+    atlas = begun(PLAIN)
+    for view in atlas.largest.views[:2]:
+        view.take_photograph(np.full((*SIZE, 3), 200, np.uint8), np.zeros(6), 0.01)
+    again = begin_on(written(atlas, tmp_path / "before"), PLAIN, Stats())
+    assert save_map(tmp_path / "now", again, None, None, True) == 2
 
 
 def test_the_trajectory_saved_is_of_the_part_that_is_saved(tmp_path: Path) -> None:

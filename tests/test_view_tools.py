@@ -8,13 +8,14 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+import torch
 
 from mvsgs.view import SavedMapView
 from mvsgs_core.export.cameras import read_cameras
-from mvsgs_core.export.ply import read_ply
+from mvsgs_core.export.ply import folded, read_ply, write_ply
 from nodes.map_page import MapPage
 from tests.support.ports import free_port
-from tests.support.tiny_map import SIZE, write_tiny_run
+from tests.support.tiny_map import SIZE, final_map, write_tiny_run
 
 HALF = np.array([[0.0, 50.0], [0.0, 100.0], [0.0, 100.0]])
 
@@ -72,6 +73,26 @@ def test_what_is_cropped_is_gone_from_page_render_and_export(shown: SavedMapView
     assert shown.cropping.said.content == "Nothing would be left."
     shown.cropping.crop(np.tile([0.0, 100.0], (3, 1)))
     assert len(splats.centers) == whole
+
+
+def test_shapes_of_splats_become_scales_on_the_page_and_in_what_is_exported(tmp_path: Path) -> None:
+    """As browsers and other viewers know only Gaussians."""
+    run = write_tiny_run(tmp_path / "run")
+    write_ply(run / "map.ply", final_map(1, "exact"))
+    opened = MapPage("127.0.0.1", free_port())
+    page = SavedMapView(opened, read_ply(run / "map.ply"), None, run / "keyframes", "tiny")
+    page.exporting.write(tmp_path / "map.ply")
+    opened.server.stop()
+    written, plain = read_ply(tmp_path / "map.ply"), folded(page._final.splats, "exact")
+    assert written.kernel == "gaussian"
+    torch.testing.assert_close(written.splats.log_scales, plain.log_scales)
+    assert opened.splats is not None
+    assert opened.unit is not None
+    shown = np.trace(opened.splats.covariances, axis1=1, axis2=2) * opened.unit**2
+    np.testing.assert_allclose(shown, (2.0 * plain.log_scales).exp().sum(dim=1), rtol=2e-3)  # 16 bits
+    assert "shapes of splats became scales" in page.exporting.said_of(tmp_path / "map.ply")
+    (tmp_path / "map.glb").touch()
+    assert page.exporting.said_of(tmp_path / "map.glb") == "map.glb: 0 bytes"
 
 
 def test_a_path_is_rendered_to_a_video_that_begins_and_ends_where_it_does(shown: SavedMapView, tmp_path: Path) -> None:

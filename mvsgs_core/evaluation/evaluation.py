@@ -21,7 +21,7 @@ from mvsgs_core.evaluation.straight import undistortion
 from mvsgs_core.evaluation.trajectory_metrics import AlignedPath, known_poses
 from mvsgs_core.export.keyframe_render import NEAR, near_plane
 from mvsgs_core.export.snapshot import Snapshot
-from mvsgs_core.trajectory import Trajectory, velocities
+from mvsgs_core.trajectory import TrackingState, Trajectory, velocities
 
 ENOUGH = 3  # held-out frames whose mean and worst say something
 
@@ -46,7 +46,7 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         self._frames = Frames(self.folder, self.max_frames, self.max_bytes)
-        self._received = 0
+        self._received: set[int] = set()  # frames
         self.size: tuple[int, int] | None = None  # height, width of the first frame
         self._truth: dict[int, np.ndarray] = {}
 
@@ -62,7 +62,7 @@ class Evaluation:
         """A frame of the stream, with what is known of the truth. mask: (H, W) bool, pixels that count; None: all."""
         if self.started is None:
             self.started = time.perf_counter()
-        self._received += 1
+        self._received.add(index)
         self.size = self.size or (image.shape[0], image.shape[1])
         if mask is None or mask.any():
             if depth is not None and mask is not None:
@@ -125,17 +125,21 @@ class Evaluation:
 
     @property
     def final_trajectory(self) -> Trajectory | None:
-        """The tracker's, following the keyframes to where the finished map has them."""
-        finished = self.finished
-        if self.trajectory is None or finished is None:
-            return self.trajectory
-        return self.trajectory.following(finished.keyframes, finished.world_from_cam)
+        """The tracker's, following the keyframes to where the finished map has them; where that sent none, of those
+        alone. None where there is no map either."""
+        return self.trajectory if self.finished is None else self._following(self.finished)
+
+    def _following(self, finished: Snapshot) -> Trajectory:
+        """Keyframes are those of the map, too, whether the tracker says so or not: they are no frames held out."""
+        if self.trajectory is None:
+            return _of_keyframes(finished)
+        followed = self.trajectory.following(finished.keyframes, finished.world_from_cam)
+        return replace(followed, keyframe=followed.keyframe | np.isin(followed.index, finished.keyframes))
 
     def scored_frames(self, refined: bool = True) -> list[scoring.ScoredFrame]:
         """All frames with a pose in the part that the map shows whose image is there, in the order of the stream."""
         finished = self.maps[refined]
-        assert self.trajectory is not None
-        tracked = self.trajectory.following(finished.keyframes, finished.world_from_cam)
+        tracked = self._following(finished)
         frames = []
         main = tracked.main(finished.keyframes)
         near = near_plane(finished, finished.world_from_cam[0]) if len(finished.keyframes) else NEAR
@@ -170,8 +174,8 @@ class Evaluation:
 
     def exposures(self, refined: bool) -> FrameExposures | None:
         """Of all frames of the track; of those outside of the part that the map shows they mean nothing."""
-        finished, tracked = self.maps[refined], self.trajectory
-        assert tracked is not None
+        finished = self.maps[refined]
+        tracked = self.trajectory or _of_keyframes(finished)
         main, place = tracked.main(finished.keyframes), _places(finished)
         mapped = np.flatnonzero(main & np.isin(tracked.index, finished.keyframes))
         affines = finished.exposures[[place[int(i)] for i in tracked.index[mapped]]]
@@ -221,7 +225,7 @@ class Evaluation:
         finished = self.maps.get(refined)
         if not self.max_frames:
             return scoring.summarize([])
-        if finished is None or self.trajectory is None or not len(finished.splats.means):
+        if finished is None or not len(finished.splats.means):
             which = "after" if refined else "before"
             notes.append(f"no renders {which} refinement were scored: " + ("no map" if not finished else "empty map"))
             return scoring.summarize([])
@@ -243,7 +247,7 @@ class Evaluation:
 
     def _exposure_report(self) -> dict[str, Any] | None:
         refined = True in self.maps
-        if not self.maps or self.trajectory is None:
+        if not self.maps:
             return None
         finished = self.maps[refined]
         return summary(finished.keyframes, finished.exposures, self.exposures(refined), finished.vignetting)
@@ -267,6 +271,7 @@ class Evaluation:
 
     def _score_trajectory(self, notes: list[str]) -> tuple[trajectory_metrics.Alignment | None, dict[str, Any]]:
         trajectory = self.final_trajectory or Trajectory.empty()
+        notes += self._about_trajectory()
         poses = known_poses(trajectory, self._truth, self.keyframes)
         posed, shown = int(trajectory.posed.sum()), int(trajectory.main(self.keyframes).sum())
         if shown < posed:
@@ -276,18 +281,32 @@ class Evaluation:
             )
         counts = {**trajectory_metrics.counts(trajectory), "ate_keyframes": int(poses.keyframe.sum())}
         counts["ate_frames"] = len(poses.keyframe)
+        if self.trajectory is None:
+            counts["frames"] = len(self._received)
         try:
             found = poses.alignment
         except ValueError as error:
-            if self.trajectory is None:
-                counts["frames"] = self._received
-                notes.append("no trajectory was received")
-            else:
+            if self.trajectory is not None or len(trajectory.index):
                 notes.append(f"no trajectory error: {error if self._truth else 'no true poses'}")
             unknown = {"path_length": None, "scale": None}
             return None, {**metrics.of_all(metrics.TRAJECTORY, None), **unknown, **counts}
         length = {"path_length": poses.path_length, "scale": found.scale}
         return found, {**metrics.of_all(metrics.TRAJECTORY, poses), **length, **counts}
+
+    def _about_trajectory(self) -> list[str]:
+        """What a user should know of the one that the tracker sent."""
+        if self.trajectory is None:
+            instead = "" if self.finished is None else ": the map's keyframes are scored, and no other frame"
+            return [f"no trajectory was received{instead}"]
+        notes = []
+        if missing := len(self._received - set(self.trajectory.index.tolist())):
+            notes.append(
+                f"{missing} of {len(self._received)} frames are not in the tracker's Trajectory: no figure is of them"
+            )
+        others = self.trajectory.index[~self.trajectory.keyframe]
+        if unsaid := int(np.isin(others, self.keyframes).sum()):
+            notes.append(f"{unsaid} keyframes of the map are none in the tracker's Trajectory: they count as keyframes")
+        return notes
 
     def aligned_path(self) -> AlignedPath | None:
         """Of the part that the map shows; None where no frame has a pose."""
@@ -326,6 +345,16 @@ class Evaluation:
 
     def close(self) -> None:
         self._frames.close()
+
+
+def _of_keyframes(finished: Snapshot) -> Trajectory:
+    """Of a map, those of its keyframes that are of this stream; their numbers stand in for their times."""
+    index = finished.keyframes[finished.keyframes >= 0]
+    count = len(index)
+    return Trajectory(
+        index, index.astype(np.float64), finished.world_from_cam[finished.keyframes >= 0], np.ones(count, bool),
+        np.full(count, TrackingState.TRACKED, np.uint8), np.zeros(count, np.int32),
+    )  # fmt: skip
 
 
 def _places(finished: Snapshot) -> dict[int, int]:

@@ -83,11 +83,11 @@ DEPTH = (
 TRAJECTORY = (
     Metric(
         "ate_rmse", "ATE", "", 4, "lower", "ATE RMSE of keyframes (after Sim(3), unit of the true poses)",
-        lambda poses: rmse(poses.errors[poses.keyframe]),
+        lambda poses: poses.keyframe_error,
     ),
     Metric(
         "ate_percent", "ATE %", "% of the path", 2, "lower", "ATE RMSE of keyframes, of the path",
-        lambda poses: 100 * rmse(poses.errors[poses.keyframe]) / poses.path_length if poses.path_length else None,
+        lambda poses: poses.keyframe_percent,
     ),
     Metric("ate_rmse_frames", "ATE of all", "", 4, "lower", "ATE RMSE of all frames", lambda poses: rmse(poses.errors)),
     Metric("rpe_translation", "RPE", "", 4, "lower", "RPE of translation by frame", lambda poses: poses.relative[0]),
@@ -105,11 +105,17 @@ RUN = {  # by their place in the report
     "time.keyframes_per_second": Metric("keyframes_per_second", "KF/s", "1/s", 2, "higher", "keyframes per second"),
     "time.cpu.*": Metric("cpu", "CPU s", "s", 1, "lower"),
 }
+COUNTS = {  # of how many frames those are, by their place in the report
+    "trajectory.frames_tracked": Metric("frames_tracked", "frames tracked", "", 0, ""),
+    "rendering.held_out.count": Metric("count", "held-out frames scored", "", 0, ""),
+    "rendering.keyframes.count": Metric("count", "keyframes scored", "", 0, ""),
+}
 METRICS = {
     **{f"rendering*.{metric.key}": metric for metric in IMAGE},
     **{f"depth.{metric.key}": metric for metric in DEPTH},
     **{f"trajectory.{metric.key}": metric for metric in TRAJECTORY},
     **RUN,
+    **COUNTS,
 }
 
 
@@ -132,4 +138,4 @@ def listed(metrics: tuple[Metric, ...], values: Mapping[str, Any]) -> str:
     return ", ".join(f"{metric.label} {metric.text(value)}" for metric, value in known)
 
 
-__all__ = ["DEPTH", "IMAGE", "METRICS", "RUN", "TRAJECTORY", "Figure", "Metric", "at", "listed", "of_all"]
+__all__ = ["COUNTS", "DEPTH", "IMAGE", "METRICS", "RUN", "TRAJECTORY", "Figure", "Metric", "at", "listed", "of_all"]

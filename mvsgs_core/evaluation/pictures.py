@@ -142,8 +142,8 @@ def _from_above(evaluation: Evaluation) -> dict[str, str]:
 
 def _exposure_plot(evaluation: Evaluation) -> dict[str, str]:
     """Gain of red, green and blue of each frame of the map's part, where there is an exposure."""
-    tracked, refined = evaluation.trajectory, True in evaluation.maps
-    found = evaluation.exposures(refined) if evaluation.maps and tracked is not None else None
+    tracked, refined = evaluation.final_trajectory, True in evaluation.maps
+    found = evaluation.exposures(refined) if evaluation.maps else None
     if found is None or tracked is None:
         return {}
     main = tracked.main(evaluation.maps[refined].keyframes)

@@ -13,6 +13,8 @@ from mvsgs_core import geometry
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.trajectory import TrackingState, Trajectory
 
+ALIGNED = 3  # poses at least, for an alignment
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -33,7 +35,7 @@ def align(estimate: np.ndarray, truth: np.ndarray) -> Alignment:
     Raises ValueError where no alignment exists: fewer than 3 poses, or positions that coincide.
     """
     for poses, which in ((truth, "true"), (estimate, "estimated")):
-        if len(poses) >= 3 and not geometry.moves(poses[:, :3, 3]):
+        if len(poses) >= ALIGNED and not geometry.moves(poses[:, :3, 3]):
             raise ValueError(f"the {which} poses do not move: their positions coincide")
     # the truth's own origin may be far away: solved around its mean inside umeyama, in float64
     return Alignment(*geometry.umeyama(estimate[:, :3, 3], truth[:, :3, 3]))
@@ -68,16 +70,34 @@ def path_length(world_from_cam: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class KnownPoses:
-    """Estimated poses whose true ones are known, and how they compare after alignment of the keyframes."""
+    """Estimated poses whose true ones are known, and how they compare after alignment of the keyframes; of all of them
+    where too few are keyframes, as where a stream is only localized in a map."""
 
     estimate: np.ndarray  # (N, 4, 4) world_from_cam
     truth: np.ndarray  # (N, 4, 4)
     keyframe: np.ndarray  # (N,) bool
 
+    @property
+    def by_keyframes(self) -> bool:
+        """Whether the keyframes are what is aligned."""
+        return int(self.keyframe.sum()) >= ALIGNED
+
     @cached_property
     def alignment(self) -> Alignment:
         """Raises ValueError where there is none, as `align` does; so do `errors` and `relative`."""
-        return align(self.estimate[self.keyframe], self.truth[self.keyframe])
+        aligned = self.keyframe if self.by_keyframes else slice(None)
+        return align(self.estimate[aligned], self.truth[aligned])
+
+    @property
+    def keyframe_error(self) -> float | None:
+        """RMSE in the unit of the truth; None where they are not what is aligned."""
+        return rmse(self.errors[self.keyframe]) if self.by_keyframes else None
+
+    @property
+    def keyframe_percent(self) -> float | None:
+        """The same, in percent of the path."""
+        error = self.keyframe_error
+        return 100 * error / self.path_length if error is not None and self.path_length else None
 
     @cached_property
     def errors(self) -> np.ndarray:

@@ -51,8 +51,10 @@ def splats(out: Path, final: Snapshot, options: argparse.Namespace) -> str:
         write_ply(out, final, fold=options.fold)
     else:
         {".splat": write_splat, ".spz": write_spz}[out.suffix](out, final)
+    shaped = out.suffix == ".ply" and final.kernel != "gaussian" and not options.fold
     silent = final.antialiased and out.suffix != ".spz"
-    told = "; antialiased: a viewer must be told, or shows it too bright" if silent else ""
+    told = "; shaped: other viewers need --fold" if shaped else ""
+    told += "; antialiased: a viewer must be told, or shows it too bright" if silent else ""
     origin = RUB_FROM_RDF @ spz_origin(final) if out.suffix == ".spz" else relative_origin(final)
     if origin.any():
         told += (

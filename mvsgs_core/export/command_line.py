@@ -26,8 +26,9 @@ def run(
     options = parser.parse_args(arguments)
     try:
         print(command(options))
-    except (ValueError, OSError, ImportError) as error:
-        print(f"{parser.prog.replace('.', ' ').split()[-1]}: {error}", file=sys.stderr)
+    except (ValueError, OSError, ImportError, MemoryError) as error:
+        said = f"not enough memory: {error}".removesuffix(": ") if isinstance(error, MemoryError) else error
+        print(f"{parser.prog.replace('.', ' ').split()[-1]}: {said}", file=sys.stderr)
         return 1
     return 0
 
@@ -57,28 +58,34 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def read_map(options: argparse.Namespace) -> tuple[Snapshot, str]:
+    """As `sound_map`, of what a command line asks for."""
+    return sound_map(options.map, options.drop_unsound, options.antialiased or None, "--drop-unsound")
+
+
+def sound_map(file: Path, drop_unsound: bool, antialiased: bool | None, dropping: str) -> tuple[Snapshot, str]:
     """The map, and what is to be said of splats that were left out because a value of theirs is not finite, or nothing.
 
-    Raises ValueError where there are such and --drop-unsound was not given.
+    antialiased: None: as the file says. dropping: how a user asks for `drop_unsound`. Raises ValueError where there are
+    such splats and nobody did, FileNotFoundError.
     """
-    if not options.map.is_file():
-        raise FileNotFoundError(f"{options.map} is missing: a map is a map.ply, or the output folder of a run")
-    final = read_ply(options.map)
+    if not file.is_file():
+        raise FileNotFoundError(f"{file} is missing: a map is a map.ply, or the output folder of a run")
+    final = read_ply(file)
     splats = final.splats
     sound = torch.ones(len(splats), dtype=torch.bool)
     for value in splats.tensors().values():
         sound &= torch.isfinite(value).reshape(len(splats), -1).all(dim=1)
     sound &= splats.quaternions.norm(dim=1) > 0
     unsound = int((~sound).sum())
-    if unsound and not options.drop_unsound:
+    if unsound and not drop_unsound:
         raise ValueError(
-            f"{unsound} of {len(splats)} splats in {options.map} have values that are not finite: the file is damaged; "
-            "--drop-unsound leaves them out"
+            f"{unsound} of {len(splats)} splats in {file} have values that are not finite: the file is damaged; "
+            f"{dropping} leaves them out"
         )
     kept = Splats(**{name: value[sound] for name, value in splats.tensors().items()})
     said = f"; {unsound} splats that are not finite were left out" if unsound else ""
-    antialiased = final.antialiased or options.antialiased
-    return replace(final, splats=kept, anchors=final.anchors[sound.numpy()], antialiased=antialiased), said
+    told = final.antialiased if antialiased is None else antialiased
+    return replace(final, splats=kept, anchors=final.anchors[sound.numpy()], antialiased=told), said
 
 
 def known_cameras(options: argparse.Namespace) -> Cameras | None:

@@ -16,7 +16,7 @@ from plyfile import PlyData
 
 from mvsgs_core.export import __main__ as export
 from mvsgs_core.export.cameras import read_cameras
-from mvsgs_core.export.command_line import input_arguments, lens
+from mvsgs_core.export.command_line import input_arguments, lens, run
 from mvsgs_core.export.earth import in_axes_of
 from mvsgs_core.export.ply import folded, read_ply, write_ply
 from mvsgs_core.export.turning import RUB_FROM_RDF
@@ -87,6 +87,31 @@ def test_a_saved_map_says_that_it_is_antialiased_and_is_rendered_so(
     assert ("antialiased" in capsys.readouterr().out) == antialiased
     assert export.main([str(tmp_path / "map.ply"), str(tmp_path / "again.ply"), "--antialiased"]) == 0
     assert read_ply(tmp_path / "again.ply").antialiased
+
+
+@pytest.mark.parametrize(("name", "words", "told"), [
+    ("map.ply", [], True), ("map.ply", ["--fold"], False), ("map.splat", [], False), ("map.spz", [], False),
+])  # fmt: skip
+def test_a_map_with_shapes_says_what_other_viewers_need(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, words: list[str], told: bool
+) -> None:
+    write_ply(tmp_path / "shaped.ply", final_map(1, "exact", np.zeros(3)))
+    assert export.main([str(tmp_path / "shaped.ply"), str(tmp_path / name), *words]) == 0
+    assert ("; shaped: other viewers need --fold" in capsys.readouterr().out) == told
+
+
+@pytest.mark.parametrize(("error", "said"), [
+    (MemoryError(), "export: not enough memory\n"),
+    (MemoryError("Unable to allocate 5 GiB"), "export: not enough memory: Unable to allocate 5 GiB\n"),
+])  # fmt: skip
+def test_memory_that_is_not_enough_is_said_in_a_line(
+    capsys: pytest.CaptureFixture[str], error: MemoryError, said: str
+) -> None:
+    def command(options: argparse.Namespace) -> str:
+        raise error
+
+    assert run(argparse.ArgumentParser(prog="mvsgs export"), [], command) == 1
+    assert capsys.readouterr().err == said
 
 
 def test_a_far_origin_stays_a_comment_so_that_no_detail_is_lost(tmp_path: Path) -> None:

@@ -1,0 +1,65 @@
+"""The images that a program saves with its map: those that a run writes with mapper.save_images=true."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from launch.compose import compose
+from launch.inline import run_inline
+from msgs import Frame, GroundTruth
+from mvsgs import Mapping
+from mvsgs_core.datasets import Item
+from nodes import Node
+from tests.support.sequences import synthetic
+
+pytestmark = pytest.mark.slow
+
+SMALL = ["mapper.iterations=1", "mapper.refinement=0", "device=cpu", "mapper.threads=1"]
+
+
+def room() -> tuple[Item, ...]:
+    return synthetic(frames=16, size=(96, 128))
+
+
+class Posed(Node):
+    def run(self) -> Iterator[Frame | GroundTruth]:
+        for item in room():
+            yield Frame(item.index, item.timestamp, item.image, item.intrinsics)
+            yield GroundTruth(item.index, item.timestamp, item.image, item.intrinsics, item.world_from_cam, item.depth)
+
+
+@pytest.mark.parametrize("more", ["tracker.readout_time=0.02", "mapper.max_pixels=3072"])
+def test_saved_images_are_those_of_a_run(tmp_path: Path, more: str) -> None:
+    """Of a rolling shutter, and of training at a smaller size."""
+    output = tmp_path / "run"
+    words = [*SMALL, more, "tracker=ground_truth", "evaluator=off", "mapper.save_images=true", f"output={output}"]
+    run_inline(compose([*words, f"dataset._target_={__name__}.Posed"]))
+    with Mapping(*SMALL, more, poses=True, intrinsics=room()[0].intrinsics) as mapping:
+        for item in room():
+            mapping.add(item.image, item.timestamp, pose=item.world_from_cam)
+    saved = mapping.save(tmp_path / "saved")
+    theirs = {file.name: file.read_bytes() for file in (output / "keyframes").iterdir()}
+    ours = {file.name: file.read_bytes() for file in (saved / "keyframes").iterdir()}
+    assert len(theirs) > 3
+    assert ours.keys() == theirs.keys()
+    assert ours == theirs
+    assert mapping.warnings == []
+
+
+def test_images_that_could_not_be_saved_are_said(tmp_path: Path) -> None:
+    few = ["mapper.max_keyframes=3", "mapper.window=1"]
+    with Mapping(*SMALL, *few, poses=True, intrinsics=room()[0].intrinsics) as mapping:
+        for item in room():
+            mapping.add(item.image, item.timestamp, pose=item.world_from_cam)
+    saved = mapping.save(tmp_path / "saved")
+    missing = len(mapping.keyframes) - len(list((saved / "keyframes").iterdir()))
+    assert missing > 0
+    assert f"{missing} of {len(mapping.keyframes)} keyframes were saved without an image" in mapping.warnings[-1]
+    count = len(mapping.warnings)
+    mapping.save(saved, images=False)
+    assert len(mapping.warnings) == count
+    np.testing.assert_array_equal(np.isfinite(mapping.trajectory.world_from_cam).all(axis=(1, 2)), True)
