@@ -215,6 +215,7 @@ class Trajectory:
     # k1, k2 as OpenCV's of the frames, by the focal lengths as found; keyframes are without; None: frames have none
     distortion: Annotated[np.ndarray, "float64 2"] | None = None
     reads_columns: bool = False  # the rolling shutter reads columns, not rows
+    in_order: bool = True  # one frame after the other along a path; false: photographs in any order
 
 
 @dataclass(frozen=True)

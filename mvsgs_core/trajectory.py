@@ -40,6 +40,7 @@ class Trajectory:
     places: np.ndarray | None = None  # (N, 3) latitude, longitude, altitude by GPS, NaN where not known; None: nowhere
     distortion: np.ndarray | None = None  # (2,) k1, k2 of the frames that the keyframes are without; None: none
     reads_columns: bool = False  # the rolling shutter reads columns, not rows
+    in_order: bool = True  # one frame after the other along a path; false: photographs in any order
 
     @classmethod
     def empty(cls) -> Trajectory:
@@ -55,6 +56,8 @@ class Trajectory:
     def velocities_of(self, index: np.ndarray) -> np.ndarray:
         """(K, 6) of the camera at the frames `index` (K,), see `velocities`; NaN where no neighbor tells it, and of
         frames of another stream."""
+        if len(self.index) == 0:
+            return np.full((len(index), 6), np.nan)
         found = np.zeros((len(self.index), 6))
         for segment in np.unique(self.segment[self.posed]):
             found += velocities(self.timestamp, self.world_from_cam, self.posed & (self.segment == segment))
@@ -78,7 +81,8 @@ class Trajectory:
         """The part that a map shows, moved to where that has its keyframes (K,), by index: world_from_cam (K, 4, 4).
 
         The frames between two of them move as they do, on the screw from one motion to the other, linear in time;
-        those before the first and after the last move as that one. Time is as `along` has it.
+        those before the first and after the last move as that one. Time is as `along` has it. Photographs in any order
+        move as the keyframe does that is nearest in space.
         """
         order = np.argsort(keyframes)
         shown = self.main(keyframes)
@@ -94,7 +98,12 @@ class Trajectory:
         target = known.copy()
         target[:, :3, 3] -= origin
         moves, times = target @ geometry.inverse(poses[anchors]), along(self.timestamp)
-        place = np.interp(times[main], times[anchors], np.arange(len(anchors)))
+        if self.in_order:
+            place = np.interp(times[main], times[anchors], np.arange(len(anchors)))
+        else:
+            centers = poses[anchors, :3, 3]
+            nearest = [np.argmin(np.linalg.norm(centers - center, axis=1)) for center in poses[main, :3, 3]]
+            place = np.array(nearest, np.float64)
         before = np.floor(place).astype(int)
         after = np.minimum(before + 1, len(anchors) - 1)
         change = geometry.se3_log(geometry.inverse(moves[before]) @ moves[after])

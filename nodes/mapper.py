@@ -14,9 +14,9 @@ from msgs import Asked, FusedKeyframe, Keyframe, Poses, Preview, Reply, Request,
 from mvsgs_core.export import keyframe_images
 from mvsgs_core.export.keyframe_images import write_image
 from mvsgs_core.export.source_camera import source_camera
+from mvsgs_core.held_out import is_held_out
 from mvsgs_core.kept_map import check_kept_map
 from mvsgs_core.mapping.atlas import Atlas
-from mvsgs_core.mapping.between import FrameBetween
 from mvsgs_core.mapping.checkpoints import checkpoint
 from mvsgs_core.mapping.checkpoints.begun import begin_on
 from mvsgs_core.mapping.checkpoints.checkpointing import Checkpointing
@@ -24,16 +24,18 @@ from mvsgs_core.mapping.checkpoints.files import checkpoint_info
 from mvsgs_core.mapping.checkpoints.replay import Replay
 from mvsgs_core.mapping.checkpoints.saved_map import SavedMap
 from mvsgs_core.mapping.config import MapperConfig
-from mvsgs_core.mapping.keyframes import RGBDKeyframe, TrainingView
+from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.losses import loss_function
 from mvsgs_core.mapping.mapper import FINAL_RATE, OnlineMapper
 from mvsgs_core.mapping.preview import preview_arrays
-from mvsgs_core.mapping.provisional import CoarseKeyframe, Provisional
+from mvsgs_core.mapping.provisional import Provisional
 from mvsgs_core.mapping.self_check import why_nothing
 from mvsgs_core.pace import Effort, Pace
 from nodes import Node
 from nodes.last_seconds import LastSeconds
+from nodes.mapped_messages import coarse_keyframe, frame_between, rgbd_keyframe
 from nodes.once import Once
+from nodes.preview_delay import PreviewDelay
 from nodes.runtime.freed_memory import return_large_blocks
 from nodes.runtime.status import rss
 from nodes.saved_maps import ABORT, SavedMaps
@@ -84,8 +86,7 @@ class Mapper(Node):
         self._last_seconds = LastSeconds()
         self._efforts = 0, 0  # that stereo and fusion made for the newest keyframe
         self._unshown = False  # a map that was begun on and that no preview showed yet
-        self._shown = -1  # newest keyframe that a preview showed
-        self._unseen: dict[int, float] = {}  # keyframes that no preview showed yet: when they were captured
+        self._preview_delay = PreviewDelay()
         self.atlas, resumed = Atlas(OnlineMapper(self.config, self.stats)), None
         self._replay: Replay | None = None
         if self.config.resume is not None:
@@ -136,28 +137,17 @@ class Mapper(Node):
         yield from self._preview()
 
     def on_tracked_frame(self, frame: TrackedFrame) -> Iterator[Preview]:
-        if self._once.frame(frame) and (not self._replay or not self._replay.problem):
-            self.atlas.add_between(
-                FrameBetween(
-                    index=frame.index, timestamp=frame.timestamp, image=frame.image, intrinsics=frame.intrinsics,
-                    keyframe=frame.keyframe, keyframe_from_cam=frame.keyframe_from_cam, scale=frame.scale,
-                    exposure=frame.exposure, velocity=frame.velocity, readout_time=frame.readout_time,
-                    reads_columns=frame.reads_columns, mask=frame.mask,
-                )
-            )  # fmt: skip
+        if is_held_out(frame.index):
+            self.stats.refuse("frames", 1, "the tracker sent held-out frames to be trained on: they were refused")
+        elif self._once.frame(frame) and (not self._replay or not self._replay.problem):
+            self.atlas.add_between(frame_between(frame))
         yield from ()
 
     def on_keyframe(self, keyframe: Keyframe) -> Iterator[Preview]:
         if not self._previewing:
             return
         self._came(keyframe)
-        self._provisional.see(
-            CoarseKeyframe(
-                index=keyframe.index, image=keyframe.image, intrinsics=keyframe.intrinsics, scale=keyframe.scale,
-                world_from_cam=keyframe.world_from_cam, inverse_depth=keyframe.inverse_depth,
-                weight=keyframe.inverse_depth_weight, segment=keyframe.segment, exposure=keyframe.exposure,
-            )
-        )  # fmt: skip
+        self._provisional.see(coarse_keyframe(keyframe))
         yield from self._preview()
 
     def on_poses(self, poses: Poses) -> Iterator[Preview]:
@@ -220,7 +210,10 @@ class Mapper(Node):
         self._settle_last()
         if just_ended:
             self.stats.arrived("last keyframe to the map before its refinement", self._last_captured)
-        yield splat_map(self.atlas.current.snapshot(), refined=False)
+        if not self.atlas.refined:
+            yield splat_map(self.atlas.current.snapshot(), refined=False)
+        else:
+            self.stats.warn("the run was cut off within its refinement: the map before that is not reported")
         while not self._frozen and (self._made_up() or self.atlas.refine()):
             self._keep()
             if self.config.realtime:
@@ -247,17 +240,7 @@ class Mapper(Node):
         self._saved.close(began + ABORT - time.monotonic())
 
     def _add(self, fused: FusedKeyframe, halvings: int) -> TrainingView | None:
-        return self.atlas.add(
-            RGBDKeyframe(
-                index=fused.index, image=fused.image, intrinsics=fused.intrinsics, world_from_cam=fused.world_from_cam,
-                depth=fused.depth, scale=fused.scale, confidence=fused.confidence, normals=fused.normals,
-                unfiltered=fused.unfiltered, timestamp=fused.timestamp, exposure=fused.exposure,
-                vignetting=fused.vignetting, photograph=fused.photograph, velocity=fused.velocity,
-                readout_time=fused.readout_time, reads_columns=fused.reads_columns, mask=fused.mask,
-            ),
-            fused.segment,
-            halvings,
-        )  # fmt: skip
+        return self.atlas.add(rgbd_keyframe(fused), fused.segment, halvings)
 
     def _meet(self, request: Request, reply: Reply) -> Reply | None:
         """Does the mapper's part. None: the reply comes later, with what is written to a disk."""
@@ -300,8 +283,7 @@ class Mapper(Node):
     def _go_on_with(self, atlas: Atlas) -> None:
         """Another map; what is counted goes on."""
         self.atlas, self._replay = atlas, None
-        self._provisional = Provisional(self.config.preview_splats)
-        self._unseen.clear()
+        self._provisional, self._preview_delay = Provisional(self.config.preview_splats), PreviewDelay()
 
     def _pass_over(self, counted: str = "") -> None:
         """A message that is not taken in, as the checkpoint has it or the stream does not fit, which is said."""
@@ -335,8 +317,8 @@ class Mapper(Node):
         if keyframe.captured > 0.0:
             self._last_captured = max(self._last_captured, keyframe.captured)
             self._last_seconds.came(keyframe.captured)
-            if self._previewing and keyframe.index > self._shown:
-                self._unseen[keyframe.index] = keyframe.captured
+            if self._previewing:
+                self._preview_delay.came(keyframe)
 
     def _keep(self) -> None:
         """Between two iterations, where nothing is half changed."""
@@ -394,6 +376,5 @@ class Mapper(Node):
             coarse=len(mapper.coarse),
         )
         shown = {view.index for view in mapper.views} | self._provisional.shown
-        for index in self._unseen.keys() & shown:
-            self.stats.arrived("keyframe to preview", self._unseen.pop(index))
-            self._shown = max(self._shown, index)
+        for captured in self._preview_delay.shown(shown):
+            self.stats.arrived("keyframe to preview", captured)

@@ -24,20 +24,20 @@ class Returning:
     def __init__(self, folder: Path, stats: Stats, clock: Callable[[], float] = time.monotonic) -> None:
         """folder: of this node and run alone; what an earlier process left in it is gone on with."""
         folder.mkdir(parents=True, exist_ok=True)
-        self._file = folder / "tracker.npz"
+        self._folder, self._file = folder, folder / "tracker.npz"
         self._stats, self._clock = stats, clock
         self._due = 0.0
         self._changed = False
         self.revision = 0  # of the newest corrections that were sent
         self.frozen = False  # frames were only found in the map, as was asked for
         self.met: set[int] = set()  # requests
-        self.newest = -1  # keyframe that the earlier process sent
+        self.newest = -1  # frame of the map that the earlier process had, up to which none is taken again
         self._sent: set[int] = set()  # keyframes of the map that it had
         self._log = folder / "sent"
         self._gap = folder / "not all of it"  # there: the log lacks lines, which a full disk has cost
         self._lost = self._gap.exists()
         self.returned = self._lost or self._log.exists()  # in an earlier process's place
-        self.another = False  # map than the run began on was asked for
+        self.another: int | None = None  # request for another map than the run began on, the newest
         for line in self._log.read_text().splitlines() if self._log.exists() else ():
             kind, _, number = line.removesuffix(";").partition(" ")
             if not line.endswith(";"):
@@ -52,8 +52,10 @@ class Returning:
             elif kind == MODE and number.isdecimal():
                 self.frozen = bool(int(number))
             elif kind == ANOTHER:
+                request, _, first = number.partition(" ")
                 self._sent.clear()
-                self.another = True
+                self.another, self._file = int(request), self._file_of(int(request))
+                self.newest = max(self.newest, int(first) - 1)
 
     def known(self) -> KnownMap | None:
         """The map as the earlier process saved it last; None: there was none. Raises ValueError for a damaged file, and
@@ -65,7 +67,7 @@ class Returning:
         if not self._file.exists():
             if self._sent:
                 raise ValueError("this tracker was killed before it had saved its map, and cannot go on in it")
-            if self.another:
+            if self.another is not None:
                 self._stats.warn("the tracker was started again: it begins another map, as was asked for before")
             return None
         known = known_map.load(self._file)
@@ -90,11 +92,17 @@ class Returning:
     def note_mode(self, frozen: bool) -> None:
         self._write(f"{MODE} {int(frozen)}")
 
-    def forget(self) -> None:
-        """Another map was begun on request: it is to be saved as soon as it has keyframes."""
-        self._file.unlink(missing_ok=True)
-        self._write(f"{ANOTHER} 0")
+    def begin(self, tracker: Tracker, request: int, first: int) -> None:
+        """Another map is gone on in, on a request of that number, from this frame on.
+
+        It is saved, or to be saved as soon as it has keyframes, in a file of its own: who returns is in one map or the
+        other, whenever this is cut off.
+        """
+        before, self._file = self._file, self._file_of(request)
         self._changed, self._due = True, 0.0
+        self.save(tracker)
+        self._write(f"{ANOTHER} {request} {first}")
+        before.unlink(missing_ok=True)
 
     def save(self, tracker: Tracker) -> None:
         """Between two frames, where it is time."""
@@ -107,6 +115,10 @@ class Returning:
             self._stats.warn(f"if this tracker is killed it cannot go on: {error}")
         now = self._clock()
         self._changed, self._due = False, now + (now - began) / SHARE
+
+    def _file_of(self, request: int) -> Path:
+        """The map that was begun on it."""
+        return self._folder / f"tracker-{request}.npz"
 
     def _write(self, line: str) -> None:
         """A disk that is full costs the return, not the run. Raises OSError where not even that can be left behind."""

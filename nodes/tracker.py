@@ -89,7 +89,7 @@ class Tracker(TrackerNode):
             self._localized.go_on()
         if (known := returning.known()) is not None:
             self.core = CoreTracker(self.config, known=known, frozen=returning.frozen)
-        elif returning.another:
+        elif returning.another is not None:
             self.core = CoreTracker(self.config)
         elif returning.frozen:
             self.core.freeze()
@@ -97,6 +97,9 @@ class Tracker(TrackerNode):
     def on_request(self, request: Request) -> Iterator[Keyframe | Poses | TrackedFrame | Request]:
         """Between two frames: what is saved is the map as it is there, and what is begun begins there."""
         self._begin()
+        if self._returning is not None and request.number == self._returning.another:
+            yield request  # met by the process before, which may have ended before it was sent; others pass over it
+            return
         if self._returning is not None and request.number in self._returning.met:
             self.stats.skip("requests that came again")
             return
@@ -131,9 +134,9 @@ class Tracker(TrackerNode):
             case Asked.SAVE_MAP:
                 self._save(request.folder)
             case Asked.RESET:
-                self._go_on_with(CoreTracker(self.config, stats=self.core.stats), request.kept)
+                self._go_on_with(CoreTracker(self.config, stats=self.core.stats), request)
             case Asked.LOAD_MAP:
-                self._go_on_with(self._on(request.folder), request.kept)
+                self._go_on_with(self._on(request.folder), request)
             case Asked.LOCALIZE if request.on:
                 self.core.freeze()
                 self._note_mode()
@@ -164,16 +167,15 @@ class Tracker(TrackerNode):
         check_no_map(folder)
         self.core.keep_map(tracker_file(folder))
 
-    def _go_on_with(self, core: CoreTracker, kept: str) -> None:
-        """Another map; what is there of the one before is kept in that folder, and goes out no more."""
+    def _go_on_with(self, core: CoreTracker, request: Request) -> None:
+        """Another map; what is there of the one before is kept, and goes out no more."""
         if self.core.mapped and not self.only_localizes:
-            self._save(kept)
+            self._save(request.kept)
         self.stats.warn("another map was begun on request: what is reported is the last one")
         self.core = core
         if self._returning is not None:
-            self._returning.forget()
+            self._returning.begin(core, request.number, 0 if self._newest is None else self._newest.index + 1)
             self._returning.note_mode(core.frozen)
-            self._returning.save(core)
         self._frames.clear()
         self._readout_times.clear()
         self._without_shutter.clear()

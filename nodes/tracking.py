@@ -149,7 +149,7 @@ class TrackerNode(Node, ABC):
             self.stats.nothing(self.core.nothing)
         trajectory = self.core.trajectory()
         found: dict[str, Any] = {"focal_factor": self._focal_factor, "readout_time": self._readout_time}
-        found["reads_columns"] = self._reads_columns
+        found["reads_columns"], found["in_order"] = self._reads_columns, self.in_stream_order
         known = {"places": places_of(trajectory.index, self._places), "distortion": self._distortion}
         yield Trajectory(**vars(trajectory) | found | known)
 

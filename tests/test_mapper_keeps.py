@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from msgs import Preview, Reply, Request
 from mvsgs_core.kept_map import tracker_file
 from mvsgs_core.mapping.checkpoints.files import checkpoint_info, state_file
+from mvsgs_core.mapping.checkpoints.saved_map import SavedMap
 from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from nodes.mapper import Mapper
 from nodes.ros2_services import newest
@@ -104,6 +107,31 @@ def test_a_run_that_ends_early_waits_for_the_map_that_is_being_saved(
     assert list(node.on_request(Request(1, "reset", kept=str(tmp_path)))) == []
     node.on_abort("the run was stopped")
     assert checkpoint_info(tmp_path).keyframes.tolist() == [0, 7]
+
+
+def test_a_map_that_could_not_be_written_is_done_once_it_is_known_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write: Callable[..., None] = CheckpointWriter._write
+    told = threading.Event()
+
+    def slowly(*given: Any) -> None:
+        try:
+            write(*given)
+        finally:
+            assert told.wait(LONG)
+
+    def no_room(*_: Any) -> None:
+        raise OSError("no room")
+
+    monkeypatch.setattr(CheckpointWriter, "_write", slowly)
+    monkeypatch.setattr(CheckpointWriter, "_write_state", no_room)
+    saved = SavedMap(mapped().atlas, settings(), tmp_path)
+    until(lambda: not saved._writer.busy)
+    assert not saved.done
+    told.set()
+    until(lambda: saved.done)
+    assert "no room" in saved.problem
 
 
 def test_the_newest_map_has_both_halves(tmp_path: Path) -> None:

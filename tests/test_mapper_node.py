@@ -26,7 +26,7 @@ from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from nodes.mapper import Mapper
 from nodes.parameters import build
-from tests.support.mapper_messages import settings, view_message
+from tests.support.mapper_messages import keyframe_message, settings, view_message
 from tests.support.shared_data import ROOT
 from tests.support.tiny_scene import pose_on_arc
 
@@ -337,16 +337,6 @@ def test_every_choice_maps_a_few_views(path: Path, tmp_path: Path) -> None:
         )  # fmt: skip
     assert psnr(render.color.clamp(0, 1).numpy(), message.image / np.float32(255)) > 25.0
     assert not node.stats.warnings
-
-
-def keyframe_message(index: int, t: float) -> Keyframe:
-    view = view_message(index, t)
-    inverse = 1.0 / view.depth[1::2, 1::2]
-    return Keyframe(
-        index=index, timestamp=view.timestamp, image=view.image, intrinsics=view.intrinsics, segment=view.segment,
-        world_from_cam=view.world_from_cam, scale=view.scale, inverse_depth=inverse.astype(np.float32),
-        inverse_depth_weight=np.ones_like(inverse, dtype=np.float32),
-    )  # fmt: skip
 
 
 def test_a_keyframe_without_depth_yet_is_in_the_preview_and_not_in_the_map() -> None:

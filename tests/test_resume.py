@@ -177,29 +177,33 @@ def test_corrections_that_the_checkpoint_has_are_not_taken_twice(tmp_path: Path)
 
 
 def test_a_refinement_that_was_cut_off_goes_on_where_it_was(tmp_path: Path) -> None:
-    def run(output: Path, cut: int | None, **changes: Any) -> SplatMap | None:
-        node, rests = Mapper(settings(output=str(output), refinement=9, **changes)), []
+    off = np.stack([pose_on_arc(k / 8) for k in range(3)])
+    off[1:, 0, 3] += [0.4, -0.4]  # so that more is owed than the end of the stream has room for
+
+    def run(output: Path, cut: int | None, **changes: Any) -> tuple[Mapper, list[SplatMap]]:
+        node, maps = Mapper(settings(output=str(output), refinement=9, iterations=30, **changes)), list[SplatMap]()
 
         def rest() -> None:
-            rests.append(None)
             if cut is not None and node.atlas.refined == cut:
                 raise Cut
 
         node.rest = rest  # type: ignore[method-assign]
         for k in range(3):
             list(node.on_fused_keyframe(view_message(k, k / 8)))
+        list(node.on_poses(Poses(1, np.arange(3), off, np.ones(3))))
         try:
-            return [m for m in node.on_end() if isinstance(m, SplatMap)][-1]
+            maps += (m for m in node.on_end() if isinstance(m, SplatMap))
         except Cut:
             node.on_abort("power")
-            return None
+        return node, maps
 
-    whole = run(tmp_path / "whole", None)
-    assert run(tmp_path / "cut", 5) is None
+    _, (before, whole) = run(tmp_path / "whole", None)
+    assert (before.refined, whole.refined) == (False, True)
+    run(tmp_path / "cut", 5)
     assert checkpoint_info(tmp_path / "cut").finished
-    again = run(tmp_path / "cut", None, resume=str(tmp_path / "cut"))
-    assert whole is not None
-    assert again is not None
+    node, (again,) = run(tmp_path / "cut", None, resume=str(tmp_path / "cut"))
+    assert again.refined, "the map before the refinement is gone"
+    assert any("within its refinement" in text for text in node.stats.warnings)
     np.testing.assert_array_equal(again.means, whole.means)
     assert again.iterations == whole.iterations
 

@@ -88,9 +88,10 @@ class Atlas:
 
         What its corrected keyframes are still owed may take as many iterations as a short refinement does, by `step`.
         """
-        self.stream_ended = True
         self.take_between()
-        self.largest.end()
+        if not self.stream_ended:  # or this was cut off after it: what was owed has had its iterations
+            self.largest.end()
+        self.stream_ended = True
         parts, log = [part for part in self.parts.values() if part.views], self.current.log
         log.values["segments_apart"] = max(0, len(parts) - 1)  # beside the map that is shown
         self.current = self.largest

@@ -71,7 +71,9 @@ class CoarseKeyframes:
             confidence=None if keyframe.confidence is None else _half(keyframe.confidence),
             normals=None if keyframe.normals is None else _half(keyframe.normals),
         )  # fmt: skip
-        self._kept[keyframe.index] = Kept(small, unit, none, None if keyframe.photograph is None else keyframe.image)
+        # a copy: a view of its message would keep all of that
+        image = None if keyframe.photograph is None else keyframe.image.copy()
+        self._kept[keyframe.index] = Kept(small, unit, none, image)
         while self.bytes > MAX_BYTES:
             self._kept.popitem(last=False)
             self._log.skip("keyframes whose splats stay larger than their images ask for")

@@ -23,7 +23,7 @@ class DensityControlConfig:
     """When and how splats are added and removed during optimization."""
 
     mode: Literal["adaptive", "none"] = "adaptive"  # adaptive: clone, split and prune
-    every: int = 50  # iterations between two rounds
+    every: int = 50  # iterations between two rounds, 1 at least
     gradient: float = 6.0e-4  # mean screen gradient, in half image widths, above which a splat is cloned or split
     split_scale: float = 0.01  # standard deviation in median depths above which it is split, not cloned
     prune_opacity: float = 0.02  # 0 to 1; below: removed
@@ -33,6 +33,9 @@ class DensityControlConfig:
     def __post_init__(self) -> None:
         if not 0.0 <= self.prune_opacity <= 1.0:
             raise ValueError(f"mapper.density_control.prune_opacity={self.prune_opacity}: an opacity, from 0 to 1")
+        if self.every < 1:
+            said = "iterations between two rounds, 1 at least; mode=none is without any"
+            raise ValueError(f"mapper.density_control.every={self.every}: {said}")
 
 
 @dataclass(frozen=True)

@@ -234,19 +234,20 @@ class OnlineMapper:
             depth = keyframe.depth * np.float32(view.scale / keyframe.scale)
             self.log.count("inserted", self.densifier.add(keyframe, at_once.smaller(halvings), depth, late=True))
 
-    def refine(self, done: int, total: int) -> None:
-        """Iteration `done` of `total` of the final refinement: any keyframe or frame between, falling rates; half of
-        them on those that are owed iterations, while any is.
+    def refine(self, done: int, total: int, first_rate: float = 1.0, *, prune: bool = True) -> None:
+        """Iteration `done` of `total` of the final refinement: any keyframe or frame between, rates falling from
+        `first_rate`; half of them on those that are owed iterations, while any is.
 
-        A sixth of the way, when the newest splats have settled, the map is rid of those that no keyframe needs; what
-        is left makes up for them, and each iteration costs less.
+        prune: a sixth of the way, when the newest splats have settled, the map is rid of those that no keyframe needs;
+        what is left makes up for them, and each iteration costs less.
         """
         if not self.views or len(self.state) == 0:
             return
-        if done == total // 6:
+        if prune and done == total // 6:
             self.trainer.prune(self.keyframes.with_image, self.median_depth)
         with self.log.time("refinement"):
-            self.trainer.rate = FINAL_RATE ** (done / max(total, 1))
+            part = done / max(total, 1)
+            self.trainer.rate = max(FINAL_RATE, first_rate ** (1.0 - part) * FINAL_RATE**part)
             view = self.keyframes.owed.first(self.config.budget) if done % 2 else None
             if view is None:
                 images = self.keyframes.trained

@@ -100,3 +100,20 @@ def test_of_two_parts_the_one_with_the_maps_keyframes_counts_however_few_its_fra
     target[:, 0, 3] += 0.5
     moves = before.following(np.array([10]), target).world_from_cam - before.world_from_cam
     np.testing.assert_allclose(moves[:, 0, 3], np.where(parts["map"], 0.5, 0.0), atol=1e-8)
+
+
+def test_photographs_in_any_order_follow_the_keyframe_that_is_nearest_in_space() -> None:
+    along = np.array([0.0, 10.0, 2.0, 8.0, 1.0, 9.0])
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = along
+    index, keyframe = np.arange(6), np.array([True, False, True, True, False, True])
+    before = Trajectory(
+        index, index / 10.0, poses, keyframe, np.zeros(6, np.uint8), np.zeros(6, np.int32), in_order=False
+    )
+    turned = geometry.se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(1.0), 0.0]))
+    target = poses[keyframe].copy()
+    target[0] = target[0] @ turned  # where 1.0 lies beside it, and 10.0 comes next
+    after = before.following(index[keyframe], target).world_from_cam
+    np.testing.assert_array_equal(after[keyframe], target)
+    np.testing.assert_allclose(after[1], poses[1], atol=1e-12)
+    np.testing.assert_allclose(after[4], turned @ poses[4], atol=1e-12)

@@ -38,7 +38,7 @@ class SavedMap:
 
     @property
     def done(self) -> bool:
-        return not self._writer.busy
+        return self.wait(0.0)
 
     @property
     def problem(self) -> str:

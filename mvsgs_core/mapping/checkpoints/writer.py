@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import threading
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+
+from torch import Tensor
 
 from mvsgs_core.kept_map import FOLDER
 from mvsgs_core.mapping.atlas import Atlas
@@ -19,11 +23,10 @@ from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.keyframes import TrainingView
 
 AHEAD = 8  # keyframes whose images may wait to be written before their checkpoint is
-ASIDE = (
-    ".map.*.ply",
-    ".trajectory.*.txt",
-    "keyframes/.*.png",
-)  # what a killed process left half written, see `atomic_file`
+ASIDE = (  # what a killed process left half written, see `atomic_file`
+    ".map.*.ply", ".trajectory.*.txt", ".cameras.*.json", ".transforms.*.json", "keyframes/.*.png",
+    f"{FOLDER}/.state-*.npz",
+)  # fmt: skip
 
 
 class CheckpointWriter:
@@ -38,14 +41,14 @@ class CheckpointWriter:
         self._number = max((number_of(file) for file in state_files(output)), default=0)
         self._before = resumed  # newest whole state of this run,
         self._images_before: set[str] = set() if resumed is None else images_of(resumed)  # and what it refers to
-        self._names: dict[int, tuple[object, str]] = {}  # by keyframe: its image, and the file of it
+        self._names: dict[int, tuple[weakref.ref[Tensor], str]] = {}  # by keyframe: its image, and the file of it
         self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()  # None: no more come
-        self._begun = False  # to write here
         self._changed = threading.Condition()
         self._pending = 0  # checkpoints that are not done,
         self._left = 0  # and jobs of any kind
         self._thread: threading.Thread | None = None
         self.problems: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._remove_parts()  # now, as nothing is being written
 
     @property
     def busy(self) -> bool:
@@ -105,6 +108,7 @@ class CheckpointWriter:
                 logging.exception("checkpoint")
                 self.problems.put(f"a checkpoint failed, the run goes on: {type(error).__name__}: {error}")
             finally:
+                del job  # with the map that it wrote, for which the next one may be long in coming
                 with self._changed:
                     self._left -= 1
                     self._changed.notify_all()
@@ -120,9 +124,6 @@ class CheckpointWriter:
 
     def _write_state(self, atlas: Atlas, sync: bool) -> None:
         (self._output / FOLDER / KEYFRAMES).mkdir(parents=True, exist_ok=True)
-        if not self._begun:
-            self._remove_parts()
-            self._begun = True
         known = {
             segment: (
                 [self._write_image(view, sync=sync) for view in part.views],
@@ -143,13 +144,13 @@ class CheckpointWriter:
         """Name of a keyframe's image file, which is there then; empty where it was let go."""
         if not view.has_image:
             return ""
-        image, name = self._names.get(view.index, (None, ""))
-        if image is not view.image:
-            name = image_name(view)
-            folder = self._output / FOLDER / KEYFRAMES
-            folder.mkdir(parents=True, exist_ok=True)
-            write_image(folder, view, name, sync=sync)
-            self._names[view.index] = (view.image, name)
+        known = self._names.get(view.index)
+        if known is not None and known[0]() is view.image:
+            return known[1]
+        name, folder = image_name(view), self._output / FOLDER / KEYFRAMES
+        folder.mkdir(parents=True, exist_ok=True)
+        write_image(folder, view, name, sync=sync)
+        self._names[view.index] = (weakref.ref(view.image), name)
         return name
 
     def _remove_others(self, states: set[Path | None], images: set[str]) -> None:
@@ -162,6 +163,6 @@ class CheckpointWriter:
 
     def _remove_parts(self) -> None:
         """Of a process that was killed while it wrote."""
-        parts = [file for pattern in ASIDE for file in self._output.glob(pattern)]
-        for file in (*parts, *(self._output / FOLDER).glob(".state-*.npz")):
-            file.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            for file in [file for pattern in ASIDE for file in self._output.glob(pattern)]:
+                file.unlink(missing_ok=True)

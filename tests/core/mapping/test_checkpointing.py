@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import time
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +18,9 @@ from mvsgs_core.export.source_camera import GIVEN, SourceCamera
 from mvsgs_core.mapping.atlas import Atlas
 from mvsgs_core.mapping.checkpoints.checkpointing import MAX_FRACTION, Checkpointing
 from mvsgs_core.mapping.checkpoints.files import FOLDER, checkpoint_info, state_files
+from mvsgs_core.mapping.checkpoints.writer import CheckpointWriter
 from mvsgs_core.mapping.mapper import OnlineMapper
+from mvsgs_core.mapping.resting_images import rest
 from mvsgs_core.trajectory_file import read_trajectory
 from tests.support.full_disk import full_after
 from tests.support.patience import LONG
@@ -184,3 +188,41 @@ def test_the_checkpoint_of_a_finished_map_is_made_where_wanted(tmp_path: Path) -
     assert checkpoint_info(tmp_path).finished
     assert (tmp_path / "map.ply").exists()
     assert read_source_camera(tmp_path / "cameras.json") == source
+
+
+def test_a_copy_that_is_written_is_let_go(tmp_path: Path) -> None:
+    writer, copy = CheckpointWriter(tmp_path, PLAIN), begun(PLAIN).frozen()
+    written = weakref.ref(copy)
+    writer.submit(copy)
+    del copy
+    assert writer.wait(LONG)
+    assert written() is None
+
+
+def test_an_image_that_went_to_disk_is_not_kept_in_memory_for_its_name(tmp_path: Path) -> None:
+    atlas = begun(PLAIN)
+    writer, (first, *_) = CheckpointWriter(tmp_path, PLAIN), atlas.current.views
+    in_memory = weakref.ref(first.image)
+    writer.prepare(first)
+    assert writer.wait(LONG)
+    files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.png")}
+    assert len(files) == 1
+    assert rest(first, atlas.current.log)
+    assert in_memory() is None
+    writer.prepare(first)
+    assert writer.wait(LONG)
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.png")} == files
+
+
+def test_what_a_killed_process_left_half_written_goes_before_anything_is_written(tmp_path: Path) -> None:
+    (tmp_path / "keyframes").mkdir()
+    left = [tmp_path / name for name in (".map.1.ply", ".cameras.1.json", ".transforms.1.json", "keyframes/.7.1.png")]
+    for file in left:
+        file.write_text("of a process that was killed")
+    atlas = begun(PLAIN)
+    checkpoints = Checkpointing(tmp_path, 30.0, atlas)
+    assert not any(file.exists() for file in left)
+    being_written = tmp_path / "keyframes" / f".000008.{os.getpid()}.png"
+    being_written.touch()
+    assert times(checkpoints, atlas) == 1
+    assert being_written.exists()

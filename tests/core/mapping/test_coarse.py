@@ -109,7 +109,9 @@ def test_depth_is_kept_nearly_as_it_was_and_without_end_is_nothing(monkeypatch: 
     np.testing.assert_allclose(found[0].depth, 1e6 * view.depth, rtol=1e-3)
     assert found[0].unfiltered is not None
     assert found[0].unfiltered[0, 0] == 0.0
+    assert found[1] is not None
     np.testing.assert_array_equal(found[1], view.image)  # free of the shutter, which the one that is trained on is not
+    assert not np.shares_memory(found[1], view.image), "a view of a message keeps all of the message"
     assert kept.next() is None
     kept.wait(view)
     size = kept.bytes

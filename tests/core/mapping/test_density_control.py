@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from mvsgs_core.mapping.config import MapperConfig
 from mvsgs_core.mapping.density_control import DensityControlConfig, control, removable
 from mvsgs_core.mapping.map_state import PARAMETERS, MapState
 from mvsgs_core.rasterizer.splats import Splats
@@ -77,6 +78,10 @@ def test_an_opacity_of_0_removes_none_and_one_of_1_all(opacity: float, left: int
     assert int((~removable(state, DensityControlConfig(prune_opacity=opacity))).sum()) == left
 
 
-def test_what_is_no_opacity_is_refused() -> None:
+def test_what_is_no_opacity_and_no_number_of_iterations_is_refused() -> None:
     with pytest.raises(ValueError, match="from 0 to 1"):
         DensityControlConfig(prune_opacity=1.5)
+    with pytest.raises(ValueError, match=r"mapper\.density_control\.every=0: .* mode=none"):
+        DensityControlConfig(every=0)
+    with pytest.raises(ValueError, match=r"mapper\.window=0: .* 1 at least"):
+        MapperConfig(window=0)
