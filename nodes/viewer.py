@@ -13,6 +13,7 @@ import torch
 import viser
 
 from msgs import Preview, SplatMap, TrackerPhase
+from mvsgs_core.export.ply import folded
 from mvsgs_core.mapping.preview import as_bytes, covariances, thinned
 from mvsgs_core.rasterizer.spherical_harmonics import C0
 from nodes import Node
@@ -132,7 +133,7 @@ class Viewer(Node):
                 final = self.seen.finish(message)
                 if self.page.unit is None:
                     self.page.begin(final.relative_pose(message.world_from_cam[-1]), message.means)
-                shown = thinned(final.splats, self.config.max_splats)
+                shown = thinned(folded(final.splats, final.kernel), self.config.max_splats)
                 self._move(dict(zip(final.keyframes.tolist(), map(final.relative_pose, final.world_from_cam))))
                 self._show_splats(
                     shown.means.numpy(), covariances(shown.quaternions, shown.log_scales, 1.0).numpy(),

@@ -23,6 +23,7 @@ import torch
 from msgs import Preview, SplatMap, TrackerPhase
 from mvsgs_core.mapping.preview import as_bytes
 from mvsgs_core.photometry import vignetting_factor
+from mvsgs_core.rasterizer.kernels import gaussian_std_ratio
 from nodes import handlers, outputs
 from nodes.splat_map import splat_map
 from nodes.viewer import Viewer
@@ -287,6 +288,17 @@ def test_the_refined_map_is_shown_whole_and_rendered(viewer: Viewer) -> None:
     )
     show(viewer, preview(1))  # an older state comes late
     assert len(splats.centers) == len(final.splats)
+
+
+def test_shapes_of_a_refined_map_become_scales(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[np.ndarray] = []
+    monkeypatch.setattr(viewer, "_show_splats", lambda means, covariances, *_: shown.append(covariances))
+    plain = replace(final_map(), world_from_cam=poses_around([0.0]))
+    shaped = replace(plain.splats, betas=torch.full_like(plain.splats.betas, 4.0))
+    for final in (plain, replace(plain, splats=shaped, kernel="exact")):
+        list(viewer.on_splat_map(splat_map(final, refined=True)))
+    ratio = float(gaussian_std_ratio(torch.tensor([4.0])))
+    np.testing.assert_allclose(shown[1], ratio**2 * shown[0], rtol=1e-4)
 
 
 def test_a_refined_keyframe_has_the_vignetting_of_its_photograph(viewer: Viewer) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from mvsgs_core.export.ply import folded
 from mvsgs_core.mapping.keyframes import TrainingView
 from mvsgs_core.mapping.mapper import OnlineMapper
 from mvsgs_core.rasterizer.reference import rotation_matrices
@@ -31,9 +32,10 @@ def preview_arrays(mapper: OnlineMapper, limit: int, provisional: Splats | None 
     """
     newest, origin, unit = mapper.views[-1], mapper.frame.origin, mapper.frame.length
     assert origin is not None
-    shown = thinned(mapper.state.detached(), limit - (0 if provisional is None else len(provisional))).tensors()
+    whole = thinned(mapper.state.detached(), limit - (0 if provisional is None else len(provisional))).tensors()
     if provisional is not None:
-        shown = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in shown.items()}
+        whole = {name: torch.cat([value, getattr(provisional, name).to(value)]) for name, value in whole.items()}
+    shown = folded(Splats(**whole), mapper.config.training.kernel).tensors()  # browsers know only Gaussians
     keyframes = np.array([view.index for view in mapper.views], dtype=np.int64)
     poses = np.stack([view.world_from_cam for view in mapper.views])
     poses[:, :3, 3] -= origin

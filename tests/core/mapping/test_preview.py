@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
-from mvsgs_core.mapping.config import MapperConfig
+from mvsgs_core.mapping.config import MapperConfig, TrainingConfig
 from mvsgs_core.mapping.mapper import OnlineMapper
-from mvsgs_core.mapping.preview import thinned
+from mvsgs_core.mapping.preview import preview_arrays, thinned
+from mvsgs_core.rasterizer.kernels import gaussian_std_ratio
 from mvsgs_core.rasterizer.rasterize import rasterize
 from mvsgs_core.rasterizer.splats import Splats
 from tests.support.tiny_scene import pose_on_arc, rgbd_keyframe
@@ -31,3 +33,16 @@ def test_a_third_of_the_splats_shows_the_map_without_holes() -> None:
     holed = Splats(**{name: value[::stride] for name, value in whole.tensors().items()})
     error, holes = ((render(splats) - render(whole)).square().mean() for splats in (fewer, holed))
     assert error < 0.5 * holes
+
+
+def test_shapes_of_splats_become_scales() -> None:
+    """What shows a preview knows only Gaussians."""
+    mapper = OnlineMapper(MapperConfig(threads=1, device="cpu", training=TrainingConfig(kernel="exact", betas=True)))
+    mapper.add_keyframe(rgbd_keyframe(0, pose_on_arc(0.0)))
+    plain = preview_arrays(mapper, len(mapper.state))["covariances"]
+    mapper.state.splats.betas.data.fill_(4.0)
+    ratio = float(gaussian_std_ratio(torch.tensor([4.0])))
+    assert abs(ratio - 1.0) > 0.2
+    shaped = preview_arrays(mapper, len(mapper.state))["covariances"]
+    np.testing.assert_allclose(shaped, ratio**2 * plain, rtol=1e-4)
+    assert shaped.shape == plain.shape == (len(mapper.state), 3, 3)
