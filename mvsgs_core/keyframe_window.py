@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
+
+
+class Correction(NamedTuple):
+    """What the tracker knows better of a keyframe that it sent."""
+
+    world_from_cam: np.ndarray  # (4, 4)
+    scale: float  # of the map
+    segment: int | None = None  # that it belongs to now; None: as it was
 
 
 class WindowedKeyframe(Protocol):
@@ -27,8 +35,8 @@ class WindowedKeyframe(Protocol):
     @property
     def scale(self) -> float: ...
 
-    def moved(self, world_from_cam: np.ndarray, scale: float) -> Self:
-        """The same keyframe after the tracker corrected its pose (4, 4) and the map's scale."""
+    def moved(self, world_from_cam: np.ndarray, scale: float, segment: int | None = None) -> Self:
+        """The same keyframe after a `Correction`."""
 
 
 K = TypeVar("K", bound=WindowedKeyframe)
@@ -76,8 +84,8 @@ class KeyframeWindow(Generic[K]):
         while self._waiting:
             yield self._next()
 
-    def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
-        """Corrected poses (world_from_cam (4, 4), scale) by keyframe index, for what is still in the window."""
+    def move(self, poses: dict[int, Correction]) -> None:
+        """Corrections by keyframe index, for what is still in the window."""
         self._keyframes = [k.moved(*poses[k.index]) if k.index in poses else k for k in self._keyframes]
 
     def _next(self) -> tuple[K, list[K]]:

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from msgs import Depth, FusedKeyframe
 from mvsgs_core import camera
 from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig, OnlineFusion
@@ -32,10 +34,13 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             return
         self._take(depth.index, depth.timestamp)
         self._depths[depth.index] = depth
+        finite = np.isfinite(depth.depth) & np.isfinite(depth.confidence)
+        if wrong := int((~finite).sum()):
+            self.stats.refuse("pixels", wrong, "pixels whose depth or confidence is not finite have none in the map")
         view = KeyframeDepth(
             index=depth.index,
-            depth=depth.depth,
-            confidence=depth.confidence,
+            depth=np.where(finite, depth.depth, np.float32(0)),
+            confidence=np.where(finite, depth.confidence, np.float32(0)),
             intrinsics=camera.scale_intrinsics(depth.intrinsics, depth.image.shape[:2], depth.depth.shape),
             world_from_cam=depth.world_from_cam,
             scale=depth.scale,
@@ -88,7 +93,6 @@ class FusionNode(WindowedNode[OnlineFusion, FusedDepth, FusedKeyframe]):
             depth=found.depth,
             confidence=found.confidence,
             normals=found.normals,
-            segment=message.segment,
             unfiltered=found.unfiltered,
             exposure=message.exposure,
             vignetting=message.vignetting,

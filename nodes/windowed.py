@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 
 from msgs import Asked, Depth, FusedKeyframe, Keyframe, Poses, Request, TrackedFrame
-from mvsgs_core.keyframe_window import WindowedKeyframe
+from mvsgs_core.keyframe_window import Correction, WindowedKeyframe
 from mvsgs_core.pace import Pace
 from nodes import Node
 from nodes.once import Once
@@ -28,7 +28,7 @@ class WindowedCore(Protocol):
     @property
     def waiting(self) -> int | None: ...
 
-    def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None: ...
+    def move(self, poses: dict[int, Correction]) -> None: ...
 
     def release(self) -> Iterator[Any]: ...
 
@@ -57,7 +57,7 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         self._core.pace.log = self.stats
         self._core.pace.waiting = self._queue
         self._came: dict[int, float] = {}  # when keyframes came that wait for later ones, by a clock of its own
-        self._poses: dict[int, tuple[np.ndarray, float]] = {}  # newest correction of each keyframe
+        self._poses: dict[int, Correction] = {}  # newest of each keyframe
         self._exposures: dict[int, np.ndarray] = {}  # (3, 4), the same
         self._vignetting: np.ndarray | None = None  # (3,) the newest
         # newest, each with its scale, and time and axis of the readout
@@ -90,8 +90,9 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         """Takes corrections in and passes them on, so that they reach the next stage between the same keyframes."""
         if not self._once.poses(poses):
             return
-        for i, pose, scale in zip(poses.index, poses.world_from_cam, poses.scale, strict=True):
-            self._poses[int(i)] = (pose, float(scale))
+        segments = [None] * len(poses.index) if poses.segment is None else poses.segment.tolist()
+        corrections = map(Correction, poses.world_from_cam, poses.scale.tolist(), segments)
+        self._poses.update(zip(poses.index.tolist(), corrections, strict=True))
         if poses.exposure is not None:
             self._exposures.update(zip(map(int, poses.index), poses.exposure, strict=True))
         if poses.vignetting is not None:
@@ -128,7 +129,7 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
         return replace(message, exposure=exposure, vignetting=vignetting)
 
     def _moved(self, message: Keyframe | Depth, now: WindowedKeyframe) -> dict[str, Any]:
-        """What corrections change of a message: pose, scale and velocity, as its keyframe has them now.
+        """What corrections change of a message: pose, scale, segment and velocity, as its keyframe has them now.
 
         One that was sent before the rolling shutter was known is its own photograph.
         """
@@ -139,13 +140,13 @@ class WindowedNode(Node, ABC, Generic[Core, Found, Sent]):
             velocity = velocity * np.repeat([now.scale / scale, 1.0], 3)
             photograph = message.image if photograph is None else photograph
         return {
-            "world_from_cam": now.world_from_cam, "scale": now.scale,
+            "world_from_cam": now.world_from_cam, "scale": now.scale, "segment": now.segment,
             "photograph": photograph, "velocity": velocity, "readout_time": readout_time,
             "reads_columns": reads_columns,
         }  # fmt: skip
 
     def _corrected(self, keyframe: K) -> K:
-        """With its newest pose, where that came before the keyframe."""
+        """With its newest correction, where that came before the keyframe."""
         return keyframe.moved(*self._poses[keyframe.index]) if keyframe.index in self._poses else keyframe
 
     def _messages(self, found: Iterator[Found]) -> Iterator[Sent]:

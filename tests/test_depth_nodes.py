@@ -142,6 +142,37 @@ def test_segments_are_not_matched_with_each_other() -> None:
     assert [(d.index, d.segment) for d in depths] == [(0, 0), (1, 0), (2, 0), (3, 1), (4, 1), (5, 1)]
 
 
+def test_a_loop_that_joins_two_segments_leaves_the_keyframes_that_wait_in_the_window() -> None:
+    """The tracker says that the segment is another's before it sends the first keyframe of the joined one."""
+    mvs, depth_fusion = stereo(), fusion()
+    before = [keyframe(i, segment=1) for i in range(4)]
+    depths = [d for k in before for d in mvs.on_keyframe(k)]
+    assert [(d.index, d.segment) for d in depths] == [(0, 1), (1, 1)]
+    first = [replace(depths[0], index=i, timestamp=0.1 * i, world_from_cam=look(0.08 * i)) for i in range(4)]
+    assert [v.index for d in first for v in depth_fusion.on_depth(d)] == [0, 1]
+    poses, scale = np.stack([look(0.08 * i) for i in range(4)]), np.ones(4)
+    joined = Poses(1, np.arange(4), poses, scale, segment=np.zeros(4, np.int32))
+    later = Poses(2, np.arange(4), poses, scale)  # which says nothing of segments
+    for node in (mvs, depth_fusion):
+        assert [p for message in (joined, later) for p in node.on_poses(message)] == [joined, later]
+    (late,) = mvs.on_keyframe(keyframe(4, segment=0))
+    assert (late.index, late.segment) == (2, 0)
+    (fused,) = depth_fusion.on_depth(replace(first[0], index=4, segment=0, world_from_cam=look(0.32)))
+    assert (fused.index, fused.segment) == (2, 0)
+
+
+def test_a_keyframe_that_a_join_overtook_is_of_the_joined_segment() -> None:
+    mvs, depth_fusion = stereo(), fusion()
+    joined = Poses(1, np.arange(1), look(0.0)[None], np.ones(1), segment=np.zeros(1, np.int32))
+    for node in (mvs, depth_fusion):
+        list(node.on_poses(joined))
+    depths = [d for k in (keyframe(0, segment=1), keyframe(1), keyframe(2)) for d in mvs.on_keyframe(k)]
+    assert [(d.index, d.segment) for d in depths] == [(0, 0)]
+    (depth,) = depths
+    sent = [replace(depth, index=i, segment=int(i == 0)) for i in range(3)]
+    assert [(v.index, v.segment) for d in sent for v in depth_fusion.on_depth(d)] == [(0, 0)]
+
+
 def test_coarse_depth_passes_the_grid_on() -> None:
     message = keyframe(0)
     (depth,) = CoarseDepth(CoarseDepth.Config(area=SIZE[0] * SIZE[1])).on_keyframe(message)
@@ -170,6 +201,23 @@ def test_what_the_filters_reject_is_sent_beside_the_filtered_depth() -> None:
     (view,) = node.on_depth(replace(depth, confidence=confidence.astype(np.float32)))
     assert not view.depth[:, :20].any()
     np.testing.assert_array_equal(view.unfiltered, depth.depth)
+
+
+def test_a_pixel_of_depth_or_confidence_that_is_not_finite_is_refused_alone() -> None:
+    mvs = stereo()
+    depths = [d for i in range(5) for d in mvs.on_keyframe(keyframe(i))] + list(mvs.on_end())
+    sound, holed = fusion(), fusion()
+    expected = [v for d in depths for v in sound.on_depth(d)] + list(sound.on_end())
+    for depth in depths:
+        depth.depth[50, 60], depth.confidence[70, 80], depth.confidence[71, 80] = np.inf, np.nan, np.inf
+    found = [v for d in depths for v in holed.on_depth(d)] + list(holed.on_end())
+    assert holed.stats.counts["refused_pixels"] == 3 * len(depths)
+    assert any("not finite" in warning for warning in holed.stats.warnings)
+    for with_holes, whole in zip(found, expected, strict=True):
+        assert np.isfinite(with_holes.confidence).all()
+        assert np.isfinite(with_holes.unfiltered).all()
+        assert (with_holes.depth > 0).sum() > 0.95 * (whole.depth > 0).sum()
+    assert (expected[2].depth > 0).mean() > 0.5
 
 
 def test_exposure_and_vignetting_pass_through_and_a_correction_that_overtakes_them_holds() -> None:

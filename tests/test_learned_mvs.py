@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from launch.compose import compose
 from msgs import Depth, Keyframe
+from mvsgs_core import camera
 from mvsgs_core.datasets import Item, open_dataset
-from mvsgs_core.mvs.learned import calibrated
+from mvsgs_core.mvs.learned import NETWORKS, calibrated
 from mvsgs_core.networks.itermvs import IterMvs
 from nodes.learned_mvs import LearnedMvs
 from tests.support.shared_data import shared
@@ -110,6 +112,17 @@ def test_what_a_network_gives_that_is_not_finite_is_counted(monkeypatch: pytest.
     assert node.stats.counts["refused_pixels"] == 3 * (8 * 4 + 2)
     assert any("no finite depth or confidence" in warning for warning in node.stats.warnings)
     assert all(not d.depth[:8, :4].any() and np.isfinite(d.confidence).all() for d in depths)
+
+
+@pytest.mark.parametrize("network", ["mvsformer", "mvsformer_p"])
+def test_the_papers_depth_is_handed_on_as_large_as_the_network_gives_it(network: str) -> None:
+    config = compose([f"mvs={network}", "mvs.weights=random", "dataset=synthetic"]).slots["mvs"].parameters
+    assert config.area == config.network_area
+    for image in ((480, 640), (680, 1200), (720, 1280)):
+        height, width = camera.fit_size(*image, config.area)
+        assert height % 8 == width % 8 == 0  # as V-FUSE needs them
+        seen = camera.fit_size(*image, config.network_area, NETWORKS[network].multiple)
+        assert height * width > 0.9 * seen[0] * seen[1]
 
 
 def test_missing_weights_say_what_to_fetch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

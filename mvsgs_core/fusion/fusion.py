@@ -13,7 +13,7 @@ from mvsgs_core.fusion.confidence import features_of, probability_of_inlier, unc
 from mvsgs_core.fusion.interface import FuseOptions, FusionBackend
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
-from mvsgs_core.keyframe_window import KeyframeWindow
+from mvsgs_core.keyframe_window import Correction, KeyframeWindow
 from mvsgs_core.pace import Effort, Pace
 
 ANY_DEPTH = 1.0  # relative difference that no two positive depths reach
@@ -31,7 +31,8 @@ class FusionConfig:
     sigma: float = 0.01  # relative depth: width of the support, at least
     sigma_most: float = 0.1  # and at most, where the neighbors have little parallax: see `uncertainty_of`
     violation: float = 1.0  # weight of free-space violations against support
-    min_neighbor_confidence: float = 0.1  # a neighbor's pixel below takes no part in the refinement
+    # a neighbor's pixel below takes no part in the refinement, a map that is all below it says nothing against a depth
+    min_neighbor_confidence: float = 0.1
     check: bool = True  # geometric consistency
     relative: float = 0.02  # relative depth difference that still agrees; refined, the support's width if that is more
     round_trip: bool = False  # check by projecting back, instead of the paper's one way
@@ -97,8 +98,8 @@ class OnlineFusion:
         """Index of the keyframe that has waited longest for later ones."""
         return self._window.waiting
 
-    def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
-        """Corrected poses (world_from_cam (4, 4), scale) by keyframe index: stored depths are scaled with them."""
+    def move(self, poses: dict[int, Correction]) -> None:
+        """Corrections by keyframe index: stored depths are scaled with them."""
         self._window.move(poses)
 
     def _fused(self, reference: KeyframeDepth, others: list[KeyframeDepth]) -> FusedDepth:
@@ -107,7 +108,7 @@ class OnlineFusion:
         return replace(found, effort=effort)
 
     def _fuse(self, reference: KeyframeDepth, others: list[KeyframeDepth], config: FusionConfig) -> FusedDepth:
-        neighbors = nearest_views(reference, others, config.neighbors)
+        neighbors = nearest_views(reference, others, config.neighbors, config.min_neighbor_confidence)
         return fuse(self._prepared(reference, neighbors), neighbors, config, self._backend)
 
     def _prepared(self, reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> KeyframeDepth:
@@ -115,8 +116,13 @@ class OnlineFusion:
         return reference
 
 
-def nearest_views(reference: KeyframeDepth, others: list[KeyframeDepth], count: int) -> list[KeyframeDepth]:
-    """Of the maps that have depth at all, those that see most of the reference's points; ties: the wider baseline."""
+def nearest_views(
+    reference: KeyframeDepth, others: list[KeyframeDepth], count: int, min_confidence: float
+) -> list[KeyframeDepth]:
+    """Of the maps that have depth at all, those that see most of the reference's points; ties: the wider baseline.
+
+    Doubtful maps come last: see `KeyframeDepth.doubtful`.
+    """
     known = reference.depth > 0
     if not known.any():
         return []
@@ -140,8 +146,9 @@ def nearest_views(reference: KeyframeDepth, others: list[KeyframeDepth], count: 
         overlap = np.mean(front & (x >= 0) & (x < other.size[1]) & (y >= 0) & (y < other.size[0]))
         baseline = np.linalg.norm(other.world_from_cam[:3, 3] - reference.world_from_cam[:3, 3])
         if overlap > 0.1:
-            scored.append((-round(float(overlap), 1), -float(baseline), other.index, other))
-    return [entry[3] for entry in sorted(scored, key=lambda entry: entry[:3])[:count]]
+            rank = other.doubtful(min_confidence), -round(float(overlap), 1), -float(baseline), other.index
+            scored.append((rank, other))
+    return [other for _, other in sorted(scored, key=lambda entry: entry[0])[:count]]
 
 
 def fuse(
@@ -169,11 +176,15 @@ def fuse(
             maps = replace(maps, depth=depth)
             doubt = uncertainty_of(backend.parallax(maps))
             within = np.clip(doubt, config.relative, max(config.relative, config.sigma_most))
-        consistent = backend.consistent_views(maps, within, config.pixels, config.round_trip)
+        doubtful = np.array([n.doubtful(config.min_neighbor_confidence) for n in neighbors])
+        certain = maps.of(~doubtful)
+        consistent = backend.consistent_views(certain, within, config.pixels, config.round_trip)
         if config.refine:
-            seeing = backend.consistent_views(maps, np.full_like(depth, ANY_DEPTH), config.pixels, False)
+            seeing = backend.consistent_views(certain, np.full_like(depth, ANY_DEPTH), config.pixels, False)
             evidence = features_of(fused, confidence, consistent, seeing, doubt)
             confidence = np.where(depth > 0, probability_of_inlier(evidence), 0.0).astype(np.float32)
+        if doubtful.any():  # such a map may agree, and is not heard where it does not
+            consistent += backend.consistent_views(maps.of(doubtful), within, config.pixels, config.round_trip)
     if reference.mask is not None:  # the neighbors may well see what is behind there
         depth = np.where(reference.mask, depth, np.float32(0))
     keep = depth > 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -36,6 +36,11 @@ class DepthMaps:
     neighbor_confidences: np.ndarray  # (N, h, w)
     there: np.ndarray  # (N, 12) warps from the reference into each neighbor: see mvsgs_core.warp
     back: np.ndarray  # (N, 12) and back
+
+    def of(self, chosen: np.ndarray) -> DepthMaps:
+        """With those neighbors alone for which `chosen` (N,) bool is true."""
+        names = ("neighbor_depths", "neighbor_confidences", "there", "back")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
 
 class FusionBackend(Protocol):

@@ -28,10 +28,17 @@ class KeyframeDepth:
         height, width = self.depth.shape
         return height, width
 
-    def moved(self, world_from_cam: np.ndarray, scale: float) -> KeyframeDepth:
-        """The same map after the tracker corrected its pose and the map's scale."""
+    def doubtful(self, min_confidence: float) -> bool:
+        """Whether all of its confidence is below that, as the tracker's depth has it in the place of stereo."""
+        return float(self.confidence.max()) < min_confidence
+
+    def moved(self, world_from_cam: np.ndarray, scale: float, segment: int | None = None) -> KeyframeDepth:
+        """The same map after the tracker corrected its pose, the map's scale, and its segment, if that is given."""
         factor = np.float32(scale / self.scale)
-        return replace(self, world_from_cam=world_from_cam, scale=float(scale), depth=self.depth * factor)
+        return replace(
+            self, world_from_cam=world_from_cam, scale=float(scale), depth=self.depth * factor,
+            segment=self.segment if segment is None else segment,
+        )  # fmt: skip
 
 
 def depth_maps(reference: KeyframeDepth, neighbors: list[KeyframeDepth]) -> DepthMaps:

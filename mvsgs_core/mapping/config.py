@@ -27,7 +27,6 @@ class TrainingConfig:
     loss: Loss = "ssim"  # ssim: L1 + SSIM as 3DGS; ges: with the frequency-modulated term
     loss_weights: LossWeights = field(default_factory=LossWeights)
     loss_function: str | None = None  # module.function of LossInputs, a loss of your own in place of these; null: none
-    frequency_horizon: int = 60  # visits of a keyframe over which the frequency-modulated mask runs through its bands
     selective: bool = True  # step only the splats that were seen
     exposure: bool = True  # use the exposures and the vignetting that the tracker estimates
     refine_poses: bool = False  # train the keyframes' poses too, the first one's excepted
@@ -48,7 +47,7 @@ class MapperConfig:
     # an image at least, and 1000 at most
     refinement: int | None = None
     refine: RefineConfig = field(default_factory=RefineConfig)  # on which machines, in which parts
-    window: int = 6  # newest keyframes, on which the local half of the budget goes
+    window: int = 6  # newest keyframes, 1 at least, on which the local half of the budget goes
     realtime: bool = False  # a new keyframe waits for no iteration: it cancels the pending ones of older keyframes
     share: float = 0.1  # of a core's time that new splats may take in real time: beyond, they get larger
     max_pixels: int | None = None  # area of the training images; null: as they come
@@ -64,6 +63,10 @@ class MapperConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     insertion: InsertionConfig = field(default_factory=InsertionConfig)
     density_control: DensityControlConfig = field(default_factory=DensityControlConfig)
+
+    def __post_init__(self) -> None:
+        if self.window < 1:
+            raise ValueError(f"mapper.window={self.window}: newest keyframes, 1 at least")
 
     @property
     def budget(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -101,7 +102,7 @@ class Trainer:
         if at_once:
             loss = self._photograph_loss(view, render, exposure)
         else:
-            inputs, own = self._loss_inputs(view, render), self._own_loss
+            inputs, own = self._loss_inputs(view, render, refining), self._own_loss
             loss = training_loss(inputs, self._weights) if own is None else own_loss(own, inputs)
         view.visits += 1
         value = float(loss.detach())
@@ -207,10 +208,18 @@ class Trainer:
             ssim_weight=self._weights["ssim"], threads=self.config.threads,
         )  # fmt: skip
 
-    def _loss_inputs(self, view: TrainingView, render: Render) -> LossInputs:
+    def _loss_inputs(self, view: TrainingView, render: Render, refining: bool) -> LossInputs:
         target = self._formation(view, None).target(view.target, render.color)
-        frequency = frequency_of(view.visits, self.config.training.frequency_horizon)
-        return LossInputs(render, target, self.state.splats, frequency, self.config.threads)
+        return LossInputs(render, target, self.state.splats, self._frequency(view, refining), self.config.threads)
+
+    def _frequency(self, view: TrainingView, refining: bool) -> float:
+        """Of the loss: to 50 in the stream, by what the image has had of a keyframe's budget; to 100 in the refinement.
+
+        How long both are, in an image's iterations, nobody knows before the stream has ended.
+        """
+        if refining:
+            return 50.0 - 50.0 * math.log10(self.rate)  # which falls from 1 to a tenth
+        return 0.5 * frequency_of(view.visits, self.config.budget)
 
     def _groups(self, median_depth: float, widest_new: float | None) -> list[optimizer.Group]:
         rates, training = self.config.optimizer, self.config.training

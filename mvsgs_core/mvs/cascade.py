@@ -12,7 +12,7 @@ import numpy as np
 
 from mvsgs_core.camera import shrunk
 from mvsgs_core.inverse_depth import enlarge_inverse_depth
-from mvsgs_core.keyframe_window import KeyframeWindow
+from mvsgs_core.keyframe_window import Correction, KeyframeWindow
 from mvsgs_core.mvs.backend import make_backend
 from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, search_range
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
@@ -61,7 +61,7 @@ class CascadeDepth:
 FULL = Effort("full", 1.0)
 NO_STEREO = Effort("the tracker's depth in the place of stereo", 0.01, telling=False)
 MASK_MARGIN = 2  # pixels beside a masked one without depth: the matching window's radius, which would show its rim
-DOUBTFUL = 0.09  # confidence of the tracker's depth: less than any with which a map takes part in fusion
+DOUBTFUL = 0.09  # confidence of the tracker's depth: in fusion, less than any that speaks against another map
 
 
 class OnlineStereo(ABC):
@@ -74,7 +74,7 @@ class OnlineStereo(ABC):
         self.config = config
         self.pace = Pace(self.efforts, config.share, only=config.efforts if config.realtime else (0,))
         self._window = KeyframeWindow[StereoKeyframe](config.window, config.lag)
-        self._previous: tuple[tuple[int, tuple[int, int]], SearchRange] | None = None  # segment and size, newest range
+        self._previous: tuple[StereoKeyframe, SearchRange] | None = None  # the newest one that got a range
 
     def prepare(self, index: int, image: np.ndarray, **given: Any) -> StereoKeyframe:
         """A keyframe for `add`, at this stereo's sizes; `given`: all else that `prepare_keyframe` takes."""
@@ -108,22 +108,28 @@ class OnlineStereo(ABC):
         """Index of the keyframe that has waited longest for later ones."""
         return self._window.waiting
 
-    def move(self, poses: dict[int, tuple[np.ndarray, float]]) -> None:
-        """Corrected poses (world_from_cam (4, 4), scale) by keyframe index, for what is still in the window."""
+    def move(self, poses: dict[int, Correction]) -> None:
+        """Corrections by keyframe index, for what is still in the window, and the range that is remembered."""
         self._window.move(poses)
+        if self._previous is not None and self._previous[0].index in poses:
+            before, search = self._previous
+            now = before.moved(*poses[before.index])
+            factor = now.scale / before.scale
+            self._previous = now, replace(search, low=search.low / factor, high=search.high / factor)
 
     def _depth_of(self, reference: StereoKeyframe, others: list[StereoKeyframe]) -> CascadeDepth:
-        kind = (reference.segment, reference.size)
-        if self._previous is not None and self._previous[0] != kind:
-            self._previous = None
-        previous = None if self._previous is None else self._previous[1]
+        previous = None
+        if self._previous is not None:
+            last, previous = self._previous
+            if (last.segment, last.size) != (reference.segment, reference.size):
+                self._previous = previous = None
         search = search_range(reference, others, previous, self.config.ranges)
         if search is None:
             return CascadeDepth(reference, empty_depth(reference.size), (), None, "no depth range is known")
         chosen = select_neighbors(reference, others, search.typical(), self.config.neighbors)
         if not chosen:
             return CascadeDepth(reference, empty_depth(reference.size), (), search, "no neighbor with a baseline")
-        self._previous = (kind, search)
+        self._previous = reference, search
         views = [n.view for n in chosen]
         with self.pace.spend() as effort:
             if self.pace.efforts[effort] is NO_STEREO:

@@ -37,12 +37,13 @@ class StereoKeyframe:
     def intrinsics_at(self, scale: int) -> np.ndarray:
         return camera.scale_intrinsics(self.intrinsics, self.size, self.gray(scale).shape[:2])
 
-    def moved(self, world_from_cam: np.ndarray, scale: float) -> StereoKeyframe:
-        """The same view after the tracker corrected its pose and the map's scale."""
+    def moved(self, world_from_cam: np.ndarray, scale: float, segment: int | None = None) -> StereoKeyframe:
+        """The same view after the tracker corrected its pose, the map's scale, and its segment, if that is given."""
         factor = np.float32(scale / self.scale)
         return replace(
-            self, world_from_cam=world_from_cam, scale=float(scale), inverse_depth=self.inverse_depth / factor
-        )
+            self, world_from_cam=world_from_cam, scale=float(scale), inverse_depth=self.inverse_depth / factor,
+            segment=self.segment if segment is None else segment,
+        )  # fmt: skip
 
 
 def prepare_keyframe(

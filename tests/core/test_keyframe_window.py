@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from mvsgs_core.keyframe_window import KeyframeWindow
+from mvsgs_core.keyframe_window import Correction, KeyframeWindow
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class One:
     size: tuple[int, int] = (2, 3)
     scale: float = 1.0
 
-    def moved(self, world_from_cam: np.ndarray, scale: float) -> One:
-        return replace(self, scale=scale)
+    def moved(self, world_from_cam: np.ndarray, scale: float, segment: int | None = None) -> One:
+        return replace(self, scale=scale, segment=self.segment if segment is None else segment)
 
 
 Handed = list[tuple[int, list[int]]]
@@ -61,7 +61,14 @@ def test_who_is_not_wanted_is_one_of_the_others_only() -> None:
 def test_corrections_reach_all_that_is_in_the_window() -> None:
     window = KeyframeWindow[One](before=2, lag=2)
     handed(window, One(0), One(1))
-    window.move({0: (np.eye(4), 2.0), 7: (np.eye(4), 3.0)})
+    window.move({0: Correction(np.eye(4), 2.0), 7: Correction(np.eye(4), 3.0)})
     first, second = window.flush()
     assert (first[0].scale, first[1][0].scale) == (2.0, 1.0)
     assert (second[0].scale, second[1][0].scale) == (1.0, 2.0)
+
+
+def test_keyframes_whose_segment_was_joined_stay_in_the_window() -> None:
+    window = KeyframeWindow[One](before=3, lag=2)
+    handed(window, One(0, segment=1), One(1, segment=1))
+    window.move({i: Correction(np.eye(4), 1.0, segment=0) for i in range(2)})
+    assert handed(window, One(2)) == [(0, [1, 2])]

@@ -99,7 +99,7 @@ void splat_depth(const float* neighbor_depth, const float* neighbor_confidence, 
     for (int y = 0; y < nh; ++y) {
         for (int x = 0; x < nw; ++x) {
             const std::size_t i = static_cast<std::size_t>(y) * nw + x;
-            if (!(neighbor_depth[i] > 0.0f) || neighbor_confidence[i] < min_neighbor_confidence) continue;
+            if (!(neighbor_depth[i] > 0.0f && neighbor_confidence[i] >= min_neighbor_confidence)) continue;
             const Projected p = project(back, static_cast<float>(x), static_cast<float>(y), neighbor_depth[i]);
             const int at = p.front ? nearest(p.x, p.y, height, width) : -1;
             if (at < 0) continue;
@@ -141,7 +141,7 @@ void fuse_depth(const DepthMaps& maps, const float* confidence, const float* nei
                     const int at = p.front ? nearest(p.x, p.y, nh, nw) : -1;
                     if (at < 0) continue;
                     const float found = neighbor_depths[n * stride + at], c = neighbor_confidences[n * stride + at];
-                    if (!(found > 0.0f) || c < o.min_neighbor_confidence) continue;
+                    if (!(found > 0.0f && c >= o.min_neighbor_confidence)) continue;
                     const float difference = (found - p.depth) / p.depth;
                     const float weight = c * exponential(sharpness * difference * difference);
                     for_it += weight;

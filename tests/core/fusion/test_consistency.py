@@ -9,11 +9,13 @@ import pytest
 
 from mvsgs_core import camera, geometry
 from mvsgs_core.fusion.backend import NativeFusionBackend
-from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig, OnlineFusion, fuse
+from mvsgs_core.fusion.fusion import FusedDepth, FusionConfig, OnlineFusion, fuse, nearest_views
 from mvsgs_core.fusion.interface import FuseOptions
 from mvsgs_core.fusion.keyframe_depth import KeyframeDepth, depth_maps
 from mvsgs_core.fusion.normals import normals_of
 from mvsgs_core.fusion.torch_backend import TorchFusionBackend
+from mvsgs_core.keyframe_window import Correction
+from mvsgs_core.mvs.cascade import DOUBTFUL
 from mvsgs_core.warp import apply_warp, relative_warp
 from tests.support.depth_views import SIZE, view
 from tests.support.plane_scene import intrinsics_of, look, true_depth
@@ -176,6 +178,54 @@ def test_few_agreeing_neighbors_count_against_a_depth_only_where_others_see_anot
     assert (found.depth[32:128, 32:88] > 0).mean() > 0.6
 
 
+def _coarse(index: int, x: float, wrong: float = 1.0) -> KeyframeDepth:
+    """The tracker's depth in the place of stereo's."""
+    found = _fine(index, x)
+    return replace(found, depth=found.depth * np.float32(wrong), confidence=found.confidence * np.float32(DOUBTFUL))
+
+
+def test_doubtful_maps_do_not_contradict_one_that_is_sure() -> None:
+    reference, good = _fine(0, 0.0), [_fine(1, 0.3), _fine(2, -0.3)]
+    wrong = [_coarse(k, x, 1.2) for k, x in enumerate((0.4, -0.4, 0.5, -0.5), 3)]
+    alone = fuse(reference, good, CONFIG, NativeFusionBackend(1))
+    among = fuse(reference, [*wrong[:2], *good, *wrong[2:]], CONFIG, NativeFusionBackend(1))
+    assert np.median(among.confidence) > np.median(alone.confidence) - 0.02
+    assert (among.depth > 0).sum() > 0.98 * (alone.depth > 0).sum() > 0.5 * reference.depth.size
+    doubted = fuse(reference, wrong, CONFIG, NativeFusionBackend(1))
+    assert not doubted.consistent.any()
+    assert not doubted.depth.any()
+
+
+def test_a_doubtful_map_may_be_the_one_that_agrees() -> None:
+    reference, coarse = _fine(0, 0.0), _coarse(1, 0.3, 1.005)
+    found = fuse(reference, [coarse], CONFIG, NativeFusionBackend(1))
+    assert found.consistent[32:128, 80:192].mean() > 0.9
+    np.testing.assert_allclose(found.unfiltered, reference.depth, rtol=1e-6)  # of its depth nothing is taken
+
+
+def test_doubtful_maps_are_the_last_neighbors() -> None:
+    reference, good = _fine(0, 0.0), _fine(1, 0.6)
+    coarse = [_coarse(k, x) for k, x in enumerate((0.3, -0.3, 0.1, -0.1), 2)]
+    chosen = nearest_views(reference, [*coarse[:2], good, *coarse[2:]], 2, CONFIG.min_neighbor_confidence)
+    assert chosen[0] is good
+    assert chosen[1] in coarse
+    assert good not in nearest_views(reference, [*coarse, good], 2, 0.0)  # the others see more of the reference
+
+
+@pytest.mark.parametrize("wrong", ["depth", "confidence"])
+def test_a_pixel_that_is_not_a_number_takes_no_part(wrong: str) -> None:
+    reference, neighbors = view(0, 0.0, 0.01), [view(1, 0.2, 0.01), view(2, -0.3, 0.01)]
+    getattr(neighbors[0], wrong)[12:16, 20:24] = np.nan
+    maps, options = depth_maps(reference, neighbors), FuseOptions(1.0, 0.1)
+    sigma = np.full(SIZE, 0.02, np.float32)
+    for backend in (NativeFusionBackend(1), TorchFusionBackend("cpu")):
+        splatted = backend.splat(maps, options)
+        neighbors[0].depth[12:16, 20:24] = 0.0
+        np.testing.assert_array_equal(splatted, backend.splat(depth_maps(reference, neighbors), options))
+        fused = backend.fuse(maps, splatted, sigma, options)
+        assert all(np.isfinite(values).all() for values in vars(fused).values())
+
+
 def test_fewer_neighbors_than_asked_for_is_said() -> None:
     fusion = OnlineFusion(CONFIG)
     assert list(fusion.add(view(0, 0.0))) == []
@@ -188,7 +238,7 @@ def test_scale_corrections_scale_stored_depth() -> None:
     fusion = OnlineFusion(CONFIG)
     for i in range(2):
         list(fusion.add(view(i, 0.1 * i)))
-    doubled = {i: (look(0.2 * i), 2.0) for i in range(2)}
+    doubled = {i: Correction(look(0.2 * i), 2.0) for i in range(2)}
     fusion.move(doubled)
     fusion.move(doubled)  # absolute: a second time changes nothing
     for found in fusion.flush():

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from mvsgs_core.inverse_depth import enlarge_inverse_depth
+from mvsgs_core.keyframe_window import Correction
 from mvsgs_core.mvs.backend import NativeBackend
+from mvsgs_core.mvs.cascade import Cascade, CascadeConfig
 from mvsgs_core.mvs.hypotheses import RangeConfig, SearchRange, fill_uncertain, search_range, upsample_surface
 from mvsgs_core.mvs.keyframe import StereoKeyframe, prepare_keyframe
 from mvsgs_core.mvs.neighbors import NeighborConfig, select_neighbors
@@ -56,6 +58,26 @@ def test_the_range_comes_from_whoever_knows() -> None:
     assert (own.source, theirs.source, before.source) == ("own grid", "neighbors' grids", "previous keyframe")
     assert theirs.high == pytest.approx(own.high, rel=0.3)
     assert search_range(blind, [], None, RangeConfig()) is None
+
+
+@pytest.mark.parametrize("segment", [0, 1])
+def test_a_range_that_is_remembered_follows_the_maps_scale_and_segment(segment: int) -> None:
+    """Only the first keyframe has a grid, and before the last one the map gets twice as large."""
+    blind = {"inverse_depth": np.zeros((12, 16), np.float32), "segment": segment}
+    first = replace(view(0, 0.0), segment=segment)
+    views = [first, *(replace(view(i, 0.2 * i), **blind) for i in range(1, 4))]
+    cascade = Cascade(CascadeConfig(area=SIZE[0] * SIZE[1], window=0, lag=1, threads=1))
+    before = [found.search for v in views[:3] for found in cascade.add(v)]
+    assert [search.source for search in before if search] == ["own grid", "neighbors' grids"]
+    doubled = [v.world_from_cam.copy() for v in views]
+    for pose in doubled:
+        pose[:3, 3] *= 2.0
+    corrections = {v.index: Correction(doubled[v.index], 2.0, segment=0) for v in views[:3]}
+    for _ in range(2):  # absolute: a second time changes nothing
+        cascade.move(corrections)
+    (late,) = cascade.add(replace(views[3], world_from_cam=doubled[3], scale=2.0, segment=0))
+    assert before[1] is not None
+    assert late.search == SearchRange(before[1].low / 2.0, before[1].high / 2.0, "previous keyframe")
 
 
 def test_neighbors_come_from_both_sides_and_have_a_baseline() -> None:
