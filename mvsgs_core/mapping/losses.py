@@ -3,7 +3,7 @@
 The photometric ones are those of GES (Hamdi et al. 2024): L1 + SSIM + an L1 inside a frequency-modulated, edge-aware
 mask. The mask comes from a difference of Gaussians of the render, whose width moves with the training's progress
 `frequency` in 0 to 100: in the first half the smooth regions are kept (the mask is inverted), in the second the edges.
-An online run, whose length is not known ahead, gives each view its own progress: see `frequency_of`.
+An online run, whose length is not known ahead, gives each view its own progress until the stream ends.
 
 One more term: its weight in `LossWeights`, its function in `TERMS`, or in `SPLAT_TERMS`. Another loss altogether, in a
 file of one's own or in a program: `training.loss_function`, a function of `LossInputs`.
@@ -51,7 +51,7 @@ class LossInputs:
     render: Render
     target: Tensor  # (H, W, 3); equal to the render where the keyframe's pixels are left out
     splats: Splats  # of the map, in its unit
-    frequency: float  # the keyframe's progress, 0 to 100
+    frequency: float  # the progress of the training, 0 to 100
     threads: int | None  # None: all
 
 
