@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -77,7 +79,7 @@ class Child:
 
     def failure(self) -> str | None:
         """What went wrong, or None as long as nothing did."""
-        code = self.process.poll()
+        code = self.code
         if self.status.state in ("failed", "stopped"):
             return self.status.error or "failed"
         if code is None or code == 0:
@@ -88,8 +90,26 @@ class Child:
         return f"exit code {code}"
 
     @property
+    def code(self) -> int | None:
+        """Its exit code; None while it runs. What it has started goes with it, while the group's number is still its:
+        of a process that has ended and was asked for its code, another may get it."""
+        if self.process.returncode is None:
+            with suppress(ChildProcessError):  # where SIGCHLD is ignored, none waits to be asked
+                if os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+                    return None
+                self.kill_group()
+            self.process.poll()
+        return self.process.returncode
+
+    @property
     def running(self) -> bool:
-        return self.process.poll() is None
+        return self.code is None
+
+    def wait(self, seconds: float = math.inf) -> None:
+        """Until it has ended, at most so long."""
+        until = time.monotonic() + seconds
+        while self.running and time.monotonic() < until:
+            time.sleep(0.005)
 
     @property
     def frozen(self) -> bool:
@@ -111,14 +131,13 @@ class Child:
 
     def send(self, number: signal.Signals) -> None:
         if self.running:
-            self.process.send_signal(number)
+            os.kill(self.process.pid, number)
 
     def kill_group(self) -> None:
-        """SIGKILL for the node and whatever it started itself."""
-        try:
-            os.killpg(self.process.pid, signal.SIGKILL)
-        except (ProcessLookupError, PermissionError):
-            self.process.kill()
+        """SIGKILL for the node and whatever it started itself; done already where it is known to have ended."""
+        if self.process.returncode is None:
+            with suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)
 
     def close(self) -> None:
         os.close(self.pipe)

@@ -79,12 +79,18 @@ def spec(
     for edge in graph.out_of(name):
         kind = edge.message.__name__
         output = outputs.setdefault(
-            kind, {"type": kind, "address": address[topic_of(edge)], "readers": 0, "observers": [], "away": 0.0}
-        )
+            kind,
+            {
+                "type": kind, "address": address[topic_of(edge)], "readers": 0, "observers": [],
+                "patience": settings.supervise.dead if slot.placement.external else 0.0, "away": 0.0,
+            },
+        )  # fmt: skip
         if returns(graph, edge.reader) and not edge.best_effort:
             output["away"] = away
         if edge.reader in graph.observers or edge.reader in graph.sources:  # a source that has ended is not missed
             output["observers"].append(edge.reader)
+            if graph.slots[edge.reader].placement.external:  # whoever starts it by hand takes the time that it takes
+                output["patience"] = 0.0
         else:
             output["readers"] += 1
     return {

@@ -12,11 +12,11 @@ import selectors
 import shlex
 import signal
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -106,9 +106,7 @@ class Supervisor:
         """Until every process has ended by itself, a stage has failed, or a signal says to stop."""
         while True:
             self._listen(REFRESH_SECONDS)
-            if any(child.failure() for child in self._stages()):
-                return self._blame()
-            while self._signals:
+            while self._signals:  # first: whoever stops a service tells its nodes, too
                 number = self._signals.pop(0)
                 if self._ended is not None:
                     self._stop_by = time.monotonic()  # there is nothing left to save
@@ -119,6 +117,8 @@ class Supervisor:
                 if self._interrupts > 1 or not self._started:  # a source would wait for readers that never come
                     return self._stopped(number)
                 self._end_sources()
+            if any(child.failure() for child in self._stages()):
+                return self._blame()
             watched = [child for name, child in self._children.items() if name not in self._failed_observers]
             if given_up := self._watchdog.look(watched):
                 child, reason = given_up
@@ -161,8 +161,7 @@ class Supervisor:
         """The run goes on without this observer."""
         self._failed_observers[child.name] = failure
         child.kill_group()
-        with suppress(subprocess.TimeoutExpired):
-            child.process.wait(1.0)
+        child.wait(1.0)
         directory.tell_gone(child.name)
         self._screen.note(f"{child.name} failed: {failure.error}; the run goes on without it (log: {child.log})")
 
@@ -172,7 +171,18 @@ class Supervisor:
                 child.read_status()
         cut_off, nothing = self._said("cut_off"), self._said("nothing")
         # where there is nothing to show, the footage is not all that there is to blame
-        return finished(tuple(self._failed_observers.values()), cut_off | nothing if nothing else {}, cut_off)
+        ended = finished(tuple(self._failed_observers.values()), cut_off | nothing if nothing else {}, cut_off)
+        unseen = "; ".join(f"{name} is external: its end is not known here" for name in self._unseen())
+        return replace(ended, code=FAILED, reason=unseen) if unseen else ended
+
+    def _unseen(self) -> list[str]:
+        """The external stages that no node here has heard to the end, itself or by others."""
+        slots, sources = self._graph.slots, self._graph.sources
+        heard = {name for name in self._children if name not in self._failed_observers}
+        for name in reversed(slots):  # readers come after their senders
+            if any(edge.reader in heard and edge.reader not in sources for edge in self._graph.out_of(name)):
+                heard.add(name)
+        return [name for name in slots if name not in heard and name not in self._graph.observers]
 
     def _said(self, key: str) -> dict[str, str]:
         """A value that is text, by node, of those that have it, in the graph's order."""
@@ -196,11 +206,15 @@ class Supervisor:
                     self._waker.recv(64)
             elif not key.data.read_status():
                 self._selector.unregister(key.fileobj)
-                with suppress(Exception):
-                    key.data.process.wait(1.0)  # its pipe is closed: it is going
+                key.data.wait(1.0)  # its pipe is closed: it is going
 
     def _end_sources(self) -> None:
-        self._screen.note("Ctrl-C: the stream ends here; the map and the report are being finished (again: stop now)")
+        elsewhere = [name for name in self._graph.sources if name not in self._children]
+        if elsewhere != self._graph.sources:
+            what = "the stream ends here; the map and the report are being finished"
+            self._screen.note(f"Ctrl-C: {what} (again: stop now)")
+        for name in elsewhere:
+            self._screen.note(f"{name} is external: end it where it runs (Ctrl-C there); Ctrl-C again here: stop now")
         for name in self._graph.sources:
             if name in self._children:
                 self._children[name].send(signal.SIGINT)
@@ -214,7 +228,7 @@ class Supervisor:
             if any(child.failure() and not child.status.peer for child in self._stages()):
                 break
         failed = [child for child in self._stages() if child.failure()]
-        child = min(failed, key=lambda child: (child.status.peer, (child.process.poll() or 0) >= 0))
+        child = min(failed, key=lambda child: (child.status.peer, (child.code or 0) >= 0))
         child.read_status()
         return self._failure(child.failed())
 
@@ -228,7 +242,7 @@ class Supervisor:
             self._listen(0.05)
         for child in self._children.values():
             child.kill_group()
-            child.process.wait()
+            child.wait()
         for child in self._children.values():
             with suppress(ValueError, OSError):
                 child.read_status()

@@ -7,6 +7,8 @@ import math
 import os
 import platform
 import subprocess
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -18,15 +20,46 @@ _GIT_SECONDS = 5.0  # for git to answer
 KERNELS = {"v4": "AVX-512", "v3": "AVX2", "generic": "generic kernels"}
 
 
-def available_cores() -> int:
-    """Cores that this process may use: its affinity, limited by a container's quota."""
+def available_cores(root: Path = Path("/")) -> int:
+    """Cores that this process may use: its affinity, limited by the quota of a container or a service.
+
+    root: of the file system that says so.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quota = Path("/sys/fs/cgroup/cpu.max")
-    if quota.exists():
-        limit, _, period = quota.read_text().partition(" ")
-        if limit != "max":
-            cores = min(cores, max(1, math.ceil(int(limit) / int(period))))
-    return cores
+    return min([cores, *(max(1, math.ceil(limit)) for limit in _quotas(root))])
+
+
+def _quotas(root: Path) -> Iterator[float]:
+    """Cores that each control group allows which this process is in, by its own limit or one above it."""
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        top = root / "sys/fs/cgroup" / ("cpu" if controllers else "")
+        own = top / path.strip("/")
+        for group in (own, *own.parents):  # in a container that sees its host's path, only the top is there
+            with suppress(OSError, ValueError):
+                yield _quota_v1(group) if controllers else _quota(group)
+            if group == top:
+                break
+
+
+def _quota(group: Path) -> float:
+    """Raises OSError or ValueError where there is none."""
+    limit, period = (group / "cpu.max").read_text().split()
+    return int(limit) / int(period)  # no number: "max"
+
+
+def _quota_v1(group: Path) -> float:
+    """Raises OSError or ValueError where there is none."""
+    limit = int((group / "cpu.cfs_quota_us").read_text())
+    if limit < 0:
+        raise ValueError("no limit")
+    return limit / int((group / "cpu.cfs_period_us").read_text())
 
 
 def processor() -> str:

@@ -32,7 +32,8 @@ def main(arguments: list[str]) -> int:
     except (OSError, ValueError) as error:
         print(error, file=sys.stderr)
         return 2
-    if spec.status_fd is not None:
+    signals.by_hand = spec.status_fd is None
+    if not signals.by_hand:
         _die_with_parent()
     _place(spec)
     from nodes.runtime.process import run
@@ -48,11 +49,12 @@ def _die_with_parent() -> None:
 
 def _place(spec: Spec) -> None:
     """Cores and threads, before the libraries that read them are loaded."""
+    niceness = min(19, os.getpriority(os.PRIO_PROCESS, 0) + spec.nice)  # a run may give way to others as a whole
     for task in Path("/proc/self/task").iterdir():  # numpy has started threads already
         if spec.cpu is not None:
             os.sched_setaffinity(int(task.name), spec.cpu)
         if spec.nice:
-            os.setpriority(os.PRIO_PROCESS, int(task.name), spec.nice)
+            os.setpriority(os.PRIO_PROCESS, int(task.name), niceness)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if spec.threads is not None:
         for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):

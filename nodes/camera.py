@@ -207,7 +207,11 @@ def _open(config: Camera.Config) -> cv2.VideoCapture:
     else:
         milliseconds = int(1000 * min(config.timeout, ANSWER))
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
-        capture = cv2.VideoCapture(config.path, cv2.CAP_ANY, limits)
+        loud = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it writes the password, too
+        try:
+            capture = cv2.VideoCapture(config.path, cv2.CAP_ANY, limits)
+        finally:
+            cv2.utils.logging.setLogLevel(loud)
         hint = "is the address right (ffplay shows the same one), and does the network let it through?"
     if not capture.isOpened():
         capture.release()

@@ -31,6 +31,12 @@ class Inbox:
         for peer in (*self._readers, *self._publishers):
             peer.watch()
 
+    def check_peers(self) -> None:
+        """Raises PeerLost if a publisher is gone without End. For a node that takes no messages now; `receive` hears
+        what there is first."""
+        for reader in self._readers:
+            reader.check_peer()
+
     def receive(self, timeout_s: float) -> tuple[Reader, Any] | None:
         """The next message with its reader, End included; None when none comes in time.
 

@@ -13,7 +13,6 @@ import gc
 import logging
 import queue
 import random
-import signal
 import sys
 import threading
 import time
@@ -53,7 +52,7 @@ def run(spec: Spec, signals: Signals) -> int:
         process.run()
     except Stopped as stop:
         process.abort("stopped", str(stop))
-        return 128 + signal.SIGTERM
+        return 128 + stop.number
     except Exception as error:
         logging.exception("failed")
         line = next(iter(str(error).splitlines()), "")
@@ -146,8 +145,16 @@ class _Process:
 
     def _await_readers(self, inbox: Inbox) -> None:
         for given in self._spec.outputs:
+            while not self._publishers[given.type].ready(given.readers):
+                self._wait(inbox, self._publishers[given.type])
+        began = time.monotonic()
+        for given in self._spec.outputs:
             publisher = self._publishers[given.type]
-            while not publisher.ready(given.readers, self._spec.awaited_observers(given)):
+            while not publisher.ready(given.readers, awaited := self._spec.awaited_observers(given)):
+                if given.patience and time.monotonic() - began > given.patience:
+                    missing = ", ".join(sorted(set(awaited) - publisher.observers.keys()))
+                    self._say(f"{publisher.topic} begins without {missing}: not there after {given.patience:g} s")
+                    break
                 self._wait(inbox, publisher)
 
     def _rest(self) -> None:
@@ -243,7 +250,7 @@ class _Process:
         """A source runs in a thread: it may hang in a camera's read, and must still be stopped and watched."""
         source, requests = _Source(runner), Requests(self._readers, runner.node)
         deadline = None
-        while deadline is None or time.monotonic() < deadline:
+        while True:
             self._signals.check()
             if deadline is None and self._signals.interrupted:
                 source.stop()
@@ -256,16 +263,21 @@ class _Process:
             try:
                 message = source.take(POLL)
             except queue.Empty:
+                if deadline is not None and time.monotonic() > deadline:
+                    break
                 inbox.watch()
                 continue
             if message is None:
-                if source.cut_off and not runner.node.live:  # a camera's stream has no other end
+                if source.cut_off:
                     _say_cut_off(runner.node)
                 return
             self._step.next("working")
             if not requests.pause.leaves_out(message):
                 yield message
+            if deadline is not None:  # to send it may have taken long, which is no fault of the read
+                deadline = time.monotonic() + STOP_GRACE
         runner.node.stats.warn(f"{self._spec.name}: its last read did not return within {STOP_GRACE:g} s of Ctrl-C")
+        _say_cut_off(runner.node)
 
     def _send(self, message: Message) -> None:
         name = type(message).__name__
@@ -304,6 +316,7 @@ class _Process:
         self._held_back(publisher.topic)
         publisher.socket.poll(round(1000 * POLL))
         inbox.watch()
+        inbox.check_peers()
 
     def _held_back(self, topic: str) -> None:
         self._step.topic, self._step.doing = topic, "held back"  # in this order: another thread reads them
@@ -330,6 +343,8 @@ class _Process:
 
 def _say_cut_off(node: Node) -> None:
     """That Ctrl-C ended its stream, unless all that was expected had come: what there is of the rest is not known."""
+    if node.live:  # a camera's stream has no other end
+        return
     frames, expected = node.stats.counts.get("frames"), node.stats.values.get("frames_expected")
     if frames is not None and expected and frames >= expected:
         return

@@ -1,5 +1,7 @@
 """What signals ask of a node: SIGINT ends a source's stream, SIGTERM stops any node at its next safe point.
 
+A second SIGINT stops a node that was started by hand, as Ctrl-C does twice in its terminal; a second SIGTERM changes
+nothing, for a launcher and whoever stops it may both send one while the node saves what it has.
 A safe point is between two hooks, at a `yield` of one, and wherever a node waits for others: no state is half changed
 there. Who does not reach one in time is killed by the alarm, which needs neither the interpreter nor its lock.
 SIGUSR1 writes where all threads stand to the log; it works in a process that hangs in a call, too.
@@ -10,13 +12,17 @@ from __future__ import annotations
 import faulthandler
 import signal
 
-STOP_SECONDS = 3.7  # from SIGTERM to the process's end, wherever it is; its launcher waits a little longer
+STOP_SECONDS = 3.7  # from the signal that stops a process to its end, wherever it is; its launcher waits longer
 ABORT_SECONDS = 3.0  # that a node has to save what must not be lost
 STARTING = {signal.SIGINT, signal.SIGUSR1}  # a launcher starts a node with these blocked, until it can handle them
 
 
 class Stopped(Exception):
-    """SIGTERM has come."""
+    """A signal that stops the node has come: its number."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped ({signal.Signals(number).name})")
+        self.number = number
 
 
 class Signals:
@@ -24,28 +30,31 @@ class Signals:
 
     def __init__(self) -> None:
         self.interrupted = False
-        self._terminated = False
+        self.by_hand = False  # nobody but its terminal's user can stop this node
+        self._stopped_by: int | None = None
 
     def install(self) -> None:
         """For the main thread of a process."""
         faulthandler.enable()
         faulthandler.register(signal.SIGUSR1)
         signal.signal(signal.SIGINT, self._interrupt)
-        signal.signal(signal.SIGTERM, self._terminate)
+        signal.signal(signal.SIGTERM, self._stop)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, STARTING)
 
     def check(self) -> None:
-        """Raises Stopped once SIGTERM has come: to be called at every safe point."""
-        if self._terminated:
-            raise Stopped("stopped (SIGTERM)")
+        """Raises Stopped once the node is to stop: to be called at every safe point."""
+        if self._stopped_by is not None:
+            raise Stopped(self._stopped_by)
 
-    def _interrupt(self, *_: object) -> None:
+    def _interrupt(self, number: int, frame: object) -> None:
+        if self.interrupted and self.by_hand:
+            self._stop(number, frame)
         self.interrupted = True
 
-    def _terminate(self, *_: object) -> None:
-        self._terminated = True
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a second one does not wait
-        end_within(STOP_SECONDS)
+    def _stop(self, number: int, frame: object) -> None:
+        if self._stopped_by is None:  # a repeated one gives no more time either
+            self._stopped_by = number
+            end_within(STOP_SECONDS)
 
 
 def end_within(seconds: float) -> None:

@@ -3,7 +3,8 @@
     {"name": "mvs", "target": "nodes.mvs.Mvs", "config": {...},
      "inputs": [{"type": "Keyframe", "slot": "tracker", "address": "ipc:///tmp/x/tracker.Keyframe",
                  "best_effort": false, "away": 0.0}],
-     "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1, "observers": [], "away": 0.0}],
+     "outputs": [{"type": "Depth", "address": "ipc:///tmp/x/mvs.Depth", "readers": 1, "observers": [], "patience": 0.0,
+                  "away": 0.0}],
      "observer": false, "returns": false, "buffer": 4, "seed": 0, "threads": 1, "cpu": null, "nice": 0, "keys": null,
      "token": "", "status_fd": null}
 
@@ -44,6 +45,7 @@ class Output:
     address: str
     readers: int
     observers: tuple[str, ...] = ()
+    patience: float = 0.0  # s for which these are waited for once all others are there; 0: until they are gone
     away: float = 0.0  # s for which a reader is waited for, once it is lost
 
 

@@ -19,6 +19,7 @@ from nodes.runtime.transport.sockets import (
     GOODBYE,
     NAME_BYTES,
     OBSERVER,
+    hung_up,
     left_open,
     open_monitor,
     open_socket,
@@ -36,7 +37,7 @@ class _Reader:
     """What both kinds of readers share: the connection, its monitor, and decoding."""
 
     delivery: bytes
-    monitored = LOST | zmq.EVENT_HANDSHAKE_SUCCEEDED  # events of the connection
+    monitored = LOST | zmq.EVENT_CONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED  # events of the connection
     longest_pause = 0  # ms between two attempts to connect, from 50 on twice as long each time; 0: always 50
 
     def __init__(
@@ -62,6 +63,7 @@ class _Reader:
         self._buffer = max(1, buffer)
         self._max_bytes = max_message_bytes(type) if max_bytes is None else max_bytes
         self._frames: deque[zmq.Frame] = deque()  # taken over, not asked for yet
+        self._descriptor: int | None = None  # of the connection
         self._lost_at: float | None = None
         self._away, self._say = away, say
         self._token, self._observer = token.encode(), observer
@@ -88,7 +90,11 @@ class _Reader:
     def watch(self) -> None:
         """Takes note of a lost connection. Raises TransportError if the publisher refuses this reader's keys."""
         while readable(self.monitor):
-            event = recv_monitor_message(self.monitor)["event"]
+            met = recv_monitor_message(self.monitor)
+            event = met["event"]
+            if event == zmq.EVENT_CONNECTED:
+                self._descriptor = met["value"]
+                continue
             if (refusal := self._refused_by(event)) is not None:
                 raise TransportError(refusal)
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
@@ -115,7 +121,7 @@ class _Reader:
         return None
 
     def check_peer(self) -> None:
-        """Raises PeerLost if the publisher is gone without End. To be called when no message waits."""
+        """Raises PeerLost if the publisher is gone without End, whatever of its messages still waits."""
         grace = max(PEER_GRACE, self._away)
         if self._lost_at is not None and not self.ended and time.monotonic() - self._lost_at > grace:
             late = f", and was not back within {self._away:g} s" if self._away else ""
@@ -193,6 +199,11 @@ class ReliableReader(_Reader):
     def watch(self) -> None:
         self._say_again()
         super().watch()
+
+    def check_peer(self) -> None:
+        if self._lost_at is None and not self._away and hung_up(self._descriptor):
+            self._lost_at = time.monotonic()  # ZeroMQ does not notice it where messages wait that nobody takes
+        super().check_peer()
 
     def head(self) -> Decoded | None:
         """The next message, if one has arrived; `take` gives it. Raises TransportError if one was lost."""
@@ -316,6 +327,10 @@ class NewestReader(_Reader):
             if self.ended:
                 break
         return message
+
+    def check_peer(self) -> None:
+        if self._end is None:  # else it is gone after that, which was not asked for yet
+            super().check_peer()
 
     def close(self) -> None:
         self._closing = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -113,6 +114,15 @@ def free_address(socket: zmq.Socket[bytes]) -> None:
 
 def readable(socket: zmq.Socket[bytes]) -> bool:
     return bool(int(socket.events) & zmq.POLLIN)
+
+
+def hung_up(connection: int | None) -> bool:
+    """Whether the other end of a connection, named by its descriptor, is gone."""
+    if connection is None or not hasattr(select, "POLLRDHUP"):
+        return False
+    looked = select.poll()
+    looked.register(connection, select.POLLRDHUP)
+    return bool(looked.poll(0))
 
 
 class _Closable(Protocol):

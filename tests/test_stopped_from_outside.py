@@ -1,0 +1,63 @@
+"""Runs that are stopped by signals from outside save what they have, whoever else is told and however often."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.support.launches import DOWN, Launch, launch
+from tests.support.patience import Stopwatch
+
+pytestmark = pytest.mark.slow
+
+__all__ = ["launch"]  # the fixture
+
+STREAM = ("source.count=0", "source.period=0.01")
+SLOW_TO_SAVE = (*STREAM, "relay._target_=tests.support.fake_graph.slow_stages.SlowToSave")
+
+
+def test_a_stage_that_is_ended_from_outside_saves_what_it_has(launch: type[Launch], tmp_path: Path) -> None:
+    """Its launcher hears of it, and tells all that still run: it must not tell the one that saves to be gone."""
+    saved = tmp_path / "saved"
+    run = launch(*SLOW_TO_SAVE, f"relay.saved={saved}")
+    run.wait_until_running()
+    watch = Stopwatch()
+    run.node("relay").terminate()
+    code, _, err = run.finish()
+    assert watch.within(DOWN)
+    assert code == 1
+    assert "relay failed: stopped (SIGTERM)" in err
+    assert saved.read_text() == "stopped (SIGTERM)"
+
+
+def test_a_service_that_is_stopped_saves_what_it_has(launch: type[Launch], tmp_path: Path) -> None:
+    """As systemd and Slurm do it: launcher and nodes are told at once."""
+    saved = tmp_path / "saved"
+    run = launch(*SLOW_TO_SAVE, f"relay.saved={saved}")
+    run.wait_until_running()
+    watch = Stopwatch()
+    for process in (run.process.pid, *run.nodes()):
+        os.kill(process, signal.SIGTERM)
+    code, out, _ = run.finish()
+    assert watch.within(DOWN)
+    assert (code, "stopped by SIGTERM" in out) == (128 + signal.SIGTERM, True)
+    assert run.report()["reason"] == "stopped by SIGTERM"
+    assert saved.read_text() == "stopped (SIGTERM)"
+
+
+def test_a_node_cannot_be_told_to_stop_so_often_that_it_never_does(launch: type[Launch]) -> None:
+    run = launch(*STREAM, "relay.seconds=1000")
+    run.wait_until_running()
+    relay, watch = run.node("relay"), Stopwatch()
+    while run.process.poll() is None:
+        with suppress(psutil.NoSuchProcess):
+            relay.terminate()
+        time.sleep(0.1)
+    assert watch.within(DOWN)
+    assert run.finish()[0] == 1
