@@ -20,6 +20,8 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.photometer import Photometer, Seen
 
+HELD = 2  # frames between two keyframes, in the mean, where these wait to go out: up to 30 do, and all images with them
+
 
 @dataclass(frozen=True)
 class Between:
@@ -73,8 +75,14 @@ class FramesBetween:
         self._complete = {index: frame for index, frame in self._complete.items() if index not in self._ended}
         self._newest, self._ended = self._ended | self._newest, {}
 
+    def hold(self, keyframes: int) -> None:
+        """The keyframes that the frames were to `end` at are solved and wait themselves: so many, and few frames do."""
+        self._ended = {}
+        while len(self._complete) > HELD * keyframes:
+            del self._complete[spared({index: image for index, (image, _) in self._complete.items()})]
+
     def close(self) -> frozenset[int]:
-        """The keyframes that the frames were to `end` at are solved: what waited for them is to be settled."""
+        """The keyframes that the frames were to `end` at go out: what waited for them is to be settled."""
         closed, self._complete, self._ended = frozenset(self._complete), {}, {}
         return closed
 

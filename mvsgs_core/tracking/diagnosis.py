@@ -30,7 +30,7 @@ class Measured:
 
 
 class Diagnosis:
-    """Collects what happens to frames before a start. Shares of the width are of the tracker's image."""
+    """Collects what happens to frames before a start. Displacements are fractions of the longer side."""
 
     def __init__(self, lost_fraction: float, min_texture: float) -> None:
         """As of FrontEndConfig and TrackerConfig."""
@@ -38,10 +38,8 @@ class Diagnosis:
         self.min_texture = min_texture
         self.blank = Measured()  # frames without texture: fraction of the cells that are textured
         self.lost = Measured()  # frames that could not be followed: fraction of the points that survived
-        self.jumped = (
-            Measured()
-        )  # of these: displacement by features, where enough of them agree, fraction of the width
-        self.followed = Measured()  # frames that were: displacement since the last keyframe, fraction of the width
+        self.jumped = Measured()  # of these: displacement by features, where enough of them agree
+        self.followed = Measured()  # frames that were: displacement since the last keyframe
         self.max_waiting = 0  # keyframes that ever waited for a start
         self.attempts: dict[str, tuple[int, str]] = {}  # starts that failed: how often, and what the last one measured
 
@@ -51,14 +49,14 @@ class Diagnosis:
     def saw(self, reference: TrackingImage, frame: TrackingImage, step: Step, lost: bool) -> None:
         """A frame after the first, and whether the reference's points could not be found in it."""
         if not lost:
-            self.followed.add(step.flow / frame.size[1])
+            self.followed.add(step.flow / frame.longer_side)
         elif frame.cells.textured.mean() < self.min_texture:
             self.no_texture(frame)
         else:
             self.lost.add(step.fraction)
             here, there = match_features(reference, frame)
             if len(here):
-                self.jumped.add(float(np.median(np.linalg.norm(there - here, axis=1))) / frame.size[1])
+                self.jumped.add(float(np.median(np.linalg.norm(there - here, axis=1))) / frame.longer_side)
 
     def failed(self, failure: str) -> None:
         """A start was tried. failure: of a Reconstruction."""
@@ -81,7 +79,7 @@ class Diagnosis:
                 f"({100 * self.min_texture:.0f} % are needed)"
             )
         if self.lost.frames > frames / 4:
-            jump = f"by {100 * self.jumped.median:.0f} % of the width, " if self.jumped.frames else ""
+            jump = f"by {100 * self.jumped.median:.0f} % of the longer side, " if self.jumped.frames else ""
             found = f"{self.jumped.frames} of them by features" if self.jumped.frames else "none of them by features"
             return (
                 f"steps too wide: {self.lost.frames} of {frames} frames could not be followed from the one before "
@@ -94,8 +92,8 @@ class Diagnosis:
             times, text = self.attempts[kind]
             return f"{text} ({times} of {sum(n for n, _ in self.attempts.values())} attempts)"
         return (
-            f"too little motion: the image moved by {100 * self.followed.median:.1f} % of its width in the median "
-            f"({100 * max(self.followed.values):.1f} % at most) since the last keyframe, over {frames} frames: "
+            f"too little motion: the image moved by {100 * self.followed.median:.1f} % of its longer side in the "
+            f"median ({100 * max(self.followed.values):.1f} % at most) since the last keyframe, over {frames} frames: "
             f"{self.max_waiting} of {needed} keyframes that a start takes"
         )
 

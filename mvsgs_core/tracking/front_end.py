@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,11 +16,13 @@ from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.places.localization import Localization, localize
 
 FASTEST = 65504.0  # pixels a second: faster, of a timestamp that is wrong, is no number of an edge
+SAME = 6.0  # gray levels by which two images of the same view differ, in the mean
+AROUND = (3, 3)  # pixels of half size about a point: no masked one is among them, see MASK_MARGIN
 
 
 @dataclass(frozen=True)
 class FrontEndConfig:
-    still_flow: float = 0.001  # of the width: median flow below which a frame did not move and is skipped
+    still_flow: float = 0.001  # of the longer side: median flow below which a frame did not move and is skipped
     feature_fraction: float = 0.5  # of the textured points: fewer found, and features are tried
     lost_fraction: float = 0.2  # fewer found: the frame is lost
     lost_inliers: float = 0.5  # of the matches, within 2 pixels of one pose: fewer, and the frame is lost
@@ -97,11 +100,11 @@ class FrontEnd:
         assert self.reference is not None
         assert self.last is not None
         field = self.between.field(self.last, image)
-        moved = float(np.median(np.hypot(field[..., 0], field[..., 1])))
-        if moved < self.config.still_flow * image.size[1] and self.step is not None and self._same(image):
+        moves = sample_field(field, self.propagated)
+        if self.step is not None and self._rests(self.step.matches.alive, moves, image):
             return replace(self.step, still=True, localization=self.step.localization if with_pose else None)
         self._set_velocity(image, field)
-        guess = self.propagated + sample_field(field, self.propagated)
+        guess = self.propagated + moves
         matches, fraction = self.matcher.match(self.reference, image, guess, self.config.feature_fraction)
         alive = matches.alive
         flow = np.inf
@@ -121,6 +124,12 @@ class FrontEnd:
             self.pose = found.cam_from_world if found else None
             self.step = step
         return step
+
+    def follows(self, image: TrackingImage, other: TrackingImage) -> bool:
+        """Whether a camera could be followed from one image to another, whatever is followed now."""
+        trial = copy(self)
+        trial.refer_to(image)
+        return not trial.is_lost(trial.follow(other, with_pose=False))
 
     def is_lost(self, step: Step) -> bool:
         """Too few points found, or no pose that they agree on."""
@@ -143,11 +152,19 @@ class FrontEnd:
                 frame.velocity = velocity
                 frame.__dict__.pop("cell_velocity", None)
 
-    def _same(self, image: TrackingImage) -> bool:
-        """Whether the last image shows the same: a covered lens does not move either."""
+    def _rests(self, seen: np.ndarray, moves: np.ndarray, image: TrackingImage) -> bool:
+        """Whether the image shows what the last one does where the reference's points are.
+
+        What is flat or masked has no flow, however the camera moves; nor has a lens that was covered, which changes.
+        seen: (M,) bool, points found in the last image. moves: (M, 2) their flow since.
+        """
         assert self.last is not None
-        change = np.abs(self.last.half.astype(np.int16) - image.half)
-        return float(np.mean(change)) < 6.0
+        if np.median(np.linalg.norm(moves[seen], axis=1)) >= self.config.still_flow * image.longer_side:
+            return False
+        change = cv2.blur(cv2.absdiff(self.last.half, image.half), AROUND)
+        height, width = change.shape
+        u, v = np.clip(0.5 * self.propagated[seen], 0, [width - 1, height - 1]).astype(int).T
+        return float(np.mean(change[v, u])) < SAME
 
 
 __all__ = ["FrontEnd", "FrontEndConfig", "Step"]

@@ -17,6 +17,7 @@ from mvsgs_core.tracking.config import TrackerConfig
 from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.image import RecentImages, TrackingImage
+from mvsgs_core.tracking.keyframe_choice import Tail
 from mvsgs_core.tracking.phase import Phase
 from mvsgs_core.tracking.publish import Update
 from mvsgs_core.tracking.session import Session
@@ -40,7 +41,7 @@ class FrozenSession(Session):
         frozen = cls.__new__(cls)
         vars(frozen).update(vars(session))
         frozen.waiting.forget()
-        frozen._tail = {}
+        frozen._tail = Tail()
         if frozen.phase is Phase.INITIALIZING:
             frozen.initializer.abandon()
             frozen.front_end.reference = None
@@ -73,7 +74,7 @@ class FrozenSession(Session):
         record.state = TrackingState.TRACKED
         record.follow(self.graph, step.reference, step.matches, step.pose, frame)
         limit = self.covisible_keyframes.limit(step.reference, self.config.keyframe_choice.max_flow)
-        if self.choice.moved(step, frame.size[1], limit):
+        if self.choice.moved(step, frame.longer_side, limit):
             self._reuse_keyframe(frame, step)
         if len(self.matcher.used) > RecentImages.LIMIT and self.front_end.reference is not None:
             self.local_map.release_images_but({self.front_end.reference.index})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from mvsgs_core.tracking.steps import Steps, whole
 # What resists a change of an inverse depth d in each step, as a fraction of 1 / d². It is no prior: drawn to the depths
 # that keyframes were given, whole maps bend (rotation against depth), by 5 % on the synthetic room.
 DAMPING = 0.5
+
+Solved: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # pose, inverse depth, information, static
 
 
 class KeyframeGraph:
@@ -52,6 +55,18 @@ class KeyframeGraph:
         velocity = np.zeros(target.shape) if matches.velocity is None else matches.velocity.T
         self.edges[source, to] = Edge(target, matches.weight, velocity, fraction)
         return True
+
+    def solved(self, indices: Iterable[int]) -> dict[int, Solved]:
+        """What a bundle adjustment changes of these keyframes, as it is now."""
+        frames = {index: self.keyframes[index] for index in indices}
+        return {index: (k.cam_from_world, k.inverse_depth, k.information, k.static) for index, k in frames.items()}
+
+    def put_back(self, solved: dict[int, Solved]) -> None:
+        """Keyframes as they were."""
+        for index, (pose, inverse_depth, information, static) in solved.items():
+            keyframe = self.keyframes[index]
+            keyframe.cam_from_world, keyframe.inverse_depth = pose, inverse_depth
+            keyframe.information, keyframe.static = information, static
 
     def neighbors(self, index: int) -> set[int]:
         return self.edges.reached([index]) - {index}

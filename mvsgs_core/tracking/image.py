@@ -65,6 +65,11 @@ class TrackingImage:
     def size(self) -> tuple[int, int]:
         return self.gray.shape[0], self.gray.shape[1]
 
+    @property
+    def longer_side(self) -> int:
+        """What motion is measured by, in pixels: a camera that is held upright moves by the same part of it."""
+        return max(self.size)
+
     @cached_property
     def pyramid(self) -> list[np.ndarray]:
         """Levels (H / 2^l + 48, W / 2^l + 48) float32, bordered."""

@@ -21,7 +21,7 @@ from mvsgs_core.tracking.steps import Steps, whole
 class InitializationConfig:
     min_keyframes: int = 6  # before an initialization is tried
     max_keyframes: int = 10  # that wait for one; the oldest goes first
-    flow: float = 0.035  # of the width: median flow between them; falls to a third while the camera is slow
+    flow: float = 0.035  # of the longer side: median flow between them; falls to a third while the camera is slow
     patience: int = 40  # frames without a keyframe over which it falls
     recent: int = 5  # keyframes before that each is matched with
     min_fraction: float = 0.25  # of the textured points that an edge must have found
@@ -54,7 +54,7 @@ class Initializer:
         return self.diagnosis.reason(self.config.min_keyframes)
 
     def flow(self, since: int) -> float:
-        """Fraction of the width that makes a keyframe, so many frames after the last one."""
+        """Fraction of the longer side that makes a keyframe, so many frames after the last one."""
         return self.config.flow * max(1.0 / 3.0, 1.0 - since / self.config.patience)
 
     def add(self, image: TrackingImage, segment: int, matches: Matches | None = None) -> None:

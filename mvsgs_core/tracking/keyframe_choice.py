@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.front_end import Step
+from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.keyframe_spacing import KeyframeSpacing
 
 DOUBT = 0.5  # of the flow that makes a keyframe: where few matches agree with the pose, so much is enough
@@ -23,7 +24,7 @@ HELD_OUT = "keyframes that were to be held out"
 
 @dataclass(frozen=True)
 class KeyframeChoiceConfig:
-    max_flow: float = 0.05  # of the width: a larger median flow since the last keyframe makes another
+    max_flow: float = 0.05  # of the longer side: a larger median flow since the last keyframe makes another
     min_fraction: float = 0.5  # of the textured points: fewer found make a keyframe
     # of the matches, within 2 pixels of one pose: fewer make a keyframe after half the flow, well before the frame is
     # lost (front_end.lost_inliers). Beside what is near the camera, points are found to the end and agree no more.
@@ -40,19 +41,22 @@ class KeyframeChoice:
 
     @property
     def max_flow(self) -> float:
-        """As a fraction of the width, now."""
+        """As a fraction of the longer side, now."""
         return self.config.max_flow * self._factor
 
     @property
     def _factor(self) -> float:
         return 1.0 if self.spacing is None else self.spacing.factor
 
-    def moved(self, step: Step, width: int, limit: float) -> bool:
-        """Whether the image has changed enough since the reference. limit: largest flow, as a fraction of the width."""
-        if step.flow > limit * width or step.fraction < self.config.min_fraction:
+    def moved(self, step: Step, side: int, limit: float) -> bool:
+        """Whether the image has changed enough since the reference.
+
+        side: pixels of its longer side. limit: largest flow, as a fraction of it.
+        """
+        if step.flow > limit * side or step.fraction < self.config.min_fraction:
             return True
         doubted = step.localization is not None and step.localization.inliers < self.config.min_inliers
-        return doubted and step.flow > DOUBT * limit / self._factor * width  # doubt waits for no wider spacing
+        return doubted and step.flow > DOUBT * limit / self._factor * side  # doubt waits for no wider spacing
 
     def saw(self, step: Step) -> None:
         """A frame that becomes no keyframe, however much it moved."""
@@ -60,29 +64,49 @@ class KeyframeChoice:
             self.spacing.look()
         self._before = (step.reference, step.flow, step.fraction)
 
-    def wants(self, index: int, step: Step, width: int, limit: float) -> bool:
-        """Whether frame `index` becomes a keyframe. limit: as of `moved`."""
+    def wants(self, index: int, step: Step, side: int, limit: float) -> bool:
+        """Whether frame `index` becomes a keyframe. side, limit: as of `moved`."""
         known, flow, fraction = self._before
         flow, fraction = (flow, fraction) if known == step.reference else (0.0, 1.0)
         self.saw(step)
-        wanted = self.moved(step, width, limit)
+        wanted = self.moved(step, side, limit)
         if wanted and is_held_out(index):
-            wanted = self._late(2.0 * step.flow - flow, 2.0 * step.fraction - fraction, width, limit)
+            wanted = self._late(2.0 * step.flow - flow, 2.0 * step.fraction - fraction, side, limit)
         if wanted and self.spacing is not None:
-            self.spacing.made(step.flow, self.config.max_flow * width)
+            self.spacing.made(step.flow, self.config.max_flow * side)
         return wanted
 
-    def is_late(self, step: Step, width: int, limit: float) -> bool:
-        """Whether the frames after this one may be lost without a keyframe. limit: as of `moved`."""
-        return self._late(step.flow, step.fraction, width, limit)
+    def is_late(self, step: Step, side: int, limit: float) -> bool:
+        """Whether the frames after this one may be lost without a keyframe. side, limit: as of `moved`."""
+        return self._late(step.flow, step.fraction, side, limit)
 
-    def _late(self, flow: float, fraction: float, width: int, limit: float) -> bool:
-        return flow > LATE_FLOW * limit * width or fraction < LATE_FRACTION * self.config.min_fraction
+    def _late(self, flow: float, fraction: float, side: int, limit: float) -> bool:
+        return flow > LATE_FLOW * limit * side or fraction < LATE_FRACTION * self.config.min_fraction
 
-    def shows_new(self, step: Step, width: int) -> bool:
+    def shows_new(self, step: Step, side: int) -> bool:
         """Whether the last frame of a stream shows enough that its reference does not."""
         lost = 1.0 - LAST * (1.0 - self.config.min_fraction)
-        return step.flow > LAST * self.config.max_flow * width or step.fraction < lost
+        return step.flow > LAST * self.config.max_flow * side or step.fraction < lost
+
+
+class Tail:
+    """The last two frames since the last keyframe, of those that were tracked: the stream may end with one of them."""
+
+    def __init__(self) -> None:
+        self._frames: dict[int, tuple[TrackingImage, Step]] = {}
+
+    @property
+    def indices(self) -> set[int]:
+        return set(self._frames)
+
+    def add(self, frame: TrackingImage, step: Step) -> None:
+        self._frames = dict(sorted(self._frames.items())[-1:]) | {frame.index: (frame, step)}
+
+    def last(self, choice: KeyframeChoice) -> tuple[TrackingImage, Step] | None:
+        """The one that is to be a keyframe at the end of the stream; None where neither shows enough."""
+        shown = {i: (f, s) for i, (f, s) in self._frames.items() if choice.shows_new(s, f.longer_side)}
+        last = newest(shown)
+        return None if last is None else shown[last]
 
 
 def newest(indices: Iterable[int]) -> int | None:
@@ -91,4 +115,4 @@ def newest(indices: Iterable[int]) -> int | None:
     return next((index for index in order if not is_held_out(index)), order[0] if order else None)
 
 
-__all__ = ["HELD_OUT", "KeyframeChoice", "KeyframeChoiceConfig", "newest"]
+__all__ = ["HELD_OUT", "KeyframeChoice", "KeyframeChoiceConfig", "Tail", "newest"]

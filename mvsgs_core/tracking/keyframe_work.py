@@ -43,15 +43,13 @@ class KeyframeWork:
 
         step: of the frame when it was followed.
         """
-        matches = {step.reference: step.matches}
+        matches, before = {step.reference: step.matches}, self.graph.solved(self.local_map.window(segment))
         yield from timed(self.stats, "local map", self.local_map.inserting(frame, step.pose, segment, matches))
-        with self.stats.time("local bundle adjustment"):
-            solution = self.local_map.adjust_window(frame.index)
+        self._adjust_window(frame.index)
         yield
-        if solution.failure:
-            self.stats.warn(f"local bundle adjustment failed: {solution.failure}")
         if self.local_map.agreement(frame.index) < self.config.front_end.lost_inliers:
             self.graph.remove(frame.index)
+            self.graph.put_back(before)  # it bent what is around it
             self.stats.count("keyframes taken back")
             return False
         self.stats.count("keyframes")
@@ -75,7 +73,7 @@ class KeyframeWork:
         """The same of a segment's first keyframes, once they are solved."""
         yield from self.calibration.estimating_readout(keyframes)
         yield
-        self.local_map.adjust_window(keyframes[-1])
+        self._adjust_window(keyframes[-1])
         yield
         self.calibration.refine(keyframes)
         yield
@@ -84,6 +82,16 @@ class KeyframeWork:
                 self.loops.add(index)
                 yield
         yield from self.photometer.updating()
+
+    def _adjust_window(self, newest: int) -> None:
+        with self.stats.time("local bundle adjustment"):
+            self._note(self.local_map.adjust_window(newest).failure, "local bundle adjustment failed")
+
+    def _note(self, failure: str, what: str) -> None:
+        """A bundle adjustment that changed nothing. failure: why; empty where it did not fail."""
+        if failure:
+            self.stats.count("failed bundle adjustments")
+            self.stats.warn(f"{what}: {failure}")
 
     def _close_loops(self, index: int) -> Steps[None]:
         closure: Closure | None = yield from timed(self.stats, "loops", self._searching(index))
@@ -98,7 +106,8 @@ class KeyframeWork:
             if closure.joined is not None:
                 self.stats.count("segments joined")
         segment = self.graph.keyframes[index].segment
-        yield from timed(self.stats, "background bundle adjustment", self.back_end.working(segment))
+        failure = yield from timed(self.stats, "background bundle adjustment", self.back_end.working(segment))
+        self._note(failure, "background bundle adjustment failed")
         yield
 
     def _searching(self, index: int) -> Steps[Closure | None]:

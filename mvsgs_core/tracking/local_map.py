@@ -24,7 +24,7 @@ REACH = 5.0  # median depths of the scene
 class LocalMapConfig:
     recent: int = 3  # keyframes before, matched both ways
     proximity: int = 3  # older keyframes that see the same, matched both ways
-    proximity_flow: float = 0.25  # of the image width: largest mean flow to such a keyframe
+    proximity_flow: float = 0.25  # of the longer side: largest mean flow to such a keyframe
     window: int = 12  # keyframes in the local bundle adjustment; the two oldest poses are held
     steps: int = 5  # of the local bundle adjustment
     robust_scale: float = 1.0  # pixels
@@ -83,9 +83,18 @@ class LocalMap:
     def members(self, segment: int) -> list[int]:
         return self.graph.keyframes.members(segment)
 
+    def largest(self) -> list[int]:
+        """Members of the segment that most keyframes of this stream are in; none where it has no keyframe."""
+        own = [keyframe.segment for index, keyframe in self.graph.keyframes.items() if index >= 0]
+        return self.members(max(sorted(set(own)), key=own.count)) if own else []
+
+    def window(self, segment: int) -> list[int]:
+        """The newest keyframes, which the local bundle adjustment changes."""
+        return self.members(segment)[-self.config.window :]
+
     def release_images(self, segment: int) -> None:
         """Forgets what was computed of keyframes that were matched since the last time and are not in the window."""
-        self.release_images_but(set(self.members(segment)[-self.config.window :]))
+        self.release_images_but(set(self.window(segment)))
 
     def release_images_but(self, kept: Set[int]) -> None:
         """Forgets what was computed of all other keyframes that were matched since the last time: of thousands few."""
@@ -111,7 +120,7 @@ class LocalMap:
         """Keyframes that see the same from close by: smallest mean flow first, no two next to each other in time."""
         places = self._within_reach(index, candidates)
         flows = self.graph_flow(index, [candidates[n] for n in places])
-        limit = self.config.proximity_flow * self.graph.keyframes[index].image.size[1]
+        limit = self.config.proximity_flow * self.graph.keyframes[index].image.longer_side
         order = {candidates[n]: n for n in places}
         chosen: list[int] = []
         for candidate in sorted(flows, key=lambda c: flows[c]):
@@ -230,7 +239,7 @@ class LocalMap:
             return np.ones(len(image.cells.points))
         values = np.concatenate(depths)
         near = native.load("tracking").median_of_nearest(
-            points, values, image.cells.points.astype(np.float64), 5, float(image.size[1])
+            points, values, image.cells.points.astype(np.float64), 5, float(image.longer_side)
         )
         return np.where(np.isfinite(near), near, np.median(values))
 

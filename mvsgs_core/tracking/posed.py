@@ -87,7 +87,7 @@ class PosedTracker:
         if self.front_end.is_lost(step):
             return self._insert(frame, pose, {}) if self._shows_another_place(frame, pose) else []
         self._lights[-1] = FrameLight(index, observed(self.graph, step.reference, frame, step.matches))
-        if not self.choice.wants(index, step, frame.size[1], self.config.keyframe_choice.max_flow):
+        if not self.choice.wants(index, step, frame.longer_side, self.config.keyframe_choice.max_flow):
             if self._complete == [step.reference] and is_held_out(step.reference) and not is_held_out(index):
                 self.graph.remove(step.reference)  # the first frame of all: this one is as good
                 return self._first(frame, pose)
@@ -114,7 +114,7 @@ class PosedTracker:
     def finish(self) -> list[int]:
         """The stream has ended: the last keyframes, one of them of the last frames if they show something new."""
         complete: list[int] = []
-        tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[2], self.size[1])}
+        tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[2], t[0].longer_side)}
         last = newest(tail)
         if last is not None:
             frame, pose, step = tail[last]

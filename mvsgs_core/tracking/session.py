@@ -28,7 +28,7 @@ from mvsgs_core.tracking.front_end import FrontEnd, Step
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage, tracking_size
 from mvsgs_core.tracking.initializer import Initializer
-from mvsgs_core.tracking.keyframe_choice import KeyframeChoice, newest
+from mvsgs_core.tracking.keyframe_choice import KeyframeChoice, Tail
 from mvsgs_core.tracking.keyframe_spacing import spacing_of
 from mvsgs_core.tracking.keyframe_work import KeyframeWork
 from mvsgs_core.tracking.local_map import LocalMap
@@ -89,7 +89,8 @@ class Session:
         self.late = False  # the work on a keyframe must go on at once, or the camera may be lost
         self._at_work: frozenset[int] = frozenset()  # keyframes whose work has begun; frames may come meanwhile
         self._since = 0  # frames since the last keyframe
-        self._tail: dict[int, tuple[TrackingImage, Step]] = {}  # the last two frames since, if they were tracked
+        self._tail = Tail()
+        self._missed: TrackingImage | None = None  # the frame before, if a start could not follow it
 
     def add(self, frame: TrackingImage) -> Update:
         """The next frame of the stream; its pose is known then, and the update's `rest` is still to be done."""
@@ -105,9 +106,9 @@ class Session:
         """Frames that may still go out, as keyframes or between them: their images are needed until then."""
         waiting = set(self.initializer.waiting) | set(self.publisher.held) | self.waiting.indices | self._at_work
         if self.phase is not Phase.INITIALIZING:
-            return waiting | set(self._tail)
-        last = self.front_end.last  # the end of the stream may force an initialization with it
-        return waiting | (set() if last is None else {last.index})
+            return waiting | self._tail.indices
+        # the end of the stream may force an initialization with one, the next frame may begin one with the other
+        return waiting | {frame.index for frame in (self.front_end.last, self._missed) if frame is not None}
 
     @property
     def members(self) -> list[int]:
@@ -118,12 +119,13 @@ class Session:
         """The stream has ended: an initialization by force if there was none, else a keyframe of the last frames."""
         if self.phase is Phase.INITIALIZING:
             yield from self._force_initialization()
-        else:
-            yield from self._end_with_a_keyframe()
-        if self.phase is not Phase.INITIALIZING:
-            self.calibration.estimate_readout(self.members[-40:])
+        elif last := self._tail.last(self.choice):
+            self.waiting.end()
+            yield whole(self._add_keyframe(*last, record_of(self.records, last[0].index)))
+        if largest := self.local_map.largest():
+            self.calibration.estimate_readout(largest[-40:])
         if self.publisher.held:
-            yield Update(TrackingState.TRACKED, self._settle())
+            yield self._publish_held()
 
     def _handle(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The phase decides what becomes of a frame, and what becomes of it decides the next phase."""
@@ -134,7 +136,9 @@ class Session:
             step = self.front_end.follow(frame, with_pose=not initializing)
         followed = not self.front_end.is_lost(step)
         if initializing:
-            self.diagnosis.saw(self.front_end.reference, frame, step, not followed)
+            self.diagnosis.saw(self._missed or self.front_end.reference, frame, step, not followed)
+        if followed:
+            self._missed = None
         if step.still:
             return self._stand_still(frame, step, record)
         if followed:
@@ -147,15 +151,16 @@ class Session:
 
     def _stand_still(self, frame: TrackingImage, step: Step, record: FrameRecord) -> Update:
         """It shows what the frame that was followed last does, whatever came between: a hand before the lens."""
-        self.stats.skip("frames that did not move")
         assert self.front_end.last is not None
         same = record_of(self.records, self.front_end.last.index)
+        if same.state == TrackingState.LOST:  # the map contradicted it when it was to be a keyframe
+            return self._lose(frame, record)
+        self.stats.skip("frames that did not move")
         record.state, record.same_as = same.state, same.index
         if self.phase is not Phase.INITIALIZING:
             record.light = observed(self.graph, step.reference, frame, step.matches)  # the light may have changed
-            if same.state != TrackingState.LOST:
-                self.phase = Phase.TRACKING
-                self.relocalizer.found()
+            self.phase = Phase.TRACKING
+            self.relocalizer.found()
         return Update(record.state)
 
     def _follow_beside_work(self, frame: TrackingImage, step: Step | None, record: FrameRecord) -> Update:
@@ -170,10 +175,10 @@ class Session:
         if tracking:
             record.state = TrackingState.TRACKED
             record.follow(self.graph, step.reference, step.matches, step.pose, frame)
-            self._note_tail(frame, step)
+            self._tail.add(frame, step)
         self.waiting.add(frame, record)
         self.choice.saw(step)
-        self.late |= self.choice.is_late(step, frame.size[1], self.choice.max_flow)
+        self.late |= self.choice.is_late(step, frame.longer_side, self.choice.max_flow)
         return Update(record.state)
 
     def _begin_work(self, frame: TrackingImage, record: FrameRecord, steps: Steps[Update]) -> Update:
@@ -191,7 +196,7 @@ class Session:
 
     def _begin_segment(self, frame: TrackingImage, record: FrameRecord) -> Update:
         """The first keyframe of a segment, if the image has any texture."""
-        self.phase = Phase.INITIALIZING
+        self.phase, self._missed = Phase.INITIALIZING, None
         self.waiting.forget()
         record.state = TrackingState.NOT_INITIALIZED
         if not self._has_texture(frame):
@@ -206,7 +211,7 @@ class Session:
         """Keyframes are collected until they can be solved; those of a later segment are looked for in the map too."""
         self.recovery.keep(frame)
         limit = self.initializer.flow(self._since)
-        if not self.choice.wants(frame.index, step, frame.size[1], limit):
+        if not self.choice.wants(frame.index, step, frame.longer_side, limit):
             only = self.initializer.waiting == [step.reference]
             if only and is_held_out(step.reference) and not is_held_out(frame.index):  # this one is as good
                 self.initializer.abandon()
@@ -227,14 +232,21 @@ class Session:
         return Update(record.state) if place is None else self._resume(frame, record, place)
 
     def _initialize_anew(self, frame: TrackingImage, record: FrameRecord) -> Update:
-        """The keyframes that wait can't be followed: they go, unless the camera is found in an earlier segment."""
+        """The keyframes that wait can't be followed: they go where the next frame only can be from this one.
+
+        Else this one was bad: a hand before the lens, a jerk. The camera may be in an earlier segment, too.
+        """
         if not self._has_texture(frame):
             return Update(record.state)
         place = self._search_map(frame)
         if place is not None:
             return self._resume(frame, record, place)
+        before, self._missed = self._missed, frame
+        if before is None or not self.front_end.follows(before, frame):
+            return Update(record.state)
         self.initializer.abandon()
-        return self._begin_segment(frame, record)
+        self._begin_segment(before, record_of(self.records, before.index))
+        return self._initialize(frame, self.front_end.follow(frame, with_pose=False), record)
 
     def _begin_tracking(self, keyframes: list[int], record: FrameRecord) -> Steps[Update]:
         """The first keyframes of a segment are solved; frames before and between them are matched at once."""
@@ -250,7 +262,7 @@ class Session:
     def _published(self, record: FrameRecord, keyframes: list[int], correction: Correction | None = None) -> Update:
         """Keyframes are ready: they go out, where the focal length is certain, and the frames before them are posed."""
         published = self.publisher.publish_all(keyframes, self.calibration.settled)
-        later = self.waiting.settle(keyframes, self.records, self.publisher.published)
+        later = self.waiting.settle(list(published) or keyframes, self.records, self.publisher)
         return Update(record.state, published, correction, later=later)
 
     def _force_initialization(self) -> Iterator[Update]:
@@ -275,13 +287,13 @@ class Session:
         self.phase = Phase.TRACKING
         record.state = TrackingState.TRACKED
         record.follow(self.graph, step.reference, step.matches, step.pose, frame)
-        width = frame.size[1]
+        side = frame.longer_side
         limit = self.covisible_keyframes.limit(step.reference, self.choice.max_flow)
-        wanted = self.choice.wants(frame.index, step, width, limit)
-        if self.choice.moved(step, width, limit) and self._reuse_keyframe(frame, step):
+        wanted = self.choice.wants(frame.index, step, side, limit)
+        if self.choice.moved(step, side, limit) and self._reuse_keyframe(frame, step):
             return Update(record.state)
         if not wanted:
-            self._note_tail(frame, step)
+            self._tail.add(frame, step)
             self.waiting.add(frame, record)
             return Update(record.state)
         return self._begin_work(frame, record, self._add_keyframe(frame, step, record))
@@ -313,14 +325,6 @@ class Session:
         self.stats.skip("keyframes spared by covisible ones")
         return True
 
-    def _end_with_a_keyframe(self) -> Iterator[Update]:
-        """The last frames show what no keyframe does: one of them becomes one."""
-        tail = {i: t for i, t in self._tail.items() if self.choice.shows_new(t[1], t[0].size[1])}
-        last = newest(tail)
-        if last is not None:
-            self.waiting.end()
-            yield whole(self._add_keyframe(*tail[last], record_of(self.records, last)))
-
     # LOST and RELOCALIZING
 
     def _lose(self, frame: TrackingImage, record: FrameRecord) -> Update:
@@ -341,8 +345,8 @@ class Session:
         if not self.relocalizer.hopeless:
             return Update(record.state)
         self.segment = 1 + max(self.publisher.highest_segment, *(k.segment for k in self.graph.keyframes.values()))
-        held = self._settle() if self.publisher.held else ()
-        return replace(self._begin_segment(frame, record), keyframes=held)
+        held = self._publish_held() if self.publisher.held else Update(record.state)
+        return replace(held, state=self._begin_segment(frame, record).state)
 
     def _search_map(self, frame: TrackingImage) -> PlaceMatch | None:
         self.recovery.keep(frame)
@@ -372,28 +376,24 @@ class Session:
 
     def _refer_to(self, keyframe: TrackingImage, pose: np.ndarray | None) -> None:
         """A new keyframe is followed from here on, by frames that came since, too. pose (4, 4): its own, in a map."""
-        last, self._tail, self._since, self.late = self.front_end.last, {}, 0, False
+        last, self._tail, self._since, self.late = self.front_end.last, Tail(), 0, False
         later = last if last and last.index > keyframe.index else None
         if pose is not None and later and (step := self.front_end.move_to(keyframe, pose)):
-            self._note_tail(later, step)
+            self._tail.add(later, step)
             return self.choice.saw(step)
         self.front_end.refer_to(keyframe)
         self.front_end.pose = pose
-
-    def _note_tail(self, frame: TrackingImage, step: Step) -> None:
-        """A frame that the stream may end with."""
-        self._tail = {index: self._tail[index] for index in sorted(self._tail)[-1:]} | {frame.index: (frame, step)}
 
     def _follow_place(self, frame: TrackingImage, place: PlaceMatch) -> None:
         """An earlier keyframe is followed from here on, whose points were found in this frame."""
         keyframe = self.graph.keyframes[place.index].image
         self.front_end.resume(keyframe, frame, place.matches, place.localization.cam_from_world)
-        self._tail = {}
+        self._tail = Tail()
 
-    def _settle(self) -> tuple[int, ...]:
-        """Keyframes that were held back, with the focal length as far as it is known."""
+    def _publish_held(self) -> Update:
+        """Keyframes that were held back, with the focal length as far as it is known, and the frames between them."""
         self.calibration.settle(list(self.publisher.held))
-        return self.publisher.publish_all([], self.calibration.settled)
+        return self._published(self.records[-1], []).whole()
 
 
 __all__ = ["Session"]

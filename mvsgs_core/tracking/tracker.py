@@ -281,8 +281,8 @@ class Tracker:
                 correction, velocity=velocity, readout_time=graph.readout_time, reads_columns=graph.reads_columns
             )
         yield Update(state, correction=correction)
-        if tracking and not self._frozen:  # after what the map waits for
-            session.calibration.check(session.members)
+        if not self._frozen:  # after what the map waits for
+            session.calibration.check(session.local_map.largest())
 
 
 __all__ = ["Tracker", "TrackerConfig", "Update"]

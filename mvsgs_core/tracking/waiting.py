@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
 from functools import partial
 
 from mvsgs_core.stats import Stats
@@ -13,6 +12,7 @@ from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from mvsgs_core.tracking.matching.matcher import Matcher
 from mvsgs_core.tracking.photometer import Photometer
+from mvsgs_core.tracking.publish import Publisher
 from mvsgs_core.tracking.settling import Settling
 
 
@@ -52,11 +52,18 @@ class WaitingFrames:
         self._between.forget()
         self._both_sides.forget()
 
-    def settle(self, keyframes: list[int], records: list[FrameRecord], published: Set[int]) -> Settling:
-        """The frames before these keyframes are to be posed; those after them go on waiting. records: of all frames."""
+    def settle(self, keyframes: list[int], records: list[FrameRecord], publisher: Publisher) -> Settling:
+        """The frames before these keyframes are to be posed; those after them go on waiting. records: of all frames.
+
+        None goes out while these keyframes are held.
+        """
+        jobs = self._both_sides.settle(keyframes)
+        if publisher.held:
+            self._between.hold(len(publisher.held))
+            return Settling(frozenset(), jobs, tuple, self._stats)
         frames = self._between.close()
-        last = partial(self._between.settle, frames, keyframes[-1], records, published)
-        return Settling(frames, self._both_sides.settle(keyframes), last, self._stats)
+        last = partial(self._between.settle, frames, keyframes[-1], records, publisher.published)
+        return Settling(frames, jobs, last, self._stats)
 
 
 __all__ = ["WaitingFrames"]

@@ -118,7 +118,7 @@ class FeatureFlow:
         from_a, in_b = match_features(a, b)
         if len(from_a) < 15:
             return Matches(np.full(points.shape, np.nan), np.zeros(len(points)))
-        target = propagate(from_a, in_b - from_a, points, self.neighbors, radius=0.15 * a.size[1])
+        target = propagate(from_a, in_b - from_a, points, self.neighbors, radius=0.15 * a.longer_side)
         return Matches(target, np.isfinite(target[:, 0]).astype(np.float64))
 
 

@@ -22,7 +22,7 @@ from mvsgs_core.tracking.places.localization import localize
 @dataclass(frozen=True)
 class CovisibilityConfig:
     min_keyframes: int = 64  # of a map: smaller ones take every view, each makes them more accurate; 0: from the start
-    max_flow: float = 0.13  # of the width: old keyframes nearer to a view than this are covisible; 0: none ever is
+    max_flow: float = 0.13  # of the longer side: old keyframes nearer to a view than this are covisible; 0: none is
     min_age: int = 12  # references since a keyframe was made, before it is old: the local window, and its baselines
     max_candidates: int = 2  # old keyframes that are tried, the nearest first
     min_fraction: float = 0.6  # of the old keyframe's textured points: fewer found, and too much in the image is new
@@ -50,7 +50,7 @@ class CovisibleKeyframes:
         self._made |= dict.fromkeys(keyframes, -self.config.min_age)
 
     def limit(self, reference: int, usual: float) -> float:
-        """Median flow, as a fraction of the width, at which another keyframe is needed; usual: that of a young one."""
+        """Median flow, as a fraction of the longer side, that makes another keyframe; usual: that of a young one."""
         return max(usual, self.config.max_flow) if reference == self.followed else usual
 
     def find(self, frame: TrackingImage, pose: np.ndarray, reference: int) -> PlaceMatch | None:
@@ -62,7 +62,7 @@ class CovisibleKeyframes:
         if self.config.max_flow == 0 or len(self.local_map.members(segment)) < self.config.min_keyframes:
             return None
         old = [index for index in sorted(self._tied_to(reference)) if self._is_old(index, segment)]
-        near = self.local_map.from_pose(pose, old, self.config.max_flow * frame.size[1])
+        near = self.local_map.from_pose(pose, old, self.config.max_flow * frame.longer_side)
         for index in near[: self.config.max_candidates]:
             found = self._verify(frame, pose, index)
             if found is not None:

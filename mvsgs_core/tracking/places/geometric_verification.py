@@ -49,7 +49,7 @@ def verifying_place(
     if len(from_keyframe) < 15:
         return None
     yield
-    guess = propagate(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * image.size[1])
+    guess = propagate(from_keyframe, in_image - from_keyframe, keyframe.points, 3, 0.15 * image.longer_side)
     matches, fraction = matcher.match(keyframe.image, image, guess, 0.0)
     known = matches.alive & keyframe.triangulated
     if fraction < criteria.min_fraction or known.sum() < criteria.min_matches:

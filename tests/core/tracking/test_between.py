@@ -10,7 +10,7 @@ import pytest
 
 from mvsgs_core.stats import Stats
 from mvsgs_core.tracking import initializer
-from mvsgs_core.tracking.between import FramesBetween
+from mvsgs_core.tracking.between import HELD, FramesBetween
 from mvsgs_core.tracking.frames import FrameRecord
 from mvsgs_core.tracking.graph import KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
@@ -73,3 +73,19 @@ def test_frames_before_the_first_keyframe_that_is_left_are_forgotten() -> None:
     between.forget_before(4)
     assert between.waiting == {6, 7, 9}
     assert between.close() == {6, 7}
+
+
+def test_few_frames_wait_with_keyframes_that_wait_themselves_spread_evenly() -> None:
+    between = frames_between(limit=8)
+    come(between, 1, 2, 3, 4, 6, 7, 8, 9)
+    between.end()
+    come(between, 11, 12, 13, 14, 16, 17, 18, 19)
+    between.end()
+    between.hold(2)
+    kept = sorted(between.waiting)
+    assert len(kept) == 2 * HELD
+    assert max(np.diff([0, *kept, 20])) <= 8
+    come(between, 21)
+    between.reopen()
+    assert between.waiting == {*kept, 21}, "the keyframes are solved"
+    assert between.close() == set(kept)

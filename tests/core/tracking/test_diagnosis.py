@@ -10,6 +10,7 @@ import pytest
 
 from mvsgs_core.datasets import Item, open_dataset
 from tests.support.sequences import synthetic, track
+from tests.support.true_maps import item as true_room
 
 
 def blank() -> list[Item]:
@@ -25,10 +26,9 @@ def turning() -> list[Item]:
 
 
 def jumping() -> list[Item]:
-    """Views from all over the room: no frame shows what the one before does."""
-    every = synthetic(frames=80)[::16]
-    other = [open_dataset("synthetic", frames=4, threads=1, scene="aerial")]
-    far = [item for items in zip(every, list(other[0])) for item in items]
+    """Views in all directions of the room and from far apart over a landscape: no frame shows what another does."""
+    landscape = list(open_dataset("synthetic", frames=400, stride=130, threads=1, scene="aerial"))
+    far = [item for items in zip([true_room(k) for k in (0, 75, 150, 225)], landscape) for item in items]
     return [replace(i, index=n, timestamp=n / 20.0) for n, i in enumerate(far)]
 
 
@@ -37,7 +37,7 @@ def jumping() -> list[Item]:
     ("items", "kind", "figures"),
     [
         (blank, "no texture", r"10 of 10 frames .* 0\.0 %"),
-        (resting, "too little motion", r"0\.0 % of its width .* \d of 6 keyframes"),
+        (resting, "too little motion", r"0\.0 % of its longer side .* \d of 6 keyframes"),
         (turning, "parallax", r"explains the matches to 0\.\d pixels|\d\.\d pixels of"),
         (jumping, "steps too wide", r"\d of \d frames .* \d+ % of the matches survive, 20 % are needed"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ import pytest
 from mvsgs_core.datasets import Item
 from mvsgs_core.datasets.lens import guess_lens
 from mvsgs_core.datasets.synthetic import Synthetic
+from mvsgs_core.tracking.between import HELD
 from mvsgs_core.tracking.phase import Phase
-from mvsgs_core.tracking.tracker import Tracker, Update
+from mvsgs_core.tracking.tracker import Tracker, TrackerConfig, Update
 from mvsgs_core.trajectory import Trajectory
-from tests.support.sequences import ate
+from tests.support.sequences import ate, synthetic
 
 pytestmark = pytest.mark.slow
 
@@ -71,17 +73,40 @@ def test_the_focal_length_is_found(focal: float) -> None:
 
 
 def test_keyframes_wait_until_the_focal_length_is_settled() -> None:
-    tracker = Tracker()
+    tracker, limit = Tracker(), TrackerConfig().frames_between
     for item in room(1.3):
         update = tracker.add(item.index, item.timestamp, item.image, GUESS, guessed=True)
         if update.keyframes:
             break
         assert tracker.pending >= set(tracker.session.graph.keyframes), "an image that is still needed"
+        held = len(tracker.session.publisher.held)
+        if held:
+            assert len(tracker.session.waiting.indices) <= HELD * held + limit, "each holds its image"
     settled = tracker.focal_factor
     assert len(update.keyframes) >= 8
+    between = [frame.index for frame in update.between]
+    for before, after in pairwise(update.keyframes):
+        assert after - before <= 2 or any(before < index < after for index in between), "they wait as the keyframes do"
     for later in room(1.3)[item.index + 1 :]:
         tracker.add(later.index, later.timestamp, later.image, GUESS, guessed=True)
         assert tracker.focal_factor == settled
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_frames_between_keyframes_that_waited_to_the_end_of_their_part_go_out_with_them(lost: bool) -> None:
+    tracker, items = Tracker(), iter(room(1.3))
+    while len(tracker.session.publisher.held if tracker.phase is Phase.TRACKING else ()) < 6:
+        item = next(items)
+        assert tracker.add(item.index, item.timestamp, item.image, GUESS, guessed=True).keyframes == ()
+    held, updates = list(tracker.session.publisher.held), list[Update]()
+    for n, other in enumerate(synthetic(frames=40, scene="aerial")[:6] if lost else (), item.index + 1):
+        updates.append(tracker.add(n, n / 20.0, other.image, GUESS, guessed=True))
+    (update,) = [update for update in [*updates, *tracker.finish()] if update.keyframes]
+    assert update.keyframes == tuple(held)
+    assert not lost or update is updates[-1], "another part begins"
+    between = [frame.index for frame in update.between]
+    for before, after in pairwise(held):
+        assert any(before < index < after for index in between)
 
 
 def test_a_camera_that_never_turns_keeps_the_guess_and_says_so() -> None:
@@ -108,6 +133,18 @@ def test_a_known_focal_length_is_left_alone_and_a_wrong_one_is_said(off: float, 
         assert "dataset.intrinsics" in warning
     else:
         assert tracker.stats.warnings == []
+
+
+def test_a_wrong_focal_length_is_said_where_the_stream_ends_elsewhere() -> None:
+    """The last frames begin a segment of their own, which gives no map."""
+    tracker, elsewhere = Tracker(), synthetic(frames=40, scene="aerial")[:10]
+    for n, item in enumerate([*room(1.3), *elsewhere]):
+        tracker.add(n, n / 20.0, item.image, room(1.3)[0].intrinsics * [0.95, 0.95, 1.0, 1.0])
+    assert tracker.phase is Phase.INITIALIZING
+    list(tracker.finish())
+    assert tracker.trajectory().segment.max() == 0
+    assert tracker.stats.values["focal_checked_px"] == pytest.approx(1.3 * SIZE[1], rel=0.015)
+    assert "focal_doubt" in tracker.stats.values
 
 
 def test_a_motion_that_hardly_tells_a_focal_length_contradicts_none() -> None:

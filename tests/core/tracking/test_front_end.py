@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from mvsgs_core import geometry
+from mvsgs_core.datasets.synthetic import Synthetic
 from mvsgs_core.tracking.front_end import FrontEnd, FrontEndConfig
+from mvsgs_core.tracking.graph import Keyframe, KeyframeGraph
 from mvsgs_core.tracking.image import TrackingImage
 from tests.support.true_maps import exact_matches, image, item, matcher, pose_error, shuffled, true_graph, true_pose
+
+SLIT = slice(107, 213)  # columns of an image: a third
 
 
 def front_end(*keyframes: int) -> FrontEnd:
@@ -131,3 +138,41 @@ def test_the_images_velocity_is_that_of_the_flow() -> None:
     slow = at(4, 2.0)
     made.follow(slow, with_pose=True)
     assert slow.velocity is None, "a second later nothing is known of it"
+
+
+@functools.cache
+def slow() -> Synthetic:
+    """The same round at a pixel a frame."""
+    return Synthetic(frames=900, loop=True, threads=1)
+
+
+def through_a_slit(number: int, masked: bool, beside: int = 0) -> TrackingImage:
+    """A slow frame whose outer two thirds show nothing, as those of an upright video in a wide one."""
+    pixels, mask = np.full((240, 320, 3), beside, np.uint8), np.zeros((240, 320), bool)
+    pixels[:, SLIT], mask[:, SLIT] = slow()[number].image[:, SLIT], True
+    return TrackingImage.of(number, number / 20.0, pixels, (240, 320), False, mask=mask if masked else None)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_camera_that_moves_between_black_borders_does_not_rest(masked: bool) -> None:
+    frame, depth, seen = through_a_slit(0, masked), slow()[0].depth, through_a_slit
+    assert depth is not None
+    inverse_depth = 1.0 / depth[*frame.cells.points.astype(int).T[::-1]].astype(np.float64)
+    graph = KeyframeGraph(slow().intrinsics)
+    true = [geometry.inverse(np.asarray(slow()[number].world_from_cam)) for number in range(9)]
+    graph.add(Keyframe(frame, true[0], inverse_depth, 1e3 / inverse_depth**2, 0))
+    made = FrontEnd(graph, matcher(), FrontEndConfig(), 1)
+    made.refer_to(frame)
+    for number in range(1, 9):
+        step = made.follow(seen(number, masked), with_pose=True)
+        assert not step.still, number
+        assert pose_error(step.pose, true[number])[0] < 0.005, "meters"
+    assert made.follow(replace(seen(8, masked), index=9), with_pose=True).still
+
+
+def test_what_changes_where_it_is_masked_is_no_motion() -> None:
+    """A robot's own arm, a clock in the image."""
+    made = front_end(0)
+    made.refer_to(through_a_slit(0, masked=True))
+    made.follow(through_a_slit(6, masked=True), with_pose=False)
+    assert made.follow(replace(through_a_slit(6, masked=True, beside=60), index=7), with_pose=False).still

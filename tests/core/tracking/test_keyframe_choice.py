@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mvsgs_core.datasets import Item
 from mvsgs_core.held_out import is_held_out
 from mvsgs_core.tracking.front_end import Step
 from mvsgs_core.tracking.keyframe_choice import HELD_OUT, KeyframeChoice, KeyframeChoiceConfig, newest
 from mvsgs_core.tracking.matching.flow import Matches
 from mvsgs_core.tracking.places.localization import Localization
-from tests.support.sequences import synthetic, track, tracked_room
+from tests.support.sequences import ate, synthetic, track, tracked_room
 
-WIDTH, LIMIT = 320, 0.05  # a keyframe after 16 pixels
+SIDE, LIMIT = 320, 0.05  # a keyframe after 16 pixels
 
 
 def step(flow: float, fraction: float = 0.9) -> Step:
@@ -25,7 +26,7 @@ def chosen(flows: list[float], fractions: list[float] | None = None, first: int 
     """Frames that are wanted as keyframes, all of them seen from one reference."""
     choice = KeyframeChoice(KeyframeChoiceConfig())
     steps = [step(f, s) for f, s in zip(flows, fractions or [0.9] * len(flows))]
-    return [n for n, s in enumerate(steps, start=first) if choice.wants(n, s, WIDTH, LIMIT)]
+    return [n for n, s in enumerate(steps, start=first) if choice.wants(n, s, SIDE, LIMIT)]
 
 
 def test_a_held_out_frame_leaves_its_place_to_the_next() -> None:
@@ -50,7 +51,7 @@ def test_few_matches_that_agree_with_the_pose_make_a_keyframe_after_half_the_flo
     choice = KeyframeChoice(KeyframeChoiceConfig())
     for flow, inliers, wanted in ((9.0, 0.7, True), (7.0, 0.7, False), (9.0, 0.8, False), (17.0, 0.8, True)):
         seen = replace(step(flow), localization=Localization(np.eye(4), inliers))
-        assert choice.moved(seen, WIDTH, LIMIT) == wanted
+        assert choice.moved(seen, SIDE, LIMIT) == wanted
 
 
 @pytest.mark.slow
@@ -81,3 +82,19 @@ def test_a_camera_that_comes_to_rest_makes_no_keyframe_in_the_end() -> None:
     last = trajectory.index[trajectory.keyframe].tolist()[-1]
     assert last <= 40
     assert last >= 39, "the newest view that is not held out, or the last frame before the rest"
+
+
+def upright(item: Item) -> Item:
+    """The same frame of the same camera, turned by 90 degrees."""
+    fx, fy, cx, cy = item.intrinsics
+    intrinsics = np.array([fy, fx, cy, item.image.shape[1] - 1 - cx])
+    return replace(item, image=np.ascontiguousarray(np.rot90(item.image)), intrinsics=intrinsics)
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_held_upright_makes_as_many_keyframes() -> None:
+    items = synthetic(frames=50, size=(216, 384))
+    across, along = (track(some)[1] for some in (items, [upright(item) for item in items]))
+    error, length = ate(along, items)
+    assert error < 0.003 * length
+    assert abs(int(across.keyframe.sum()) - int(along.keyframe.sum())) <= 1

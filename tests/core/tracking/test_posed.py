@@ -143,3 +143,24 @@ def test_frames_that_can_not_be_followed_are_keyframes_where_they_show_another_p
     tracker.add(36, 36 / 30.0, hand, gone)
     assert max(tracker.graph.keyframes) == 36
     assert len(tracker.graph.keyframes) == before + 1
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_held_upright_makes_as_many_keyframes() -> None:
+    counts = []
+    for turned in (False, True):
+        items = synthetic(frames=50, size=(216, 384))
+        fx, fy, cx, cy = items[0].intrinsics
+        size, intrinsics = (
+            ((384, 216), np.array([fy, fx, cy, 383 - cx])) if turned else ((216, 384), items[0].intrinsics)
+        )
+        tracker = PosedTracker(PosedConfig(), size, intrinsics)
+        turn = np.eye(4)
+        if turned:  # what lay to the right lies above
+            turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+        keyframes: list[int] = []
+        for item in items:
+            image = np.ascontiguousarray(np.rot90(item.image)) if turned else item.image
+            keyframes += tracker.add(item.index, item.timestamp, image, item.world_from_cam @ turn)
+        counts.append(len(keyframes + tracker.finish()))
+    assert abs(counts[0] - counts[1]) <= 1

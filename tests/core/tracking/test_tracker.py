@@ -99,6 +99,29 @@ def test_a_turning_start_waits_for_parallax_and_is_filled_in_later() -> None:
     assert np.mean(trajectory.state == TrackingState.TRACKED) > 0.9
 
 
+def test_bad_frames_before_the_start_cost_no_other_than_themselves() -> None:
+    """A slow camera: a start takes longer than from one of them to the next."""
+    random, items = np.random.default_rng(0), list(synthetic(frames=600, stop=100))
+    bad = range(7, len(items), 15)
+    for n in bad:
+        items[n] = replace(items[n], image=random.integers(0, 255, items[n].image.shape, dtype=np.uint8))
+    _, trajectory, updates = track(items)
+    assert any(update.keyframes for update in updates[: len(items)])
+    known = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))
+    assert trajectory.index[~known].tolist() == list(bad)
+    error, length = ate(trajectory, items)
+    assert error < 0.01 * length
+
+
+def test_a_camera_that_is_elsewhere_before_the_start_begins_anew_with_its_first_frame_there() -> None:
+    elsewhere = synthetic(frames=40, scene="aerial")
+    items = [replace(i, index=n, timestamp=n / 20.0) for n, i in enumerate([*synthetic(frames=80)[:8], *elsewhere])]
+    _, trajectory, _ = track(items)
+    known = np.isfinite(trajectory.world_from_cam).all(axis=(1, 2))
+    assert known.tolist() == [False] * 8 + [True] * len(elsewhere)
+    assert set(trajectory.segment[known].tolist()) == {0}
+
+
 def test_a_covered_lens_is_lost_and_found_again() -> None:
     items = synthetic(frames=90, covered=12, covered_start=50)
     tracker, trajectory, updates = track(items)
