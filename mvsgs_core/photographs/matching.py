@@ -58,17 +58,16 @@ def propose_pairs(features: list[Features], neighbors: int) -> list[tuple[int, i
 
 def _most_alike(alike: np.ndarray, of: int, count: int) -> list[int]:
     """Up to `count` photographs, those most alike first: `COPIES` of itself at most, and one of others' copies."""
-    same = alike >= COPY * FIRST
     chosen: list[int] = []
     copies = 0
     for other in np.argsort(-alike[of], kind="stable").tolist():
         if len(chosen) == count or alike[of, other] <= 0:
             break
-        if same[of, other]:
+        if alike[of, other] >= COPY * FIRST:
             copies += 1
             if copies > COPIES:
                 continue
-        elif same[other, chosen].any():
+        elif (alike[other, chosen] >= COPY * FIRST).any():
             continue
         chosen.append(other)
     return chosen

@@ -240,8 +240,11 @@ class Reconstruction:
         self._solve(use, free, steps, lens=True, tolerance=tolerance)
         self._normalize()
         self._forget()
-        self._drop()
+        dropped = self._drop()
         self._triangulate(None)
+        if dropped:  # only with more points than are there now are they tried again
+            seen = np.bincount(self.tracks.photograph[self._known()[self.tracks.track]], minlength=len(self.poses))
+            self._failed |= {index: int(seen[index]) for index in dropped}
 
     def _solve(self, use: np.ndarray, free: np.ndarray, steps: int, lens: bool, tolerance: float) -> None:
         views = len(self.order) if lens and self.free_lens else 0
@@ -287,15 +290,14 @@ class Reconstruction:
         np.maximum.at(off, track, np.arccos(np.clip(np.sum(rays * mean[track], axis=1), -1.0, 1.0)))
         self.points[(count < 2) | (2.0 * off < MIN_ANGLE)] = np.nan
 
-    def _drop(self) -> None:
-        """Photographs that too few points hold any more lose their poses."""
+    def _drop(self) -> list[int]:
+        """Photographs that too few points hold any more lose their poses; which."""
         use, _ = self._agreeing()
         held = np.bincount(self.tracks.photograph[use], minlength=len(self.poses))
-        seen = np.bincount(self.tracks.photograph[self._known()[self.tracks.track]], minlength=len(self.poses))
-        for index in [n for n in self.order if held[n] < MIN_SEEN]:
-            self.poses[index] = np.nan
-            self._failed[index] = int(seen[index])
-            self.order.remove(index)
+        dropped = [n for n in self.order if held[n] < MIN_SEEN]
+        self.poses[dropped] = np.nan
+        self.order = [n for n in self.order if n not in dropped]
+        return dropped
 
     def _normalize(self) -> None:
         """The unit is the cameras' spread: nothing runs away from the solver's thresholds."""
